@@ -1,0 +1,42 @@
+# One .venv for everything, made anew when pyproject.toml changes.
+
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/stamp
+
+.PHONY: demo test lint bench docs clean
+
+demo: $(STAMP)
+	$(BIN)/r2p demo
+
+test: $(STAMP) system
+	$(BIN)/pytest
+
+lint: $(STAMP)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+bench: $(STAMP)
+	$(BIN)/python -m benchmarks
+
+docs: $(STAMP)
+	$(BIN)/mkdocs build --strict
+
+clean:
+	rm -rf .venv site
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
+	$(BIN)/python -m pip install --quiet --editable '.[all]' --group test --group lint --group docs --group bench
+	touch $@
+
+# What the tests use of the system: installed where we may, else they say what they skip.
+.PHONY: system
+system:
+	@command -v socat >/dev/null || { [ "$$(id -u)" = 0 ] && apt-get install --quiet --yes socat >/dev/null; } \
+	  || { [ "$$(id -u)" = 0 ] && apt-get update --quiet >/dev/null && apt-get install --quiet --yes socat >/dev/null; } \
+	  || echo "socat is missing: the tests over a serial cable are skipped (apt install socat)"

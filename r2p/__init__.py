@@ -1,0 +1,109 @@
+"""r2p: typed publish/subscribe from the microcontroller on the CAN bus to the PC in the next town.
+
+Nodes are coroutine functions that exchange typed messages on topics; modules run nodes and join networks by transports:
+
+    async def blink(node: r2p.Node) -> None:
+        leds = node.advertise("leds", Led)
+        async for _ in node.every(0.5):
+            await leds.publish(Led(led=3, value=1))
+
+    r2p.run(blink, via="tcp:192.168.0.10:23")
+"""
+
+from r2p.errors import (
+    Broken,
+    Closed,
+    Deadlock,
+    DecodeError,
+    Error,
+    InvalidName,
+    MessageError,
+    NameTooLong,
+    NodeCrashed,
+    TransportError,
+    TypeMismatch,
+)
+from r2p.messages import (
+    Layout,
+    Len,
+    Message,
+    Timestamp,
+    f32,
+    f64,
+    i8,
+    i16,
+    i32,
+    i64,
+    layout,
+    u8,
+    u16,
+    u32,
+    u64,
+)
+from r2p.module import LinkDown, LinkUp, LinkWaits, Listening, Module, ModuleEvent
+from r2p.node import Node, Tick
+from r2p.protocols.events import Command
+from r2p.publisher import (
+    Missed,
+    NonRealTime,
+    Periodic,
+    PeriodicPublisher,
+    Publisher,
+    Sporadic,
+    SporadicPublisher,
+)
+from r2p.run import run
+from r2p.sample import PublisherClass, Sample, Source
+from r2p.subscriber import Subscriber
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Broken",
+    "Closed",
+    "Command",
+    "Deadlock",
+    "DecodeError",
+    "Error",
+    "InvalidName",
+    "Layout",
+    "Len",
+    "LinkDown",
+    "LinkUp",
+    "LinkWaits",
+    "Listening",
+    "Message",
+    "MessageError",
+    "Missed",
+    "Module",
+    "ModuleEvent",
+    "NameTooLong",
+    "Node",
+    "NodeCrashed",
+    "NonRealTime",
+    "Periodic",
+    "PeriodicPublisher",
+    "Publisher",
+    "PublisherClass",
+    "Sample",
+    "Source",
+    "Sporadic",
+    "SporadicPublisher",
+    "Subscriber",
+    "Tick",
+    "Timestamp",
+    "TransportError",
+    "TypeMismatch",
+    "f32",
+    "f64",
+    "i8",
+    "i16",
+    "i32",
+    "i64",
+    "layout",
+    "run",
+    "u8",
+    "u16",
+    "u32",
+    "u64",
+]

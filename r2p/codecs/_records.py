@@ -1,0 +1,102 @@
+"""Messages of a fixed size: a packed body, then a type byte, as on the topics `R2P` and `BOOT_<module>`.
+
+One table says it all: for each frozen struct its type byte and, attribute by attribute, the kinds of the `struct`
+module (`x` is a byte without an attribute). A `str` attribute is a name: NUL padded, without a terminator when it fills
+its field.
+"""
+
+import struct
+from typing import Generic, TypeVar
+
+import msgspec
+
+from r2p.codecs import UnknownType
+from r2p.errors import DecodeError, MessageError
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class Record(Generic[T]):
+    """The wire format of one struct, without padding and little-endian: `Record(Alive, 0x11, "7s x B")`.
+
+    `version` is the body's first byte, for types that have one. Attributes in `may_be_empty` are names that may be
+    missing.
+    """
+
+    def __init__(
+        self, cls: type[T], code: int, kinds: str, *, version: int | None = None, may_be_empty: tuple[str, ...] = ()
+    ) -> None:
+        self.cls = cls
+        self.code = code
+        self.version = version
+        self._may_be_empty = may_be_empty
+        self._format = struct.Struct("<" + kinds)
+        self._fields = list(zip(cls.__struct_fields__, (k for k in kinds.split() if k != "x"), strict=True))
+        self._names = [field.type is str for field in msgspec.structs.fields(cls)]
+
+    def pack(self, message: T) -> bytes:
+        return self._format.pack(*(self._packable(message, name, kind) for name, kind in self._fields))
+
+    def unpack(self, body: bytes) -> T:
+        values = self._format.unpack_from(body)
+        named = zip(self._fields, self._names, values, strict=True)
+        return self.cls(*(self._name(field[0], value) if is_name else value for field, is_name, value in named))
+
+    def _packable(self, message: T, name: str, kind: str) -> int | bytes:
+        """The value as `struct` takes it without cutting or filling it in silence."""
+        value: int | str | bytes = getattr(message, name)
+        where = f"{self.cls.__name__}.{name} = {value!r}"
+        if isinstance(value, int):
+            _check_int(where, kind, value)
+            return value
+        size = struct.calcsize(kind)
+        if isinstance(value, bytes):
+            if len(value) != size:
+                raise MessageError(f"{where}: takes {size} bytes, not {len(value)}")
+            return value
+        if not (value or name in self._may_be_empty) or len(value) > size or not _is_plain(value):
+            raise MessageError(f"{where}: takes a name of 1 to {size} printable ASCII characters")
+        return value.encode()
+
+    def _name(self, name: str, field: bytes) -> str:
+        text = field.partition(b"\0")[0].decode("latin-1")
+        if not (text or name in self._may_be_empty) or not _is_plain(text):
+            raise DecodeError(f"{self.cls.__name__}.{name}: {text!r} is no name")
+        return text
+
+
+class Codec(Generic[T]):
+    """Encodes and decodes a family of records, told apart by their last byte; each is `size` bytes."""
+
+    def __init__(self, size: int, *records: Record[T]) -> None:
+        self._size = size
+        self._by_class: dict[type[msgspec.Struct], Record[T]] = {record.cls: record for record in records}
+        self._by_code = {record.code: record for record in records}
+
+    def encode(self, message: T) -> bytes:
+        record = self._by_class[type(message)]
+        version = b"" if record.version is None else bytes((record.version,))
+        return (version + record.pack(message)).ljust(self._size - 1, b"\0") + bytes((record.code,))
+
+    def decode(self, data: bytes) -> T:
+        if len(data) != self._size:
+            raise DecodeError(f"{len(data)} bytes instead of {self._size}")
+        record = self._by_code.get(data[-1])
+        if record is None:
+            raise UnknownType(f"unknown type 0x{data[-1]:02X}")
+        if record.version is None:
+            return record.unpack(data)
+        if data[0] != record.version:
+            raise UnknownType(f"version {data[0]} of {record.cls.__name__}")
+        return record.unpack(data[1:])
+
+
+def _is_plain(text: str) -> bool:
+    return text.isascii() and text.isprintable()
+
+
+def _check_int(where: str, kind: str, value: int) -> None:
+    try:
+        struct.pack("<" + kind, value)
+    except struct.error:
+        raise MessageError(f"{where}: takes {struct.calcsize(kind)} unsigned bytes") from None

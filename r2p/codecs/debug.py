@@ -1,0 +1,191 @@
+r"""The debug transport's lines: `@DDDDDDDD:LLname:PPpayload:CC\r\n` (PROTOCOL.md 3).
+
+The reader takes a line that lies whole and sound in its buffer with one regular expression. Anything else - a line cut
+by the end of a chunk, damage, noise - goes field by field, as firmware reads. Both ways give the same lines, however
+the bytes are cut into chunks.
+
+Two things we do otherwise than firmware: a wrong checksum drops the message, and so does a character in a topic name
+that is not printable, so that a line end always ends the damage.
+"""
+
+import re
+from binascii import Error as BadHex
+from binascii import hexlify, unhexlify
+from collections.abc import Callable
+
+import msgspec
+
+from r2p.errors import MessageError
+from r2p.names import TOPIC_MAX
+
+PAYLOAD_MAX = 255
+
+_HEX = b"0123456789ABCDEFabcdef"
+_PRINTABLE = bytes(range(0x20, 0x7F))
+_LINE_END = b"\r\n"
+_AT = ord("@")
+_WHOLE = re.compile(rb"@([^:]{8}):([^:]{2})([ -9;-~]{1,16}):([^:]{4,512}):([^:]{2})[\r\n]*")
+_NOISE = re.compile(rb"[^\r\n]+")
+
+
+class Line(msgspec.Struct, frozen=True, gc=False):
+    """One message as it goes over the line.
+
+    `topic` is 1 to 16 bytes of printable ASCII, `data` 1 to 255 bytes; `deadline`, an unsigned 32-bit number of
+    microseconds, means something to its sender only.
+    """
+
+    topic: bytes
+    data: bytes
+    deadline: int
+
+
+def encode(topic: bytes, data: bytes, deadline: int) -> bytes:
+    """One line, with its end. Raises `MessageError` when the topic or the payload does not fit; the deadline wraps."""
+    return encoder(topic)(data, deadline)
+
+
+def encoder(topic: bytes) -> Callable[[bytes, int], bytes]:
+    """`encode` for many messages of one topic: takes payload and deadline."""
+    if not 1 <= len(topic) <= TOPIC_MAX or topic.strip(_PRINTABLE):
+        raise MessageError(f"topic {topic!r}: a line carries 1 to {TOPIC_MAX} printable characters")
+    name = b":%02X%b:" % (len(topic), topic)
+    name_sum = len(topic) + sum(topic)
+
+    def encode_message(data: bytes, deadline: int) -> bytes:
+        size = len(data)
+        if not 1 <= size <= PAYLOAD_MAX:
+            raise MessageError(f"topic {topic.decode()}: a line carries 1 to {PAYLOAD_MAX} bytes, not {size}")
+        stamp = (deadline & 0xFFFFFFFF).to_bytes(4, "big")
+        checksum = -(name_sum + sum(stamp) + size + sum(data)) & 0xFF
+        return b"@%b%b%02X%b:%02X\r\n" % (hexlify(stamp).upper(), name, size, hexlify(data).upper(), checksum)
+
+    return encode_message
+
+
+class Reader:
+    """Turns a stream into lines and never fails: what is no message is counted by reason in `drops`.
+
+    | reason | what came |
+    | --- | --- |
+    | garbage | anything between messages but line ends, once for each run up to a line end or an `@` |
+    | cut short | a line end inside a message |
+    | bad hex, bad separator, bad name | another wrong character in that place |
+    | topic length | no name, or one of over 16 bytes |
+    | empty payload | a payload length of 0 |
+    | checksum | a sum that is wrong; firmware does not look |
+
+    What follows a dropped message up to the line end belongs to it, and is not counted again. The reader holds at most
+    one unfinished message, under 600 bytes.
+    """
+
+    def __init__(self) -> None:
+        self.drops: dict[str, int] = {}
+        self._held = b""
+        self._counted = False  # the noise that comes next, up to a line end, is already counted
+
+    def feed(self, data: bytes) -> list[Line]:
+        """The messages that these bytes complete, in order."""
+        buffer = self._held + data
+        lines: list[Line] = []
+        at = 0
+        while at < len(buffer):
+            if buffer[at] != _AT:
+                at = self._skip_noise(buffer, at)
+            elif (whole := _WHOLE.match(buffer, at)) and (line := _sound(whole)):
+                lines.append(line)
+                self._counted = False
+                at = whole.end()
+            else:
+                try:
+                    at = self._read(buffer, at, lines)
+                except _Unfinished:
+                    break
+        self._held = buffer[at:]
+        return lines
+
+    def _skip_noise(self, buffer: bytes, start: int) -> int:
+        end = buffer.find(b"@", start)
+        if end < 0:
+            end = len(buffer)
+        runs = sum(1 for _ in _NOISE.finditer(buffer, start, end))
+        if self._counted and buffer[start] not in _LINE_END:
+            runs -= 1
+        if runs:
+            self._drop("garbage", runs)
+        self._counted = buffer[end - 1] not in _LINE_END
+        return end
+
+    def _read(self, buffer: bytes, start: int, lines: list[Line]) -> int:
+        """Read one message field by field and return where to go on: firmware looks on after the wrong character."""
+        fields = _Fields(buffer, start + 1)
+        try:
+            lines.append(fields.line())
+            self._counted = False
+        except _Wrong as wrong:
+            self._drop(str(wrong))
+            self._counted = buffer[fields.at - 1] not in _LINE_END
+        return fields.at
+
+    def _drop(self, reason: str, count: int = 1) -> None:
+        self.drops[reason] = self.drops.get(reason, 0) + count
+
+
+def _sound(whole: re.Match[bytes]) -> Line | None:
+    deadline, name_size, topic, payload, checksum = whole.groups()
+    try:
+        raw = unhexlify(deadline + name_size + payload + checksum)
+    except BadHex:
+        return None
+    if raw[4] != len(topic) or raw[5] != len(raw) - 7 or (sum(raw) + sum(topic)) & 0xFF:
+        return None
+    return Line(topic, raw[6:-1], int.from_bytes(raw[:4], "big"))
+
+
+class _Unfinished(Exception):
+    """Right so far, but the rest is yet to come."""
+
+
+class _Wrong(Exception):
+    """No message; says why."""
+
+
+class _Fields:
+    """A place in the buffer that moves field by field, and past the first wrong character."""
+
+    def __init__(self, buffer: bytes, at: int) -> None:
+        self.at = at
+        self._buffer = buffer
+
+    def line(self) -> Line:
+        deadline = self._hex(4)
+        self._separator()
+        name_size = self._hex(1)
+        if not 1 <= name_size[0] <= TOPIC_MAX:
+            raise _Wrong("topic length")
+        topic = self._take(name_size[0], _PRINTABLE, "bad name")
+        self._separator()
+        size = self._hex(1)
+        if not size[0]:
+            raise _Wrong("empty payload")
+        data = self._hex(size[0])
+        self._separator()
+        if sum(deadline + name_size + topic + size + data + self._hex(1)) & 0xFF:
+            raise _Wrong("checksum")
+        return Line(topic, data, int.from_bytes(deadline, "big"))
+
+    def _separator(self) -> None:
+        self._take(1, b":", "bad separator")
+
+    def _hex(self, size: int) -> bytes:
+        return unhexlify(self._take(2 * size, _HEX, "bad hex"))
+
+    def _take(self, count: int, allowed: bytes, otherwise: str) -> bytes:
+        text = self._buffer[self.at : self.at + count]
+        if wrong := text.lstrip(allowed):
+            self.at += len(text) - len(wrong) + 1
+            raise _Wrong("cut short" if wrong[0] in _LINE_END else otherwise)
+        if len(text) < count:
+            raise _Unfinished
+        self.at += count
+        return text

@@ -1,0 +1,67 @@
+"""Messages: frozen values with a fixed layout, little-endian and packed (PROTOCOL.md 2).
+
+A message class is plain annotations. At the first `layout(T)` they become a small tree of shapes, and the tree becomes
+two Python functions around one `struct.Struct`, so that packing costs little more than the struct itself.
+
+    class Wheel(r2p.Message):
+        speed: r2p.f32 = 0.0                                    # a number: u8 .. u64, i8 .. i64, f32, f64; or a bool
+        currents: tuple[r2p.f32, r2p.f32] = (0.0, 0.0)          # an array of numbers, texts, arrays or messages
+        serial: Annotated[tuple[r2p.u8, ...], r2p.Len(16)]      # a longer one; no default: required
+        name: Annotated[str, r2p.Len(8)] = ""                   # ASCII, padded with NUL
+        stamp: r2p.Timestamp = r2p.Timestamp()                  # a message in the message
+
+The order on the wire is the order of definition, base classes first; a field defined again keeps its place.
+
+A value is packed exactly or refused with a MessageError: no number is wrapped or cut, no text shortened. Numbers are
+what the struct module takes as such: a bool, or an object with `__index__`, is an integer, and an integer is a float;
+an f32 is rounded to its 24 bits; NaN and infinities pass. A bool has to be a bool, an array a tuple, and a message of
+the very class. Reading, any byte but 0 is True, and a text ends at its first NUL: firmware leaves rubbish behind it.
+"""
+
+from r2p.messages.layouts import SIZE_MAX, Layout, Message, Timestamp, layout
+from r2p.messages.schemas import message_type
+from r2p.messages.shapes import (
+    Array,
+    Chars,
+    Field,
+    Len,
+    Nested,
+    Scalar,
+    Shape,
+    f32,
+    f64,
+    i8,
+    i16,
+    i32,
+    i64,
+    u8,
+    u16,
+    u32,
+    u64,
+)
+
+__all__ = [
+    "SIZE_MAX",
+    "Array",
+    "Chars",
+    "Field",
+    "Layout",
+    "Len",
+    "Message",
+    "Nested",
+    "Scalar",
+    "Shape",
+    "Timestamp",
+    "f32",
+    "f64",
+    "i8",
+    "i16",
+    "i32",
+    "i64",
+    "layout",
+    "message_type",
+    "u8",
+    "u16",
+    "u32",
+    "u64",
+]

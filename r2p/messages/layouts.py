@@ -1,0 +1,215 @@
+"""Message classes, and the layout that is compiled from their annotations at first use.
+
+A layout is kept in its class, so that a class that a tool has built from a schema can go again, layout and all.
+"""
+
+import keyword
+import re
+from collections.abc import Callable, Iterator
+from hashlib import blake2b
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    Self,
+    TypeVar,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import msgspec
+
+from r2p.errors import DecodeError, MessageError
+from r2p.messages.packing import functions
+from r2p.messages.shapes import BOOL, Array, Chars, Field, Len, Nested, Scalar, Shape, show, u32
+
+SIZE_MAX = 1024
+"""Bytes of the longest message: 128 RTCAN fragments of 8. The debug line carries 255."""
+
+_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_METHODS = frozenset({"encode", "decode"})  # a field of that name would hide the method
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
+class Message(msgspec.Struct, frozen=True, gc=False):
+    """The base of all messages: subclass it, and annotate the fields."""
+
+    _layout: ClassVar[Any] = None
+
+    def encode(self) -> bytes:
+        """Pack the message; raises MessageError."""
+        return layout(type(self)).encode(self)
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """Unpack a message; raises DecodeError."""
+        return layout(cls).decode(data)
+
+
+M = TypeVar("M", bound=Message)
+
+
+class Layout(msgspec.Struct, Generic[M], frozen=True, eq=False):
+    """How the messages of one class lie in bytes.
+
+    `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with the path of what
+    is nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` its BLAKE2b-64 (8 bytes). `zero` is the
+    message of zero bytes. `encode` raises MessageError that names the field; `decode` raises DecodeError.
+    """
+
+    cls: type[M]
+    fields: tuple[Field, ...]
+    size: int
+    schema: str
+    fingerprint: bytes
+    zero: M
+    encode: Callable[[M], bytes]
+    decode: Callable[[bytes], M]
+
+    def __repr__(self) -> str:
+        return f"<Layout of {self.cls.__name__}, {self.size} bytes: {self.schema}>"
+
+
+def layout(cls: type[M]) -> Layout[M]:
+    """The layout of a message class, compiled at first use.
+
+    Raises MessageError for a class without a fixed layout of 1 to `SIZE_MAX` bytes, saying what to write instead.
+    """
+    return _layout(cls, ())
+
+
+class Timestamp(Message):
+    """An instant inside a message: seconds and nanoseconds since 1970, up to 2106 (PROTOCOL.md 2)."""
+
+    sec: u32 = 0
+    nsec: u32 = 0
+
+    @property
+    def ns(self) -> int:
+        """The instant in nanoseconds."""
+        return self.sec * 1_000_000_000 + self.nsec
+
+    @classmethod
+    def from_ns(cls, ns: int) -> Self:
+        """The timestamp of an instant in nanoseconds; raises MessageError outside of 1970 to 2106."""
+        sec, nsec = divmod(ns, 1_000_000_000)
+        if not 0 <= sec < 1 << 32:
+            raise MessageError(f"{show(ns)} ns is no instant between 1970 and 2106, the years of a Timestamp")
+        return cls(sec, nsec)
+
+
+def check_field_name(path: str, name: str) -> None:
+    """Raises MessageError for a name that can't be a field's."""
+    if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name) or name in _METHODS:
+        raise MessageError(f"{path}: name a field in ASCII, a letter first; no Python keyword, not encode, not decode")
+
+
+def _layout(cls: Any, outer: tuple[type, ...]) -> Layout[Any]:
+    """The layout of a class that is met inside of the classes `outer`."""
+    found: Layout[Any] | None = vars(cls).get("_layout") if isinstance(cls, type) else None  # not a base class's
+    if found is None:
+        if not (isinstance(cls, type) and issubclass(cls, Message)):
+            raise MessageError(f"{show(cls)} is no message class: subclass r2p.Message")
+        cls._layout = found = _compile(cls, outer)
+    return found
+
+
+def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
+    if cls in outer:
+        raise MessageError(f"{cls.__name__} holds itself: a message has a fixed size")
+    if not cls.__struct_config__.frozen:
+        raise MessageError(f"{cls.__name__} is not frozen, but subscribers share the very object: no frozen=False here")
+    fields = tuple(Field(name, _shape(hint, f"{cls.__name__}.{name}", (*outer, cls))) for name, hint in _hints(cls))
+    size = sum(field.shape.size for field in fields)
+    _check_size(cls.__name__, size)
+    encode, decode = functions(cls, fields)
+    try:
+        zero: M = decode(bytes(size))
+    except DecodeError as error:
+        raise MessageError(f"{cls.__name__} refuses to be all zero, which any module may send: {error}") from error
+    schema = " ".join(leaf for field in fields for leaf in _leaves(field.shape, field.name))
+    return Layout(cls, fields, size, schema, blake2b(schema.encode(), digest_size=8).digest(), zero, encode, decode)
+
+
+def _hints(cls: type[Message]) -> Iterator[tuple[str, Any]]:
+    """Field names and annotations in wire order: `get_type_hints` begins with the base classes."""
+    try:
+        hints = get_type_hints(cls, include_extras=True)
+    except (NameError, AttributeError, SyntaxError, TypeError) as error:
+        raise MessageError(
+            f"{cls.__name__}: {error}: import what its annotations name at run time, not under TYPE_CHECKING; and "
+            "under `from __future__ import annotations` they can only name what its module holds, not a function"
+        ) from error
+    for name, hint in hints.items():
+        if name in cls.__struct_fields__:
+            check_field_name(f"{cls.__name__}.{name}", name)
+            yield name, hint
+
+
+def _shape(hint: Any, path: str, outer: tuple[type, ...]) -> Shape:
+    base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    length = next((_length(mark.count, path) for mark in marks if isinstance(mark, Len)), None)
+    if get_origin(base) is tuple:
+        return _array(get_args(base), length, path, outer)
+    if base is str and length:
+        return Chars(length)
+    scalar = next((mark for mark in marks if isinstance(mark, Scalar)), BOOL if base is bool else None)
+    if scalar and not length:
+        return scalar
+    if isinstance(base, type) and issubclass(base, Message) and not length:
+        return Nested(_layout(base, outer))
+    raise MessageError(f"{path}: {show(hint)} has no fixed size, use {_instead(base)}")
+
+
+def _length(count: Any, path: str) -> int:
+    if not (isinstance(count, int) and 1 <= count <= SIZE_MAX):
+        raise MessageError(f"{path}: Len takes an integer from 1 to {SIZE_MAX}, not {show(count)}")
+    return count
+
+
+def _array(items: tuple[Any, ...], length: int | None, path: str, outer: tuple[type, ...]) -> Array:
+    open_ended = items[1:] == (...,)
+    count = length if open_ended else len(items)
+    if not count or (length or count) != count or not (open_ended or all(item == items[0] for item in items)):
+        raise MessageError(
+            f"{path}: an array has one type and a fixed length, tuple[r2p.f32, r2p.f32] or "
+            "Annotated[tuple[r2p.f32, ...], r2p.Len(16)]; for different types nest a Message"
+        )
+    array = Array(_shape(items[0], f"{path}[]", outer), count)
+    _check_size(path, array.size)
+    return array
+
+
+def _check_size(path: str, size: int) -> None:
+    if not 1 <= size <= SIZE_MAX:
+        raise MessageError(f"{path} has {size} bytes: a message has 1 to {SIZE_MAX}")
+
+
+def _instead(base: Any) -> str:
+    array = "tuple[r2p.f32, r2p.f32] or Annotated[tuple[r2p.f32, ...], r2p.Len(16)]"
+    texts = {
+        int: "one of r2p.u8 .. r2p.u64, r2p.i8 .. r2p.i64",
+        float: "r2p.f32 or r2p.f64",
+        str: "Annotated[str, r2p.Len(16)]",
+        bytes: "Annotated[tuple[r2p.u8, ...], r2p.Len(16)]",
+        list: array,
+        tuple: array,
+    }
+    others = "r2p.u8 .. r2p.f64, bool, a Message, a tuple of one of these, or Annotated[str, r2p.Len(16)]"
+    return next((text for kind, text in texts.items() if kind is (get_origin(base) or base)), others)
+
+
+def _leaves(shape: Shape, path: str) -> Iterator[str]:
+    """The schema's `path:kind` of all that a field holds."""
+    match shape:
+        case Nested(inner):
+            for field in inner.fields:
+                yield from _leaves(field.shape, f"{path}.{field.name}")
+        case Array(Chars() | Array() | Nested() as item, count):
+            for i in range(count):
+                yield from _leaves(item, f"{path}[{i}]")
+        case _:
+            yield f"{path}:{shape.kind}"

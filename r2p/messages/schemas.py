@@ -1,0 +1,102 @@
+"""Message classes built back from their schema, for tools that meet a topic whose type they don't have.
+
+A schema may come from anybody. It is read without looking at details, within bounds; then the schema of the new class
+is compared with it, and whatever was odd makes a difference.
+"""
+
+import keyword
+import re
+from typing import Annotated, Any, TypeAlias, cast
+
+import msgspec
+
+from r2p.errors import MessageError
+from r2p.messages.layouts import Message, Timestamp, check_field_name, layout
+from r2p.messages.shapes import HINTS, Len, show
+
+SCHEMA_MAX = 32_768
+"""Characters of the longest schema that is read back."""
+
+_DEPTH_MAX = 16  # parts of a path
+_CLASSES_MAX = 64  # different nested messages
+
+_Leaf: TypeAlias = tuple[tuple[str, ...], str]  # ("wheels", "[0]", ".speed"), "f32"
+
+_CLASS_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
+_PART = re.compile(r"\.?[A-Za-z0-9_]+|\[[0-9]{1,4}\]")
+_KIND = re.compile(r"([a-z0-9]{1,8})(?:\[([0-9]{1,4})\])?")
+
+
+def message_type(name: str, schema: str) -> type[Message]:
+    """Build a message class from its schema ("led:u32 value:u8").
+
+    All fields are required; a nested message of `sec:u32 nsec:u32` is a Timestamp, the other ones get made-up names.
+    Raises MessageError for what is not exactly the schema of a message class, or longer than `SCHEMA_MAX`.
+    """
+    if not _CLASS_NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise MessageError(f"{show(name)} is no name for a message class")
+    if len(schema) > SCHEMA_MAX:
+        raise MessageError(f"the schema of {name} has {len(schema)} characters, more than {SCHEMA_MAX}")
+    cls = _Reader().message(name, tuple(_leaf(text) for text in schema.split(" ")))
+    if layout(cls).schema != schema:
+        raise MessageError(f"{show(schema)} is no schema of a message class")
+    return cls
+
+
+def _leaf(text: str) -> _Leaf:
+    path, _, kind = text.partition(":")
+    parts = tuple(_PART.findall(path))
+    if len(parts) > _DEPTH_MAX:
+        raise MessageError(f"{show(text)}: nested deeper than {_DEPTH_MAX}")
+    return parts, kind
+
+
+class _Reader:
+    """Groups leaves by the first part of their path, and the groups by the next one."""
+
+    def __init__(self) -> None:
+        self.classes: dict[tuple[_Leaf, ...], type[Message]] = {
+            (((".sec",), "u32"), ((".nsec",), "u32")): Timestamp,
+        }
+
+    def message(self, name: str, leaves: tuple[_Leaf, ...]) -> type[Message]:
+        fields: dict[str, list[_Leaf]] = {}
+        for parts, kind in leaves:
+            head = "".join(parts[:1]).removeprefix(".")
+            fields.setdefault(head, []).append((parts[1:], kind))
+        for field in fields:
+            check_field_name(f"{name}.{show(field)}", field)
+        hints = [(field, self.hint(f"{name}_{field}", tuple(inner))) for field, inner in fields.items()]
+        made: Any = msgspec.defstruct(name, hints, bases=(Message,), module=__name__, frozen=True, gc=False)
+        return cast("type[Message]", made)
+
+    def hint(self, name: str, leaves: tuple[_Leaf, ...]) -> Any:
+        parts, kind = leaves[0]
+        if not parts:
+            return _hint(kind)
+        if not parts[0].startswith("["):
+            return self.nested(name, leaves)
+        items = tuple((rest[1:], kind) for rest, kind in leaves if rest[:1] == parts[:1])
+        count = len({rest[:1] for rest, _ in leaves})
+        return _array(self.hint(name, items), count)
+
+    def nested(self, name: str, leaves: tuple[_Leaf, ...]) -> type[Message]:
+        if leaves not in self.classes:
+            if len(self.classes) > _CLASSES_MAX:
+                raise MessageError(f"more than {_CLASSES_MAX} different messages in one")
+            self.classes[leaves] = self.message(name, leaves)
+        return self.classes[leaves]
+
+
+def _hint(kind: str) -> Any:
+    found = _KIND.fullmatch(kind)
+    base, count = found.groups() if found else ("", None)
+    if base == "char" and count:
+        return Annotated[str, Len(int(count))]
+    if base not in HINTS:
+        raise MessageError(f"{show(kind)} is no kind of field")
+    return HINTS[base] if count is None else _array(HINTS[base], int(count))
+
+
+def _array(item: Any, count: int) -> Any:
+    return Annotated[tuple.__class_getitem__((item, ...)), Len(count)]

@@ -1,0 +1,169 @@
+"""Shapes: what a field is made of. Packing is generated from them, and tools turn text into fields by them.
+
+A field is a number, a text, an array of one shape, or a message. All shapes say their `kind` (as in schemas), the
+`format` and `size` (bytes) that they pack to, and the values that are `allowed`, for people; a tool walks them with one
+
+    match field.shape:
+        case Scalar(kind): ...
+        case Chars(length): ...
+        case Array(item, count): ...
+        case Nested(layout): ...
+"""
+
+import struct
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_args
+
+import msgspec
+
+if TYPE_CHECKING:
+    from r2p.messages.layouts import Layout
+
+UNFIT = (struct.error, ArithmeticError, AttributeError, TypeError, ValueError)
+"""What packing raises for a value that does not fit."""
+
+
+class Scalar(msgspec.Struct, frozen=True):
+    """A number or a bool; `format` is its letter in the struct module."""
+
+    kind: str
+    format: str
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize("<" + self.format)
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """The least and the greatest value of an integer."""
+        bits = 8 * self.size
+        return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.kind.startswith("i") else (0, (1 << bits) - 1)
+
+    @property
+    def allowed(self) -> str:
+        other = {"bool": "True or False", "f32": "a number up to ±3.402823e38", "f64": "a number up to ±1.797693e308"}
+        return other.get(self.kind) or "an integer from {} to {}".format(*self.limits)
+
+    def holds(self, value: object) -> bool:
+        """Whether the value packs."""
+        if self.kind == "bool":
+            return value is True or value is False
+        try:
+            struct.pack("<" + self.format, value)
+        except UNFIT:
+            return False
+        return True
+
+
+class Chars(msgspec.Struct, frozen=True):
+    """A text of at most `length` ASCII characters, padded with NUL; without a terminator when it fills the field."""
+
+    length: int
+
+    @property
+    def kind(self) -> str:
+        return f"char[{self.length}]"
+
+    @property
+    def format(self) -> str:
+        return f"{self.length}s"
+
+    @property
+    def size(self) -> int:
+        return self.length
+
+    @property
+    def allowed(self) -> str:
+        return f"at most {self.length} ASCII characters without a NUL"
+
+    def holds(self, value: object) -> bool:
+        """Whether the value packs."""
+        return isinstance(value, str) and value.isascii() and "\0" not in value and len(value) <= self.length
+
+
+class Array(msgspec.Struct, frozen=True):
+    """A tuple of exactly `count` values of one shape."""
+
+    item: "Shape"
+    count: int
+
+    @property
+    def kind(self) -> str:
+        return f"{self.item.kind}[{self.count}]"
+
+    @property
+    def format(self) -> str:
+        return f"{self.count}{self.item.format}" if isinstance(self.item, Scalar) else self.item.format * self.count
+
+    @property
+    def size(self) -> int:
+        return self.count * self.item.size
+
+    @property
+    def allowed(self) -> str:
+        return f"a tuple of {self.count}"
+
+
+class Nested(msgspec.Struct, frozen=True):
+    """A message in a message."""
+
+    layout: "Layout[Any]"
+
+    @property
+    def kind(self) -> str:
+        return self.layout.cls.__name__
+
+    @property
+    def format(self) -> str:
+        return "".join(field.shape.format for field in self.layout.fields)
+
+    @property
+    def size(self) -> int:
+        return self.layout.size
+
+    @property
+    def allowed(self) -> str:
+        return f"a {self.kind}"
+
+
+Shape: TypeAlias = Scalar | Chars | Array | Nested
+
+
+class Field(msgspec.Struct, frozen=True):
+    """One field of a message class."""
+
+    name: str
+    shape: Shape
+
+
+class Len(msgspec.Struct, frozen=True):
+    """In `Annotated`: the elements of an array, or the characters (bytes) of a text."""
+
+    count: int
+
+
+u8 = Annotated[int, Scalar("u8", "B")]
+u16 = Annotated[int, Scalar("u16", "H")]
+u32 = Annotated[int, Scalar("u32", "I")]
+u64 = Annotated[int, Scalar("u64", "Q")]
+i8 = Annotated[int, Scalar("i8", "b")]
+i16 = Annotated[int, Scalar("i16", "h")]
+i32 = Annotated[int, Scalar("i32", "i")]
+i64 = Annotated[int, Scalar("i64", "q")]
+f32 = Annotated[float, Scalar("f32", "f")]
+f64 = Annotated[float, Scalar("f64", "d")]
+
+BOOL = Scalar("bool", "?")
+HINTS: dict[str, Any] = {
+    "bool": bool,
+    **{get_args(hint)[1].kind: hint for hint in (u8, u16, u32, u64, i8, i16, i32, i64, f32, f64)},
+}
+"""The annotation of each scalar kind."""
+
+
+def show(value: object) -> str:
+    """A value in an error text: it may be anything, so it is cut."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        text = object.__repr__(value)
+    return text if len(text) <= 80 else f"{text[:76]} ..."

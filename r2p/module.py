@@ -1,0 +1,367 @@
+"""A module: nodes, the topics between them, and the links that make those topics part of a network.
+
+The module is where everything that runs is owned: one task for each node and each transport, all of which have ended
+when its `async with` block has.
+"""
+
+import asyncio
+import logging
+import os
+import socket
+from collections import deque
+from collections.abc import AsyncIterator, Iterable
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from r2p.clock import clock_of, random_of
+from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
+from r2p.errors import Closed, Error, NodeCrashed
+from r2p.logs import LogTopic
+from r2p.names import module_name, module_name_from, node_name, topic_name
+from r2p.network import Network, describe_mismatch
+from r2p.node import Node
+from r2p.protocols.events import (
+    Command,
+    Echoes,
+    Event,
+    Mismatched,
+    ModuleChanged,
+    ModuleGone,
+    ModuleInfo,
+    NameConflict,
+    Obey,
+)
+from r2p.supervisor import NodeFunction, Supervisor, name_of
+from r2p.topic import Topic, TopicSpace
+from r2p.transports.link import Link, Transport
+from r2p.transports.url import open_transport
+from r2p.watchdog import Watchdog
+
+logger = logging.getLogger("r2p.module")
+
+EVENTS = 256
+"""Events that an `events()` iteration holds before it loses the oldest."""
+
+
+class LinkUp(msgspec.Struct, frozen=True):
+    """A link works (again): after `outage` seconds, in which `lost` messages found it down."""
+
+    link: str
+    outage: float
+    lost: int
+
+
+class LinkDown(msgspec.Struct, frozen=True):
+    """A link works no more."""
+
+    link: str
+    reason: str
+
+
+class LinkWaits(msgspec.Struct, frozen=True):
+    """A link can't be had yet; it is tried again and again."""
+
+    link: str
+    reason: str
+
+
+class Listening(msgspec.Struct, frozen=True):
+    """A transport takes connections."""
+
+    url: str
+    address: str
+
+
+ModuleEvent = LinkUp | LinkDown | LinkWaits | Listening | Mismatched | ModuleChanged | ModuleGone | NameConflict
+
+
+class Module:
+    """A module of the robot's network, in this process.
+
+        async with r2p.Module("PC1", via=["tcp:192.168.0.10:23"]) as module:
+            module.start(blink, priority=10)
+            await module.wait()
+
+    `name` has at most 7 characters (default: from the host name). `via` are transport URLs; None takes those of the
+    environment variable R2P_VIA (separated by blanks), and without it the module is local only. `remap` renames
+    topics for all its nodes. An `observer` is a tool that only looks: it sends no ALIVE and has no `log` topic.
+    """
+
+    def __init__(
+        self,
+        name: str | None = None,
+        *,
+        via: str | Transport | Iterable[str | Transport] | None = None,
+        remap: dict[str, str] | None = None,
+        observer: bool = False,
+        watchdog: bool = True,
+    ) -> None:
+        self.name = module_name(name) if name is not None else module_name_from(socket.gethostname())
+        self.observer = observer
+        self.rebooted = False
+        """Whether REBOOT has restarted its nodes."""
+        self.stopped = False
+        """Whether STOP has ended its nodes; REBOOT starts them again."""
+        self.links: list[Link] = []
+        """Its links, also those that are down."""
+        self.refused: dict[str, int] = {}
+        """Commands that were not obeyed, by name."""
+        self.network = Network(self)
+        """What it knows of the network."""
+        self._via = _urls(via)
+        self._remap = _checked_remap(remap)
+        self._with_watchdog = watchdog
+        self._supervisors: dict[str, Supervisor] = {}
+        self._listeners: list[tuple[deque[ModuleEvent], asyncio.Event]] = []
+        self._flags = 0
+        self._open = False
+
+    # Life
+
+    async def __aenter__(self) -> Self:
+        loop = asyncio.get_running_loop()
+        clock = clock_of(loop)
+        self.random = random_of(loop)
+        self.instance = self.random.getrandbits(32)
+        self.space = TopicSpace(self.name, loop, clock)
+        self.space.changed = self._topic_changed
+        self._changed = asyncio.Event()
+        self._log = None if self.observer else LogTopic(self.space)
+        self._watchdog = Watchdog(loop) if self._with_watchdog and not clock.virtual else None
+        self._tasks = asyncio.TaskGroup()
+        self._transports: list[asyncio.Task[None]] = []
+        await self._tasks.__aenter__()
+        self._open = True
+        try:
+            await self._open_transports()
+        except BaseException:
+            await self._close()
+            raise
+        if self._watchdog is not None:
+            self._watchdog.start()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._close()
+        crashed = [each.error for each in self._supervisors.values() if each.error is not None]
+        if crashed and (error is None or isinstance(error, asyncio.CancelledError)):
+            raise NodeCrashed(f"{len(crashed)} node(s) of module {self.name} crashed", crashed)
+
+    async def _open_transports(self) -> None:
+        for via in self._via:
+            transport = open_transport(via) if isinstance(via, str) else via
+            opened = asyncio.get_running_loop().create_future()
+            running = self._tasks.create_task(
+                transport.run(self, lambda opened=opened: opened.done() or opened.set_result(None)),
+                name=f"{self.name} {via}",
+            )
+            await asyncio.wait([opened, running], return_when=asyncio.FIRST_COMPLETED)
+            self._transports.append(running)
+
+    async def _close(self) -> None:
+        if not self._open:
+            return
+        self._open = False
+        try:
+            await asyncio.gather(*(each.stop() for each in self._supervisors.values()))
+            if self._log is not None:
+                self._log.close()
+        finally:
+            for task in self._transports:
+                task.cancel()
+            await self._tasks.__aexit__(None, None, None)
+            if self._watchdog is not None:
+                self._watchdog.close()
+            self._changed.set()
+            for _, arrived in self._listeners:
+                arrived.set()
+
+    # Nodes
+
+    def start(
+        self,
+        function: NodeFunction,
+        *args: object,
+        name: str | None = None,
+        priority: int = 0,
+        remap: dict[str, str] | None = None,
+        restart: bool = False,
+    ) -> Node:
+        """Run `function(node, *args)` as a node; its name is the function's unless given, at most 8 characters.
+
+        Nodes of higher priority get their messages first. With `restart` a crash restarts it, after a pause that grows.
+        Raises NameTooLong, InvalidName, and Error if the name is taken.
+        """
+        if not self._open:
+            raise Closed(f"module {self.name} is not open: use it in `async with`")
+        if not asyncio.iscoroutinefunction(function):
+            raise Error(f"{function!r} is no coroutine function: write `async def name(node: r2p.Node) -> None`")
+        name = node_name(name) if name is not None else name_of(function)
+        if name in self._supervisors and self._supervisors[name].running:
+            raise Error(f"module {self.name} has a node {name} already: give this one another name=")
+        names = self._remap | _checked_remap(remap)
+        log = self._log.publish if self._log is not None else _no_log
+
+        def make_node() -> Node:
+            return Node(name, self.space, priority=priority, remap=names, log=log)
+
+        supervisor = Supervisor(function, args, make_node, restart=restart)
+        self._supervisors[name] = supervisor
+        supervisor.start(self._tasks, self._changed.set)
+        return supervisor.node
+
+    @property
+    def nodes(self) -> dict[str, Supervisor]:
+        """Its nodes by name, also the ones that have ended."""
+        return dict(self._supervisors)
+
+    async def wait(self) -> None:
+        """Wait until all nodes have ended by themselves (not by STOP: a stopped module waits for REBOOT)."""
+        while self._open and (self.stopped or any(each.running for each in self._supervisors.values())):
+            self._changed.clear()
+            await self._changed.wait()
+
+    async def stop(self) -> None:
+        """End all nodes; links and management go on (ALIVE says so)."""
+        self.stopped = True
+        self._set_flags(self._flags | FLAG_STOPPED)
+        await asyncio.gather(*(each.stop() for each in self._supervisors.values()))
+
+    async def reboot(self) -> None:
+        """End all nodes and start them from the beginning."""
+        await asyncio.gather(*(each.stop() for each in self._supervisors.values()))
+        for supervisor in self._supervisors.values():
+            supervisor.start(self._tasks, self._changed.set)
+        self.stopped = False
+        self.rebooted = True
+        self._set_flags(FLAG_REBOOTED)
+
+    # Network
+
+    def command(self, command: Command, module: str) -> None:
+        """Send STOP, REBOOT or BOOTLOAD to another module, by all links. None of them is an emergency stop."""
+        for link in self.links:
+            link.command(command, module_name(module))
+
+    def query(self) -> None:
+        """Ask all others to repeat what they publish and subscribe."""
+        for link in self.links:
+            link.query()
+
+    async def events(self) -> AsyncIterator[ModuleEvent]:
+        """What happens to the links and on the network, from now on, until the module closes."""
+        queue: deque[ModuleEvent] = deque(maxlen=EVENTS)
+        arrived = asyncio.Event()
+        listener = (queue, arrived)
+        self._listeners.append(listener)
+        try:
+            while True:
+                while queue:
+                    yield queue.popleft()
+                if not self._open:
+                    return
+                arrived.clear()
+                await arrived.wait()
+        finally:
+            self._listeners.remove(listener)
+
+    # For transports (the Hub)
+
+    def attach(self, link: Link) -> None:
+        self.links.append(link)
+        self.space.links.append(link)
+        for topic in list(self.space.topics.values()):
+            link.topic_changed(topic)
+        link.set_flags(self._flags)
+
+    def detach(self, link: Link) -> None:
+        self.links.remove(link)
+        self.space.links.remove(link)
+
+    def link_waits(self, link: Link, reason: str) -> None:
+        logger.warning("link %s: %s; trying again", link.name, reason)
+        self._tell(LinkWaits(link.name, reason))
+
+    def listening(self, url: str, address: str) -> None:
+        logger.info("%s takes connections at %s", url, address)
+        self._tell(Listening(url, address))
+
+    def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
+        if link.up:
+            logger.info("link %s is up, after %.1f s; %d messages lost meanwhile", link.name, outage, lost)
+            self._tell(LinkUp(link.name, outage, lost))
+        else:
+            logger.warning("link %s is down: %s", link.name, reason)
+            self._tell(LinkDown(link.name, reason))
+
+    def discovered(self, link: Link, event: Event) -> None:
+        match event:
+            case Obey():
+                self._obey(event.command)
+            case Mismatched():
+                logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
+                self._tell(event)
+            case NameConflict():
+                logger.error("link %s: two modules carry the name %s: rename one (--module)", link.name, event.module)
+                self._tell(event)
+            case Echoes():
+                logger.error("link %s gives back what we send: switch off local echo at the other end", link.name)
+            case ModuleChanged():
+                self._check_namesakes(link, event.info)
+                self._tell(event)
+            case ModuleGone():
+                self._tell(event)
+
+    def _obey(self, command: Command) -> None:
+        logger.warning("module %s: %s from the network", self.name, command.name)
+        if not self._open:
+            return
+        if command is Command.STOP:
+            self._tasks.create_task(self.stop(), name=f"{self.name} stop")
+        elif command is Command.REBOOT:
+            self._tasks.create_task(self.reboot(), name=f"{self.name} reboot")
+        else:
+            self.refused[command.name] = self.refused.get(command.name, 0) + 1
+            logger.error("module %s is a program on a PC, it has no boot loader: BOOTLOAD refused", self.name)
+
+    def _check_namesakes(self, link: Link, info: ModuleInfo) -> None:
+        """Two who can't hear each other may have one name: whoever hears both tells them."""
+        for other in self.links:
+            namesake = other.discovery.modules.get(info.name) if other is not link else None
+            if namesake is None or None in (info.instance, namesake.instance) or namesake.instance == info.instance:
+                continue
+            for each in (link, other):
+                each.tell_conflict(info.name, namesake.instance or 0, info.instance or 0)
+            self.discovered(link, NameConflict(info.name, namesake.instance, info.instance))
+
+    def _topic_changed(self, topic: Topic) -> None:
+        for link in self.links:
+            link.topic_changed(topic)
+
+    def _set_flags(self, flags: int) -> None:
+        self._flags = flags
+        for link in self.links:
+            link.set_flags(flags)
+
+    def _tell(self, event: ModuleEvent) -> None:
+        for queue, arrived in self._listeners:
+            queue.append(event)
+            arrived.set()
+
+
+def _urls(via: str | Transport | Iterable[str | Transport] | None) -> list[str | Transport]:
+    if via is None:
+        return list(os.environ.get("R2P_VIA", "").split())
+    return [via] if isinstance(via, str | Transport) else list(via)
+
+
+def _checked_remap(remap: dict[str, str] | None) -> dict[str, str]:
+    return {topic_name(old): topic_name(new) for old, new in (remap or {}).items()}
+
+
+def _no_log(level: int, node: str, text: str) -> None:
+    """An observer keeps its log lines to itself."""

@@ -1,0 +1,47 @@
+"""Names as they fit the wire: `module/node/topic` (PROTOCOL.md 1).
+
+Names are checked where a person gives them; names that come from a wire are only compared.
+"""
+
+import re
+
+from r2p.errors import InvalidName, NameTooLong
+
+MODULE_MAX = 7
+NODE_MAX = 8
+TOPIC_MAX = 16
+TRANSPORT_MAX = 8
+
+MANAGEMENT = "R2P"
+LOADER_PREFIX = "BOOT_"
+
+_ALLOWED = re.compile(r"[A-Za-z0-9_]+")
+
+
+def module_name(name: str) -> str:
+    """Check a module's name: 1 to 7 characters of `[A-Za-z0-9_]`."""
+    return _checked("module", name, MODULE_MAX)
+
+
+def node_name(name: str) -> str:
+    """Check a node's name: 1 to 8 characters of `[A-Za-z0-9_]`."""
+    return _checked("node", name, NODE_MAX)
+
+
+def topic_name(name: str) -> str:
+    """Check a topic's name: 1 to 16 characters of `[A-Za-z0-9_]`; a leading slash, as in the thesis, is taken off."""
+    return _checked("topic", name.removeprefix("/"), TOPIC_MAX)
+
+
+def module_name_from(hostname: str) -> str:
+    """The default module name on a machine: its host name as far as it fits ("lab-pc.local" -> "labpc")."""
+    letters = "".join(_ALLOWED.findall(hostname.partition(".")[0]))
+    return letters[:MODULE_MAX] or "PC"
+
+
+def _checked(what: str, name: str, longest: int) -> str:
+    if not _ALLOWED.fullmatch(name):
+        raise InvalidName(f"{what} name {name!r}: use letters, digits and underscores only")
+    if len(name) > longest:
+        raise NameTooLong(f"{what} name {name!r} has {len(name)} characters, the wire carries {longest}: shorten it")
+    return name

@@ -1,0 +1,310 @@
+"""A node: one asyncio task of a module, and what it publishes and subscribes.
+
+The function's body is initialisation and loop; cancellation is termination. Whatever the node opened is closed when
+its function ends, however it ends.
+"""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from typing import Any, NamedTuple, TypeVar, overload
+
+from r2p.clock import Ticker
+from r2p.errors import Error, TransportError
+from r2p.messages import Message, layout
+from r2p.names import topic_name
+from r2p.publisher import (
+    AnyPublisher,
+    NonRealTime,
+    Periodic,
+    PeriodicPublisher,
+    Publisher,
+    Sporadic,
+    SporadicPublisher,
+    pause,
+)
+from r2p.subscriber import Callback, Keep, Subscriber
+from r2p.topic import TopicSpace
+
+M = TypeVar("M", bound=Message)
+
+QUEUE = 16
+"""Messages that a subscriber's queue holds unless it says otherwise."""
+
+_SECOND = 1_000_000_000
+
+
+class Tick(NamedTuple):
+    """One period of `Node.every`: when it was due (monotonic ns), how late it came (s), periods that were skipped."""
+
+    due: int
+    late: float
+    skipped: int
+
+
+class NodeLogger(logging.LoggerAdapter[logging.Logger]):
+    """Logs as usual, under `r2p.MODULE.NODE`; records from INFO up also go to the module's `log` topic."""
+
+    def __init__(self, logger: logging.Logger, publish: Callable[[int, str], None]) -> None:
+        super().__init__(logger)
+        self._publish = publish
+
+    def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
+        kwargs["stacklevel"] = kwargs.get("stacklevel", 1) + 1
+        super().log(level, msg, *args, **kwargs)
+        if level >= logging.INFO:
+            self._publish(level, str(msg) % args if args else str(msg))
+
+
+class Node:
+    """What a node's function gets: the way to its topics. Made by `Module.start`."""
+
+    def __init__(
+        self,
+        name: str,
+        space: TopicSpace,
+        *,
+        priority: int = 0,
+        remap: dict[str, str] | None = None,
+        log: Callable[[int, str, str], None] = lambda _level, _node, _text: None,
+    ) -> None:
+        self.name = name
+        self.module = space.module
+        self.priority = priority
+        self.log = NodeLogger(
+            logging.getLogger(f"r2p.{space.module}.{name}"), lambda level, text: log(level, name, text)
+        )
+        self.publishers: list[AnyPublisher] = []
+        self.subscribers: list[Subscriber[Any]] = []
+        self.crashed: Callable[[Exception], None] = self._raise
+        """What to do with an error outside the node's own task; its supervisor sets it."""
+        self._space = space
+        self._remap = remap or {}
+
+    @overload
+    def advertise(
+        self, topic: str, type: type[M], klass: NonRealTime = ..., *, latch: bool = ..., strict: bool = ...
+    ) -> Publisher[M]: ...
+
+    @overload
+    def advertise(
+        self, topic: str, type: type[M], klass: Sporadic, *, latch: bool = ..., strict: bool = ...
+    ) -> SporadicPublisher[M]: ...
+
+    @overload
+    def advertise(
+        self, topic: str, type: type[M], klass: Periodic[M], *, latch: bool = ..., strict: bool = ...
+    ) -> PeriodicPublisher[M]: ...
+
+    def advertise(
+        self,
+        topic: str,
+        type: type[M],
+        klass: NonRealTime | Sporadic | Periodic[M] = NonRealTime(),  # noqa: B008 - a frozen value
+        *,
+        latch: bool = False,
+        strict: bool = False,
+    ) -> Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]:
+        """Publish a topic; the class value says how: `NonRealTime()`, `Sporadic(deadline)`, `Periodic(period, fill)`.
+
+        `latch` sends the last value to every subscriber that joins later, and again when its module reboots.
+        `strict` raises TransportError where a link is known not to give what the class asks for.
+        Raises InvalidName or NameTooLong, MessageError (a type without a layout), TypeMismatch.
+        """
+        shape = layout(type)
+        name = self._resolve(topic)
+        self._check_links(name, shape.size, klass, strict=strict)
+        where = self._space.open(name, shape)
+        publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
+        match klass:
+            case NonRealTime():
+                publisher = Publisher(self._space, self, where, shape, klass, latch=latch)
+            case Sporadic():
+                publisher = SporadicPublisher(self._space, self, where, shape, klass, latch=latch)
+            case Periodic():
+                publisher = PeriodicPublisher(self._space, self, where, shape, klass, latch=latch)
+                publisher.start()
+        where.publishers.append(publisher)
+        for queue in where.queues:
+            queue.publisher_joined()
+        self.publishers.append(publisher)
+        self._space.changed(where)
+        return publisher
+
+    @overload
+    def subscribe(
+        self,
+        topic: str,
+        type: type[M],
+        callback: Callback[M] | None = ...,
+        *,
+        queue: int = ...,
+        lossy: bool = ...,
+        keep: Keep = ...,
+        max_age: float | None = ...,
+        timeout: float | None = ...,
+        on_timeout: Callable[[], object] | None = ...,
+    ) -> Subscriber[M]: ...
+
+    @overload
+    def subscribe(
+        self,
+        topic: str,
+        type: None,
+        callback: Callback[bytes] | None = ...,
+        *,
+        queue: int = ...,
+        lossy: bool = ...,
+        keep: Keep = ...,
+        max_age: float | None = ...,
+        timeout: float | None = ...,
+        on_timeout: Callable[[], object] | None = ...,
+    ) -> Subscriber[bytes]: ...
+
+    def subscribe(
+        self,
+        topic: str,
+        type: type[Message] | None,
+        callback: Callback[Any] | None = None,
+        *,
+        queue: int = QUEUE,
+        lossy: bool = False,
+        keep: Keep = "newest",
+        max_age: float | None = None,
+        timeout: float | None = None,
+        on_timeout: Callable[[], object] | None = None,
+    ) -> Subscriber[Any]:
+        """Subscribe a topic; with the type None messages are packed bytes.
+
+        `queue` messages are held. When it is full, non real-time publishers wait for it, up to their stall time, unless
+        it is `lossy`; whoever does not wait drops its oldest message, or with `keep="oldest"` the new one, counted in
+        `lost`. Messages older than `max_age` seconds are skipped. When nothing comes for `timeout` seconds,
+        `on_timeout` is called once; without it, the iteration raises TimeoutError.
+        A `callback` is called, in this node's task, from `spin()`.
+        Raises InvalidName or NameTooLong, MessageError (a type without a layout), TypeMismatch.
+        """
+        if queue < 1:
+            raise ValueError(f"topic {topic}: a queue holds 1 message or more, not {queue}")
+        shape = None if type is None else layout(type)
+        where = self._space.open(self._resolve(topic), shape)
+        subscriber: Subscriber[Any] = Subscriber(
+            self._space,
+            self,
+            where,
+            shape,
+            queue=queue,
+            lossy=lossy,
+            keep=keep,
+            callback=callback,
+            max_age=max_age,
+            timeout=timeout,
+            on_timeout=on_timeout,
+        )
+        self.subscribers.append(subscriber)
+        where.join(subscriber)
+        self._space.changed(where)
+        return subscriber
+
+    async def spin(self, timeout: float | None = None) -> bool:
+        """Wait for messages of subscriptions with a callback, and call those; False after `timeout` seconds without.
+
+        Callbacks run in this node's task, one at a time; a coroutine function is awaited.
+        """
+        deadline = None if timeout is None else self._space.loop.time() + timeout
+        while not await self._serve():
+            try:
+                async with asyncio.timeout_at(deadline):
+                    await self._arrival()
+            except TimeoutError:
+                return False
+        await pause()
+        return True
+
+    async def every(self, period: float) -> AsyncIterator[Tick]:
+        """Tick each `period` seconds on absolute phase, first after one period; a slow body skips periods, counted."""
+        loop = self._space.loop
+        waiter: asyncio.Future[None] | None = None
+        tick: Tick | None = None
+
+        def on_tick(due: int, late: int, skipped: int) -> None:
+            nonlocal tick
+            missed = 0 if tick is None else tick.skipped + 1
+            tick = Tick(due, late / _SECOND, skipped + missed)
+            if waiter is not None and not waiter.done():
+                waiter.set_result(None)
+
+        ticker = Ticker(loop, round(period * _SECOND), on_tick)
+        ticker.start()
+        try:
+            while True:
+                if tick is None:
+                    waiter = loop.create_future()
+                    await waiter
+                current, tick = tick, None
+                if current is not None:
+                    yield current
+        finally:
+            ticker.close()
+
+    def now(self) -> int:
+        """UTC in ns; never jumps back."""
+        return self._space.clock.now()
+
+    def crash(self, error: Exception) -> None:
+        """End this node with an error that arose outside its own task (in a periodic publisher's `fill`)."""
+        self.crashed(error)
+
+    def enter(self) -> None:
+        """The node's function starts: its priority counts from now on."""
+        self._space.waker.enter(self.priority)
+
+    def close(self) -> None:
+        """Close all its publishers and subscribers; the module does so when the node's function has ended."""
+        for publisher in self.publishers:
+            publisher.close()
+        for subscriber in self.subscribers:
+            subscriber.close()
+        self.publishers.clear()
+        self.subscribers.clear()
+        self._space.waker.leave(self.priority)
+
+    @staticmethod
+    def _raise(error: Exception) -> None:
+        raise error
+
+    def _resolve(self, topic: str) -> str:
+        name = topic_name(topic)
+        return topic_name(self._remap.get(name, name))
+
+    def _check_links(
+        self, topic: str, size: int, klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool
+    ) -> None:
+        for link in self._space.links:
+            reason = link.refusal(size)
+            if reason and not strict:
+                self.log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
+            elif strict and link.best_effort(klass.publisher_class):
+                reason = link.guarantee(klass.publisher_class)
+            if reason and strict:
+                raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
+
+    async def _serve(self) -> bool:
+        served = False
+        for subscriber in [each for each in self.subscribers if each.callback is not None]:
+            served |= await subscriber.serve()
+        return served
+
+    async def _arrival(self) -> None:
+        """Wait until a subscription with a callback gets a message."""
+        listening = [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
+        if not listening:
+            raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
+        waiter = self._space.loop.create_future()
+        for subscriber in listening:
+            subscriber.waiter = waiter
+        try:
+            await waiter
+        finally:
+            for subscriber in listening:
+                if subscriber.waiter is waiter:
+                    subscriber.waiter = None

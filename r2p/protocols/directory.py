@@ -1,0 +1,179 @@
+"""What one link told about the network: modules, topics, endpoints. Nothing here decides what flows.
+
+Every table is bounded: when it is full, what was not heard for longest is forgotten, so that lies on the wire push out
+the truth only until it is repeated.
+"""
+
+from collections import Counter
+from typing import TypeVar
+
+import msgspec
+
+from r2p.codecs import management
+from r2p.protocols.events import ModuleInfo, Source
+
+MOST = 4096
+"""Entries in each table."""
+
+LEASE = 5_000_000_000
+"""How long an r2p module may be silent at least (ns)."""
+
+FOR_EVER = 0xFFFF * 1_000_000
+"""The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class TopicInfo(msgspec.Struct):
+    """A topic as heard on the link. Instants are in monotonic ns, None: never; `size` in bytes, 0: not said."""
+
+    name: str
+    size: int = 0
+    fingerprint: bytes | None = None
+    advertised_at: int | None = None
+    requested_at: int | None = None
+    mismatch: bool = False
+
+
+class EndpointInfo(msgspec.Struct, frozen=True):
+    """A publisher or subscriber of a node, as its r2p module tells; `module` is empty until its HELLO was heard."""
+
+    module: str
+    instance: int
+    node: str
+    topic: str
+    role: int
+    publisher_class: int
+
+
+EndpointKey = tuple[int, str, str, int]
+
+
+class _Starts(msgspec.Struct):
+    """The recent starts of one module name, to tell two modules from one that restarts."""
+
+    previous: int
+    at: int
+    swaps: int = 0
+
+
+class Directory:
+    """The tables of one link."""
+
+    def __init__(self, counts: Counter[str]) -> None:
+        self.modules: dict[str, ModuleInfo] = {}
+        self.topics: dict[str, TopicInfo] = {}
+        self.endpoints: dict[EndpointKey, EndpointInfo] = {}
+        self._counts = counts
+        self._names: dict[int, str] = {}
+        self._starts: dict[str, _Starts] = {}
+
+    @property
+    def knows_r2p(self) -> bool:
+        """Whether any r2p module is known on the link."""
+        return bool(self._names)
+
+    def name_of(self, instance: int) -> str:
+        return self._names.get(instance, "")
+
+    def alive(self, now: int, message: management.Alive, source: Source) -> tuple[ModuleInfo | None, ModuleInfo]:
+        """A module's state: what was known before, and what is known now."""
+        before = self.modules.get(message.module)
+        if before is None:
+            info = ModuleInfo(message.module, message.flags, now, source=source)
+        else:
+            info = msgspec.structs.replace(before, flags=message.flags, last_heard=now)
+        return before, info
+
+    def hello(self, now: int, message: management.Hello, source: Source) -> tuple[ModuleInfo | None, ModuleInfo]:
+        """An r2p module: what was known before, and what is known now."""
+        before = self.modules.get(message.module)
+        return before, ModuleInfo(
+            name=message.module,
+            flags=before.flags if before is not None else 0,
+            last_heard=now,
+            instance=message.instance,
+            observer=bool(message.flags & management.HELLO_TOOL),
+            lease=max(LEASE, message.lease_ms * 1_000_000),
+            hops=message.hops,
+            source=source,
+        )
+
+    def keep(self, info: ModuleInfo) -> ModuleInfo | None:
+        """Enter a module; who had to be forgotten for it comes back."""
+        before = self.modules.get(info.name)
+        if before is not None and before.instance is not None and before.instance != info.instance:
+            self._forget_instance(before.instance)
+        forgotten = self._put(self.modules, info.name, info, "modules forgotten")
+        if info.instance is not None:
+            self._names[info.instance] = info.name
+        if forgotten is not None:
+            self._forget(forgotten)
+        return forgotten
+
+    def remove(self, info: ModuleInfo) -> None:
+        """A module is gone, and its endpoints with it."""
+        if self.modules.pop(info.name, None) is not None:
+            self._forget(info)
+
+    def count_swaps(self, now: int, before: ModuleInfo | None, instance: int) -> int:
+        """How often a name went back and forth between two instances within a lease; a restart does not go back."""
+        if before is None or before.instance in {None, instance}:
+            return 0
+        known = self._starts.get(before.name)
+        back = known is not None and known.previous == instance and now - known.at < LEASE
+        swaps = known.swaps + 1 if known is not None and back else 0
+        self._starts[before.name] = _Starts(before.instance or 0, now, swaps)
+        return swaps
+
+    def was(self, name: str, instance: int) -> bool:
+        """Whether the module had this instance just before its present one."""
+        known = self._starts.get(name)
+        return known is not None and known.previous == instance
+
+    def topic(self, name: str) -> TopicInfo:
+        """The entry of a topic that was just heard of."""
+        info = self.topics.get(name) or TopicInfo(name)
+        self._put(self.topics, name, info, "topics forgotten")
+        return info
+
+    def typed(self, message: management.TypeInfo) -> None:
+        """The type of a topic; a publisher's word counts more than a subscriber's."""
+        info = self.topic(message.topic)
+        if message.role == management.ROLE_PUBLISHES or info.fingerprint is None:
+            known = message.fingerprint != management.ANY_TYPE
+            info.fingerprint = message.fingerprint if known else info.fingerprint
+            info.size = message.size or info.size
+
+    def endpoint(self, message: management.Endpoint) -> EndpointKey | None:
+        """An endpoint exists (its key comes back) or is gone."""
+        role = message.role & ~management.ROLE_GONE
+        key = (message.instance, message.node, message.topic, role)
+        if message.role & management.ROLE_GONE:
+            self.endpoints.pop(key, None)
+            return None
+        module = self.name_of(message.instance)
+        info = EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
+        self._put(self.endpoints, key, info, "endpoints forgotten")
+        return key
+
+    def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
+        """Enter a value as the latest heard one; what had to go for it comes back."""
+        table.pop(key, None)
+        forgotten = None
+        if len(table) >= MOST:
+            forgotten = table.pop(next(iter(table)))
+            self._counts[reason] += 1
+        table[key] = value
+        return forgotten
+
+    def _forget(self, info: ModuleInfo) -> None:
+        self._starts.pop(info.name, None)
+        if info.instance is not None:
+            self._forget_instance(info.instance)
+
+    def _forget_instance(self, instance: int) -> None:
+        self._names.pop(instance, None)
+        for key in [key for key in self.endpoints if key[0] == instance]:
+            del self.endpoints[key]

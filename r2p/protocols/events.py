@@ -1,0 +1,140 @@
+"""What discovery tells the shell around it: to send, to attach, to let go, to report. All values are frozen.
+
+`source` is the transport address of a sender on a bus (its id8 on CAN), None on a line with one other end.
+"""
+
+import enum
+from collections.abc import Hashable
+
+import msgspec
+
+from r2p.codecs import management
+
+Source = Hashable
+
+
+class Command(enum.Enum):
+    """What one module can order another to do (PROTOCOL.md 4)."""
+
+    STOP = "stop"
+    REBOOT = "reboot"
+    BOOTLOAD = "bootload"
+
+
+class Shape(msgspec.Struct, frozen=True):
+    """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (all zero: unknown)."""
+
+    size: int = 0
+    fingerprint: bytes = management.ANY_TYPE
+
+    def fits(self, other: "Shape") -> bool:
+        """Whether nothing that both know differs."""
+        if self.size != other.size and self.size and other.size:
+            return False
+        typed = self.fingerprint != management.ANY_TYPE and other.fingerprint != management.ANY_TYPE
+        return not typed or self.fingerprint == other.fingerprint
+
+
+class ModuleInfo(msgspec.Struct, frozen=True):
+    """A module as heard on the link.
+
+    `flags` are those of its ALIVE, `last_heard` is in monotonic ns. Only an r2p module has an `instance` (the random
+    number of its start), a `lease` (ns that it may be silent), and can be an `observer`, a tool that sends no ALIVE.
+    `hops` counts the gateways in between.
+    """
+
+    name: str
+    flags: int = 0
+    last_heard: int = 0
+    instance: int | None = None
+    observer: bool = False
+    lease: int = 0
+    hops: int = 0
+    source: Source = None
+
+    @property
+    def r2p(self) -> bool:
+        return self.instance is not None
+
+
+class Send(msgspec.Struct, frozen=True):
+    """Put these 32 bytes on the topic `R2P`; `urgent` ones before everything else."""
+
+    data: bytes
+    urgent: bool = False
+
+
+class Joined(msgspec.Struct, frozen=True):
+    """A remote subscriber is new, or came back after a restart. Attach the topic to this link if it is not
+    yet, and send the latched value; `queue` is the length that it asked for.
+    """
+
+    topic: str
+    params: bytes
+    queue: int
+    source: Source = None
+
+
+class Left(msgspec.Struct, frozen=True):
+    """Nobody on this link subscribes the topic any more: detach it."""
+
+    topic: str
+
+
+class Opened(msgspec.Struct, frozen=True):
+    """A remote publisher is new, or has new parameters: take its data. `size` is in bytes, 0 where it did not say."""
+
+    topic: str
+    source: Source
+    params: bytes
+    size: int
+
+
+class Shut(msgspec.Struct, frozen=True):
+    """That remote publisher is gone or has another type: take no more data from it."""
+
+    topic: str
+    source: Source
+
+
+class Obey(msgspec.Struct, frozen=True):
+    """Somebody orders this very module."""
+
+    command: Command
+
+
+class Mismatched(msgspec.Struct, frozen=True):
+    """Same topic, another type: refused. `role` is theirs: ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
+
+    topic: str
+    source: Source
+    role: int
+    ours: Shape
+    theirs: Shape
+
+
+class NameConflict(msgspec.Struct, frozen=True):
+    """Two modules carry one name; an instance is None for firmware, which has none."""
+
+    module: str
+    instance_a: int | None
+    instance_b: int | None
+
+
+class Echoes(msgspec.Struct, frozen=True):
+    """The line gives back what we send."""
+
+
+class ModuleChanged(msgspec.Struct, frozen=True):
+    """A module is new, or another than before in anything but the time it was heard."""
+
+    info: ModuleInfo
+
+
+class ModuleGone(msgspec.Struct, frozen=True):
+    """An r2p module said good-bye, or was silent for its lease."""
+
+    info: ModuleInfo
+
+
+Event = Send | Joined | Left | Opened | Shut | Obey | Mismatched | NameConflict | Echoes | ModuleChanged | ModuleGone

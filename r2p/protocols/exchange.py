@@ -1,0 +1,226 @@
+"""Who may exchange what: both sides of ADVERTISE, SUBSCRIBE_REQUEST and SUBSCRIBE_RESPONSE (PROTOCOL.md 4).
+
+Every message is answered every time; only what it changes becomes an event. A type that does not fit is refused by both
+sides because each tells its own, with every repetition and as the answer to what it refuses. A TYPE is never answered,
+so two that disagree don't argue.
+"""
+
+from collections import Counter
+
+from r2p.codecs import management
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.protocols.announcer import Announcer, Own
+from r2p.protocols.directory import LEASE, Directory
+from r2p.protocols.events import Joined, Left, Mismatched, ModuleInfo, Opened, Shape, Shut, Source
+from r2p.protocols.outbox import Outbox
+from r2p.protocols.peers import Peer, Peers
+from r2p.protocols.schedule import Timers
+
+
+class Exchange:
+    """What flows on one link, by peer and topic."""
+
+    def __init__(
+        self, own: Announcer, outbox: Outbox, directory: Directory, timers: Timers, counts: Counter[str]
+    ) -> None:
+        self._own = own
+        self._outbox = outbox
+        self._directory = directory
+        self._timers = timers
+        self._counts = counts
+        self._peers = Peers(counts)
+
+    # What peers say
+
+    def advertised(self, now: int, message: management.Advertise, source: Source) -> None:
+        """A publisher: ask for its data if somebody here wants it."""
+        topic = message.topic
+        info = self._directory.topic(topic)
+        info.advertised_at, info.size = now, message.size or info.size
+        own = self._own.subscribers.get(topic)
+        peer = self._peers.obtain(source) if own is not None else None
+        if own is None or peer is None:
+            return
+        if peer.is_r2p(now):
+            self._outbox.say(own.type(topic, ROLE_SUBSCRIBES))
+        if self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
+            self._outbox.say(own.request(topic))
+
+    def requested(self, now: int, message: management.SubscribeRequest, source: Source) -> None:
+        """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
+        topic = message.topic
+        self._directory.topic(topic).requested_at = now
+        own = self._own.publishers.get(topic)
+        peer = self._peers.obtain(source) if own is not None else None
+        if own is None or peer is None:
+            return
+        if peer.is_r2p(now):
+            self._outbox.say(own.type(topic, ROLE_PUBLISHES))
+        theirs = peer.types.get((topic, ROLE_SUBSCRIBES))
+        if theirs is not None and not self._fits(peer, topic, ROLE_SUBSCRIBES, theirs):
+            return
+        self._outbox.say(management.SubscribeResponse(topic, own.shape.size, max(message.queue, 1), own.params))
+        if self._peers.join(peer, topic):
+            self._outbox.tell(Joined(topic, message.params, message.queue, source))
+        self._renew(now, peer, topic)
+
+    def responded(self, now: int, message: management.SubscribeResponse, source: Source) -> None:
+        """A publisher that will send: let its data in."""
+        topic = message.topic
+        peer = self._peers.obtain(source) if topic in self._own.subscribers else None
+        if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
+            return
+        info = self._directory.topic(topic)
+        info.size = message.size or info.size
+        if peer.opened.get(topic) != (message.params, message.size):
+            peer.opened[topic] = (message.params, message.size)
+            self._outbox.tell(Opened(topic, source, message.params, message.size))
+
+    def typed(self, now: int, message: management.TypeInfo, source: Source) -> None:
+        """A peer's type of a topic: compare it if the topic is ours too."""
+        self._directory.typed(message)
+        own = self._counterpart(message.role).get(message.topic)
+        peer = self._peers.obtain(source) if own is not None else None
+        if peer is not None:
+            theirs = peer.types[message.topic, message.role] = Shape(message.size, message.fingerprint)
+            self._fits(peer, message.topic, message.role, theirs)
+
+    def unsubscribed(self, now: int, message: management.Unsubscribe, source: Source) -> None:
+        """A subscriber is gone; where several modules share an address, only the lease tells who is left."""
+        peer = self._peers.get(source)
+        if peer is not None and peer.direct == {self._directory.name_of(message.instance)}:
+            self._end(peer, message.topic)
+        else:
+            self._counts["unsubscribe left to the lease"] += 1
+
+    # What changed on our side
+
+    def retyped(self, topic: str, role: int) -> None:
+        """Our own type is new: compare it with those of the peers in this role."""
+        for peer in self._peers.all():
+            peer.refused.pop((topic, role), None)
+            theirs = peer.types.get((topic, role))
+            if theirs is not None:
+                self._fits(peer, topic, role, theirs)
+
+    def withdrawn(self, topic: str) -> None:
+        """Our last publisher is gone."""
+        for peer in self._peers.all():
+            self._end(peer, topic)
+            peer.forget_type(topic, ROLE_SUBSCRIBES)
+
+    def unwanted(self, topic: str) -> None:
+        """Our last subscriber is gone."""
+        for peer in self._peers.all():
+            self._shut(peer, topic)
+            peer.forget_type(topic, ROLE_PUBLISHES)
+
+    # Who is there
+
+    def met(self, now: int, info: ModuleInfo, *, is_new: bool) -> None:
+        """An r2p module is the very other end: from now on its address has leases."""
+        peer = self._peers.obtain(info.source)
+        if peer is None:
+            return
+        if is_new and peer.r2p_until:  # the first HELLO of all may just be later than its module's requests
+            peer.mark_stale()
+        peer.meet(now, info)
+        for topic in list(peer.permanent):
+            self._renew(now, peer, topic)
+
+    def restarted(self, source: Source) -> None:
+        """A module there lost what it knew: its next requests are as good as new."""
+        peer = self._peers.get(source)
+        if peer is not None:
+            peer.mark_stale()
+
+    def moved_away(self, now: int, info: ModuleInfo) -> None:
+        """A module is not at this address any more; with the last r2p module goes all that was asked and offered."""
+        peer = self._peers.get(info.source)
+        if peer is not None and info.name in peer.direct:
+            peer.direct.discard(info.name)
+            if not peer.direct:
+                self._depart(now, peer)
+
+    def left(self, now: int, source: Source) -> None:
+        """The good-bye of a module whose other HELLOs were all lost."""
+        peer = self._peers.get(source)
+        if peer is not None and not peer.direct:
+            self._depart(now, peer)
+
+    def interrupted(self) -> None:
+        """The link is down. Firmware does not notice a reconnect: its subscriptions stay, leases end."""
+        for peer in self._peers.all():
+            peer.r2p_until = 0
+            for topic in [topic for topic in peer.requests if topic not in peer.permanent]:
+                self._end(peer, topic)
+            peer.mark_stale()
+            self._peers.tidy(peer)
+
+    def lease_over(self, source: Source, topic: str) -> None:
+        peer = self._peers.get(source)
+        if peer is not None:
+            self._end(peer, topic)
+
+    def memory_over(self, source: Source) -> None:
+        """What a peer sent before it left can't arrive any more."""
+        peer = self._peers.get(source)
+        if peer is not None:
+            self._peers.tidy(peer)
+
+    def _depart(self, now: int, peer: Peer) -> None:
+        for topic in list(peer.requests):
+            self._end(peer, topic)
+        for topic in list(peer.opened):
+            self._shut(peer, topic)
+        peer.types.clear()
+        peer.refused.clear()
+        peer.r2p_until = now + LEASE
+        self._timers.set(("peer", peer.source), peer.r2p_until)
+
+    def _counterpart(self, role: int) -> dict[str, Own]:
+        """Our side of what a peer in this role tells."""
+        return {ROLE_PUBLISHES: self._own.subscribers, ROLE_SUBSCRIBES: self._own.publishers}.get(role, {})
+
+    def _fits(self, peer: Peer, topic: str, role: int, theirs: Shape) -> bool:
+        """Whether a peer's type fits ours; if not, it is told once and nothing flows."""
+        ours = self._counterpart(role)[topic].shape
+        fits = ours.fits(theirs)
+        self._directory.topic(topic).mismatch = not fits
+        if fits:
+            peer.refused.pop((topic, role), None)
+            return True
+        if peer.refused.get((topic, role)) != theirs:
+            peer.refused[topic, role] = theirs
+            self._outbox.tell(Mismatched(topic, peer.source, role, ours, theirs))
+        if role == ROLE_SUBSCRIBES:
+            self._end(peer, topic)
+        else:
+            self._shut(peer, topic)
+        return False
+
+    def _renew(self, now: int, peer: Peer, topic: str) -> None:
+        """A subscription was made or repeated: a lease with r2p peers, for ever with firmware."""
+        key = ("lease", peer.source, topic)
+        if not peer.is_r2p(now):
+            peer.permanent.add(topic)
+            self._timers.clear(key)
+            return
+        peer.permanent.discard(topic)
+        if peer.lease is not None:
+            self._timers.set(key, now + peer.lease)
+
+    def _end(self, peer: Peer, topic: str) -> None:
+        self._timers.clear(("lease", peer.source, topic))
+        if self._peers.end(peer, topic):
+            self._outbox.tell(Left(topic))
+
+    def _shut(self, peer: Peer, topic: str) -> None:
+        if peer.opened.pop(topic, None) is not None:
+            self._outbox.tell(Shut(topic, peer.source))
+
+
+def _theirs(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> Shape:
+    """What a publisher's message says of its type, with the TYPE before it if that speaks of the same size."""
+    typed = peer.types.get((message.topic, ROLE_PUBLISHES))
+    return typed if typed is not None and typed.size == message.size else Shape(message.size)

@@ -1,0 +1,104 @@
+"""Who is at the other end, by transport address, and what it subscribed, publishes and calls its types.
+
+A firmware peer's subscriptions last for ever. Those of an r2p peer (its HELLO came without a gateway in between) are
+leases. A peer counts as r2p until its lease is over even after it said good-bye: what it sent before may still arrive.
+"""
+
+from collections import Counter
+
+import msgspec
+
+from r2p.protocols.directory import FOR_EVER
+from r2p.protocols.events import ModuleInfo, Shape, Source
+
+MOST = 4096
+"""Peers on one link."""
+
+
+class Peer(msgspec.Struct, eq=False):
+    """One address on the link.
+
+    `direct`: the r2p modules there, by name (several share an address where a line has more than two ends). `lease` in
+    ns, None: as long as the module lives. `requests`: the topics subscribed, and whether the module restarted since;
+    `permanent`: those that are no leases. The keys of `types` and `refused` are topic and role.
+    """
+
+    source: Source
+    direct: set[str] = msgspec.field(default_factory=set)
+    r2p_until: int = 0
+    lease: int | None = None
+    requests: dict[str, bool] = msgspec.field(default_factory=dict)
+    permanent: set[str] = msgspec.field(default_factory=set)
+    opened: dict[str, tuple[bytes, int]] = msgspec.field(default_factory=dict)
+    types: dict[tuple[str, int], Shape] = msgspec.field(default_factory=dict)
+    refused: dict[tuple[str, int], Shape] = msgspec.field(default_factory=dict)
+
+    def is_r2p(self, now: int) -> bool:
+        return bool(self.direct) or now < self.r2p_until
+
+    def meet(self, now: int, info: ModuleInfo) -> None:
+        """The HELLO of an r2p module at this address."""
+        lease = None if info.lease >= FOR_EVER else info.lease
+        shared = bool(self.direct - {info.name})
+        if shared and lease is not None:  # the longest lease counts, and that only ends with them all
+            lease = max(lease, self.lease) if self.lease is not None else None
+        self.lease = lease
+        self.direct.add(info.name)
+        self.r2p_until = max(self.r2p_until, now + info.lease)
+
+    def mark_stale(self) -> None:
+        """Whoever sits there restarted: its next requests are as good as new."""
+        self.requests = dict.fromkeys(self.requests, True)
+
+    def forget_type(self, topic: str, role: int) -> None:
+        self.types.pop((topic, role), None)
+        self.refused.pop((topic, role), None)
+
+
+class Peers:
+    """All peers of one link, and how many of them subscribe each topic."""
+
+    def __init__(self, counts: Counter[str]) -> None:
+        self._peers: dict[Source, Peer] = {}
+        self._subscribed: Counter[str] = Counter()
+        self._counts = counts
+
+    def get(self, source: Source) -> Peer | None:
+        return self._peers.get(source)
+
+    def obtain(self, source: Source) -> Peer | None:
+        """The peer at this address, a new one if need be; None and counted where there are too many."""
+        peer = self._peers.get(source)
+        if peer is None:
+            if len(self._peers) >= MOST:
+                self._counts["too many peers"] += 1
+                return None
+            peer = self._peers[source] = Peer(source)
+        return peer
+
+    def all(self) -> list[Peer]:
+        return list(self._peers.values())
+
+    def join(self, peer: Peer, topic: str) -> bool:
+        """The peer subscribes the topic. Says whether that is new, or as good as new."""
+        stale = peer.requests.get(topic)
+        peer.requests[topic] = False
+        if stale is None:
+            self._subscribed[topic] += 1
+        return stale is not False
+
+    def end(self, peer: Peer, topic: str) -> bool:
+        """The peer's subscription is over. Says whether it was the last one of the topic."""
+        if peer.requests.pop(topic, None) is None:
+            return False
+        peer.permanent.discard(topic)
+        self._subscribed[topic] -= 1
+        if self._subscribed[topic]:
+            return False
+        del self._subscribed[topic]
+        return True
+
+    def tidy(self, peer: Peer) -> None:
+        """Forget a peer with whom there is nothing going on."""
+        if not (peer.direct or peer.requests or peer.opened):
+            self._peers.pop(peer.source, None)

@@ -1,0 +1,271 @@
+"""Subscribers: one bounded queue, and the ways to empty it: `async for`, `fetch`, callbacks.
+
+Nothing is awaited between taking a message and handing it out, so a cancelled reader loses none.
+"""
+
+import asyncio
+import inspect
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+from r2p.clock import Alarm
+from r2p.errors import Closed, DecodeError
+from r2p.messages import Layout
+from r2p.publisher import BURST, pause
+from r2p.sample import Sample
+from r2p.topic import QueueSink, Topic, TopicSpace
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+    from r2p.node import Node
+
+T = TypeVar("T")
+
+Callback = Callable[[T], Awaitable[None] | None]
+Keep = Literal["newest", "oldest"]
+
+_SECOND = 1_000_000_000
+
+
+class _GuardedQueue(deque[Sample]):
+    """A queue that notes when the last message that is fresh enough came in; only for subscribers with a time-out."""
+
+    def __init__(self, note: Callable[[Sample], None]) -> None:
+        super().__init__()
+        self._note = note
+
+    def append(self, sample: Sample) -> None:
+        super().append(sample)
+        self._note(sample)
+
+
+class Subscriber(QueueSink, Generic[T]):
+    """One subscription of a node. Made by `Node.subscribe`.
+
+    Iterate it (`async for message in sub`), `fetch()` single messages, or give a callback that `node.spin()` serves.
+    Leaving an `async for` keeps the subscription; `close()` or `async with` ends it.
+    """
+
+    def __init__(
+        self,
+        space: TopicSpace,
+        node: "Node",
+        topic: Topic,
+        layout: Layout[Any] | None,
+        *,
+        queue: int,
+        lossy: bool,
+        keep: Keep,
+        callback: Callback[T] | None,
+        max_age: float | None,
+        timeout: float | None,
+        on_timeout: Callable[[], object] | None,
+    ) -> None:
+        super().__init__(space.waker, node, queue, node.priority, lossy=lossy, keep_oldest=keep == "oldest")
+        self.topic = topic.name
+        self.callback = callback
+        self.undecodable = 0
+        """Messages whose bytes are none of the type; skipped."""
+        self.stale = 0
+        """Messages older than `max_age` when their turn came; skipped."""
+        self.timeouts = 0
+        """Times that nothing (fresh) came for `timeout` seconds."""
+        self._space = space
+        self._topic = topic
+        self._layout = layout
+        self._type = None if layout is None else layout.cls
+        self._max_age = None if max_age is None else round(max_age * _SECOND)
+        self._on_timeout = on_timeout
+        self._closed = False
+        self._matches: list[asyncio.Future[None]] = []
+        self._silent = False
+        self._timeout = 0 if timeout is None else round(timeout * _SECOND)
+        self._heard = space.clock.monotonic()
+        self._alarm = Alarm(space.loop, self._check_silence)
+        if timeout is not None:
+            self.queue = _GuardedQueue(self._note)
+            self._alarm.set(self._heard + self._timeout)
+
+    @property
+    def publishers(self) -> int:
+        """Who publishes the topic, as far as this module knows: local publishers and remote ones that answered."""
+        return len(self._topic.publishers) + self._topic.inlets
+
+    async def wait_publisher(self) -> None:
+        """Wait until somebody publishes the topic."""
+        while not self.publishers:
+            waiter = self._space.loop.create_future()
+            self._matches.append(waiter)
+            try:
+                await waiter
+            finally:
+                self._matches.remove(waiter)
+
+    def publisher_joined(self) -> None:
+        for waiter in self._matches:
+            if not waiter.done():
+                waiter.set_result(None)
+
+    def __aiter__(self) -> AsyncIterator[T]:
+        return self._iterate(whole=False)
+
+    def samples(self) -> AsyncIterator[Sample]:
+        """Iterate samples: messages with their source, stamp, deadline and packed bytes."""
+        return self._iterate(whole=True)
+
+    async def _iterate(self, *, whole: bool) -> AsyncIterator[Any]:  # noqa: C901 - see below
+        # One long function, because this is where every message passes: calls would take as long as the work.
+        queue, kind, create_future = self.queue, self._type, self._space.loop.create_future
+        fussy = self._max_age is not None
+        while not self._closed:
+            if not queue:
+                if self.waiter is not None:
+                    raise self._two_readers()
+                waiter = self.waiter = create_future()
+                try:
+                    await waiter
+                finally:
+                    if self.waiter is waiter:
+                        self.waiter = None
+            credit = BURST if self.priority >= self._waker.top else 1
+            while queue:
+                sample = queue.popleft()
+                if self._room is not None and len(queue) <= self._room_at:
+                    self._made_room()
+                message = sample.message
+                if fussy or message.__class__ is not kind:
+                    message = self._examine(sample)
+                    if message is None:
+                        continue
+                yield sample if whole else message
+                credit -= 1
+                if not credit:
+                    if queue:
+                        await self._give_way()
+                    break
+
+    async def fetch(self, timeout: float | None = None) -> T:
+        """Wait for one message. Raises TimeoutError after `timeout` seconds, Closed if the subscription is closed."""
+        if not self.queue and timeout is not None:
+            async with asyncio.timeout(timeout):
+                return await self.fetch()
+        while not self._closed:
+            message = self._next()
+            if message is not None:
+                return message
+            await self._arrival()
+        raise Closed(f"the subscription of {self.topic} is closed: subscribe again")
+
+    def close(self) -> None:
+        """End the subscription; whoever waits for its next message is woken."""
+        if not self._closed:
+            self._closed = True
+            self._alarm.close()
+            self._topic.leave(self)
+            self._space.release(self._topic)
+            self.queue.clear()
+            self._made_room()
+            if self.waiter is not None and not self.waiter.done():
+                self.waiter.set_result(None)
+
+    async def __aenter__(self) -> "Self":
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: "TracebackType | None"
+    ) -> None:
+        self.close()
+
+    # For the node, and below
+
+    async def serve(self) -> bool:
+        """Hand what waits now to the callback; says whether there was anything. For `Node.spin`."""
+        served = False
+        for _ in range(len(self.queue)):
+            message = self._next()
+            if message is None:
+                break
+            served = True
+            if self.callback is not None and inspect.isawaitable(pending := self.callback(message)):
+                await pending
+            if self.priority < self._waker.top:
+                await self._give_way()
+        return served
+
+    def _next(self) -> T | None:
+        """The next good message that waits, or None."""
+        queue = self.queue
+        while queue:
+            sample = queue.popleft()
+            if self._room is not None and len(queue) <= self._room_at:
+                self._made_room()
+            message: T | None = self._examine(sample)
+            if message is not None:
+                return message
+        return None
+
+    def _examine(self, sample: Sample) -> Any:
+        """The sample's message as this subscriber's type; None, counted, if it is too old or does not decode."""
+        if self._max_age is not None and self._space.clock.now() - sample.stamp > self._max_age:
+            self.stale += 1
+            return None
+        if self._layout is None:
+            return sample.data
+        message: Any = sample.message
+        if message.__class__ is self._type:
+            return message
+        try:
+            message = self._layout.decode(sample.data)
+        except DecodeError:
+            self.undecodable += 1
+            return None
+        if sample.message is None:
+            sample.message = message
+        return message
+
+    async def _arrival(self) -> None:
+        """Wait until something is in the queue, or the subscription is closed."""
+        if self.waiter is not None:
+            raise self._two_readers()
+        waiter = self.waiter = self._space.loop.create_future()
+        try:
+            await waiter
+        finally:
+            if self.waiter is waiter:
+                self.waiter = None
+
+    def _two_readers(self) -> RuntimeError:
+        return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each")
+
+    async def _give_way(self) -> None:
+        if self.priority >= self._waker.top:
+            await pause()
+        else:
+            turn = self._space.loop.create_future()
+            self._waker.queue(self.priority, turn)
+            await turn
+
+    def _note(self, sample: Sample) -> None:
+        if self._max_age is None or self._space.clock.now() - sample.stamp <= self._max_age:
+            self._heard = self._space.clock.monotonic()
+            if self._silent:
+                self._silent = False
+                self._alarm.set(self._heard + self._timeout)
+
+    def _check_silence(self) -> None:
+        now = self._space.clock.monotonic()
+        if now < self._heard + self._timeout:
+            self._alarm.set(self._heard + self._timeout)
+            return
+        self.timeouts += 1
+        if self._on_timeout is not None:
+            self._silent = True
+            self._on_timeout()
+            return
+        self._heard = now
+        self._alarm.set(now + self._timeout)
+        if self.waiter is not None and not self.waiter.done():
+            self.waiter.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / _SECOND} s"))

@@ -1,0 +1,13 @@
+"""For the tests of programs that use r2p: a pytest plugin, found by pytest by itself.
+
+Mark a test, a class or a module, and its `async def` tests run under virtual time; nothing else has to be configured:
+
+    @pytest.mark.virtual_time
+    async def test_the_lease_ends() -> None:
+        ...
+        await asyncio.sleep(3600)       # takes no time
+
+`@pytest.mark.virtual_time(seed=7)` gives `r2p.clock.random_of()` another seed. An exception that nobody awaits, in a
+callback or in a forgotten task, fails the test. Works with hypothesis, and next to the plugins of anyio and of
+pytest-asyncio.
+"""

@@ -1,0 +1,493 @@
+"""A link: one line, connection or bus as a module sees it, and the discovery that runs on it.
+
+    topic space  ->  Outlet.offer  ->  Link.write
+    wire         ->  Link.take     ->  Inlet  ->  Topic.deliver
+
+A transport (what a URL names) makes links, keeps them up, and feeds them. The link's discovery decides what flows:
+nothing is sent for which nobody asked, nothing is taken that nobody opened.
+"""
+
+import abc
+import random
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Iterable
+from typing import Any, ClassVar, Protocol
+
+import msgspec
+
+from r2p.clock import Alarm
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.names import MANAGEMENT
+from r2p.protocols.discovery import Discovery
+from r2p.protocols.events import Command, Event, Joined, Left, Opened, Send, Shut
+from r2p.sample import PublisherClass, Sample, Source
+from r2p.topic import PATIENCE, Outlet, Sink, Topic, TopicSpace
+
+TURN = 64
+"""Messages that a link hands out before it lets the event loop run once."""
+
+_SECOND = 1_000_000_000
+
+
+class LinkStats(msgspec.Struct):
+    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions."""
+
+    sent: int = 0
+    received: int = 0
+    bytes_sent: int = 0
+    bytes_received: int = 0
+    ups: int = 0
+    lost: Counter[str] = msgspec.field(default_factory=Counter)
+
+
+class Inlet(msgspec.Struct):
+    """Where the messages of one topic that come in by a link go; `senders` are the publishers that opened it."""
+
+    topic: Topic
+    source: Source
+    size: int
+    senders: set[Hashable]
+
+
+class Hub(Protocol):
+    """What a transport gets from the module that opened it."""
+
+    @property
+    def space(self) -> TopicSpace: ...
+
+    @property
+    def instance(self) -> int:
+        """Random 32-bit number of this run of the module."""
+
+    @property
+    def observer(self) -> bool:
+        """Whether the module is a tool that only looks."""
+
+    @property
+    def random(self) -> random.Random:
+        """For jitter; seeded under virtual time."""
+
+    def attach(self, link: "Link") -> None:
+        """A link exists from now on."""
+
+    def detach(self, link: "Link") -> None:
+        """It does not any more."""
+
+    def link_waits(self, link: "Link", reason: str) -> None:
+        """It can't be reached yet."""
+
+    def listening(self, url: str, address: str) -> None:
+        """A transport takes connections at an address."""
+
+    def link_changed(self, link: "Link", reason: str, outage: float, lost: int) -> None:
+        """It went up or down; on the way up: s that it was down, messages lost by that."""
+
+    def discovered(self, link: "Link", event: Event) -> None:
+        """Its discovery found something that concerns the module."""
+
+
+class LinkOutlet(Outlet):
+    """One topic on its way out by one link."""
+
+    __slots__ = ("_link", "size", "topic")
+
+    def __init__(self, link: "Link", topic: Topic) -> None:
+        super().__init__(link.name)
+        self._link = link
+        self.topic = topic
+
+    def offer(self, sample: Sample) -> bool:
+        link = self._link
+        if not link.up:
+            self.lost += 1
+            link.stats.lost["link down"] += 1
+            return True
+        if link.full:
+            return False
+        link.write(self.topic.name, sample)
+        return True
+
+    def force(self, sample: Sample) -> None:
+        if not self.offer(sample):
+            self.lost += 1
+            self._link.stats.lost["send buffer full"] += 1
+
+    def when_room(self, callback: Callable[[], None], *, soon: bool = False) -> None:
+        self._link.when_room(callback)
+
+
+class Transport(abc.ABC):
+    """What a URL names: it opens links to a hub, and keeps them up until it is cancelled."""
+
+    @abc.abstractmethod
+    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+        """Attach links and keep them alive for ever; on cancellation close and detach them.
+
+        Calls `opened()` once it works, or works on its way by itself: the module's `async with` waits for that. Raises
+        TransportError for what waiting can't mend, such as an address in use.
+        """
+
+
+class Arrival(Protocol):
+    """What came in: a topic's name as it is on this link, and packed bytes."""
+
+    @property
+    def topic(self) -> bytes: ...
+
+    @property
+    def data(self) -> bytes: ...
+
+
+class Link(abc.ABC):
+    """What all links share: discovery, outlets and inlets, fair intake, state and counters."""
+
+    longest: ClassVar[int] = 255
+    """Bytes of the longest message."""
+
+    point_to_point: ClassVar[bool] = True
+
+    def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0) -> None:
+        self.name = name
+        self.up = False
+        self.stats = LinkStats()
+        self.discovery = Discovery(
+            hub.space.module,
+            hub.instance,
+            rate=management_rate,
+            burst=max(4, int(management_rate / 4)),
+            observer=hub.observer,
+        )
+        self._hub = hub
+        self._space = hub.space
+        self._clock = hub.space.clock
+        self._alarm = Alarm(hub.space.loop, self._poll)
+        self._outlets: dict[str, LinkOutlet] = {}
+        self._inlets: dict[bytes, Inlet] = {}
+        self._told: dict[str, _Told] = {}
+        self._backlog: deque[Any] = deque()
+        self._handing_out = False
+        self._blocked: list[Sink] = []
+        self._patience = 0
+        self._room: list[Callable[[], None]] = []
+        self._down_at = self._clock.monotonic()
+        self._lost_at_down = 0
+        self._unreachable = ""
+        self._closed = False
+
+    # For the transport that owns the link
+
+    def went_up(self) -> None:
+        """The other end can be reached: announce everything."""
+        outage = (self._clock.monotonic() - self._down_at) / _SECOND
+        lost = self.stats.lost["link down"] - self._lost_at_down
+        self.up = True
+        self._unreachable = ""
+        self.stats.ups += 1
+        self._hub.link_changed(self, "", outage, lost)
+        self._apply(self.discovery.link_up(self._clock.monotonic()))
+
+    def unreachable(self, reason: str) -> None:
+        """It can't be reached yet: tell the user once for each reason."""
+        if reason != self._unreachable:
+            self._unreachable = reason
+            self._hub.link_waits(self, reason)
+
+    def went_down(self, reason: str) -> None:
+        """The other end is gone. What waits to be sent is discarded and counted: no stale command ever arrives late."""
+        if not self.up:
+            return
+        self.up = False
+        self._down_at = self._clock.monotonic()
+        self._lost_at_down = self.stats.lost["link down"]
+        self.stats.lost["link down"] += self.discard()
+        self._hub.link_changed(self, reason, 0.0, 0)
+        self._apply(self.discovery.link_down(self._down_at))
+        for outlet in self._outlets.values():
+            for publisher in outlet.topic.publishers:
+                publisher.degraded(self.name, reason)
+        self._made_room()
+
+    def close(self) -> None:
+        """Say good-bye, and let go of all topics."""
+        if self._closed:
+            return
+        self._closed = True
+        self._apply(self.discovery.leave(self._clock.monotonic()))
+        self.up = False
+        self._alarm.close()
+        self._backlog.clear()
+        for outlet in self._outlets.values():
+            outlet.topic.leave(outlet)
+        self._outlets.clear()
+        for name in list(self._inlets):
+            self._shut_all(name.decode())
+        self._made_room()
+
+    def take(self, arrivals: Iterable[Arrival]) -> None:
+        """Hand out what came in, at most TURN messages in one turn of the loop.
+
+        A full queue whose reader keeps up gets a few turns to make room; one that does not loses messages, and nobody
+        else waits for it.
+        """
+        self._backlog.extend(arrivals)
+        if not self._handing_out:
+            self._hand_out()
+
+    # For subclasses
+
+    @property
+    @abc.abstractmethod
+    def full(self) -> bool:
+        """Whether the send buffer has no room."""
+
+    @abc.abstractmethod
+    def write(self, topic: str, sample: Sample) -> None:
+        """Put a sample into the send buffer; there is room."""
+
+    @abc.abstractmethod
+    def write_management(self, data: bytes) -> None:
+        """Put a management message into the send buffer, ahead of the limit for samples; lost if nothing moves."""
+
+    @abc.abstractmethod
+    def sample(self, inlet: Inlet, arrival: Any) -> Sample:
+        """The sample that came in."""
+
+    def discard(self) -> int:
+        """Empty the send buffer; says how many samples are lost by that."""
+        return 0
+
+    def sender(self, arrival: Any) -> Hashable:
+        """The sender's address on a bus; None on a line with one other end."""
+        return None
+
+    def pause(self) -> None:
+        """Stop reading, if possible: what came in is still being handed out."""
+
+    def resume(self) -> None:
+        """Go on reading."""
+
+    def _made_room(self) -> None:
+        callbacks, self._room = self._room, []
+        for callback in callbacks:
+            callback()
+
+    # For outlets, publishers and the module
+
+    def when_room(self, callback: Callable[[], None]) -> None:
+        self._room.append(callback)
+
+    def guarantee(self, publisher_class: PublisherClass) -> str:
+        return "best effort, in order" + (", waits for room" if publisher_class == PublisherClass.NON_REAL_TIME else "")
+
+    def best_effort(self, publisher_class: PublisherClass) -> bool:
+        return publisher_class != PublisherClass.NON_REAL_TIME
+
+    def refusal(self, size: int) -> str | None:
+        return f"{size} bytes, and it carries at most {self.longest} in a message" if size > self.longest else None
+
+    async def admission(self, topic: str) -> None:
+        """Best effort is admitted at once."""
+
+    def command(self, command: Command, module: str) -> None:
+        """Send STOP, REBOOT or BOOTLOAD to a module."""
+        self._apply(self.discovery.command(self._clock.monotonic(), command, module))
+
+    def tell_conflict(self, module: str, instance_a: int, instance_b: int) -> None:
+        """Tell two modules that they carry one name."""
+        self._apply(self.discovery.conflict(self._clock.monotonic(), module, instance_a, instance_b))
+
+    def query(self) -> None:
+        """Ask everybody to repeat what they publish and subscribe."""
+        self._apply(self.discovery.query(self._clock.monotonic()))
+
+    def set_flags(self, flags: int) -> None:
+        """Tell the module's state, as in ALIVE."""
+        self._apply(self.discovery.set_flags(self._clock.monotonic(), flags))
+
+    def topic_changed(self, topic: Topic) -> None:
+        """A publisher or a subscriber of this module came or went: tell the others."""
+        now = self._clock.monotonic()
+        told = self._told.pop(topic.name, _NOTHING)
+        wish = _wish(topic)
+        if wish.publishes and self.refusal(wish.size):
+            wish = msgspec.structs.replace(wish, publishes=False)
+        if wish != told:
+            self._apply(_announce(self.discovery, now, topic.name, told, wish))
+        if not wish.subscribes:
+            self._shut_all(topic.name)
+        if wish != _NOTHING:
+            self._told[topic.name] = wish
+
+    # Discovery
+
+    def _poll(self) -> None:
+        self._apply(self.discovery.poll(self._clock.monotonic()))
+
+    def _apply(self, events: Iterable[Event]) -> None:
+        for event in events:
+            match event:
+                case Send():
+                    if self.up:
+                        self.write_management(event.data)
+                case Joined():
+                    self._attach(event.topic)
+                case Left():
+                    self._detach(event.topic)
+                case Opened():
+                    self._open(event.topic, event.size, event.source)
+                case Shut():
+                    self._shut(event.topic, event.source)
+                case _:
+                    self._hub.discovered(self, event)
+        if not self._closed:
+            self._alarm.set(self.discovery.next_deadline())
+
+    def _attach(self, name: str) -> None:
+        topic = self._space.topics.get(name)
+        if topic is None:
+            return
+        outlet = self._outlets.get(name)
+        if outlet is None or outlet.topic is not topic:
+            outlet = self._outlets[name] = LinkOutlet(self, topic)
+            topic.join(outlet)
+        else:
+            for publisher in topic.publishers:
+                publisher.joined(outlet)
+
+    def _detach(self, name: str) -> None:
+        outlet = self._outlets.pop(name, None)
+        if outlet is not None:
+            outlet.topic.leave(outlet)
+
+    def _open(self, name: str, size: int, sender: Hashable = None) -> None:
+        topic = self._space.topics.get(name)
+        if topic is None or not topic.queues:
+            return
+        inlet = self._inlets.get(name.encode())
+        if inlet is None:
+            size = topic.layout.size if topic.layout is not None else size
+            inlet = self._inlets[name.encode()] = Inlet(topic, self._source(), size, set())
+        if sender not in inlet.senders:
+            inlet.senders.add(sender)
+            topic.inlets += 1
+            for queue in topic.queues:
+                queue.publisher_joined()
+
+    def _shut(self, name: str, sender: Hashable) -> None:
+        inlet = self._inlets.get(name.encode())
+        if inlet is not None and sender in inlet.senders:
+            inlet.senders.remove(sender)
+            inlet.topic.inlets -= 1
+            if not inlet.senders:
+                del self._inlets[name.encode()]
+
+    def _shut_all(self, name: str) -> None:
+        inlet = self._inlets.pop(name.encode(), None)
+        if inlet is not None:
+            inlet.topic.inlets -= len(inlet.senders)
+
+    def _source(self) -> Source:
+        """Who publishes at the other end: known where only one module was heard."""
+        modules = [info.name for info in self.discovery.modules.values()]
+        return Source(modules[0] if len(modules) == 1 else "", "", self.name)
+
+    # Intake
+
+    def _hand_out(self) -> None:
+        self._handing_out = True
+        backlog, inlets = self._backlog, self._inlets
+        for _ in range(TURN):
+            if not backlog:
+                self._handing_out = False
+                self.resume()
+                return
+            arrival = backlog.popleft()
+            inlet = inlets.get(arrival.topic)
+            if inlet is None:
+                self._take_other(arrival)
+            elif not self._belongs(arrival, inlet):
+                pass
+            else:
+                self.stats.received += 1
+                sample = self.sample(inlet, arrival)
+                blocked = inlet.topic.deliver(sample)
+                if blocked is not None:
+                    self._blocked, self._patience = blocked, PATIENCE
+                    self._space.loop.call_soon(self._retry, sample)
+                    self.pause()
+                    return
+        self._space.loop.call_soon(self._hand_out)
+        self.pause()
+
+    def _belongs(self, arrival: Any, inlet: Inlet) -> bool:
+        if len(arrival.data) != inlet.size and inlet.size:
+            self.stats.lost["wrong size"] += 1
+            return False
+        if not self.point_to_point and self.sender(arrival) not in inlet.senders:
+            self.stats.lost["not subscribed"] += 1
+            return False
+        return True
+
+    def _retry(self, sample: Sample) -> None:
+        self._patience -= 1
+        self._blocked = [sink for sink in self._blocked if not sink.offer(sample)]
+        if self._blocked and self._patience > 0:
+            self._space.loop.call_soon(self._retry, sample)
+            return
+        for sink in self._blocked:
+            sink.give_up(sample)
+        self._blocked = []
+        self._hand_out()
+
+    def _take_other(self, arrival: Any) -> None:
+        if arrival.topic == _MANAGEMENT:
+            self._apply(self.discovery.receive(self._clock.monotonic(), arrival.data, self.sender(arrival)))
+        else:
+            self.stats.lost["not subscribed"] += 1
+
+
+class _Told(msgspec.Struct, frozen=True):
+    """What the other ends have been told of a topic."""
+
+    publishes: bool = False
+    subscribes: bool = False
+    size: int = 0
+    fingerprint: bytes = bytes(8)
+    queue: int = 1
+    endpoints: frozenset[tuple[str, int, int]] = frozenset()  # node, role, publisher class
+
+
+_NOTHING = _Told()
+_MANAGEMENT = MANAGEMENT.encode()
+
+
+def _wish(topic: Topic) -> _Told:
+    """What the other ends should know of a topic."""
+    publishers = {(each.node.name, ROLE_PUBLISHES, int(each.publisher_class)) for each in topic.publishers}
+    subscribers = {(each.owner, ROLE_SUBSCRIBES, 0) for each in topic.queues}
+    return _Told(
+        publishes=bool(publishers),
+        subscribes=bool(subscribers),
+        size=topic.layout.size if topic.layout is not None else 0,
+        fingerprint=topic.layout.fingerprint if topic.layout is not None else bytes(8),
+        queue=min(max((each.limit for each in topic.queues), default=1), 0xFFFF),
+        endpoints=frozenset(publishers | subscribers),
+    )
+
+
+def _announce(discovery: Discovery, now: int, topic: str, told: _Told, wish: _Told) -> list[Event]:
+    events: list[Event] = []
+    retyped = (wish.size, wish.fingerprint) != (told.size, told.fingerprint)
+    if wish.publishes and (retyped or not told.publishes):
+        events += discovery.advertise(now, topic, wish.size, wish.fingerprint)
+    elif told.publishes and not wish.publishes:
+        events += discovery.withdraw(now, topic)
+    if wish.subscribes and (retyped or not told.subscribes):
+        events += discovery.subscribe(now, topic, wish.size, wish.queue, wish.fingerprint)
+    elif told.subscribes and not wish.subscribes:
+        events += discovery.unsubscribe(now, topic)
+    for node, role, publisher_class in wish.endpoints - told.endpoints:
+        events += discovery.endpoint(now, node, topic, role, publisher_class)
+    for node, role, _class in told.endpoints - wish.endpoints:
+        events += discovery.endpoint_gone(now, node, topic, role)
+    return events

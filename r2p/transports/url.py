@@ -1,0 +1,101 @@
+"""Transport URLs: `SCHEME:ADDRESS`, with options as `?baud=115200&x=1` or `,baud=115200` (a `?` is a shell pattern).
+
+The built-in schemes are a table of import strings, so that a transport's library is loaded only when it is used; other
+packages add theirs through the entry-point group `r2p.transports`.
+"""
+
+import importlib
+import re
+from collections.abc import Callable
+from importlib import metadata
+from typing import TypeVar, cast
+
+import msgspec
+
+from r2p.errors import TransportError
+from r2p.transports.link import Transport
+
+T = TypeVar("T")
+
+BUILT_IN = {
+    "memory": "r2p.transports.memory:MemoryTransport",
+    "tcp": "r2p.transports.tcp:TcpTransport",
+    "tcp-listen": "r2p.transports.tcp:TcpListenTransport",
+    "serial": "r2p.transports.serial:SerialTransport",
+}
+
+GROUP = "r2p.transports"
+
+_OPTIONS = re.compile(r"[?,&]")
+_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
+
+
+class Url(msgspec.Struct, frozen=True):
+    """A transport's URL, taken apart."""
+
+    scheme: str
+    address: str
+    options: dict[str, str]
+
+    def __str__(self) -> str:
+        options = ",".join(f"{name}={value}" for name, value in self.options.items())
+        return f"{self.scheme}:{self.address}" + (f",{options}" if options else "")
+
+    def parsed(self, known: dict[str, Callable[[str], T]]) -> dict[str, T]:
+        """Options converted by `known`: name -> converter. Raises TransportError for an unknown or a bad one."""
+        values: dict[str, T] = {}
+        for name, value in self.options.items():
+            if name not in known:
+                options = ", ".join(sorted(known)) or "none"
+                raise TransportError(f"{self.scheme}: has no option {name!r}; it knows: {options}")
+            try:
+                values[name] = known[name](value)
+            except ValueError as error:
+                raise TransportError(f"{self}: option {name}={value}: {error}") from error
+        return values
+
+
+def parse(text: str) -> Url:
+    """Take a URL apart. Raises TransportError if it has no scheme or an option without `=`."""
+    scheme, colon, rest = text.partition(":")
+    if not colon or not scheme:
+        raise TransportError(f"transport {text!r}: give it as SCHEME:ADDRESS, for example tcp:192.168.0.10:23")
+    address, *pairs = _OPTIONS.split(rest)
+    options: dict[str, str] = {}
+    for pair in filter(None, pairs):
+        name, equals, value = pair.partition("=")
+        if not equals:
+            raise TransportError(f"transport {text!r}: option {pair!r} needs a value: {pair}=...")
+        options[name] = value
+    return Url(scheme, address, options)
+
+
+def open_transport(text: str) -> Transport:
+    """The transport that a URL names, not running yet.
+
+    Raises TransportError for an unknown scheme or option, and for an extra that is not installed.
+    """
+    url = parse(text)
+    return _factory(url.scheme)(url)
+
+
+def schemes() -> list[str]:
+    """All schemes that can be used, the ones of other packages included."""
+    return sorted({*BUILT_IN, *(entry.name for entry in metadata.entry_points(group=GROUP))})
+
+
+def duration(text: str) -> float:
+    """Seconds from "10ms", "20us", "1.5s" or "1.5"."""
+    match = re.fullmatch(r"([0-9.eE+-]+)\s*(ns|us|ms|s|)", text.strip())
+    if match is None:
+        raise ValueError(f"{text!r} is no duration: use 10ms, 20us or seconds")
+    return float(match[1]) * _UNITS[match[2]]
+
+
+def _factory(scheme: str) -> Callable[[Url], Transport]:
+    if scheme in BUILT_IN:
+        module, _, name = BUILT_IN[scheme].partition(":")
+        return cast("Callable[[Url], Transport]", getattr(importlib.import_module(module), name))
+    for entry in metadata.entry_points(group=GROUP, name=scheme):
+        return cast("Callable[[Url], Transport]", entry.load())
+    raise TransportError(f"unknown transport {scheme!r}: use one of {', '.join(schemes())}")

@@ -1,0 +1,61 @@
+"""The watchdog: tells which code blocks the event loop, while it blocks it.
+
+A thread asks the loop for a sign of life. Where none comes for LIMIT seconds, it logs the stack that the loop is stuck
+in, once, and afterwards how long it took. One block of 100 ms is ten missed periods of a 100 Hz node: worth a log line.
+"""
+
+import asyncio
+import logging
+import sys
+import threading
+import time
+import traceback
+
+logger = logging.getLogger("r2p.watchdog")
+
+LIMIT = 0.1
+"""Seconds that the loop may be blocked."""
+
+
+class Watchdog:
+    """Watches the loop of the thread that starts it."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, limit: float = LIMIT) -> None:
+        self._loop = loop
+        self._limit = limit
+        self._alive = threading.Event()
+        self._ended = threading.Event()
+        self._watched = 0
+        self._thread = threading.Thread(target=self._watch, name="r2p-watchdog", daemon=True)
+
+    def start(self) -> None:
+        self._watched = threading.get_ident()
+        self._thread.start()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(self._limit):
+            self._alive.clear()
+            asked = time.monotonic()
+            try:
+                self._loop.call_soon_threadsafe(self._alive.set)
+            except RuntimeError:  # the loop is closed
+                return
+            if not self._alive.wait(self._limit) and not self._ended.is_set():
+                self._report()
+                self._wait_out(asked)
+
+    def _report(self) -> None:
+        task = asyncio.current_task(self._loop)
+        who = f"task {task.get_name()}" if task is not None else "a callback"
+        frame = sys._current_frames().get(self._watched)  # noqa: SLF001 - documented, for exactly this use
+        stack = "".join(traceback.format_stack(frame)) if frame is not None else "(no stack)\n"
+        logger.warning("%s has blocked the event loop for over %.0f ms:\n%s", who, self._limit * 1e3, stack.rstrip())
+
+    def _wait_out(self, asked: float) -> None:
+        while not self._alive.wait(self._limit) and not self._ended.is_set():
+            pass
+        logger.warning("the event loop runs again after %.0f ms", (time.monotonic() - asked) * 1e3)

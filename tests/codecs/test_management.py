@@ -1,0 +1,168 @@
+"""The management messages against the recordings, and against what only peers of another kind or time send."""
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r2p.codecs import UnknownType
+from r2p.codecs import management as m
+from r2p.codecs.debug import Reader
+from r2p.errors import DecodeError, MessageError
+from tests.vectors import Case, cases
+
+TYPES: dict[str, Callable[..., m.Management]] = {
+    "ALIVE": m.Alive,
+    "STOP": m.Stop,
+    "REBOOT": m.Reboot,
+    "BOOTLOAD": m.Bootload,
+    "ADVERTISE": m.Advertise,
+    "SUBSCRIBE_REQUEST": m.SubscribeRequest,
+    "SUBSCRIBE_RESPONSE": m.SubscribeResponse,
+}
+
+
+def recorded(case: Case) -> list[tuple[bytes, dict[str, Any]]]:
+    entries = [entry for entry in case.transcript if entry.decoded.get("topic") == "R2P"]
+    return [(Reader().feed(entry.data)[0].data, entry.decoded) for entry in entries]
+
+
+def expected(decoded: dict[str, Any]) -> m.Management:
+    cls = TYPES[decoded["type"]]
+    if cls is m.Alive:
+        return m.Alive(decoded["name"], decoded["flags"])
+    if cls in (m.Stop, m.Reboot, m.Bootload):
+        return cls(decoded["name"])
+    params = bytes.fromhex(decoded["raw_params"])
+    return cls(decoded["name"], decoded["payload_size"], decoded["queue_length"], params)
+
+
+def padded(body: bytes, code: int) -> bytes:
+    return body.ljust(31, b"\0") + bytes((code,))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", [case for case in cases() if recorded(case)], ids=str)
+def test_recorded_messages(case: Case) -> None:
+    for data, decoded in recorded(case):
+        message = m.decode(data)
+        assert message == expected(decoded)
+        if not (isinstance(message, m.SubscribeRequest) and message.queue == 0):
+            assert m.encode(message) == data
+
+
+def test_all_recorded_types_are_met() -> None:
+    assert {decoded["type"] for case in cases() for _, decoded in recorded(case)} == set(TYPES)
+
+
+LAYOUTS = [
+    (m.Alive("IMU1", m.FLAG_REBOOTED | m.FLAG_BOOT), padded(b"IMU1\0\0\0\0\x06", 0x11)),
+    (m.Path("IMUGW12", "ledpub12", "leds567890123456"), b"IMUGW12ledpub12leds567890123456\x31"),
+    (m.Path("IMU1", "", "leds"), padded(b"IMU1\0\0\0" + bytes(8) + b"leds", 0x31)),
+    (
+        m.Hello("PC1", 0x12345678, m.HELLO_QUERY | m.HELLO_TOOL, 2, 5000),
+        padded(b"\x01PC1\0\0\0\0\x78\x56\x34\x12\x03\x02\x88\x13", 0x50),
+    ),
+    (
+        m.TypeInfo(m.ROLE_SUBSCRIBES, "leds567890123456", b"ABCDEFGH", 5),
+        padded(b"\x01\x02leds567890123456ABCDEFGH\x05\0", 0x51),
+    ),
+    (m.Unsubscribe("leds", 1), padded(b"\x01leds" + bytes(12) + b"\x01\0\0\0", 0x52)),
+    (
+        m.Endpoint(m.ROLE_PUBLISHES + m.ROLE_GONE, 7, "ledpub", "leds567890123456", m.CLASS_HRT),
+        b"\x01\x81\x07\0\0\0ledpub\0\0leds567890123456\x03\x53",
+    ),
+    (m.Conflict("IMU1", 1, 2), padded(b"\x01IMU1\0\0\0\x01\0\0\0\x02\0\0\0", 0x54)),
+]
+
+
+@pytest.mark.parametrize(("message", "data"), LAYOUTS, ids=lambda value: type(value).__name__)
+def test_layouts_that_nobody_recorded(message: m.Management, data: bytes) -> None:
+    assert m.encode(message) == data
+    assert m.decode(data) == message
+
+
+@pytest.mark.parametrize("code", [0x12, 0x13, 0x14])
+def test_a_tool_of_2013_leaves_the_reserved_byte_out(code: int) -> None:
+    message = m.decode(padded(b"IMU1\0\0\0\x01", code))
+    assert message in (m.Stop("IMU1"), m.Reboot("IMU1"), m.Bootload("IMU1"))
+
+
+def test_what_stands_behind_a_name_means_nothing() -> None:
+    data = b"leds\0garbage\xff\xff\xff\xff" + b"\x05\0" + b"\0\0" + b"\xcc" * 10 + b"\xaa" + b"\x21"
+    assert m.decode(data) == m.Advertise("leds", 5, 0, b"\xcc" * 10)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", bytes(31), bytes(33), padded(b"IMU\xff", 0x11), padded(b"\x1b[2J", 0x12), padded(b"\0IMU1", 0x11)],
+    ids=["nothing", "short", "long", "not ASCII", "control characters", "no name"],
+)
+def test_bytes_that_are_no_message(data: bytes) -> None:
+    with pytest.raises(DecodeError) as caught:
+        m.decode(data)
+    assert not isinstance(caught.value, UnknownType)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [padded(b"", 0x00), padded(b"x", 0x40), padded(b"x", 0xFF), padded(b"\x02PC1", 0x50), padded(b"\0PC1", 0x54)],
+    ids=["RAW", "0x40", "0xFF", "version 2", "version 0"],
+)
+def test_messages_to_ignore(data: bytes) -> None:
+    with pytest.raises(UnknownType):
+        m.decode(data)
+
+
+@pytest.mark.parametrize(
+    ("message", "says"),
+    [
+        (m.SubscribeRequest("leds", 5, 0), "SubscribeRequest.queue = 0 halts firmware"),
+        (m.Alive("IMU12345"), r"Alive.module = 'IMU12345': takes a name of 1 to 7"),
+        (m.Alive(""), "Alive.module"),
+        (m.Alive("gärtner"), "Alive.module"),
+        (m.Alive("a\0b"), "Alive.module"),
+        (m.Alive("IMU1", 256), "Alive.flags = 256: takes 1 unsigned bytes"),
+        (m.Advertise("leds", 0x10000), "Advertise.size"),
+        (m.Advertise("leds", 5, -1), "Advertise.queue"),
+        (m.Advertise("leds", 5, 0, b"\0"), "Advertise.params = .* takes 10 bytes, not 1"),
+        (m.TypeInfo(1, "leds", bytes(9), 5), "TypeInfo.fingerprint"),
+        (m.Unsubscribe("leds", 1 << 32), "Unsubscribe.instance"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, msgspec.Struct) else "",
+)
+def test_values_that_do_not_fit(message: m.Management, says: str) -> None:
+    with pytest.raises(MessageError, match=says):
+        m.encode(message)
+
+
+@given(st.binary(min_size=31, max_size=31), st.sampled_from([*range(0x11, 0x15), *range(0x21, 0x24), 0x31, 0x40]))
+def test_any_bytes_decode_or_raise_decode_error(body: bytes, code: int) -> None:
+    try:
+        message = m.decode(body + bytes((code,)))
+    except DecodeError:
+        return
+    if not isinstance(message, m.SubscribeRequest) or message.queue:
+        assert m.decode(m.encode(message)) == message
+
+
+names = st.text(st.characters(min_codepoint=33, max_codepoint=126), min_size=1, max_size=7)
+u8, u16, u32 = (st.integers(0, (1 << bits) - 1) for bits in (8, 16, 32))
+messages: st.SearchStrategy[m.Management] = st.one_of(
+    st.builds(m.Alive, names, u8),
+    st.builds(m.SubscribeRequest, names, u16, st.integers(1, 0xFFFF), st.binary(min_size=10, max_size=10)),
+    st.builds(m.Hello, names, u32, u8, u8, u16),
+    st.builds(m.TypeInfo, u8, names, st.binary(min_size=8, max_size=8), u16),
+    st.builds(m.Endpoint, u8, u32, st.just("") | names, names, u8),
+    st.builds(m.Conflict, names, u32, u32),
+)
+
+
+@given(messages)
+def test_what_is_encoded_decodes(message: m.Management) -> None:
+    data = m.encode(message)
+    assert len(data) == m.SIZE
+    assert m.decode(data) == message

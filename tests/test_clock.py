@@ -1,0 +1,283 @@
+from __future__ import annotations
+
+import asyncio
+import errno
+import itertools
+import random
+import time
+from typing import NoReturn
+
+import pytest
+
+import r2p.clock
+from r2p.clock import Alarm, SystemClock, Ticker, clock_of, random_of
+from r2p.sim import VirtualLoop, run
+
+MS = 1_000_000
+SECOND = 1_000_000_000
+
+Tick = tuple[int, int, int]
+
+
+class Hands:
+    """Clocks set by hand: UTC and the monotonic one."""
+
+    def __init__(self) -> None:
+        self.utc = 1000 * SECOND
+        self.monotonic = 5 * SECOND
+        self.clock = SystemClock(lambda: self.utc, lambda: self.monotonic)
+
+    def wait(self, ns: int) -> int:
+        self.utc += ns
+        self.monotonic += ns
+        return self.clock.now()
+
+
+def test_utc_goes_on_at_half_speed_after_it_was_set_back() -> None:
+    hands = Hands()
+    before = hands.clock.now()
+    hands.utc -= 10 * SECOND
+    assert hands.clock.now() == before
+    assert hands.wait(4 * SECOND) == before + 2 * SECOND
+    assert hands.wait(4 * SECOND) == before + 4 * SECOND
+    assert hands.wait(12 * SECOND) == before + 10 * SECOND == hands.utc
+    assert hands.wait(1 * SECOND) == before + 11 * SECOND == hands.utc
+
+
+def test_utc_may_be_set_back_again_and_again() -> None:
+    hands = Hands()
+    told = [hands.clock.now()]
+    for step in (10, 3, 0, 40, 0, 0, 2):
+        hands.utc -= step * SECOND
+        told += [hands.clock.now(), hands.wait(2 * SECOND), hands.wait(3 * SECOND)]
+    assert told == sorted(told)
+    assert all(later - earlier <= 3 * SECOND for earlier, later in itertools.pairwise(told))
+    hands.wait(200 * SECOND)
+    assert hands.clock.now() == hands.utc
+
+
+def test_half_speed_begins_anew_when_full_speed_was_in_between() -> None:
+    hands = Hands()
+    hands.clock.now()
+    hands.utc -= 2 * SECOND
+    hands.clock.now()
+    before = hands.wait(1000 * SECOND)
+    hands.utc -= 2 * SECOND
+    hands.clock.now()
+    assert hands.wait(1 * SECOND) == before + SECOND // 2
+
+
+def test_utc_set_forward_is_followed_at_once() -> None:
+    hands = Hands()
+    hands.clock.now()
+    hands.utc += 3600 * SECOND
+    assert hands.clock.now() == hands.utc
+
+
+def test_without_a_loop_time_and_random_numbers_are_the_computers() -> None:
+    clock = clock_of()
+    assert not clock.virtual
+    assert abs(clock.now() - time.time_ns()) < 60 * SECOND
+    assert clock.monotonic() <= time.monotonic_ns()
+    assert random_of() is random_of()
+
+
+def test_a_loop_may_bring_its_own_time_and_random_numbers() -> None:
+    async def main() -> tuple[bool, float]:
+        return clock_of().virtual, random_of().random()
+
+    assert run(main, seed=3) == (True, random.Random(3).random())
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        assert clock_of(runner.get_loop()) is runner.get_loop().clock  # type: ignore[attr-defined]  # of VirtualLoop
+
+
+# Alarm
+
+
+class Rings:
+    def __init__(self) -> None:
+        self.clock = clock_of()
+        self.at: list[int] = []
+        self.alarm = Alarm(asyncio.get_running_loop(), lambda: self.at.append(self.clock.monotonic()))
+
+
+@pytest.mark.virtual_time
+async def test_alarm_goes_off_once_at_its_deadline() -> None:
+    rings = Rings()
+    rings.alarm.set(333_333_333)
+    await asyncio.sleep(10)
+    assert rings.at == [333_333_333]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("deadlines", "expected"),
+    [
+        ([2 * SECOND, 3 * SECOND], [3 * SECOND]),
+        ([3 * SECOND, 2 * SECOND], [2 * SECOND]),
+        ([2 * SECOND, 4 * SECOND, 3 * SECOND], [3 * SECOND]),
+        ([2 * SECOND, None], []),
+        ([2 * SECOND, None, 1 * SECOND], [1 * SECOND]),
+        ([-5 * SECOND], [0]),
+        ([None], []),
+    ],
+    ids=str,
+)
+async def test_the_last_deadline_counts(deadlines: list[int | None], expected: list[int]) -> None:
+    rings = Rings()
+    for deadline in deadlines:
+        rings.alarm.set(deadline)
+    await asyncio.sleep(10)
+    assert rings.at == expected
+
+
+@pytest.mark.virtual_time
+async def test_alarm_is_set_again_in_its_own_callback() -> None:
+    def again() -> None:
+        at.append(clock_of().monotonic())
+        alarm.set(at[-1] + SECOND if len(at) < 3 else None)
+
+    at: list[int] = []
+    alarm = Alarm(asyncio.get_running_loop(), again)
+    alarm.set(SECOND)
+    await asyncio.sleep(10)
+    assert at == [1 * SECOND, 2 * SECOND, 3 * SECOND]
+
+
+@pytest.mark.virtual_time
+async def test_a_closed_alarm_is_silent() -> None:
+    rings = Rings()
+    rings.alarm.set(SECOND)
+    rings.alarm.close()
+    rings.alarm.close()
+    await asyncio.sleep(10)
+    assert rings.at == []
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("delay", [0, 300_000, 1_400_000, 2_490_000])
+async def test_alarm_is_never_early_on_a_real_loop(delay: int) -> None:
+    loop = asyncio.get_running_loop()
+    went_off = asyncio.Event()
+    deadline = clock_of().monotonic() + delay
+    Alarm(loop, went_off.set).set(deadline)
+    await went_off.wait()
+    assert clock_of().monotonic() >= deadline
+
+
+# Ticker
+
+
+async def ticks(period: int, count: int, work: int = 0) -> list[Tick]:
+    """The first `count` callbacks of a ticker; the first one blocks the loop for `work` ns."""
+    loop = asyncio.get_running_loop()
+    done = loop.create_future()
+    seen: list[Tick] = []
+
+    def on_tick(scheduled: int, late: int, skipped: int) -> None:
+        seen.append((scheduled, late, skipped))
+        if len(seen) == count:
+            ticker.close()
+            done.set_result(None)
+        until = clock_of().monotonic() + work
+        while len(seen) == 1 and clock_of().monotonic() < until:
+            pass
+
+    ticker = Ticker(loop, period, on_tick)
+    ticker.start()
+    await done
+    return seen
+
+
+def check_phase(seen: list[Tick], period: int) -> None:
+    for (before, _, _), (scheduled, late, skipped) in itertools.pairwise(seen):
+        assert scheduled - before == (1 + skipped) * period
+        assert 0 <= late < period
+
+
+@pytest.mark.virtual_time
+async def test_ticks_are_exact_under_virtual_time() -> None:
+    await asyncio.sleep(0.1234567)
+    assert await ticks(333_333, 5000) == [(123_456_700 + k * 333_333, 0, 0) for k in range(1, 5001)]
+
+
+@pytest.fixture(params=["timerfd", "loop timers"])
+def source(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_descriptors(first: int, period: int) -> NoReturn:
+        raise OSError(errno.EMFILE, f"no descriptor for {first} + k * {period}")
+
+    if request.param == "loop timers":
+        monkeypatch.setattr(r2p.clock, "_open_timerfd", no_descriptors)
+
+
+@pytest.mark.anyio
+@pytest.mark.usefixtures("source")
+@pytest.mark.parametrize("period", [2 * MS, 100_000])
+async def test_ticks_keep_their_phase_on_a_real_loop(period: int) -> None:
+    before = clock_of().monotonic()
+    seen = await ticks(period, 20)
+    assert seen[0][0] >= before + period
+    check_phase(seen, period)
+
+
+@pytest.mark.anyio
+@pytest.mark.usefixtures("source")
+async def test_ticks_are_skipped_while_the_loop_is_blocked() -> None:
+    seen = await ticks(1 * MS, 4, work=5 * MS)
+    assert seen[1][2] >= 4
+    check_phase(seen, 1 * MS)
+
+
+@pytest.mark.anyio
+@pytest.mark.usefixtures("source")
+async def test_the_shortest_period_leaves_the_loop_to_others() -> None:
+    ticking = asyncio.create_task(ticks(1000, 500))
+    turns = 0
+    while not ticking.done():
+        await asyncio.sleep(0)
+        turns += 1
+    check_phase(await ticking, 1000)
+    assert turns > 100
+
+
+@pytest.mark.anyio
+@pytest.mark.usefixtures("source")
+async def test_an_exception_is_reported_and_the_ticker_goes_on() -> None:
+    loop = asyncio.get_running_loop()
+    reported: list[object] = []
+    third = asyncio.Event()
+
+    def on_tick(_scheduled: int, _late: int, _skipped: int) -> None:
+        if len(reported) == 2:
+            ticker.close()
+            third.set()
+        else:
+            raise ValueError("tick")
+
+    handler = loop.get_exception_handler()
+    loop.set_exception_handler(lambda _, context: reported.append(context["exception"]))
+    ticker = Ticker(loop, MS, on_tick)
+    ticker.start()
+    await third.wait()
+    loop.set_exception_handler(handler)
+    assert [str(error) for error in reported] == ["tick", "tick"]
+
+
+@pytest.mark.virtual_time
+async def test_a_ticker_begins_anew_and_ends() -> None:
+    at: list[int] = []
+    ticker = Ticker(asyncio.get_running_loop(), SECOND, lambda scheduled, *_: at.append(scheduled))
+    ticker.start()
+    await asyncio.sleep(1.5)
+    ticker.start()
+    await asyncio.sleep(2.2)
+    ticker.close()
+    ticker.close()
+    await asyncio.sleep(5)
+    assert at == [1_000_000_000, 2_500_000_000, 3_500_000_000]
+
+
+@pytest.mark.virtual_time
+async def test_a_period_under_a_microsecond_is_refused() -> None:
+    with pytest.raises(ValueError, match="999 ns is too short"):
+        Ticker(asyncio.get_running_loop(), 999, print)
