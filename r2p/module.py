@@ -154,13 +154,12 @@ class Module:
     async def _open_transports(self) -> None:
         for via in self._via:
             transport = open_transport(via) if isinstance(via, str) else via
-            opened = asyncio.get_running_loop().create_future()
-            running = self._tasks.create_task(
-                transport.run(self, lambda opened=opened: opened.done() or opened.set_result(None)),
-                name=f"{self.name} {via}",
-            )
-            await asyncio.wait([opened, running], return_when=asyncio.FIRST_COMPLETED)
+            opened = asyncio.Event()
+            running = self._tasks.create_task(transport.run(self, opened.set), name=f"{self.name} {via}")
             self._transports.append(running)
+            ready = self._tasks.create_task(opened.wait())
+            await asyncio.wait([ready, running], return_when=asyncio.FIRST_COMPLETED)
+            ready.cancel()
 
     async def _close(self) -> None:
         if not self._open:

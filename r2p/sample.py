@@ -37,7 +37,8 @@ class Sample(msgspec.Struct, gc=False):
     """One published message.
 
     `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none). `stamped` says whether the stamp is the
-    sender's, or else the reception's. `sequence` counts the messages of one publisher from 1; 0 where the link does not carry it.
+    sender's, or else the reception's. `sequence` counts the messages of one publisher from 1; 0 where the link
+    does not carry it.
     `message` is None until somebody decodes a sample that came over a link.
     """
 

@@ -79,8 +79,9 @@ class Reader:
     one unfinished message, under 600 bytes.
     """
 
-    def __init__(self) -> None:
-        self.drops: dict[str, int] = {}
+    def __init__(self, drops: dict[str, int] | None = None) -> None:
+        """`drops` to count in, where more than one reader's losses belong together."""
+        self.drops: dict[str, int] = {} if drops is None else drops
         self._held = b""
         self._counted = False  # the noise that comes next, up to a line end, is already counted
 

@@ -13,7 +13,8 @@ from r2p.codecs.management import FLAG_BOOT
 from r2p.names import LOADER_PREFIX, MANAGEMENT
 from r2p.protocols.events import Event, ModuleChanged
 from r2p.sample import Sample
-from r2p.transports.link import Hub, Inlet, Link
+from r2p.transports.intake import Inlet
+from r2p.transports.link import Hub, Link
 
 BUFFER = 64 * 1024
 """Bytes that wait for a connection that takes no more, before its publishers have to wait or lose."""
@@ -52,7 +53,7 @@ class LineLink(Link):
 
     def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0, buffer: int = BUFFER) -> None:
         super().__init__(name, hub, management_rate=management_rate)
-        self._reader = debug.Reader()
+        self._reader = debug.Reader(self.stats.lost)
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
         self._carrier: Carrier | None = None
         self._lines: list[bytes] = []
@@ -67,7 +68,7 @@ class LineLink(Link):
         """Bytes flow from now on."""
         self._carrier = carrier
         self._blocked_carrier = False
-        self._reader.reset()
+        self._reader = debug.Reader(self.stats.lost)
         carrier.send(OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
             self.went_up()

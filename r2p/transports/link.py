@@ -9,44 +9,22 @@ nothing is sent for which nobody asked, nothing is taken that nobody opened.
 
 import abc
 import random
-from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
 from typing import Any, ClassVar, Protocol
 
 import msgspec
 
 from r2p.clock import Alarm
-from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.names import MANAGEMENT
 from r2p.protocols.discovery import Discovery
 from r2p.protocols.events import Command, Event, Joined, Left, Opened, Send, Shut
 from r2p.sample import PublisherClass, Sample, Source
-from r2p.topic import PATIENCE, Outlet, Sink, Topic, TopicSpace
-
-TURN = 64
-"""Messages that a link hands out before it lets the event loop run once."""
+from r2p.topic import Outlet, Topic, TopicSpace
+from r2p.transports.announce import NOTHING, Told, announce, wish_of
+from r2p.transports.intake import Arrival, Inlet, Intake, LinkStats
 
 _SECOND = 1_000_000_000
-
-
-class LinkStats(msgspec.Struct):
-    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions."""
-
-    sent: int = 0
-    received: int = 0
-    bytes_sent: int = 0
-    bytes_received: int = 0
-    ups: int = 0
-    lost: Counter[str] = msgspec.field(default_factory=Counter)
-
-
-class Inlet(msgspec.Struct):
-    """Where the messages of one topic that come in by a link go; `senders` are the publishers that opened it."""
-
-    topic: Topic
-    source: Source
-    size: int
-    senders: set[Hashable]
+_MANAGEMENT = MANAGEMENT.encode()
 
 
 class Hub(Protocol):
@@ -89,7 +67,7 @@ class Hub(Protocol):
 class LinkOutlet(Outlet):
     """One topic on its way out by one link."""
 
-    __slots__ = ("_link", "size", "topic")
+    __slots__ = ("_link", "topic")
 
     def __init__(self, link: "Link", topic: Topic) -> None:
         super().__init__(link.name)
@@ -128,16 +106,6 @@ class Transport(abc.ABC):
         """
 
 
-class Arrival(Protocol):
-    """What came in: a topic's name as it is on this link, and packed bytes."""
-
-    @property
-    def topic(self) -> bytes: ...
-
-    @property
-    def data(self) -> bytes: ...
-
-
 class Link(abc.ABC):
     """What all links share: discovery, outlets and inlets, fair intake, state and counters."""
 
@@ -162,12 +130,8 @@ class Link(abc.ABC):
         self._clock = hub.space.clock
         self._alarm = Alarm(hub.space.loop, self._poll)
         self._outlets: dict[str, LinkOutlet] = {}
-        self._inlets: dict[bytes, Inlet] = {}
-        self._told: dict[str, _Told] = {}
-        self._backlog: deque[Any] = deque()
-        self._handing_out = False
-        self._blocked: list[Sink] = []
-        self._patience = 0
+        self._intake = Intake(self, hub.space.loop, self.stats)
+        self._told: dict[str, Told] = {}
         self._room: list[Callable[[], None]] = []
         self._down_at = self._clock.monotonic()
         self._lost_at_down = 0
@@ -215,23 +179,21 @@ class Link(abc.ABC):
         self._apply(self.discovery.leave(self._clock.monotonic()))
         self.up = False
         self._alarm.close()
-        self._backlog.clear()
         for outlet in self._outlets.values():
             outlet.topic.leave(outlet)
         self._outlets.clear()
-        for name in list(self._inlets):
-            self._shut_all(name.decode())
+        self._intake.close()
         self._made_room()
 
     def take(self, arrivals: Iterable[Arrival]) -> None:
-        """Hand out what came in, at most TURN messages in one turn of the loop.
+        """Something came in."""
+        self._intake.take(arrivals)
 
-        A full queue whose reader keeps up gets a few turns to make room; one that does not loses messages, and nobody
-        else waits for it.
-        """
-        self._backlog.extend(arrivals)
-        if not self._handing_out:
-            self._hand_out()
+    def take_other(self, arrival: Arrival) -> None:
+        if arrival.topic == _MANAGEMENT:
+            self._apply(self.discovery.receive(self._clock.monotonic(), arrival.data, self.sender(arrival)))
+        else:
+            self.stats.lost["not subscribed"] += 1
 
     # For subclasses
 
@@ -266,14 +228,10 @@ class Link(abc.ABC):
     def resume(self) -> None:
         """Go on reading."""
 
-    def _made_room(self) -> None:
-        callbacks, self._room = self._room, []
-        for callback in callbacks:
-            callback()
-
     # For outlets, publishers and the module
 
     def when_room(self, callback: Callable[[], None]) -> None:
+        """Call back once when the send buffer has room again."""
         self._room.append(callback)
 
     def guarantee(self, publisher_class: PublisherClass) -> str:
@@ -307,15 +265,15 @@ class Link(abc.ABC):
     def topic_changed(self, topic: Topic) -> None:
         """A publisher or a subscriber of this module came or went: tell the others."""
         now = self._clock.monotonic()
-        told = self._told.pop(topic.name, _NOTHING)
-        wish = _wish(topic)
+        told = self._told.pop(topic.name, NOTHING)
+        wish = wish_of(topic)
         if wish.publishes and self.refusal(wish.size):
             wish = msgspec.structs.replace(wish, publishes=False)
         if wish != told:
-            self._apply(_announce(self.discovery, now, topic.name, told, wish))
+            self._apply(announce(self.discovery, now, topic.name, told, wish))
         if not wish.subscribes:
-            self._shut_all(topic.name)
-        if wish != _NOTHING:
+            self._intake.shut_all(topic.name)
+        if wish != NOTHING:
             self._told[topic.name] = wish
 
     # Discovery
@@ -336,7 +294,7 @@ class Link(abc.ABC):
                 case Opened():
                     self._open(event.topic, event.size, event.source)
                 case Shut():
-                    self._shut(event.topic, event.source)
+                    self._intake.shut(event.topic, event.source)
                 case _:
                     self._hub.discovered(self, event)
         if not self._closed:
@@ -361,133 +319,16 @@ class Link(abc.ABC):
 
     def _open(self, name: str, size: int, sender: Hashable = None) -> None:
         topic = self._space.topics.get(name)
-        if topic is None or not topic.queues:
-            return
-        inlet = self._inlets.get(name.encode())
-        if inlet is None:
+        if topic is not None and topic.queues:
             size = topic.layout.size if topic.layout is not None else size
-            inlet = self._inlets[name.encode()] = Inlet(topic, self._source(), size, set())
-        if sender not in inlet.senders:
-            inlet.senders.add(sender)
-            topic.inlets += 1
-            for queue in topic.queues:
-                queue.publisher_joined()
-
-    def _shut(self, name: str, sender: Hashable) -> None:
-        inlet = self._inlets.get(name.encode())
-        if inlet is not None and sender in inlet.senders:
-            inlet.senders.remove(sender)
-            inlet.topic.inlets -= 1
-            if not inlet.senders:
-                del self._inlets[name.encode()]
-
-    def _shut_all(self, name: str) -> None:
-        inlet = self._inlets.pop(name.encode(), None)
-        if inlet is not None:
-            inlet.topic.inlets -= len(inlet.senders)
+            self._intake.open(topic, self._source(), size, sender)
 
     def _source(self) -> Source:
         """Who publishes at the other end: known where only one module was heard."""
         modules = [info.name for info in self.discovery.modules.values()]
         return Source(modules[0] if len(modules) == 1 else "", "", self.name)
 
-    # Intake
-
-    def _hand_out(self) -> None:
-        self._handing_out = True
-        backlog, inlets = self._backlog, self._inlets
-        for _ in range(TURN):
-            if not backlog:
-                self._handing_out = False
-                self.resume()
-                return
-            arrival = backlog.popleft()
-            inlet = inlets.get(arrival.topic)
-            if inlet is None:
-                self._take_other(arrival)
-            elif not self._belongs(arrival, inlet):
-                pass
-            else:
-                self.stats.received += 1
-                sample = self.sample(inlet, arrival)
-                blocked = inlet.topic.deliver(sample)
-                if blocked is not None:
-                    self._blocked, self._patience = blocked, PATIENCE
-                    self._space.loop.call_soon(self._retry, sample)
-                    self.pause()
-                    return
-        self._space.loop.call_soon(self._hand_out)
-        self.pause()
-
-    def _belongs(self, arrival: Any, inlet: Inlet) -> bool:
-        if len(arrival.data) != inlet.size and inlet.size:
-            self.stats.lost["wrong size"] += 1
-            return False
-        if not self.point_to_point and self.sender(arrival) not in inlet.senders:
-            self.stats.lost["not subscribed"] += 1
-            return False
-        return True
-
-    def _retry(self, sample: Sample) -> None:
-        self._patience -= 1
-        self._blocked = [sink for sink in self._blocked if not sink.offer(sample)]
-        if self._blocked and self._patience > 0:
-            self._space.loop.call_soon(self._retry, sample)
-            return
-        for sink in self._blocked:
-            sink.give_up(sample)
-        self._blocked = []
-        self._hand_out()
-
-    def _take_other(self, arrival: Any) -> None:
-        if arrival.topic == _MANAGEMENT:
-            self._apply(self.discovery.receive(self._clock.monotonic(), arrival.data, self.sender(arrival)))
-        else:
-            self.stats.lost["not subscribed"] += 1
-
-
-class _Told(msgspec.Struct, frozen=True):
-    """What the other ends have been told of a topic."""
-
-    publishes: bool = False
-    subscribes: bool = False
-    size: int = 0
-    fingerprint: bytes = bytes(8)
-    queue: int = 1
-    endpoints: frozenset[tuple[str, int, int]] = frozenset()  # node, role, publisher class
-
-
-_NOTHING = _Told()
-_MANAGEMENT = MANAGEMENT.encode()
-
-
-def _wish(topic: Topic) -> _Told:
-    """What the other ends should know of a topic."""
-    publishers = {(each.node.name, ROLE_PUBLISHES, int(each.publisher_class)) for each in topic.publishers}
-    subscribers = {(each.owner, ROLE_SUBSCRIBES, 0) for each in topic.queues}
-    return _Told(
-        publishes=bool(publishers),
-        subscribes=bool(subscribers),
-        size=topic.layout.size if topic.layout is not None else 0,
-        fingerprint=topic.layout.fingerprint if topic.layout is not None else bytes(8),
-        queue=min(max((each.limit for each in topic.queues), default=1), 0xFFFF),
-        endpoints=frozenset(publishers | subscribers),
-    )
-
-
-def _announce(discovery: Discovery, now: int, topic: str, told: _Told, wish: _Told) -> list[Event]:
-    events: list[Event] = []
-    retyped = (wish.size, wish.fingerprint) != (told.size, told.fingerprint)
-    if wish.publishes and (retyped or not told.publishes):
-        events += discovery.advertise(now, topic, wish.size, wish.fingerprint)
-    elif told.publishes and not wish.publishes:
-        events += discovery.withdraw(now, topic)
-    if wish.subscribes and (retyped or not told.subscribes):
-        events += discovery.subscribe(now, topic, wish.size, wish.queue, wish.fingerprint)
-    elif told.subscribes and not wish.subscribes:
-        events += discovery.unsubscribe(now, topic)
-    for node, role, publisher_class in wish.endpoints - told.endpoints:
-        events += discovery.endpoint(now, node, topic, role, publisher_class)
-    for node, role, _class in told.endpoints - wish.endpoints:
-        events += discovery.endpoint_gone(now, node, topic, role)
-    return events
+    def _made_room(self) -> None:
+        callbacks, self._room = self._room, []
+        for callback in callbacks:
+            callback()

@@ -16,7 +16,8 @@ import msgspec
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.sample import PublisherClass, Sample, Source
-from r2p.transports.link import Hub, Inlet, Link, Transport
+from r2p.transports.intake import Inlet
+from r2p.transports.link import Hub, Link, Transport
 from r2p.transports.url import Url, duration
 
 IN_FLIGHT = 1024

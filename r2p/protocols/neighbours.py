@@ -1,0 +1,187 @@
+"""Who comes and goes on one link: modules, restarts, namesakes, and the echo of our own voice.
+
+Firmware is known by its ALIVE only; it never says good-bye, and is remembered for good. An r2p module also says HELLO
+with the random number of its start (its instance), which tells a restart from a namesake.
+"""
+
+from collections import Counter
+from collections.abc import Hashable
+
+from r2p.codecs import management
+from r2p.protocols.announcer import Announcer
+from r2p.protocols.directory import FOR_EVER, LEASE, Directory
+from r2p.protocols.events import Echoes, ModuleChanged, ModuleGone, ModuleInfo, NameConflict, Source
+from r2p.protocols.exchange import Exchange
+from r2p.protocols.outbox import Outbox
+from r2p.protocols.schedule import Schedule, Timers
+
+_SECOND = 1_000_000_000
+_TELL_AGAIN = 5 * _SECOND
+"""Conflicts and echoes are told at most this often."""
+_ECHO_MEMORY = 10 * _SECOND
+"""A line that echoed is expected to do so for this long."""
+_SWAPS = 3
+"""A name that goes back and forth between two instances this often belongs to two modules."""
+_RESTART = management.FLAG_REBOOTED | management.FLAG_BOOT
+
+
+class Neighbours:
+    """The modules of one link."""
+
+    def __init__(
+        self,
+        module: str,
+        instance: int,
+        directory: Directory,
+        exchange: Exchange,
+        announcer: Announcer,
+        schedule: Schedule,
+        timers: Timers,
+        outbox: Outbox,
+        counts: Counter[str],
+    ) -> None:
+        self._module = module
+        self._instance = instance
+        self._directory = directory
+        self._exchange = exchange
+        self._announcer = announcer
+        self._schedule = schedule
+        self._timers = timers
+        self._outbox = outbox
+        self._counts = counts
+        self._echoing_until = 0
+        self._silent_until: dict[str, int] = {}
+
+    def alive(self, now: int, message: management.Alive, source: Source) -> None:
+        """Any module shows its state."""
+        if message.module == self._module and not self._is_namesake(now):
+            return
+        before, info = self._directory.alive(now, message, source)
+        if before is not None and _restarted(before.flags, info.flags):
+            self._exchange.restarted(source)
+        self._keep(now, before, info)
+
+    def hello(self, now: int, message: management.Hello, source: Source) -> None:
+        """An r2p module, maybe this very one."""
+        if (message.module, message.instance) == (self._module, self._instance):
+            self._heard_ourselves(now)
+        elif message.flags & management.HELLO_LEAVING:
+            self._leaving(now, message, source)
+        else:
+            self._present(now, message, source)
+
+    def endpoint(self, now: int, message: management.Endpoint, source: Source) -> None:
+        """A publisher or subscriber of a remote node."""
+        if message.instance == self._instance:
+            return
+        key = self._directory.endpoint(message)
+        info = self._directory.modules.get(self._directory.name_of(message.instance))
+        lease = info.lease if info is not None else LEASE
+        if key is not None and lease < FOR_EVER:
+            self._timers.set(("endpoint", key), now + lease)
+
+    def conflict(self, now: int, message: management.Conflict, source: Source) -> None:
+        """Somebody who hears more than we do found a namesake of ours."""
+        instances = (message.instance_a, message.instance_b)
+        if message.module == self._module and self._instance in instances:
+            self._tell_conflict(now, message.module, *instances)
+
+    def is_echo(self, now: int, data: bytes) -> bool:
+        """Whether a line that echoes gave back one of the last messages; our HELLO is how we know that it does."""
+        if now >= self._echoing_until or not self._outbox.forget(data):
+            return False
+        self._echoing_until = now + _ECHO_MEMORY
+        self._counts["echo"] += 1
+        return True
+
+    def expired(self, now: int, name: str) -> None:
+        """An r2p module was silent for its lease."""
+        self._gone(now, self._directory.modules[name])
+
+    def interrupted(self, now: int) -> None:
+        """The link is down: nobody can be heard."""
+        self._directory.endpoints.clear()
+        self._echoing_until = 0
+        for info in [info for info in self._directory.modules.values() if info.r2p]:
+            self._gone(now, info)
+
+    def _is_namesake(self, now: int) -> bool:
+        """Our own name in an ALIVE: an echo, or somebody else's. Says whether that is a module to remember."""
+        if now < self._echoing_until:
+            self._counts["echo"] += 1
+            return False
+        namesake = self._directory.modules.get(self._module)
+        self._tell_conflict(now, self._module, self._instance, namesake.instance if namesake is not None else None)
+        return namesake is not None
+
+    def _present(self, now: int, message: management.Hello, source: Source) -> None:
+        """An r2p module introduces itself, for the first time or again."""
+        known_start = self._directory.was(message.module, message.instance)
+        before, info = self._directory.hello(now, message, source)
+        self._look_for_namesakes(now, before, message)
+        is_new = not known_start and (before is None or before.instance != info.instance)
+        if before is not None and (before.source, before.hops) != (info.source, info.hops):
+            self._exchange.moved_away(now, before)
+        if message.hops == 0:
+            self._exchange.met(now, info, is_new=is_new)
+        self._keep(now, before, info)
+        if is_new or message.flags & management.HELLO_QUERY:
+            self._schedule.repeat(now)
+
+    def _look_for_namesakes(self, now: int, before: ModuleInfo | None, message: management.Hello) -> None:
+        swaps = self._directory.count_swaps(now, before, message.instance)
+        if message.module == self._module:
+            self._tell_conflict(now, message.module, self._instance, message.instance)
+        elif before is not None and swaps >= _SWAPS:
+            self._tell_conflict(now, message.module, before.instance, message.instance)
+
+    def _leaving(self, now: int, message: management.Hello, source: Source) -> None:
+        info = self._directory.modules.get(message.module)
+        if info is not None and info.instance == message.instance:
+            self._gone(now, info)
+        elif message.hops == 0:
+            self._exchange.left(now, source)
+
+    def _keep(self, now: int, before: ModuleInfo | None, info: ModuleInfo) -> None:
+        """Enter what was heard of a module, and tell if it is more than a sign of life."""
+        forgotten = self._directory.keep(info)
+        if info.r2p:
+            self._timers.set(("module", info.name), now + info.lease)
+        if before is None or _as_heard(before) != _as_heard(info):
+            self._outbox.tell(ModuleChanged(info))
+        if forgotten is not None and forgotten.r2p:
+            self._gone(now, forgotten)
+        self._announcer.follow(r2p=self._directory.knows_r2p)
+
+    def _gone(self, now: int, info: ModuleInfo) -> None:
+        self._directory.remove(info)
+        self._timers.clear(("module", info.name))
+        self._outbox.tell(ModuleGone(info))
+        self._exchange.moved_away(now, info)
+        self._announcer.follow(r2p=self._directory.knows_r2p)
+
+    def _heard_ourselves(self, now: int) -> None:
+        self._counts["echo"] += 1
+        self._echoing_until = now + _ECHO_MEMORY
+        if self._may_tell(now, ""):
+            self._outbox.tell(Echoes())
+
+    def _tell_conflict(self, now: int, module: str, instance_a: int | None, instance_b: int | None) -> None:
+        if self._may_tell(now, module):
+            self._outbox.tell(NameConflict(module, instance_a, instance_b))
+
+    def _may_tell(self, now: int, what: str) -> bool:
+        if now < self._silent_until.get(what, now):
+            return False
+        self._silent_until = {each: until for each, until in self._silent_until.items() if until > now}
+        self._silent_until[what] = now + _TELL_AGAIN
+        return True
+
+
+def _restarted(before: int, after: int) -> bool:
+    """Whether a module started anew between two ALIVEs: only a start changes its mode or ends a STOP."""
+    return bool((before ^ after) & _RESTART or before & ~after & management.FLAG_STOPPED)
+
+
+def _as_heard(info: ModuleInfo) -> tuple[Hashable, ...]:
+    return (info.flags, info.instance, info.observer, info.lease, info.hops, info.source)

@@ -1,0 +1,54 @@
+"""What the other ends of a link are told of this module's topics, and the difference to what they should be told."""
+
+import msgspec
+
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.protocols.discovery import Discovery
+from r2p.protocols.events import Event
+from r2p.topic import Topic
+
+
+class Told(msgspec.Struct, frozen=True):
+    """What the other ends have been told of a topic."""
+
+    publishes: bool = False
+    subscribes: bool = False
+    size: int = 0
+    fingerprint: bytes = bytes(8)
+    queue: int = 1
+    endpoints: frozenset[tuple[str, int, int]] = frozenset()  # node, role, publisher class
+
+
+NOTHING = Told()
+
+
+def wish_of(topic: Topic) -> Told:
+    """What the other ends should know of a topic."""
+    publishers = {(each.node.name, ROLE_PUBLISHES, int(each.publisher_class)) for each in topic.publishers}
+    subscribers = {(each.owner, ROLE_SUBSCRIBES, 0) for each in topic.queues}
+    return Told(
+        publishes=bool(publishers),
+        subscribes=bool(subscribers),
+        size=topic.layout.size if topic.layout is not None else 0,
+        fingerprint=topic.layout.fingerprint if topic.layout is not None else bytes(8),
+        queue=min(max((each.limit for each in topic.queues), default=1), 0xFFFF),
+        endpoints=frozenset(publishers | subscribers),
+    )
+
+
+def announce(discovery: Discovery, now: int, topic: str, told: Told, wish: Told) -> list[Event]:
+    events: list[Event] = []
+    retyped = (wish.size, wish.fingerprint) != (told.size, told.fingerprint)
+    if wish.publishes and (retyped or not told.publishes):
+        events += discovery.advertise(now, topic, wish.size, wish.fingerprint)
+    elif told.publishes and not wish.publishes:
+        events += discovery.withdraw(now, topic)
+    if wish.subscribes and (retyped or not told.subscribes):
+        events += discovery.subscribe(now, topic, wish.size, wish.queue, wish.fingerprint)
+    elif told.subscribes and not wish.subscribes:
+        events += discovery.unsubscribe(now, topic)
+    for node, role, publisher_class in wish.endpoints - told.endpoints:
+        events += discovery.endpoint(now, node, topic, role, publisher_class)
+    for node, role, _class in told.endpoints - wish.endpoints:
+        events += discovery.endpoint_gone(now, node, topic, role)
+    return events

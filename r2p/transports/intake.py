@@ -1,0 +1,163 @@
+"""What comes in by a link, on its way to the topics: only what was opened, and a few messages at a time.
+
+A slow reader must not stop a line that others share, and a fast one should lose nothing. So a full queue gets PATIENCE
+turns of the event loop to make room; one that does not is lossy until it has.
+"""
+
+import asyncio
+from collections import Counter, deque
+from collections.abc import Hashable, Iterable
+from typing import Any, ClassVar, Protocol
+
+import msgspec
+
+from r2p.sample import Sample, Source
+from r2p.topic import PATIENCE, Sink, Topic
+
+TURN = 64
+"""Messages that a link hands out before it lets the event loop run once."""
+
+
+class LinkStats(msgspec.Struct):
+    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions."""
+
+    sent: int = 0
+    received: int = 0
+    bytes_sent: int = 0
+    bytes_received: int = 0
+    ups: int = 0
+    lost: Counter[str] = msgspec.field(default_factory=Counter)
+
+
+class Arrival(Protocol):
+    """What came in: a topic's name as it is on this link, and packed bytes."""
+
+    @property
+    def topic(self) -> bytes: ...
+
+    @property
+    def data(self) -> bytes: ...
+
+
+class Inlet(msgspec.Struct):
+    """Where the messages of one topic that come in by a link go; `senders` are the publishers that opened it."""
+
+    topic: Topic
+    source: Source
+    size: int
+    senders: set[Hashable]
+
+
+class Receiver(Protocol):
+    """The link of an intake."""
+
+    point_to_point: ClassVar[bool]
+
+    def sample(self, inlet: Inlet, arrival: Any) -> Sample:
+        """The sample that came in."""
+
+    def sender(self, arrival: Any) -> Hashable:
+        """The sender's address on a bus; None on a line with one other end."""
+
+    def take_other(self, arrival: Any) -> None:
+        """Something came in for which there is no inlet."""
+
+    def pause(self) -> None:
+        """Stop reading, if possible: what came in is still being handed out."""
+
+    def resume(self) -> None:
+        """Go on reading."""
+
+
+class Intake:
+    """The inlets of one link, and the way through them."""
+
+    def __init__(self, link: Receiver, loop: asyncio.AbstractEventLoop, stats: LinkStats) -> None:
+        self._link = link
+        self._loop = loop
+        self._stats = stats
+        self._inlets: dict[bytes, Inlet] = {}
+        self._backlog: deque[Any] = deque()
+        self._busy = False
+        self._patience = 0
+
+    def open(self, topic: Topic, source: Source, size: int, sender: Hashable) -> None:
+        """Take what `sender` publishes: messages of `size` bytes, 0: of any size."""
+        key = topic.name.encode()
+        inlet = self._inlets.get(key)
+        if inlet is None:
+            inlet = self._inlets[key] = Inlet(topic, source, size, set())
+        if sender not in inlet.senders:
+            inlet.senders.add(sender)
+            topic.inlets += 1
+            for queue in topic.queues:
+                queue.publisher_joined()
+
+    def shut(self, name: str, sender: Hashable) -> None:
+        """Take no more from this sender."""
+        inlet = self._inlets.get(name.encode())
+        if inlet is not None and sender in inlet.senders:
+            inlet.senders.remove(sender)
+            inlet.topic.inlets -= 1
+            if not inlet.senders:
+                del self._inlets[name.encode()]
+
+    def shut_all(self, name: str) -> None:
+        """Take no more of this topic."""
+        inlet = self._inlets.pop(name.encode(), None)
+        if inlet is not None:
+            inlet.topic.inlets -= len(inlet.senders)
+
+    def close(self) -> None:
+        self._backlog.clear()
+        for name in list(self._inlets):
+            self.shut_all(name.decode())
+
+    def take(self, arrivals: Iterable[Arrival]) -> None:
+        """Hand out what came in, at most TURN messages in one turn of the loop."""
+        self._backlog.extend(arrivals)
+        if not self._busy:
+            self._hand_out()
+
+    def _hand_out(self) -> None:
+        self._busy = True
+        link, backlog, inlets = self._link, self._backlog, self._inlets
+        for _ in range(TURN):
+            if not backlog:
+                self._busy = False
+                link.resume()
+                return
+            arrival = backlog.popleft()
+            inlet = inlets.get(arrival.topic)
+            if inlet is None:
+                link.take_other(arrival)
+            elif self._belongs(arrival, inlet):
+                self._stats.received += 1
+                sample = link.sample(inlet, arrival)
+                blocked = inlet.topic.deliver(sample)
+                if blocked is not None:
+                    self._patience = PATIENCE
+                    self._loop.call_soon(self._retry, sample, blocked)
+                    link.pause()
+                    return
+        self._loop.call_soon(self._hand_out)
+        link.pause()
+
+    def _belongs(self, arrival: Arrival, inlet: Inlet) -> bool:
+        if len(arrival.data) != inlet.size and inlet.size:
+            self._stats.lost["wrong size"] += 1
+            return False
+        if not self._link.point_to_point and self._link.sender(arrival) not in inlet.senders:
+            self._stats.lost["not subscribed"] += 1
+            return False
+        return True
+
+    def _retry(self, sample: Sample, blocked: list[Sink]) -> None:
+        self._patience -= 1
+        blocked = [sink for sink in blocked if not sink.offer(sample)]
+        if blocked and self._patience > 0:
+            self._loop.call_soon(self._retry, sample, blocked)
+            return
+        for sink in blocked:
+            sink.give_up(sample)
+        self._hand_out()

@@ -1,0 +1,262 @@
+"""From annotations to layouts: schemas, sizes, fingerprints, and the classes that have none."""
+
+import gc
+import weakref
+from collections.abc import Callable
+from hashlib import blake2b
+from typing import Annotated, Any, Literal, assert_type
+
+import msgspec
+import pytest
+
+from r2p.errors import MessageError
+from r2p.messages import (
+    SIZE_MAX,
+    Array,
+    Chars,
+    Field,
+    Layout,
+    Len,
+    Message,
+    Nested,
+    Scalar,
+    Timestamp,
+    f32,
+    i8,
+    i16,
+    layout,
+    message_type,
+    u8,
+    u16,
+    u32,
+)
+from r2p.msg import Led, Velocity3
+from tests.messages import text_annotations
+from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot, Wheel
+
+WHEELS = " ".join(f"wheels[{i}].speed:f32 wheels[{i}].ok:bool wheels[{i}].name:char[4]" for i in range(2))
+NAMES = "names[0]:char[3] names[1]:char[3]"
+REST = "serial:u8[16] best.speed:f32 best.ok:bool best.name:char[4]"
+
+
+def made(hint: object) -> type[Message]:
+    """A message class with one field of that annotation."""
+    return msgspec.defstruct("Made", [("x", hint)], bases=(Message,), frozen=True)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("cls", "size", "schema"),
+    [
+        (Led, 5, "led:u32 value:u8"),
+        (Timestamp, 8, "sec:u32 nsec:u32"),
+        (Numbers, 43, "a:u8 b:u16 c:u32 d:u64 e:i8 f:i16 g:i32 h:i64 i:f32 j:f64 k:bool"),
+        (
+            Robot,
+            65,
+            f"stamp.sec:u32 stamp.nsec:u32 {WHEELS} grid[0]:u8[3] grid[1]:u8[3] {NAMES} flags:bool[2] {REST}",
+        ),
+        (Keywords, 9, "a:u8 b.sec:u32 b.nsec:u32"),
+        (Derived, 11, "a:u8 b.sec:u32 b.nsec:u32 c:i16"),
+        (Redefined, 8, "a:u8 b:u32 c:i16 d:u8"),
+    ],
+)
+def test_schema_and_size(cls: type[Message], size: int, schema: str) -> None:
+    shape = layout(cls)
+    assert (shape.size, shape.schema) == (size, schema)
+    assert shape.fingerprint == blake2b(schema.encode(), digest_size=8).digest()
+    assert shape.cls is cls
+
+
+def test_fields_are_a_tree_for_tools() -> None:
+    stamp, wheels, grid, names, flags, serial, best = layout(Robot).fields
+    assert stamp == Field("stamp", Nested(layout(Timestamp)))
+    assert wheels.shape == Array(Nested(layout(Wheel)), 2)
+    assert grid.shape == Array(Array(Scalar("u8", "B"), 3), 2)
+    assert names.shape == Array(Chars(3), 2)
+    assert flags.shape == Array(Scalar("bool", "?"), 2)
+    assert (serial.shape.kind, serial.shape.size, serial.shape.format) == ("u8[16]", 16, "16B")
+    assert (best.shape.kind, best.shape.size, best.shape.format) == ("Wheel", 9, "f?4s")
+
+
+@pytest.mark.parametrize(("hint", "limits"), [(u8, (0, 255)), (i8, (-128, 127)), (u16, (0, 65535))])
+def test_limits_of_integers(hint: object, limits: tuple[int, int]) -> None:
+    shape = layout(made(hint)).fields[0].shape
+    assert isinstance(shape, Scalar)
+    assert shape.limits == limits
+
+
+def test_zero_also_where_fields_are_required() -> None:
+    assert layout(Numbers).zero == Numbers(0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.0, False)
+    assert layout(Robot).zero == Robot()
+
+
+def test_a_layout_is_made_once_and_not_taken_from_a_base_class() -> None:
+    assert layout(Keywords) is layout(Keywords)
+    assert layout(Derived) is not layout(Keywords)
+    assert repr(layout(Led)) == "<Layout of Led, 5 bytes: led:u32 value:u8>"
+
+
+def test_a_layout_goes_with_its_class() -> None:
+    cls = message_type("Gone", "a.b:u8 c:u16[3]")
+    assert layout(cls).size == 7
+    gone = weakref.ref(cls)
+    del cls
+    gc.collect()
+    assert gone() is None
+
+
+def test_a_class_in_a_function_with_what_the_function_holds() -> None:
+    class Inner(Message):
+        x: u8
+
+    class Outer(Message):
+        inner: Inner
+        many: tuple[Inner, Inner]
+
+    assert layout(Outer).schema == "inner.x:u8 many[0].x:u8 many[1].x:u8"
+
+
+def test_annotations_that_are_text() -> None:
+    assert layout(text_annotations.Stamped).schema == "stamp.sec:u32 stamp.nsec:u32 names[0]:char[4] names[1]:char[4]"
+    assert layout(text_annotations.local()).schema == "a:u16 s.stamp.sec:u32 s.stamp.nsec:u32 " + " ".join(
+        f"s.names[{i}]:char[4]" for i in range(2)
+    )
+
+
+@pytest.mark.parametrize("build", [text_annotations.names_a_local, text_annotations.names_a_type_checking_import])
+def test_text_that_names_nothing_at_run_time(build: Callable[[], type[Message]]) -> None:
+    with pytest.raises(MessageError, match="is not defined: import what its annotations name at run time"):
+        layout(build())
+
+
+@pytest.mark.parametrize(
+    ("hint", "instead"),
+    [
+        (int, "r2p.u8 .. r2p.u64, r2p.i8 .. r2p.i64"),
+        (float, "use r2p.f32 or r2p.f64"),
+        (str, r"use Annotated\[str, r2p.Len"),
+        (bytes, r"Annotated\[tuple\[r2p.u8, ...\], r2p.Len"),
+        (list[int], r"use tuple\[r2p.f32"),
+        (list, r"use tuple\[r2p.f32"),
+        (tuple, r"use tuple\[r2p.f32"),
+        (dict[str, int], r"use r2p.u8 .. r2p.f64, bool, a Message, a tuple"),
+        (u8 | None, "use r2p.u8 .. r2p.f64, bool"),
+        (Any, "use r2p.u8 .. r2p.f64, bool"),
+        (Literal[1, 2], "use r2p.u8 .. r2p.f64, bool"),
+        (msgspec.Struct, "use r2p.u8 .. r2p.f64, bool"),
+        (Annotated[u8, Len(3)], "has no fixed size, use one of r2p.u8"),
+        (Annotated[bool, Len(3)], "has no fixed size"),
+        (Annotated[Led, Len(3)], "has no fixed size"),
+        (tuple[u8, ...], "an array has one type and a fixed length"),
+        (tuple[()], "an array has one type and a fixed length"),
+        (tuple[u8, f32], "for different types nest a Message"),
+        (tuple[u8, u8, u16], "for different types nest a Message"),
+        (Annotated[tuple[u8, u8], Len(3)], "an array has one type and a fixed length"),
+        (tuple[int, int], r"Made.x\[\]: .* use one of r2p.u8"),
+        (Annotated[str, Len(0)], "Len takes an integer from 1 to 1024, not 0"),
+        (Annotated[str, Len(-1)], "Len takes an integer from 1 to 1024, not -1"),
+        (Annotated[tuple[u8, ...], Len(10**9)], "Len takes an integer"),
+        (Annotated[str, Len("8")], "Len takes an integer .* not '8'"),  # type: ignore[arg-type]
+        (Annotated[tuple[Annotated[tuple[u8, ...], Len(1000)], ...], Len(1000)], "has 1000000 bytes"),
+    ],
+)
+def test_no_fixed_layout(hint: object, instead: str) -> None:
+    with pytest.raises(MessageError, match=f"^Made.x.*{instead}"):
+        layout(made(hint))
+
+
+def test_array_written_out_and_with_its_length() -> None:
+    assert layout(made(Annotated[tuple[u8, u8], Len(2)])).schema == "x:u8[2]"
+    assert layout(made(tuple[u8])).schema == "x:u8[1]"
+    assert layout(made(Annotated[u8, "whatever else"])).schema == "x:u8"
+
+
+def test_size_limits() -> None:
+    class Empty(Message):
+        pass
+
+    assert layout(made(Annotated[str, Len(SIZE_MAX)])).size == 1024
+    for cls in (Empty, Message, made(Empty), made(tuple[Empty, Empty])):
+        with pytest.raises(MessageError, match="has 0 bytes: a message has 1 to 1024"):
+            layout(cls)
+
+
+def test_too_large_in_all() -> None:
+    class Large(Message):
+        a: Annotated[str, Len(1000)]
+        b: Annotated[str, Len(25)]
+
+    with pytest.raises(MessageError, match="Large has 1025 bytes: a message has 1 to 1024"):
+        layout(Large)
+
+
+def test_a_class_that_holds_itself() -> None:
+    with pytest.raises(MessageError, match="Endless holds itself"):
+        layout(text_annotations.Endless)
+
+
+@pytest.mark.parametrize("name", ["encode", "decode", "_x", "größe", "class"])
+def test_field_names_that_are_refused(name: str) -> None:
+    cls = msgspec.defstruct("Made", [(name, u8)], bases=(Message,), frozen=True)
+    with pytest.raises(MessageError, match=f"Made.{name}: name a field in ASCII"):
+        layout(cls)  # type: ignore[type-var]
+
+
+def test_a_message_is_frozen() -> None:
+    class Loose(Message, frozen=False):  # type: ignore[misc]
+        x: u8 = 0
+
+    with pytest.raises(MessageError, match="Loose is not frozen"):
+        layout(Loose)
+    with pytest.raises(AttributeError):
+        Led().value = 1  # type: ignore[misc]
+
+
+def test_a_class_that_refuses_zero() -> None:
+    class Picky(Message):
+        x: u8
+
+        def __post_init__(self) -> None:
+            if not self.x:
+                raise ValueError("x is 0")
+
+    with pytest.raises(MessageError, match=r"Picky refuses to be all zero.*x is 0"):
+        layout(Picky)
+
+
+@pytest.mark.parametrize("what", [int, msgspec.Struct, Led(), None, "Led", tuple[u8, u8]])
+def test_no_message_class(what: Any) -> None:
+    with pytest.raises(MessageError, match=r"is no message class: subclass r2p.Message"):
+        layout(what)
+
+
+def test_timestamps_are_exact() -> None:
+    stamp = Timestamp.from_ns(1_700_000_000_123_456_789)
+    assert stamp == Timestamp(sec=1_700_000_000, nsec=123_456_789)
+    assert stamp.ns == 1_700_000_000_123_456_789
+    assert Timestamp.from_ns((1 << 32) * 10**9 - 1) == Timestamp((1 << 32) - 1, 999_999_999)
+    for ns in (-1, (1 << 32) * 10**9):
+        with pytest.raises(MessageError, match="no instant between 1970 and 2106"):
+            Timestamp.from_ns(ns)
+
+
+def test_what_type_checkers_see() -> None:
+    """These lines are checked when the tests are type-checked; an ignore that nothing needs is an error there."""
+    led = Led(led=3, value=1)
+    assert_type(led.value, int)
+    assert_type(Velocity3(x=1.5).x, float)
+    assert_type(Led.decode(led.encode()), Led)
+    assert_type(layout(Led), Layout[Led])
+    assert_type(layout(Led).zero, Led)
+    assert_type(layout(Led).decode(bytes(5)), Led)
+    assert_type(Robot().wheels[0].ok, bool)
+    Led(led="3")  # type: ignore[arg-type]
+    Led(4, 5)
+    with pytest.raises(TypeError):
+        Wheel(colour=1)  # type: ignore[call-arg]
+    with pytest.raises(TypeError):
+        Numbers(a=1)  # type: ignore[call-arg]
+    with pytest.raises(MessageError):
+        layout(Led).encode(Wheel())  # type: ignore[arg-type]
+    assert i16 is not u16
+    assert u32 is not u8

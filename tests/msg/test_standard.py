@@ -1,0 +1,119 @@
+"""The standard messages: byte for byte the firmware's, with fingerprints that must never change."""
+
+import pytest
+
+import r2p.msg
+from r2p.messages import Message, Timestamp, layout
+from r2p.msg import Led, Log, Odometry, Pose3, Proximity, StampedQEI, Tilt, Velocity3, firmware, robot, text
+
+EVERY: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]
+
+FIRMWARE = {
+    "Led": (5, "led:u32 value:u8"),
+    "Float32": (4, "data:f32"),
+    "PWM": (2, "pwm:u16"),
+    "PWM2": (4, "pwm1:i16 pwm2:i16"),
+    "PWM3": (6, "pwm1:i16 pwm2:i16 pwm3:i16"),
+    "Speed": (2, "speed:u16"),
+    "Speed2": (8, "value:f32[2]"),
+    "Speed3": (12, "value:f32[3]"),
+    "QEI": (2, "delta:i16"),
+    "StampedQEI": (10, "timestamp.sec:u32 timestamp.nsec:u32 delta:i16"),
+    "Encoder": (4, "delta:f32"),
+    "StampedEncoder": (12, "timestamp.sec:u32 timestamp.nsec:u32 delta:f32"),
+    "Encoder2": (8, "left_delta:f32 right_delta:f32"),
+    "AbsoluteEncoder": (4, "position:f32"),
+    "Velocity3": (12, "x:f32 y:f32 w:f32"),
+    "StampedVelocity3": (20, "timestamp.sec:u32 timestamp.nsec:u32 x:f32 y:f32 w:f32"),
+    "StampedPose3": (20, "timestamp.sec:u32 timestamp.nsec:u32 x:f32 y:f32 w:f32"),
+    "Tilt": (4, "angle:f32"),
+    "IMURaw9": (18, " ".join(f"{sensor}_{axis}:i16" for sensor in ("acc", "gyro", "mag") for axis in "xyz")),
+    "StampedIMURaw9": (
+        26,
+        "timestamp.sec:u32 timestamp.nsec:u32 "
+        + " ".join(f"{sensor}_{axis}:i16" for sensor in ("acc", "gyro", "mag") for axis in "xyz"),
+    ),
+}
+"""PROTOCOL.md 2."""
+
+SIZES = {
+    "IMU": 24,
+    "StampedIMU": 32,
+    "Proximity": 8,
+    "Battery": 7,
+    "Pressure": 8,
+    "GPS": 32,
+    "StampedGPS": 40,
+    "Setpoint": 4,
+    "Pose3": 12,
+    "Odometry": 24,
+    "StampedOdometry": 32,
+    "Text": 64,
+    "Log": 145,
+    "Timestamp": 8,
+}
+
+
+@pytest.mark.parametrize("name", FIRMWARE)
+def test_firmware_layout(name: str) -> None:
+    shape = layout(getattr(firmware, name))
+    assert (shape.size, shape.schema) == FIRMWARE[name]
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_size(name: str) -> None:
+    assert layout(getattr(r2p.msg, name)).size == SIZES[name]
+
+
+def test_all_are_listed() -> None:
+    assert set(r2p.msg.__all__) == {*FIRMWARE, *SIZES}
+    defined = {
+        name
+        for module in (firmware, robot, text)
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Message) and value.__module__ == module.__name__
+    }
+    assert defined == {*r2p.msg.__all__} - {"Timestamp"}
+
+
+@pytest.mark.parametrize("cls", EVERY)
+def test_defaults_are_zero_and_a_debug_line_carries_it(cls: type[Message]) -> None:
+    assert cls() == layout(cls).zero
+    assert cls().encode() == bytes(layout(cls).size)
+    assert layout(cls).size <= 255
+
+
+@pytest.mark.parametrize("cls", EVERY)
+def test_is_documented(cls: type[Message]) -> None:
+    assert cls.__doc__ != Message.__doc__
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(
+    ("message", "payload"),
+    [
+        (Led(led=2, value=1), "0200000001"),
+        (Led(led=2), "0200000000"),
+        (Velocity3(x=1.0, y=2.0, w=3.0), "0000803F0000004000004040"),
+        (Velocity3(x=0.5, y=-0.25, w=0.125), "0000003F000080BE0000003E"),
+        (Velocity3(x=1001.0), "00407A440000000000000000"),
+    ],
+)
+def test_recorded_payloads(message: Message, payload: str) -> None:
+    assert message.encode().hex().upper() == payload
+    assert type(message).decode(bytes.fromhex(payload)) == message
+
+
+@pytest.mark.parametrize(
+    ("message", "payload"),
+    [
+        (Tilt(-1.0), "000080bf"),
+        (StampedQEI(Timestamp(1, 2), -3), "0100000002000000fdff"),
+        (Proximity((1, 2, 3, 65535)), "010002000300ffff"),
+        (Odometry(Pose3(1.0, 0.0, 0.0), Velocity3(w=2.0)), "0000803f" + "00" * 16 + "00000040"),
+        (Log(Timestamp(1, 0), 20, "blink", "hi"), "010000000000000014" + b"blink\0\0\0hi".hex() + "00" * 126),
+    ],
+)
+def test_packed(message: Message, payload: str) -> None:
+    assert message.encode().hex() == payload
+    assert type(message).decode(bytes.fromhex(payload)) == message
