@@ -21,10 +21,9 @@ from r2p.publisher import (
     Publisher,
     Sporadic,
     SporadicPublisher,
-    pause,
 )
 from r2p.subscriber import Callback, Keep, Subscriber
-from r2p.topic import TopicSpace
+from r2p.topic import TopicSpace, pause
 
 M = TypeVar("M", bound=Message)
 

@@ -8,9 +8,8 @@ Each counts its misses, signals them by a callback of its class value, and logs 
 """
 
 import asyncio
-import types
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NoReturn, TypeVar
 
 import msgspec
@@ -19,25 +18,16 @@ from r2p.clock import Alarm, Clock, Ticker
 from r2p.errors import Closed, MessageError
 from r2p.messages import Layout, Message
 from r2p.sample import PublisherClass, Sample, Source
-from r2p.topic import Outlet, QueueSink, Sink, Topic, TopicSpace
+from r2p.topic import BURST, Outlet, QueueSink, Sink, Topic, TopicSpace, pause
 
 if TYPE_CHECKING:
     from r2p.node import Node
 
 M = TypeVar("M", bound=Message)
 
-BURST = 16
-"""Messages that publish() or an iteration handles before it lets the event loop run once."""
-
 _SECOND = 1_000_000_000
 _NRT = PublisherClass.NON_REAL_TIME
 _LATE_SHARE = 10  # a periodic sample is late when it is off by more than period / 10
-
-
-@types.coroutine
-def pause() -> Generator[None, None, None]:
-    """Let the event loop run once."""
-    yield
 
 
 class Missed(msgspec.Struct, frozen=True):

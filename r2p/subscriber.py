@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 from r2p.clock import Alarm
 from r2p.errors import Closed, DecodeError
 from r2p.messages import Layout
-from r2p.publisher import BURST, pause
 from r2p.sample import Sample
-from r2p.topic import QueueSink, Topic, TopicSpace
+from r2p.topic import BURST, QueueSink, Topic, TopicSpace, pause
 
 if TYPE_CHECKING:
     from types import TracebackType

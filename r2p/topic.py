@@ -9,8 +9,9 @@ handler steps of unimportant ones.
 import asyncio
 import heapq
 import itertools
+import types
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any, Protocol
 
 from r2p.clock import Clock
@@ -21,8 +22,17 @@ from r2p.sample import PublisherClass, Sample
 if TYPE_CHECKING:
     from r2p.publisher import BasePublisher
 
+BURST = 16
+"""Messages that publish() or an iteration handles before it lets the event loop run once."""
+
 PATIENCE = 4
 """Turns of the event loop that a link waits for a full queue before it goes on without it."""
+
+
+@types.coroutine
+def pause() -> Generator[None, None, None]:
+    """Let the event loop run once."""
+    yield
 
 
 class Waker:

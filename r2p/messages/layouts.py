@@ -56,8 +56,8 @@ class Layout(msgspec.Struct, Generic[M], frozen=True, eq=False):
     """How the messages of one class lie in bytes.
 
     `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with the path of what
-    is nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` its BLAKE2b-64 (8 bytes). `zero` is the
-    message of zero bytes. `encode` raises MessageError that names the field; `decode` raises DecodeError.
+    is nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` its BLAKE2b-64 (8 bytes).
+    `encode` raises MessageError that names the field; `decode` raises DecodeError.
     """
 
     cls: type[M]
@@ -65,9 +65,13 @@ class Layout(msgspec.Struct, Generic[M], frozen=True, eq=False):
     size: int
     schema: str
     fingerprint: bytes
-    zero: M
     encode: Callable[[M], bytes]
     decode: Callable[[bytes], M]
+
+    @property
+    def zero(self) -> M:
+        """The message of zero bytes. It is not kept: a class that holds an instance of itself is never collected."""
+        return self.decode(bytes(self.size))
 
     def __repr__(self) -> str:
         return f"<Layout of {self.cls.__name__}, {self.size} bytes: {self.schema}>"
@@ -127,11 +131,11 @@ def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
     _check_size(cls.__name__, size)
     encode, decode = functions(cls, fields)
     try:
-        zero: M = decode(bytes(size))
+        decode(bytes(size))
     except DecodeError as error:
         raise MessageError(f"{cls.__name__} refuses to be all zero, which any module may send: {error}") from error
     schema = " ".join(leaf for field in fields for leaf in _leaves(field.shape, field.name))
-    return Layout(cls, fields, size, schema, blake2b(schema.encode(), digest_size=8).digest(), zero, encode, decode)
+    return Layout(cls, fields, size, schema, blake2b(schema.encode(), digest_size=8).digest(), encode, decode)
 
 
 def _hints(cls: type[Message]) -> Iterator[tuple[str, Any]]:

@@ -193,6 +193,8 @@ def _attached(link: LineLink, hub: Hub) -> LineLink:
 
 def _host_port(url: Url) -> tuple[str, int]:
     """The address's host (may be empty) and port."""
+    if url.address.isdecimal():
+        return "", int(url.address)
     host, colon, port = url.address.rpartition(":")
     if not colon or port.endswith("]"):
         host, port = url.address, str(PORT)

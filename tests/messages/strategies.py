@@ -25,4 +25,4 @@ def values(shape: Shape) -> st.SearchStrategy[Any]:
         case Scalar("bool"):
             return st.booleans()
         case Scalar(kind):
-            return FLOATS.get(kind) or st.integers(*shape.limits)
+            return FLOATS[kind] if kind in FLOATS else st.integers(*shape.limits)

@@ -152,7 +152,7 @@ def test_text_that_names_nothing_at_run_time(build: Callable[[], type[Message]])
         (tuple[u8, f32], "for different types nest a Message"),
         (tuple[u8, u8, u16], "for different types nest a Message"),
         (Annotated[tuple[u8, u8], Len(3)], "an array has one type and a fixed length"),
-        (tuple[int, int], r"Made.x\[\]: .* use one of r2p.u8"),
+        (tuple[int, int], r"\[\]: .* use one of r2p.u8"),
         (Annotated[str, Len(0)], "Len takes an integer from 1 to 1024, not 0"),
         (Annotated[str, Len(-1)], "Len takes an integer from 1 to 1024, not -1"),
         (Annotated[tuple[u8, ...], Len(10**9)], "Len takes an integer"),

@@ -1,0 +1,1 @@
+"""The `r2p` command: only the public API."""
