@@ -197,7 +197,7 @@ class Discovery:
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         """Order a module to stop, reboot or enter its loader."""
         self._outbox.say(_ORDERS[command](module), urgent=True)
-        return self._go_on(now)
+        return self._outbox.take()
 
     def query(self, now: int) -> list[Event]:
         """Ask everybody to repeat what they publish and subscribe."""

@@ -88,7 +88,7 @@ class Schedule:
         self.stop()
         self._fresh.append(Item(Kind.QUERY, once=True))
         self._eager = self._count
-        self._step_at = now
+        self._step_at = now + self._interval
         self._presence_at = now + self._presence_period
 
     def stop(self) -> None:

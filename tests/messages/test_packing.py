@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r2p.msg
@@ -30,6 +30,7 @@ def one(kind: str) -> type[Any]:
     return msgspec.defstruct("One", [("x", HINTS[kind])], bases=(Message,), frozen=True)
 
 
+@settings(max_examples=30)  # of each class
 @given(st.data())
 @pytest.mark.parametrize("cls", ALL)
 def test_round_trip(cls: type[Message], data: st.DataObject) -> None:
@@ -40,6 +41,7 @@ def test_round_trip(cls: type[Message], data: st.DataObject) -> None:
     assert cls.decode(packed).encode() == packed
 
 
+@settings(max_examples=30)  # of each class
 @given(st.data())
 @pytest.mark.parametrize("cls", ALL)
 def test_any_bytes_are_a_message_or_a_decode_error(cls: type[Message], data: st.DataObject) -> None:

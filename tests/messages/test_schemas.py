@@ -1,7 +1,7 @@
 """Classes built back from schemas, which anybody may have sent."""
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r2p.msg
@@ -14,6 +14,7 @@ from tests.messages.strategies import messages
 STANDARD: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]
 
 
+@settings(max_examples=30)  # of each class
 @given(st.data())
 @pytest.mark.parametrize("cls", [*STANDARD, Numbers, Robot, Keywords, Derived, Redefined])
 def test_a_class_built_back_reads_the_same(cls: type[Message], data: st.DataObject) -> None:

@@ -4,7 +4,20 @@ import pytest
 
 import r2p.msg
 from r2p.messages import Message, Timestamp, layout
-from r2p.msg import Led, Log, Odometry, Pose3, Proximity, StampedQEI, Tilt, Velocity3, firmware, robot, text
+from r2p.msg import (
+    Led,
+    Log,
+    Odometry,
+    Pose3,
+    Proximity,
+    StampedIMURaw9,
+    StampedQEI,
+    Tilt,
+    Velocity3,
+    firmware,
+    robot,
+    text,
+)
 
 EVERY: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]
 
@@ -85,7 +98,22 @@ def test_defaults_are_zero_and_a_debug_line_carries_it(cls: type[Message]) -> No
 
 @pytest.mark.parametrize("cls", EVERY)
 def test_is_documented(cls: type[Message]) -> None:
-    assert cls.__doc__ != Message.__doc__
+    assert cls.__doc__
+
+
+@pytest.mark.parametrize(
+    ("cls", "fingerprint"),
+    [
+        (Led, "9ef58fbde4f40142"),
+        (Velocity3, "c9e1a1a464f51d66"),
+        (StampedIMURaw9, "44137799cf5d0152"),
+        (Odometry, "075f2f25b6e57f3e"),
+        (Log, "53518cff02425b99"),
+    ],
+)
+def test_fingerprints_are_the_same_for_ever(cls: type[Message], fingerprint: str) -> None:
+    """Peers compare them: a layout that changes must get another one, any other change must not."""
+    assert layout(cls).fingerprint.hex() == fingerprint
 
 
 @pytest.mark.golden

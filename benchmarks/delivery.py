@@ -1,0 +1,175 @@
+"""Delivery inside one module: publisher to subscriber tasks."""
+
+import asyncio
+import time
+from collections.abc import Iterator
+
+import r2p
+from benchmarks.loops import run_on
+from benchmarks.table import Row, p50_p99, rate, typical
+
+
+class Pair(r2p.Message):
+    """8 bytes."""
+
+    a: r2p.u32 = 0
+    b: r2p.f32 = 0.0
+
+
+MESSAGE = Pair(a=1, b=2.0)
+RUNS = 5
+
+
+async def throughput(messages: int, subscribers: int, *, each: bool) -> float:
+    """Messages a second from one publisher to `subscribers` nodes; `each`: yielding after each message."""
+
+    async def consume(node: r2p.Node) -> None:
+        left = messages
+        async for _ in node.subscribe("pairs", Pair, queue=64):
+            left -= 1
+            if not left:
+                return
+
+    async with r2p.Module("BENCH", via=[], watchdog=False) as module:
+        for index in range(subscribers):
+            module.start(consume, name=f"sub{index}")
+        await asyncio.sleep(0)
+        took = 0.0
+
+        async def produce(node: r2p.Node) -> None:
+            nonlocal took
+            publisher = node.advertise("pairs", Pair)
+            started = time.perf_counter()
+            for _ in range(messages):
+                await publisher.publish(MESSAGE)
+                if each:
+                    await asyncio.sleep(0)
+            took = started
+
+        module.start(produce)
+        await module.wait()
+        return messages / (time.perf_counter() - took)
+
+
+async def queue_throughput(messages: int) -> float:
+    """The same through an asyncio.Queue, without types."""
+    queue: asyncio.Queue[int] = asyncio.Queue(64)
+
+    async def consume() -> None:
+        for _ in range(messages):
+            await queue.get()
+
+    consumer = asyncio.create_task(consume())
+    started = time.perf_counter()
+    for number in range(messages):
+        await queue.put(number)
+    await consumer
+    return messages / (time.perf_counter() - started)
+
+
+async def cyphal_throughput(messages: int) -> float:
+    """pycyphal 1.x's loopback transport: send and receive 8 bytes."""
+    from pycyphal.transport import MessageDataSpecifier, Priority, Transfer
+    from pycyphal.transport import InputSessionSpecifier, OutputSessionSpecifier, PayloadMetadata, Timestamp
+    from pycyphal.transport.loopback import LoopbackTransport
+
+    transport = LoopbackTransport(1)
+    subject, metadata = MessageDataSpecifier(1000), PayloadMetadata(1024)
+    output = transport.get_output_session(OutputSessionSpecifier(subject, None), metadata)
+    arriving = transport.get_input_session(InputSessionSpecifier(subject, None), metadata)
+    loop = asyncio.get_running_loop()
+    payload = [memoryview(bytes(8))]
+    started = time.perf_counter()
+    for number in range(messages):
+        transfer = Transfer(Timestamp.now(), Priority.NOMINAL, number, payload)
+        await output.send(transfer, loop.time() + 1)
+        await arriving.receive(loop.time() + 1)
+    took = time.perf_counter() - started
+    transport.close()
+    return messages / took
+
+
+async def latencies(messages: int) -> list[float]:
+    """Seconds from publish() to the subscriber's next line."""
+    taken: list[float] = []
+    at = 0.0
+
+    async def consume(node: r2p.Node) -> None:
+        async for _ in node.subscribe("pairs", Pair):
+            taken.append(time.perf_counter() - at)
+            if len(taken) == messages:
+                return
+
+    async def produce(node: r2p.Node) -> None:
+        nonlocal at
+        publisher = node.advertise("pairs", Pair)
+        await publisher.wait_subscriber()
+        for _ in range(messages):
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            at = time.perf_counter()
+            await publisher.publish(MESSAGE)
+            await asyncio.sleep(0)
+
+    async with r2p.Module("BENCH", via=[], watchdog=False) as module:
+        module.start(consume)
+        module.start(produce)
+        await module.wait()
+    return taken
+
+
+async def wake_latencies(messages: int) -> list[float]:
+    """Seconds from setting a future to the next line of the task that waits for it: what the loop itself takes."""
+    loop = asyncio.get_running_loop()
+    taken: list[float] = []
+    waiter: asyncio.Future[None] = loop.create_future()
+    at = 0.0
+
+    async def wait() -> None:
+        nonlocal waiter
+        for _ in range(messages):
+            await waiter
+            taken.append(time.perf_counter() - at)
+            waiter = loop.create_future()
+
+    task = asyncio.create_task(wait())
+    while len(taken) < messages:
+        await asyncio.sleep(0)
+        at = time.perf_counter()
+        waiter.set_result(None)
+        await asyncio.sleep(0)
+    await task
+    return taken
+
+
+def rows() -> Iterator[Row]:
+    cyphal = typical(3, lambda: run_on("asyncio", cyphal_throughput(20_000)))
+    for loop, goal in (("asyncio", 200e3), ("uvloop", 350e3)):
+        ours = typical(RUNS, lambda loop=loop: run_on(loop, throughput(100_000, 1, each=True)))  # type: ignore[misc]
+        yield Row(
+            f"publish to one subscriber, yielding each ({loop})",
+            rate(ours),
+            f"pycyphal loopback {rate(cyphal)}: {ours / cyphal:.1f}x",
+            f"{rate(goal)}, 4x",
+            ours >= goal and ours >= 4 * cyphal,
+        )
+    queue = typical(RUNS, lambda: run_on("uvloop", queue_throughput(200_000)))
+    ours = typical(RUNS, lambda: run_on("uvloop", throughput(400_000, 1, each=False)))
+    yield Row(
+        "the same, yielding every 16 messages (uvloop)",
+        rate(ours),
+        f"asyncio.Queue, untyped {rate(queue)}: {ours / queue:.1f}x",
+        "1.00 M/s",
+        ours >= 1e6,
+    )
+    ours = 20 * typical(RUNS, lambda: run_on("uvloop", throughput(40_000, 20, each=False)))
+    yield Row("20 subscribers, yielding every 16: deliveries (uvloop)", rate(ours), "", "3.00 M/s", ours >= 3e6)
+    median, worst = p50_p99(run_on("uvloop", latencies(50_000)))
+    bare, bare_worst = p50_p99(run_on("uvloop", wake_latencies(50_000)))
+    yield Row(
+        "publish to the subscriber's next line, p50, p99 (uvloop)",
+        f"{median:.1f} us, {worst:.1f} us",
+        f"bare future {bare:.1f} us, {bare_worst:.1f} us",
+        "5 us, 20 us",
+        median <= 5 and worst <= 20,
+    )

@@ -1,0 +1,92 @@
+"""The parts of the schedule by themselves."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r2p.protocols.schedule import Bucket, Item, Kind, Schedule, Timers
+from tests.protocols.wire import MS, S
+
+
+@given(
+    st.floats(0.5, 10_000),
+    st.integers(2, 50),
+    st.lists(st.tuples(st.integers(0, S), st.integers(1, 2)), max_size=60),
+)
+def test_a_bucket_never_lets_more_pass(rate: float, burst: int, wishes: list[tuple[int, int]]) -> None:
+    bucket = Bucket(rate, burst)
+    now, passed = 0, list[int]()
+    for wait, count in wishes:
+        now += wait
+        if bucket.ready_at(count) <= now:
+            bucket.take(now, count)
+            passed += [now] * count
+    for first, start in enumerate(passed):
+        for last in range(first, len(passed)):
+            assert last - first + 1 <= burst + (passed[last] - start) / bucket.gap
+
+
+class TestTimers:
+    @given(st.lists(st.tuples(st.integers(0, 9), st.one_of(st.none(), st.integers(0, 100))), max_size=100))
+    def test_like_a_dictionary(self, changes: list[tuple[int, int | None]]) -> None:
+        timers, model = Timers(), dict[int, int]()
+        for key, due in changes:
+            if due is None:
+                timers.clear(key)
+                model.pop(key, None)
+            else:
+                timers.set(key, due)
+                model[key] = due
+            assert timers.next() == min(model.values(), default=None)
+        assert set(timers.pop(50)) == {key for key, due in model.items() if due <= 50}
+        assert list(timers.pop(50)) == []
+        assert set(timers.pop(100)) == {key for key, due in model.items() if due > 50}
+        assert timers.next() is None
+
+    def test_what_comes_and_goes_leaves_nothing_behind(self) -> None:
+        timers = Timers()
+        for n in range(10_000):
+            timers.set(n, 1000)
+            timers.clear(n)
+        assert len(timers._heap) < 200
+
+    def test_a_key_can_be_set_while_keys_run_out(self) -> None:
+        timers = Timers()
+        timers.set("a", 1)
+        for key in timers.pop(5):
+            timers.set(key, 6)
+        assert timers.next() == 6
+
+
+class TestSchedule:
+    def test_a_ring_of_what_is_left(self) -> None:
+        schedule = Schedule(1000, 100, 0)
+        items = [Item(Kind.PUBLISHER, (f"t{n}",)) for n in range(4)]
+        for item in items:
+            schedule.add(item)
+        schedule.drop(items[1])
+        schedule.start(0)
+        said = []
+        for now in range(0, 10 * S, 10 * MS):
+            while (item := schedule.pop(now)) is not None:
+                said.append(item.key)
+                schedule.sent(now, 1)
+            if now == 5 * S:
+                schedule.drop(items[0])
+        names = [key[0] for key in said if key]
+        assert names[:6] == ["t0", "t2", "t3"] * 2
+        assert set(names[-6:]) == {"t2", "t3"}
+
+    def test_what_is_said_once_is_forgotten_when_the_link_goes_down(self) -> None:
+        schedule = Schedule(1, 2, 0)
+        schedule.start(0)
+        schedule.add(Item(Kind.PUBLISHER, ("t",)))
+        schedule.add(Item(Kind.UNSUBSCRIBE, ("t",), once=True))
+        schedule.stop()
+        schedule.start(0)
+        kinds = []
+        for now in range(0, 5 * S, S):
+            while (item := schedule.pop(now)) is not None:
+                kinds.append(item.kind)
+                schedule.sent(now, 1)
+        assert kinds[:2] == [Kind.QUERY, Kind.PUBLISHER]
+        assert Kind.UNSUBSCRIBE not in kinds
