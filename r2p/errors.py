@@ -16,6 +16,9 @@ Bad bytes from a wire raise none of these: they are counted in `link.stats` and 
 """
 
 
+from collections.abc import Sequence
+
+
 class Error(Exception):
     """The root of all r2p exceptions."""
 
@@ -54,6 +57,10 @@ class Broken(TransportError):
 
 class NodeCrashed(Error, ExceptionGroup[Exception]):
     """What the nodes of a module raised, one exception a node; each carries a note that names its node."""
+
+    def derive(self, excs: Sequence[Exception]) -> "NodeCrashed":  # type: ignore[override]  # typeshed: any exception
+        """What `except*` and `split` leave is still a NodeCrashed."""
+        return NodeCrashed(self.message, excs)
 
 
 class Deadlock(Error):

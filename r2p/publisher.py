@@ -27,7 +27,7 @@ M = TypeVar("M", bound=Message)
 
 _SECOND = 1_000_000_000
 _NRT = PublisherClass.NON_REAL_TIME
-_LATE_SHARE = 10  # a periodic sample is late when it is off by more than period / 10
+_LATE_SHARE = 2  # a period is late when it is off by more than half of it
 
 
 class Missed(msgspec.Struct, frozen=True):
@@ -43,9 +43,9 @@ class Missed(msgspec.Struct, frozen=True):
     count: int = 1
 
     def __str__(self) -> str:
-        where = f" to {self.where}" if self.where else ""
-        late = f", {self.late * 1e3:.1f} ms late" if self.late else ""
-        return f"topic {self.topic}: {self.count} message(s){where} missed: {self.reason}{late}"
+        where = f" ({self.where})" if self.where else ""
+        late = f" by {self.late * 1e3:.1f} ms" if self.late else ""
+        return f"topic {self.topic}{where}: {self.reason}{late}"
 
 
 Signal = Callable[[Missed], object]
@@ -211,7 +211,7 @@ class BasePublisher(Generic[M]):
         now = self._clock.monotonic()
         if now - self._logged >= _SECOND:
             self._logged = now
-            self.node.log.warning("%s (%d in all)", missed, self.missed + self.late)
+            self.node.log.warning("%s (missed %d, late %d so far)", missed, self.missed, self.late)
         if callback is not None:
             callback(missed)
 
@@ -443,7 +443,7 @@ class PeriodicPublisher(BasePublisher[M]):
         if skipped or late > self.period * _SECOND / _LATE_SHARE:
             self.late += 1
             self.skipped += skipped
-            reason = f"late, {skipped} period(s) skipped" if skipped else "late"
+            reason = f"{skipped} period(s) skipped, the next one late" if skipped else "late"
             self._signal(Missed(self.topic, reason, late=late / _SECOND, count=skipped), self._on_late)
         try:
             message = self._fill()

@@ -1,0 +1,20 @@
+"""Runs all benchmarks, or those that are named: `python -m benchmarks delivery codecs`."""
+
+import importlib
+import itertools
+import logging
+import sys
+
+from benchmarks.table import show
+
+ALL = ("delivery", "priority", "codecs", "network", "timers", "start")
+
+
+def main() -> None:
+    logging.disable()
+    names = sys.argv[1:] or ALL
+    show(itertools.chain.from_iterable(importlib.import_module(f"benchmarks.{name}").rows() for name in names))
+
+
+if __name__ == "__main__":
+    main()

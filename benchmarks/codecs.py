@@ -1,0 +1,69 @@
+"""Packing messages and lines."""
+
+import struct
+import timeit
+from collections.abc import Callable, Iterator
+
+import r2p
+from benchmarks.table import Row, rate, typical
+from r2p.codecs import debug
+from r2p.msg import StampedIMURaw9
+
+PAYLOAD = bytes(range(32))
+NUMBER = 50_000
+
+
+def seconds(function: Callable[[], object], number: int = NUMBER) -> float:
+    """Seconds of one call."""
+    return typical(5, lambda: timeit.timeit(function, number=number) / number)
+
+
+def rows() -> Iterator[Row]:
+    yield from _messages()
+    yield from _lines()
+
+
+def _messages() -> Iterator[Row]:
+    layout = r2p.layout(StampedIMURaw9)
+    bare = struct.Struct("<II9h")
+    values = (1, 2, *range(9))
+    message = layout.decode(bare.pack(*values))
+    data = layout.encode(message)
+    encode, decode = layout.encode, layout.decode
+    for what, ours, base in (
+        ("encode", seconds(lambda: encode(message)), seconds(lambda: bare.pack(*values))),
+        ("decode", seconds(lambda: decode(data)), seconds(lambda: bare.unpack(data))),
+    ):
+        yield Row(
+            f"{what} StampedIMURaw9",
+            f"{ours * 1e9:.0f} ns",
+            f"bare struct {base * 1e9:.0f} ns: {ours / base:.1f}x",
+            "within 3x",
+            ours <= 3 * base,
+        )
+
+
+def _lines() -> Iterator[Row]:
+    encode = debug.encoder(b"encoder")
+    line = encode(PAYLOAD, 0)
+    chunk = line * 500
+    ours = 1 / seconds(lambda: encode(PAYLOAD, 0))
+    bare = 1 / seconds(lambda: PAYLOAD.hex().upper().encode())
+    yield Row(
+        "debug lines encoded, 32 bytes",
+        rate(ours),
+        f"bytes.hex of the payload alone {rate(bare)}: {ours / bare:.2f}x",
+        "200 k/s",
+        ours >= 200e3,
+    )
+    reader = debug.Reader()
+    ours = 500 / seconds(lambda: reader.feed(chunk), 100)
+    text = PAYLOAD.hex()
+    bare = 1 / seconds(lambda: bytes.fromhex(text))
+    yield Row(
+        "debug lines decoded, 32 bytes",
+        rate(ours),
+        f"bytes.fromhex of the payload alone {rate(bare)}: {ours / bare:.2f}x",
+        "200 k/s",
+        ours >= 200e3,
+    )

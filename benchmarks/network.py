@@ -1,0 +1,157 @@
+"""Two processes over TCP on loopback, against bare asyncio streams that exchange lines."""
+
+import asyncio
+import multiprocessing
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from multiprocessing.connection import Connection
+from typing import Any
+
+import r2p
+from benchmarks.loops import run_on
+from benchmarks.table import Row, p50_p99, rate
+from r2p.transports.tcp import TcpListenTransport
+from r2p.transports.url import parse
+
+MESSAGES = 200_000
+ROUNDS = 10_000
+
+
+class Eight(r2p.Message):
+    """32 bytes."""
+
+    values: tuple[r2p.f32, r2p.f32, r2p.f32, r2p.f32, r2p.f32, r2p.f32, r2p.f32, r2p.f32] = (0.0,) * 8
+
+
+MESSAGE = Eight(values=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0))
+LINE = b"@00000000:05eight:20" + bytes(32).hex().encode() + b":00\r\n"
+
+
+async def _serve(pipe: Connection) -> None:
+    """The other process: counts the stream `eight`, says how many came and how long it took, and echoes `ping`."""
+    transport = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
+
+    async def count(node: r2p.Node) -> None:
+        left, started = MESSAGES, 0.0
+        subscriber = node.subscribe("eight", Eight, queue=64)
+        async for _ in subscriber:
+            started = started or time.perf_counter()
+            left -= 1
+            if not left:
+                break
+        pipe.send((MESSAGES - left, subscriber.lost, time.perf_counter() - started))
+
+    async def echo(node: r2p.Node) -> None:
+        back = node.advertise("pong", Eight)
+        async for message in node.subscribe("ping", Eight):
+            await back.publish(message)
+
+    async with r2p.Module("SERVER", via=[transport], watchdog=False) as module:
+        module.start(count)
+        module.start(echo)
+        pipe.send(transport.port)
+        await module.wait()
+
+
+async def _serve_lines(pipe: Connection) -> None:
+    """The bare other process: counts lines, then echoes them."""
+
+    async def handle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        started = 0.0
+        for _ in range(MESSAGES):
+            await reader.readline()
+            started = started or time.perf_counter()
+        pipe.send((MESSAGES, 0, time.perf_counter() - started))
+        while line := await reader.readline():
+            writer.write(line)
+
+    server = await asyncio.start_server(handle, "127.0.0.1", 0)
+    pipe.send(server.sockets[0].getsockname()[1])
+    await server.serve_forever()
+
+
+async def _drive(port: int, pipe: Connection) -> tuple[float, int, list[float]]:
+    """Stream, then ping: messages a second, messages lost, round trips in seconds."""
+    trips: list[float] = []
+    result: tuple[float, int] = (0.0, 0)
+
+    async def stream(node: r2p.Node) -> None:
+        nonlocal result
+        publisher = node.advertise("eight", Eight)
+        await publisher.wait_subscriber()
+        for _ in range(MESSAGES):
+            await publisher.publish(MESSAGE)
+        received, lost, seconds = await asyncio.to_thread(pipe.recv)
+        result = (received / seconds, MESSAGES - received + lost)
+        await ping(node)
+
+    async def ping(node: r2p.Node) -> None:
+        publisher, answers = node.advertise("ping", Eight), node.subscribe("pong", Eight)
+        await publisher.wait_subscriber()
+        await answers.wait_publisher()
+        for _ in range(ROUNDS):
+            at = time.perf_counter()
+            await publisher.publish(MESSAGE)
+            await answers.fetch()
+            trips.append(time.perf_counter() - at)
+
+    async with r2p.Module("CLIENT", via=f"tcp:127.0.0.1:{port}", watchdog=False) as module:
+        module.start(stream)
+        await module.wait()
+    return (*result, trips)
+
+
+async def _drive_lines(port: int, pipe: Connection) -> tuple[float, int, list[float]]:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    for _ in range(MESSAGES):
+        writer.write(LINE)
+        await writer.drain()
+    received, lost, seconds = await asyncio.to_thread(pipe.recv)
+    trips = []
+    for _ in range(ROUNDS):
+        at = time.perf_counter()
+        writer.write(LINE)
+        await reader.readline()
+        trips.append(time.perf_counter() - at)
+    writer.close()
+    return received / seconds, lost, trips
+
+
+Server = Callable[[Connection], Coroutine[Any, Any, None]]
+Driver = Callable[[int, Connection], Coroutine[Any, Any, tuple[float, int, list[float]]]]
+
+
+def _process(serve: Server, pipe: Connection) -> None:
+    run_on("uvloop", serve(pipe))
+
+
+def _both(serve: Server, drive: Driver) -> tuple[float, int, list[float]]:
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    server = context.Process(target=_process, args=(serve, there), daemon=True)
+    server.start()
+    try:
+        return run_on("uvloop", drive(here.recv(), here))
+    finally:
+        server.terminate()
+        server.join()
+
+
+def rows() -> Iterator[Row]:
+    bare, _, bare_trips = _both(_serve_lines, _drive_lines)
+    ours, lost, trips = _both(_serve, _drive)
+    yield Row(
+        "two processes over TCP, typed, 32 bytes",
+        f"{rate(ours)}, {lost} lost",
+        f"bare asyncio lines {rate(bare)}: {ours / bare:.2f}x",
+        "80 k/s, none lost",
+        ours >= 80e3 and not lost,
+    )
+    (median, worst), (bare_median, bare_worst) = p50_p99(trips), p50_p99(bare_trips)
+    yield Row(
+        "round trip over TCP, typed, 32 bytes, p50, p99",
+        f"{median:.0f} us, {worst:.0f} us",
+        f"bare line echo {bare_median:.0f} us, {bare_worst:.0f} us: {median / bare_median:.1f}x",
+        "p50 within 2x",
+        median <= 2 * bare_median,
+    )
