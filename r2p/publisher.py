@@ -10,7 +10,7 @@ Each counts its misses, signals them by a callback of its class value, and logs 
 import asyncio
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, NoReturn, TypeVar
+from typing import Any, ClassVar, Generic, Literal, NoReturn, TypeVar
 
 import msgspec
 
@@ -18,10 +18,7 @@ from r2p.clock import Alarm, Clock, Ticker
 from r2p.errors import Closed, MessageError
 from r2p.messages import Layout, Message
 from r2p.sample import PublisherClass, Sample, Source
-from r2p.topic import BURST, Outlet, QueueSink, Sink, Topic, TopicSpace, pause
-
-if TYPE_CHECKING:
-    from r2p.node import Node
+from r2p.topic import BURST, Outlet, Owner, QueueSink, Sink, Topic, TopicSpace, pause
 
 M = TypeVar("M", bound=Message)
 
@@ -92,7 +89,7 @@ class BasePublisher(Generic[M]):
 
     publisher_class: PublisherClass
 
-    def __init__(self, space: TopicSpace, node: "Node", topic: Topic, layout: Layout[M], *, latch: bool) -> None:
+    def __init__(self, space: TopicSpace, node: Owner, topic: Topic, layout: Layout[M], *, latch: bool) -> None:
         self.topic = topic.name
         self.type = layout.cls
         self.node = node
@@ -228,7 +225,7 @@ class Publisher(BasePublisher[M]):
     publisher_class = PublisherClass.NON_REAL_TIME
 
     def __init__(
-        self, space: TopicSpace, node: "Node", topic: Topic, layout: Layout[M], klass: NonRealTime, *, latch: bool
+        self, space: TopicSpace, node: Owner, topic: Topic, layout: Layout[M], klass: NonRealTime, *, latch: bool
     ) -> None:
         super().__init__(space, node, topic, layout, latch=latch)
         self._stall = klass.stall
@@ -310,7 +307,7 @@ class SporadicPublisher(BasePublisher[M]):
     publisher_class = PublisherClass.SPORADIC
 
     def __init__(
-        self, space: TopicSpace, node: "Node", topic: Topic, layout: Layout[M], klass: Sporadic, *, latch: bool
+        self, space: TopicSpace, node: Owner, topic: Topic, layout: Layout[M], klass: Sporadic, *, latch: bool
     ) -> None:
         super().__init__(space, node, topic, layout, latch=latch)
         if klass.deadline <= 0 or klass.pending < 1:
@@ -417,7 +414,7 @@ class PeriodicPublisher(BasePublisher[M]):
     publisher_class = PublisherClass.PERIODIC
 
     def __init__(
-        self, space: TopicSpace, node: "Node", topic: Topic, layout: Layout[M], klass: Periodic[M], *, latch: bool
+        self, space: TopicSpace, node: Owner, topic: Topic, layout: Layout[M], klass: Periodic[M], *, latch: bool
     ) -> None:
         super().__init__(space, node, topic, layout, latch=latch)
         if klass.period <= 0:

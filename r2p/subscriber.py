@@ -13,13 +13,12 @@ from r2p.clock import Alarm
 from r2p.errors import Closed, DecodeError
 from r2p.messages import Layout
 from r2p.sample import Sample
-from r2p.topic import BURST, QueueSink, Topic, TopicSpace, pause
+from r2p.topic import BURST, Owner, QueueSink, Topic, TopicSpace, pause
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from r2p.node import Node
 
 T = TypeVar("T")
 
@@ -51,7 +50,7 @@ class Subscriber(QueueSink, Generic[T]):
     def __init__(
         self,
         space: TopicSpace,
-        node: "Node",
+        node: Owner,
         topic: Topic,
         layout: Layout[Any] | None,
         *,

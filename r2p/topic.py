@@ -9,18 +9,16 @@ handler steps of unimportant ones.
 import asyncio
 import heapq
 import itertools
+import logging
 import types
 from collections import deque
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from r2p.clock import Clock
 from r2p.errors import TypeMismatch
 from r2p.messages import Layout
 from r2p.sample import PublisherClass, Sample
-
-if TYPE_CHECKING:
-    from r2p.publisher import BasePublisher
 
 BURST = 16
 """Messages that publish() or an iteration handles before it lets the event loop run once."""
@@ -33,6 +31,19 @@ PATIENCE = 4
 def pause() -> Generator[None, None, None]:
     """Let the event loop run once."""
     yield
+
+
+class Owner(Protocol):
+    """The node that a publisher or a subscriber belongs to."""
+
+    name: str
+    priority: int
+
+    @property
+    def log(self) -> logging.LoggerAdapter[logging.Logger]: ...
+
+    def crash(self, error: Exception) -> None:
+        """End the node with an error that arose outside its own task."""
 
 
 class Waker:
@@ -125,9 +136,7 @@ class QueueSink(Sink):
 
     __slots__ = ("_waker", "keep_oldest", "limit", "node", "priority", "queue", "waiter")
 
-    def __init__(
-        self, waker: Waker, node: object, limit: int, priority: int, *, lossy: bool, keep_oldest: bool
-    ) -> None:
+    def __init__(self, waker: Waker, node: Owner, limit: int, priority: int, *, lossy: bool, keep_oldest: bool) -> None:
         super().__init__()
         self._waker = waker
         self.node = node
@@ -161,7 +170,7 @@ class QueueSink(Sink):
     @property
     def owner(self) -> str:
         """The name of its node."""
-        return str(getattr(self.node, "name", ""))
+        return self.node.name
 
     def publisher_joined(self) -> None:
         """The topic has one more publisher."""
@@ -183,13 +192,29 @@ class Outlet(Sink):
         self.link = link
 
 
+class Advertised(Protocol):
+    """A publisher as its topic sees it."""
+
+    node: Owner
+    publisher_class: PublisherClass
+
+    def joined(self, sink: Sink) -> None:
+        """Somebody joined, or came back after a reboot."""
+
+    def left(self, sink: Sink) -> None:
+        """Somebody left."""
+
+    def degraded(self, link: str, reason: str) -> None:
+        """A link that carried the topic does not any more."""
+
+
 class Topic:
     """One topic in one module."""
 
     def __init__(self, name: str, waker: Waker) -> None:
         self.name = name
         self.layout: Layout[Any] | None = None
-        self.publishers: list[BasePublisher[Any]] = []
+        self.publishers: list[Advertised] = []
         self.queues: list[QueueSink] = []
         self.outlets: list[Outlet] = []
         self.inlets = 0
