@@ -15,6 +15,8 @@ _SECOND = 1_000_000_000
 _STEP = _SECOND // 2
 _ROUND = 3 * _SECOND // 2
 _PRESENCE_APART = _SECOND // 10
+_PRESENCE_SHARE = 8
+"""Message times between two presences at least: on a slow line they would leave no room for anything else."""
 _QUIET_MOST = _SECOND
 """A step that waits for a quiet line goes out this late at the latest."""
 _MOST = 2
@@ -99,7 +101,8 @@ class Schedule:
 
     def repeat(self, now: int) -> None:
         """Somebody is new: say everything once more, presence first."""
-        self._presence_at = min(self._presence_at, max(now, self._presence_sent + _PRESENCE_APART))
+        apart = max(_PRESENCE_APART, _PRESENCE_SHARE * self._bucket.gap)
+        self._presence_at = min(self._presence_at, max(now, self._presence_sent + apart))
         self._eager = self._count
 
     def traffic(self, now: int) -> None:
@@ -145,7 +148,7 @@ class Schedule:
 
     @property
     def _presence_period(self) -> int:
-        return min(_ROUND, _STEP * (self._count + 1))
+        return max(min(_ROUND, _STEP * (self._count + 1)), _PRESENCE_SHARE * self._bucket.gap)
 
     def _turn_at(self) -> int:
         self._eager = min(self._eager, self._count)

@@ -13,7 +13,10 @@ PROMPT_MS = 4
 
 PubSub = m.Advertise | m.SubscribeRequest | m.SubscribeResponse
 PLAIN = [case for case in cases("pubsub") if "malformed" not in case.name]
-HALTED = "subscribe_leds_queue0-"  # queue_length 0 halts firmware: it has no answer to compare with
+NOT_LIKE_US = (
+    "subscribe_leds_queue0-",  # queue_length 0 halts firmware: it has no answer to compare with
+    "cmd_queue_nonzero_subres-bridge",  # a firmware gateway also answers for topics that it only subscribes
+)
 DEBUG_LINE = [case for case in cases() if case.group != "bootloader" and case.stream(TO_NODE) + case.stream(FROM_NODE)]
 
 
@@ -42,7 +45,7 @@ def recorded_answers(case: Case, at: int) -> list[tuple[str, str, int]]:
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("case", [case for case in PLAIN if not str(case).startswith(HALTED)], ids=str)
+@pytest.mark.parametrize("case", [case for case in PLAIN if not str(case).startswith(NOT_LIKE_US)], ids=str)
 def test_as_the_module_it_answers_like_firmware(case: Case) -> None:
     """The topics exist from the first ADVERTISE on, and end with what ends the module."""
     node = Discovery("IMU1" if case.build.startswith("plain") else "IMUGW", 1)

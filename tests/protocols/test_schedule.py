@@ -67,8 +67,8 @@ class TestSchedule:
         schedule.start(0)
         said = []
         for now in range(0, 10 * S, 10 * MS):
-            while (item := schedule.pop(now)) is not None:
-                said.append(item.key)
+            while (each := schedule.pop(now)) is not None:
+                said.append(each.key)
                 schedule.sent(now, 1)
             if now == 5 * S:
                 schedule.drop(items[0])
@@ -90,3 +90,15 @@ class TestSchedule:
                 schedule.sent(now, 1)
         assert kinds[:2] == [Kind.QUERY, Kind.PUBLISHER]
         assert Kind.UNSUBSCRIBE not in kinds
+
+    def test_presence_leaves_room_on_a_slow_line(self) -> None:
+        schedule = Schedule(1, 2, 0)
+        schedule.add(Item(Kind.PUBLISHER, ("t",)))
+        schedule.start(0)
+        kinds = []
+        for now in range(0, 60 * S, S):
+            schedule.repeat(now)
+            while (item := schedule.pop(now)) is not None:
+                kinds.append(item.kind)
+                schedule.sent(now, 2 if item.kind in {Kind.PRESENCE, Kind.QUERY} else 1)
+        assert kinds.count(Kind.PUBLISHER) > kinds.count(Kind.PRESENCE) > 5

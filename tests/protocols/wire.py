@@ -138,3 +138,28 @@ class World:
             heapq.heappush(self._on_the_way, (at, self._sent, side, data))
             if self._random.random() >= self.line.repeat:
                 return
+
+
+ONE = b"\x01" * 8
+TWO = b"\x02" * 8
+ME, PEER = 0x1111, 0x2222
+SOON = 200 * MS
+"""Before the next step of what is repeated."""
+PC2 = m.Hello("PC2", PEER)
+REQUEST = m.SubscribeRequest("leds", 5, 8)
+RESPONSE = m.SubscribeResponse("cmd", 12)
+
+
+def started(*, observer: bool = False, quiet: float = 0.0) -> Discovery:
+    """A module that publishes `leds` and subscribes `cmd`, 100 ms after its link went up."""
+    discovery = Discovery("PC1", ME, observer=observer, quiet=quiet)
+    discovery.advertise(0, "leds", 5, ONE)
+    discovery.subscribe(0, "cmd", 12, 5, TWO)
+    discovery.link_up(0)
+    run(discovery, 0, 100 * MS)
+    return discovery
+
+
+def joined(discovery: Discovery, now: int, source: object = None) -> bool:
+    """Whether a request for `leds` makes a subscriber that is new, or as good as new."""
+    return any(isinstance(event, Joined) for event in hear(discovery, now, REQUEST, source=source))
