@@ -1,0 +1,100 @@
+"""The `r2p` command: a table of names, each imported only when it is called, so that `r2p --help` answers at once.
+
+A group of commands is a module with `app`, a `session.group(...)`; a single command is a module with `command`, a
+function as Typer takes it. How they join the network, and end: see `r2p.tools.session`.
+"""
+
+import importlib
+import os
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from r2p.tools.output import abandon_stdout
+
+GROUPS = {
+    "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
+    "node": ("r2p.tools.node", "Nodes, and what they publish and subscribe."),
+    "module": ("r2p.tools.module", "Modules: list, stop, reboot, bootload."),
+}
+COMMANDS = {
+    "run": ("r2p.tools.run", "Run functions as the nodes of a module."),
+    "doctor": ("r2p.tools.doctor", "Tell what this machine has and lacks for r2p."),
+    "demo": ("r2p.tools.demo", "Show r2p at work, without hardware."),
+}
+
+
+class LazyGroup(TyperGroup):
+    """Knows its commands by name and help line; loads the one that is called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command if name is None else _load(name), rest
+
+
+app = typer.Typer(
+    cls=LazyGroup,
+    help="Typed topics from the microcontroller on the robot to the PC in the next town.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def main() -> None:
+    """The entry point."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the shell: >&-
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - stays open
+    try:
+        app(prog_name="r2p")
+    except KeyboardInterrupt:  # before a command has taken care of signals itself
+        raise SystemExit(0) from None
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):
+            abandon_stdout()
+            raise SystemExit(0) from None
+        raise
+    finally:
+        _flush()
+
+
+def _flush() -> None:
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        abandon_stdout()
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        import r2p
+
+        typer.echo(f"r2p {r2p.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: bool = typer.Option(False, "--version", is_eager=True, callback=_show_version, help="Print the version."),
+) -> None:
+    """Options of the command itself."""
+
+
+def _load(name: str) -> Any:
+    if name in GROUPS:
+        return typer.main.get_command(importlib.import_module(GROUPS[name][0]).app)
+    single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    single.command(name)(importlib.import_module(COMMANDS[name][0]).command)
+    return typer.main.get_command(single)
+
+
+def _unloaded() -> None:
+    """Stands for a command that has not been loaded."""
+
+
+for _name, (_path, _summary) in (GROUPS | COMMANDS).items():
+    app.command(_name, help=_summary)(_unloaded)

@@ -1,0 +1,213 @@
+"""What tools print: text for people at a terminal, JSON lines in a pipe, or the --format that was asked for.
+
+Output never stops the event loop: a tool that did would not read its links, and so make a robot wait for somebody's
+pager. Where the reader of a pipe is slow, `put` waits, the tool's lossy queues overflow, and that is counted.
+"""
+
+import asyncio
+import contextlib
+import csv
+import functools
+import io
+import json
+import os
+import select
+import stat
+import sys
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from typing import Any, Literal, TextIO
+
+Record = Mapping[str, Any]
+
+_ATOMIC = 4096  # bytes that a pipe takes without blocking once it says that it takes some (POSIX: at least 512)
+
+
+class PipeClosed(Exception):
+    """Nobody reads our output any more: the end, exit code 0."""
+
+
+class Output:
+    """Writes records to stdout, each as soon as it is there.
+
+    `format` None: "text" at a terminal, else "json". Records hold numbers, texts, lists and nested records.
+    """
+
+    def __init__(self, format: Literal["yaml", "json", "csv"] | None = None, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stdout
+        self.format = format or ("text" if self._stream.isatty() else "json")
+        """"text", "yaml", "json" or "csv"."""
+        self._columns: list[str] | None = None
+        self._lock = asyncio.Lock()
+
+    @contextlib.asynccontextmanager
+    async def while_read(self) -> AsyncIterator[None]:
+        """End the block with PipeClosed as soon as nobody reads the pipe any more, also while there is no output."""
+        fd = waitable(self._stream)
+        if fd is None or not stat.S_ISFIFO(os.fstat(fd).st_mode):
+            yield
+            return
+        loop, task, gone = asyncio.get_running_loop(), asyncio.current_task(), False
+
+        def hang_up() -> None:  # a pipe's writing end has nothing to read but this
+            nonlocal gone
+            gone = True
+            loop.remove_reader(fd)
+            if task is not None:
+                task.cancel()
+
+        loop.add_reader(fd, hang_up)
+        try:
+            yield
+        except asyncio.CancelledError:
+            if not gone or task is None:
+                raise
+            task.uncancel()
+            raise PipeClosed from None
+        finally:
+            loop.remove_reader(fd)
+
+    async def put(self, record: Record, text: str | None = None) -> None:
+        """Write one record of a stream; `text` is its form for people, default: YAML. Raises PipeClosed."""
+        async with self._lock:
+            await self._write(self._record(record, text))
+
+    async def table(self, rows: Iterable[Record], columns: list[str]) -> None:
+        """Write a list of records with the same keys; for people in aligned columns. Raises PipeClosed."""
+        rows = list(rows)
+        match self.format:
+            case "text":
+                text = aligned(rows, columns)
+            case "csv":
+                text = _csv(columns) + "".join(_csv([_cell(row[name]) for name in columns]) for row in rows)
+            case _:
+                text = "".join(self._record({name: row[name] for name in columns}, None) for row in rows)
+        async with self._lock:
+            await self._write(text)
+
+    def _record(self, record: Record, text: str | None) -> str:
+        match self.format:
+            case "json":
+                return json.dumps(record, allow_nan=False) + "\n"
+            case "csv":
+                return self._row(record)
+            case "text" if text is not None:
+                return text + "\n"
+            case _:
+                return to_yaml(record) + "---\n"
+
+    def _row(self, record: Record) -> str:
+        leaves = flatten(record)
+        if self._columns is None:
+            self._columns = list(leaves)
+            return _csv(self._columns) + self._row(record)
+        return _csv([leaves.get(name, "") for name in self._columns])
+
+    async def _write(self, text: str) -> None:
+        fd = waitable(self._stream)
+        try:
+            if fd is None:
+                self._stream.write(text)
+                self._stream.flush()
+                return
+            data = memoryview(text.encode())
+            while data:
+                await _room(fd)
+                data = data[os.write(fd, data[:_ATOMIC]) :]
+        except BrokenPipeError as error:
+            raise PipeClosed from error
+
+
+def waitable(stream: TextIO) -> int | None:
+    """The file descriptor, if it can be waited for; files never make anybody wait."""
+    try:
+        fd = stream.fileno()
+    except (OSError, ValueError):  # none: a test's stream
+        return None
+    regular = stat.S_ISREG(os.fstat(fd).st_mode) or sys.platform == "win32"
+    return None if regular else fd
+
+
+async def _room(fd: int) -> None:
+    """Wait until something can be written without blocking."""
+    if select.select([], [fd], [], 0)[1]:
+        return
+    loop = asyncio.get_running_loop()
+    room = asyncio.Event()
+    loop.add_writer(fd, room.set)
+    try:
+        await room.wait()
+    finally:
+        loop.remove_writer(fd)
+
+
+def flatten(record: Record) -> dict[str, Any]:
+    """The leaves of a record by path: "stamp.sec", "value[0]"."""
+    leaves: dict[str, Any] = {}
+
+    def visit(path: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for name, inner in value.items():
+                visit(f"{path}.{name}" if path else name, inner)
+        elif isinstance(value, list | tuple):
+            for i, inner in enumerate(value):
+                visit(f"{path}[{i}]", inner)
+        else:
+            leaves[path] = value
+
+    visit("", record)
+    return leaves
+
+
+def to_yaml(record: Any) -> str:
+    """A record as YAML: one line a field, and for a list of plain values."""
+    return _yaml_dumper()(record)
+
+
+@functools.cache
+def _yaml_dumper() -> Callable[[Any], str]:
+    import yaml
+
+    base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+    class Dumper(base):  # type: ignore[misc]
+        """Lists of plain values on one line."""
+
+    def represent(dumper: Any, items: Iterable[Any]) -> Any:
+        items = list(items)
+        nested = any(isinstance(each, Mapping | list | tuple) for each in items)
+        return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=not nested)
+
+    Dumper.add_representer(list, represent)
+    Dumper.add_representer(tuple, represent)
+    return lambda record: str(
+        yaml.dump(record, Dumper=Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=1 << 20)
+    )
+
+
+def aligned(rows: Iterable[Record], columns: list[str]) -> str:
+    """A table for people: columns aligned, lists joined by blanks, nothing for None."""
+    lines = [[name.upper() for name in columns], *([_cell(row[name]) for name in columns] for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    return "".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() + "\n" for line in lines
+    )
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _csv(cells: Iterable[Any]) -> str:
+    line = io.StringIO()
+    csv.writer(line, lineterminator="\n").writerow(cells)
+    return line.getvalue()
+
+
+def abandon_stdout() -> None:
+    """Nobody reads standard output any more: let the interpreter flush what is left to nowhere."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):  # no real file, or closed
+        return

@@ -1,0 +1,325 @@
+"""How every tool joins the network, talks to people, and ends.
+
+A tool is a coroutine function whose first parameter is a `Session`; `tool()` makes a command of it:
+
+    app = session.group("List and watch things.")
+
+    @session.command(app, "list")
+    async def list_(session: Session, ..., format: Format = None) -> None:
+        "One line of help."
+
+That adds --via, -v and -q, joins as an observer, and maps how it ends to an exit code: 0 fine (also Ctrl-C, SIGTERM
+and a closed pipe), 1 an error of r2p, 2 `Usage`, 3 `TimedOut`. The coroutine function stays what it is, so tests call
+it under virtual time, inside of `async with join(Settings(via=["memory:lab"])) as session`. A command outside of a
+group is `command = session.tool(body)`; one that joins by itself (as `run` does) takes `settings()` and `execute()`,
+with the options `Via`, `Verbose`, `Quiet`.
+"""
+
+import asyncio
+import contextlib
+import functools
+import inspect
+import os
+import string
+import tomllib
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+import typer
+
+import r2p
+from r2p.clock import random_of
+from r2p.run import run_main
+from r2p.tools.output import PipeClosed, abandon_stdout
+from r2p.tools.stderr import log_to_stderr, say
+from r2p.transports.url import duration
+
+B = TypeVar("B", bound=Callable[..., Awaitable[None]])
+
+CONFIG = "r2p.toml"
+PATIENCE = 1.0
+"""Seconds that a tool waits before it says what for."""
+
+_SETTLED = 0.3  # seconds without news, after which an r2p peer has told everything
+_FIRMWARE = 1.5  # seconds in which a module that repeats itself each half second should have said something
+_LOOK = 0.05  # seconds between two looks for news
+_LINK_UP = 5.0  # seconds that a look at the network waits for the first link
+
+
+class Usage(Exception):
+    """The user asked for something that can't be: exit code 2."""
+
+
+class TimedOut(Exception):
+    """What was waited for did not come: exit code 3."""
+
+
+def seconds(text: str) -> float:
+    """A duration of more than 0 s from "10ms", "20us" or seconds, for an option's `parser`."""
+    try:
+        value = duration(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    if value <= 0:
+        raise typer.BadParameter(f"{text!r}: a time of more than 0 is needed")
+    return value
+
+
+Via = Annotated[
+    list[str] | None,
+    typer.Option("--via", metavar="URL", help="How to join: tcp:HOST:PORT, serial:DEVICE, ... (may repeat)."),
+]
+Verbose = Annotated[int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Tell more.")]
+Quiet = Annotated[int, typer.Option("--quiet", "-q", count=True, show_default=False, help="Tell less on stderr.")]
+Format = Annotated[
+    Literal["yaml", "json", "csv"] | None,
+    typer.Option("--format", help="Default: for people at a terminal, JSON lines in a pipe."),
+]
+Timeout = Annotated[
+    float | None,
+    typer.Option(
+        "--timeout", parser=seconds, metavar="TIME", help="Give up (exit 3) when nothing comes for so long: 2, 500ms."
+    ),
+]
+Wait = Annotated[
+    float | None,
+    typer.Option(
+        "--wait", parser=seconds, metavar="TIME", help="Listen for so long; firmware tells one topic each 0.5 s."
+    ),
+]
+
+
+class Settings(msgspec.Struct):
+    """What the command line, R2P_VIA and r2p.toml say. `types` are "package.module:Class" by topic."""
+
+    via: list[str] = []
+    types: dict[str, str] = {}
+    remap: dict[str, str] = {}
+    module: str | None = None
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The keys of r2p.toml."""
+
+    via: str | list[str] = []
+    module: str | None = None
+    types: dict[str, str] = {}
+    remap: dict[str, str] = {}
+
+
+def settings(via: list[str] | None = None, directory: Path | None = None) -> Settings:
+    """The settings; precedence for `via`: argument, R2P_VIA, r2p.toml in the directory (default: working directory).
+
+    Raises Usage for an r2p.toml that can't be read.
+    """
+    file = _read((directory or Path.cwd()) / CONFIG)
+    from_file = [file.via] if isinstance(file.via, str) else file.via
+    chosen = via or os.environ.get("R2P_VIA", "").split() or from_file
+    return Settings(chosen, file.types, file.remap, file.module)
+
+
+def _read(path: Path) -> _File:
+    try:
+        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
+    except FileNotFoundError:
+        return _File()
+    except (OSError, ValueError) as error:  # unreadable, no TOML, or other keys
+        raise Usage(f"{path}: {error}") from error
+
+
+class Session:
+    """A tool on the network: its module, and its voice (stderr; stdout is for output alone)."""
+
+    def __init__(self, module: r2p.Module, settings: Settings, *, name: str = "tool", verbose: int = 0) -> None:
+        self.module = module
+        self.settings = settings
+        self.verbose = verbose
+        self._name = name
+
+    @functools.cached_property
+    def node(self) -> r2p.Node:
+        """A node to publish and subscribe with; it lives as long as the session."""
+        return self.module.start(_live, name=self._name)
+
+    @property
+    def where(self) -> str:
+        """The network that it is on, in words."""
+        return ", ".join(self.settings.via) or "this tool alone"
+
+    def say(self, text: str) -> None:
+        """Tell the user."""
+        say(text)
+
+    @contextlib.contextmanager
+    def waiting(self, what: str | Callable[[], str]) -> Iterator[None]:
+        """While the block waits: after a second, say what for (a function is asked then)."""
+
+        def tell() -> None:
+            self.say(f"waiting for {what if isinstance(what, str) else what()} on {self.where}")
+
+        timer = asyncio.get_running_loop().call_later(PATIENCE, tell)
+        try:
+            yield
+        finally:
+            timer.cancel()
+
+    async def settle(self, wait: float | None = None) -> None:
+        """Listen to the network until the others have told what they have, or for `wait` seconds.
+
+        r2p modules are asked and answer at once; firmware repeats itself step by step, so there may be more to come,
+        which is said. Raises r2p.TransportError if no link comes up.
+        """
+        if not self.settings.via:
+            return
+        await self._link_up()
+        if wait is not None:
+            await asyncio.sleep(wait)
+            return
+        self.module.query()
+        loop = asyncio.get_running_loop()
+        start = news_at = loop.time()
+        known = 0
+        while loop.time() - start < _FIRMWARE:
+            await asyncio.sleep(_LOOK)
+            if (count := self._known()) != known:
+                known, news_at = count, loop.time()
+            if loop.time() - news_at > _SETTLED and not self._expects_more():
+                return
+        if self._hears_firmware():
+            self.say("firmware tells one topic each half second: there may be more, listen longer with --wait 5")
+
+    async def _link_up(self) -> None:
+        loop = asyncio.get_running_loop()
+        end = loop.time() + _LINK_UP
+        with self.waiting("a link"):
+            while not any(link.up for link in self.module.links):
+                if loop.time() > end:
+                    raise r2p.TransportError(f"no connection on {self.where}")
+                await asyncio.sleep(_LOOK)
+
+    def _known(self) -> int:
+        topics = self.module.network.topics().values()
+        endpoints = sum(len(view.publishers) + len(view.subscribers) for view in topics)
+        return len(topics) + endpoints + len(self.module.network.modules())
+
+    def _expects_more(self) -> bool:
+        """Whether there is a link on which no r2p module is heard that would answer at once."""
+        return any(link.up and link.name not in self._answering() for link in self.module.links)
+
+    def _answering(self) -> set[str]:
+        return {view.link for view in self.module.network.modules() if view.instance is not None}
+
+    def _hears_firmware(self) -> bool:
+        """Whether somebody is heard who does not answer."""
+        network = self.module.network
+        links = {link for view in network.topics().values() for link in view.published_on + view.subscribed_on if link}
+        return any(view.instance is None for view in network.modules()) or bool(links - self._answering())
+
+
+async def _live(node: r2p.Node) -> None:
+    """The node of a tool: what it opens is used elsewhere."""
+    await asyncio.get_running_loop().create_future()
+
+
+@contextlib.asynccontextmanager
+async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> AsyncIterator[Session]:
+    """Join the network as an observer, a module named `_` and six random characters; `name` is its node's."""
+    if not settings.via:
+        say("local only: this tool sees nothing but itself; give --via tcp:HOST:PORT, or set R2P_VIA")
+    alphabet = string.ascii_lowercase + string.digits
+    module_name = "_" + "".join(random_of(asyncio.get_running_loop()).choices(alphabet, k=6))
+    async with r2p.Module(module_name, via=settings.via, observer=True, watchdog=False) as module:
+        yield Session(module, settings, name=name, verbose=verbose)
+
+
+def command(app: typer.Typer, name: str) -> Callable[[B], B]:
+    """Decorate a coroutine function that takes a Session first, then its own arguments and options: it stays as it is,
+    and `app` gets the command made of it.
+    """
+
+    def register(body: B) -> B:
+        app.command(name)(tool(body))
+        return body
+
+    return register
+
+
+def tool(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """The command made of such a coroutine function."""
+    name = body.__name__.strip("_")
+
+    def run(**given: Any) -> None:
+        via, verbose, quiet = (given.pop(name) for name in _COMMON)
+
+        async def main() -> None:
+            async with join(settings(via), name=name, verbose=verbose) as session:
+                await body(session, **given)
+
+        execute(main, verbose=verbose, quiet=quiet)
+
+    own = list(inspect.signature(body, eval_str=True).parameters.values())[1:]
+    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *_COMMON.values())]
+    function: Any = run
+    function.__name__ = body.__name__
+    function.__doc__ = body.__doc__
+    function.__annotations__ = {each.name: each.annotation for each in parameters}
+    function.__signature__ = inspect.Signature(parameters)
+    return run
+
+
+_COMMON = {
+    name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+    for name, annotation, default in (("via", Via, None), ("verbose", Verbose, 0), ("quiet", Quiet, 0))
+}
+
+
+def group(help: str) -> typer.Typer:
+    """A group of commands for `main.GROUPS`."""
+    app = typer.Typer(
+        help=help, no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False
+    )
+    app.callback()(_no_options)  # makes it a group even of one command
+    return app
+
+
+def _no_options() -> None:
+    """A group has no options of its own."""
+
+
+def execute(main: Callable[[], Awaitable[object]], *, verbose: int = 0, quiet: int = 0) -> None:
+    """Run a command on the fastest event loop until it ends or a signal ends it; errors become exit codes."""
+    log_to_stderr(verbose - quiet)
+    try:
+        run_main(main)
+    except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - sorted out by _explain, or raised again
+        _explain(error)
+
+
+def _explain(error: BaseException) -> None:
+    """Tell what ended a command, and exit as it deserves; a bug is raised again."""
+    leaves = list(_leaves(error))
+    for leaf in leaves:
+        if isinstance(leaf, PipeClosed):
+            abandon_stdout()
+            return
+        if isinstance(leaf, Usage | r2p.InvalidName):  # names that did not come from a person raise nothing
+            raise typer.BadParameter(str(leaf)) from leaf
+        if isinstance(leaf, TimedOut):
+            say(str(leaf))
+            raise typer.Exit(3) from leaf
+    if not all(isinstance(leaf, r2p.Error) for leaf in leaves):
+        raise error
+    for leaf in leaves:
+        say(leaf.message if isinstance(leaf, r2p.NodeCrashed) else str(leaf))
+    raise typer.Exit(1) from error
+
+
+def _leaves(error: BaseException) -> Iterator[BaseException]:
+    """The errors in nested groups; what nodes raised is one error, its details have been logged."""
+    if isinstance(error, BaseExceptionGroup) and not isinstance(error, r2p.NodeCrashed):
+        for each in error.exceptions:
+            yield from _leaves(each)
+    else:
+        yield error

@@ -1,0 +1,53 @@
+"""What tools tell people: on stderr, in short lines; nobody there to read them is no error."""
+
+import contextlib
+import logging
+import sys
+from typing import Any
+
+
+def say(text: str) -> None:
+    """Tell the user, on stderr."""
+    with contextlib.suppress(OSError):  # nobody reads it
+        print(f"r2p: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the one place
+
+
+class _Short(logging.Formatter):
+    """A log record as a line for people; nodes' records begin with `module/node`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        _, _, rest = record.name.partition(".")
+        module, _, node = rest.partition(".")
+        where = f"{module}/{node}: " if node else "r2p: "
+        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        text = where + level + record.getMessage()
+        if record.exc_info:
+            text += "\n" + self.formatException(record.exc_info)
+        return text
+
+
+class _Stderr(logging.StreamHandler[Any]):
+    """Whatever stderr is when something is logged; nobody there to read it: silence."""
+
+    def __init__(self) -> None:
+        super().__init__(sys.stderr)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.stream = sys.stderr
+        super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        if not isinstance(sys.exc_info()[1], OSError | ValueError):
+            super().handleError(record)
+
+
+_HANDLER = _Stderr()
+_HANDLER.setFormatter(_Short())
+
+
+def log_to_stderr(level: int) -> None:
+    """Log records of r2p go to stderr: INFO and up, each -v or -q moves that by one level."""
+    logger = logging.getLogger("r2p")
+    logger.addHandler(_HANDLER)  # only once, however often
+    logger.propagate = False
+    logger.setLevel(max(logging.DEBUG, min(logging.INFO - 10 * level, logging.CRITICAL)))

@@ -1,0 +1,105 @@
+"""The type of a topic: given, written in r2p.toml, told by its publisher, or else unknown.
+
+A peer tells the fingerprint of a layout, not the layout: it is looked up among `r2p.msg` and the classes that r2p.toml
+names.
+"""
+
+import difflib
+
+import r2p
+from r2p.network import TopicView
+from r2p.tools.loading import load_module
+from r2p.tools.session import Session, Settings, Usage
+
+STANDARD = "r2p.msg"
+
+
+def load_type(text: str) -> type[r2p.Message]:
+    """The message class that `package.module:Class`, `FILE.py:Class`, or just a name in r2p.msg names. Raises Usage."""
+    where, _, name = (text if ":" in text else f"{STANDARD}:{text}").rpartition(":")
+    cls = getattr(load_module(where), name, None)
+    if not (isinstance(cls, type) and issubclass(cls, r2p.Message)):
+        raise Usage(f"{where} has no message class {name!r}{_similar(where, name)}")
+    try:
+        r2p.layout(cls)
+    except r2p.MessageError as error:
+        raise Usage(f"{text}: {error}") from error
+    return cls
+
+
+def _similar(where: str, name: str) -> str:
+    classes = [key for key, value in vars(load_module(where)).items() if isinstance(value, type)]
+    close = difflib.get_close_matches(name, classes, n=1)
+    return f"; did you mean {where}:{close[0]}?" if close else "; write package.module:Class or FILE.py:Class"
+
+
+def standard_types() -> list[type[r2p.Message]]:
+    """The classes of r2p.msg; of those with the same layout the firmware's comes first."""
+    module = load_module(STANDARD)
+    return sorted((getattr(module, name) for name in module.__all__), key=lambda cls: str(cls.__module__))
+
+
+def type_name(cls: type[r2p.Message]) -> str:
+    """How `--type` names a class."""
+    module = STANDARD if cls.__module__.startswith(f"{STANDARD}.") else cls.__module__
+    return f"{module}:{cls.__name__}"
+
+
+class Types:
+    """Finds types of topics for one session."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._by_topic = settings.types
+        self._by_fingerprint: dict[bytes, type[r2p.Message]] | None = None
+
+    def stated(self, topic: str, given: str | None) -> type[r2p.Message] | None:
+        """The type that the user states: `given` by --type, or in r2p.toml. Raises Usage."""
+        text = given or self._by_topic.get(topic)
+        return None if text is None else load_type(text)
+
+    def of(self, view: TopicView) -> type[r2p.Message] | None:
+        """The type of a topic as far as it is stated or told. Raises Usage for an r2p.toml that names nothing."""
+        stated = self.stated(view.name, None)
+        if stated is not None or view.fingerprint is None:
+            return stated
+        return self.by_fingerprint(view.fingerprint)
+
+    def by_fingerprint(self, fingerprint: bytes) -> type[r2p.Message] | None:
+        """The known class of that layout."""
+        if self._by_fingerprint is None:
+            known = [*standard_types(), *map(load_type, self._by_topic.values())]
+            self._by_fingerprint = {r2p.layout(cls).fingerprint: cls for cls in reversed(known)}
+        return self._by_fingerprint.get(fingerprint)
+
+
+def of_size(size: int) -> list[str]:
+    """The standard types of so many bytes."""
+    return [type_name(cls) for cls in standard_types() if r2p.layout(cls).size == size]
+
+
+def suggestion(size: int) -> str:
+    """Which types it might be, for the end of a sentence."""
+    names = of_size(size)
+    return f"; of {size} bytes are {', '.join(names)}" if names else ""
+
+
+def complete_type(incomplete: str) -> list[str]:
+    """Completions for --type."""
+    return [name for name in map(type_name, standard_types()) if name.startswith(incomplete)]
+
+
+async def find(session: Session, topic: str, given: str | None) -> type[r2p.Message]:
+    """The type to publish a topic with: stated, or told by who subscribes it. Raises Usage if it can't be known."""
+    types = Types(session.settings)
+    stated = types.stated(topic, given)
+    if stated is not None:
+        return stated
+    await session.settle()
+    view = session.module.network.topics().get(topic, TopicView(topic))
+    found = types.of(view)
+    if found is None:
+        size = f" ({view.size} bytes; of that size: {', '.join(of_size(view.size)) or 'none in r2p.msg'})" * bool(
+            view.size
+        )
+        raise Usage(f"the type of {topic} is unknown{size}: give --type package.module:Class")
+    return found

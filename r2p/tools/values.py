@@ -1,0 +1,262 @@
+"""Messages as people and scripts write them, both ways: what `echo` prints, `pub` takes.
+
+A value gets its type from the message's field, never from how it is written: YAML is read as texts only. So `1e-3` is a
+number, the key `on` a text, and "nan" in quotes, as JSON needs it, is not-a-number all the same.
+"""
+
+import json
+import math
+import re
+import struct
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from r2p.errors import MessageError
+from r2p.messages import Array, Chars, Layout, Message, Nested, Scalar, Shape, layout
+from r2p.messages.shapes import show
+
+M = TypeVar("M", bound=Message)
+
+META = "_"
+"""The key of what is not part of a message: its topic, stamp, source."""
+
+_PAIR = re.compile(r"([A-Za-z_][\w.]*)=(.*)", re.DOTALL)
+_STEP = re.compile(r"[^.\[\]]+")
+_TRUE = {"true", "yes", "on", "1"}
+_FALSE = {"false", "no", "off", "0"}
+_SMALLEST_NORMAL = 2.0**-126
+
+
+def parse(cls: type[M], texts: Iterable[str]) -> M:
+    """A message from YAML or JSON mappings and `x=1.5` pairs, the later ones winning; what is left out is zero.
+
+    A pair's name may lead into a nested message (`stamp.sec=5`). Raises MessageError.
+    """
+    plain: dict[str, Any] = {}
+    shape = layout(cls)
+    for text in texts:
+        pair = _PAIR.fullmatch(text.strip())
+        if pair is None:
+            _merge(plain, _mapping(text))
+        else:
+            path, value = pair.groups()
+            _merge(plain, {path: value if _is_text(shape, path) else _yaml(value)})
+    return from_plain(cls, plain)
+
+
+def parse_line(cls: type[M], line: str) -> M:
+    """A message from one line of a stream: JSON as `echo` prints it, else as `parse` takes it. Raises MessageError."""
+    if line.lstrip().startswith("{"):
+        try:
+            plain = json.loads(line)
+        except ValueError:
+            return parse(cls, [line])
+        return from_plain(cls, plain)
+    return parse(cls, [line])
+
+
+def from_plain(cls: type[M], plain: Mapping[str, Any]) -> M:
+    """A message from a mapping of plain values; a key may be a path (`stamp.sec`). Raises MessageError."""
+    nested: dict[str, Any] = {}
+    _merge(nested, {name: value for name, value in plain.items() if name != META})
+    message: M = _message(layout(cls), nested, cls.__name__)
+    return message
+
+
+def to_plain(message: Message) -> dict[str, Any]:
+    """A message as JSON can hold it: NaN and infinities as texts, an f32 as its shortest decimal."""
+    shape = layout(type(message))
+    return {field.name: _plain(field.shape, getattr(message, field.name)) for field in shape.fields}
+
+
+def pick(plain: Mapping[str, Any], path: str) -> Any:
+    """The value at a path: `stamp.sec`, `value[0]`. Raises KeyError that lists what there is."""
+    value: Any = plain
+    for step in _STEP.findall(path):
+        if isinstance(value, Mapping) and step in value:
+            value = value[step]
+        elif isinstance(value, list) and step.isdecimal() and int(step) < len(value):
+            value = value[int(step)]
+        else:
+            raise KeyError(f"no field {path}: there are {', '.join(_names(plain))}")
+    return value
+
+
+def _names(plain: Mapping[str, Any]) -> list[str]:
+    """The paths of all fields, for people."""
+    names: list[str] = []
+    for name, value in plain.items():
+        inner = _names(value) if isinstance(value, Mapping) else []
+        names += [f"{name}.{each}" for each in inner] or [name]
+    return names
+
+
+# Text to values
+
+
+def _yaml(text: str) -> Any:
+    """YAML, all scalars as texts."""
+    import yaml
+
+    try:
+        return yaml.load(text, Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))
+    except yaml.YAMLError as error:
+        raise MessageError(f"{text!r} is no YAML: {getattr(error, 'problem', None) or error}") from error
+
+
+def _mapping(text: str) -> dict[str, Any]:
+    value = _yaml(text)
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise MessageError(f"{text!r} is no message: write '{{x: 1.5, w: 0.25}}' or x=1.5 w=0.25")
+    return value
+
+
+def _is_text(shape: Layout[Any], path: str) -> bool:
+    """Whether the path leads to a text field, which is taken as it stands."""
+    kind: Shape = Nested(shape)
+    for name in path.split("."):
+        fields = {field.name: field.shape for field in kind.layout.fields} if isinstance(kind, Nested) else {}
+        if name not in fields:
+            return False
+        kind = fields[name]
+    return isinstance(kind, Chars)
+
+
+def _merge(into: dict[str, Any], plain: Mapping[str, Any]) -> None:
+    """Add values, paths as keys taken apart."""
+    for path, value in plain.items():
+        *parents, name = path.split(".")
+        place = into
+        for parent in parents:
+            inner = place.setdefault(parent, {})
+            if not isinstance(inner, dict):
+                raise MessageError(f"{path}: {parent} is given as a value already")
+            place = inner
+        if isinstance(value, Mapping) and isinstance(place.get(name, {}), dict):
+            _merge(place.setdefault(name, {}), value)
+        else:
+            place[name] = value
+
+
+def _message(shape: Layout[Any], plain: Mapping[str, Any], path: str) -> Any:
+    fields = {field.name: field.shape for field in shape.fields}
+    unknown = [name for name in plain if name not in fields]
+    if unknown:
+        raise MessageError(f"{path} has no field {', '.join(unknown)}: it has {', '.join(fields)}")
+    given = {name: _value(fields[name], value, f"{path}.{name}") for name, value in plain.items()}
+    zero = shape.zero
+    rest = {name: getattr(zero, name) for name in fields if name not in given}
+    return shape.cls(**given, **rest)
+
+
+def _value(shape: Shape, plain: Any, path: str) -> Any:
+    match shape:
+        case Nested(inner) if isinstance(plain, Mapping):
+            return _message(inner, plain, path)
+        case Array(item, count) if isinstance(plain, list) and len(plain) == count:
+            return tuple(_value(item, each, f"{path}[{i}]") for i, each in enumerate(plain))
+        case Chars():
+            value: Any = plain if isinstance(plain, str) else _refused
+        case Scalar():
+            value = _number(shape, plain)
+        case _:
+            value = _refused
+    if value is _refused or (isinstance(shape, Scalar | Chars) and not shape.holds(value)):
+        raise MessageError(f"{path} takes {_wanted(shape)}, not {_shown(plain)}")
+    return value
+
+
+_refused = object()
+
+
+def _wanted(shape: Shape) -> str:
+    match shape:
+        case Nested(inner):
+            return "a mapping of " + ", ".join(field.name for field in inner.fields)
+        case Array(_, count):
+            return f"a list of {count}"
+        case Scalar("bool"):
+            return "true or false"
+        case _:
+            return shape.allowed
+
+
+def _shown(plain: Any) -> str:
+    if isinstance(plain, list):
+        return f"a list of {len(plain)}"
+    if isinstance(plain, Mapping):
+        return "a mapping"
+    return "nothing" if plain is None else show(plain)
+
+
+def _number(shape: Scalar, plain: Any) -> Any:
+    """A number or a bool from what YAML (texts) or JSON (values) holds; `_refused` if it is none."""
+    if shape.kind == "bool":
+        text = str(plain).lower()
+        return True if text in _TRUE else False if text in _FALSE else _refused
+    if isinstance(plain, bool) or not isinstance(plain, int | float | str):
+        return _refused
+    try:
+        return _float(plain) if shape.kind in {"f32", "f64"} else _integer(plain)
+    except (ValueError, OverflowError):
+        return _refused
+
+
+def _float(plain: float | str) -> float:
+    if isinstance(plain, str):
+        plain = re.sub(r"^([+-]?)\.(?=[a-z])", r"\1", plain.strip().lower())  # YAML's .nan and .inf
+    return float(plain)
+
+
+def _integer(plain: float | str) -> int:
+    """5, 0x1f, 5.0 and 1e3; raises ValueError for the rest."""
+    if isinstance(plain, str):
+        text = plain.strip()
+        for base in (10, 0):
+            try:
+                return int(text, base)
+            except ValueError:
+                continue
+        plain = float(text)
+    if not math.isfinite(plain) or plain != int(plain):
+        raise ValueError
+    return int(plain)
+
+
+# Values to text
+
+
+def _plain(shape: Shape, value: Any) -> Any:
+    match shape:
+        case Nested(inner):
+            return {field.name: _plain(field.shape, getattr(value, field.name)) for field in inner.fields}
+        case Array(item, _):
+            return [_plain(item, each) for each in value]
+        case Scalar("f32" | "f64" as kind):
+            if not math.isfinite(value):
+                return str(float(value))
+            return shortest_f32(value) if kind == "f32" else float(value)
+        case _:
+            return value
+
+
+def shortest_f32(value: float) -> float:
+    """The float with the shortest decimal text that packs to the same four bytes."""
+    packed = struct.pack("<f", value)
+    exact = struct.unpack("<f", packed)[0]
+    for digits in range(6 if abs(exact) >= _SMALLEST_NORMAL else 1, 9):
+        for candidate in _decimals(exact, digits):
+            if struct.pack("<f", candidate) == packed:
+                return candidate
+    return float(f"{exact:.9g}")
+
+
+def _decimals(value: float, digits: int) -> Iterable[float]:
+    """The nearest decimal of so many digits, and below a power of two, where floats lie closer, the two beside it."""
+    nearest = f"{value:.{digits - 1}e}"
+    yield float(nearest)
+    if abs(math.frexp(value)[0]) == 0.5:
+        mantissa, exponent = nearest.split("e")
+        unit = int(mantissa.replace(".", ""))
+        for neighbour in (unit - 1, unit + 1):
+            yield float(f"{neighbour}e{int(exponent) - digits + 1}")

@@ -1,0 +1,78 @@
+"""The command itself: help, completion, and what it loads for them."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from r2p.tools.main import COMMANDS, GROUPS, app
+from tests.tools.rig import process
+
+
+def run(*arguments: str, **environment: str) -> tuple[int, str, str]:
+    with process(*arguments, env=environment) as child:
+        out, err = child.communicate()
+        return child.returncode, out, err
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
+def test_help_lists_all_commands(arguments: list[str]) -> None:
+    text = CliRunner().invoke(app, arguments).output
+    assert re.findall(r"^  (\w+)  ", text.partition("Commands:")[2], re.MULTILINE) == [*GROUPS, *COMMANDS]
+
+
+@pytest.mark.parametrize("name", [*GROUPS, *COMMANDS])
+def test_every_command_has_help(name: str) -> None:
+    result = CliRunner().invoke(app, [name, "--help"])
+    assert result.exit_code == 0, result.output
+    assert f"{name} " in result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [(["topc"], "Did you mean 'topic'?"), (["topic", "ehco"], "Did you mean 'echo'?"), (["topic", "echo"], "Missing")],
+)
+def test_mistakes_are_usage_errors(arguments: list[str], hint: str) -> None:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert hint in result.stderr
+
+
+def test_version() -> None:
+    assert re.fullmatch(r"r2p \d+\.\d+\.\d+\n", CliRunner().invoke(app, ["--version"]).output)
+
+
+@pytest.mark.processes
+def test_help_loads_no_command_and_no_library_that_it_does_not_need() -> None:
+    program = (
+        "import contextlib, sys; from r2p.tools.main import app\n"
+        "with contextlib.suppress(SystemExit): app(['--help'])\n"
+        "print('loaded', *sys.modules)"
+    )
+    text = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    loaded = set(text.partition("loaded ")[2].split())
+    assert "r2p.tools.main" in loaded
+    assert not loaded & {"yaml", "rich", "serial", "r2p.tools.session", "r2p.tools.topic", "r2p.tools.run"}
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("to", "topic"),
+        ("topic e", "echo"),
+        ("topic echo --fi", "--field"),
+        ("topic echo leds --format j", "json"),
+        ("topic pub cmd --type r2p.msg:Velo", "r2p.msg:Velocity3"),
+    ],
+)
+def test_completion(words: str, found: str) -> None:
+    line = f"r2p {words}"
+    code, out, err = run(
+        _R2P_COMPLETE="complete_bash", COMP_WORDS=line, COMP_CWORD=str(len(line.split()) - 1), _TYPER_COMPLETE_ARGS=line
+    )
+    assert (code, out.split(), err) == (0, [found], "")

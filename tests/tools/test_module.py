@@ -1,0 +1,169 @@
+"""`r2p module`: who is listed, and when an order counts as carried out."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+import pytest
+
+import r2p
+from r2p.msg import Led, Velocity3
+from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
+from r2p.tools.module import bootload, list_, reboot, stop
+from r2p.tools.session import Session, Settings, TimedOut, Usage
+from r2p.transports.memory import network
+from tests.tools.rig import printed, robot, tool
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+pytestmark = pytest.mark.virtual_time
+
+
+async def hold(node: r2p.Node) -> None:
+    node.advertise("leds", Led)
+    await asyncio.Event().wait()
+
+
+@contextlib.asynccontextmanager
+async def board(*, repeats: bool = True, age: float = 0.0) -> AsyncIterator[tuple[Powered, Session]]:
+    """IMU1, emulated, and a tool that joins its wire after `age` seconds."""
+    imu = FirmwareModule(
+        "IMU1", publishers=[Publishes("leds", Led)], subscribers=[Subscribes("cmd", Velocity3)], repeats=repeats
+    )
+    async with Powered(imu) as power:
+        await asyncio.sleep(age)
+        async with r2p.Module("_tool01", via=power.wire(), observer=True, watchdog=False) as module:
+            yield power, Session(module, Settings(via=["wire:IMU1"]))
+
+
+async def test_r2p_modules_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(hold), robot(name="ARM") as arm, tool(), tool() as session:
+        await arm.stop()
+        await list_(session)
+    assert [(row["module"], row["state"], row["kind"], row["link"]) for row in printed(capsys)] == [
+        ("ARM", "stopped", "r2p", "memory:lab"),
+        ("BOT", "running", "r2p", "memory:lab"),
+    ]
+
+
+async def test_tools_are_listed_on_demand(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(), tool() as other, tool() as session:
+        await list_(session, all=True)
+    assert [(row["module"], row["state"]) for row in printed(capsys)] == [
+        ("BOT", "running"),
+        (other.module.name, "observer"),
+    ]
+
+
+async def test_firmware_is_given_time_to_say_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    async with board(age=1.2) as (_, session):  # it has just said it
+        await list_(session)
+        captured = capsys.readouterr()
+    assert '"module": "IMU1", "state": "running", "rebooted": false, "kind": "firmware"' in captured.out
+    assert "waiting for ALIVE of firmware on wire:IMU1" in captured.err
+
+
+async def test_nobody_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        await list_(session)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "no module has been heard on memory:lab" in captured.err
+
+
+async def test_stop_and_reboot_an_r2p_module(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(hold) as bot, tool() as session:
+        await stop(session, "BOT")
+        assert bot.stopped
+        assert not bot.nodes["hold"].running
+        for _ in range(3):
+            await reboot(session, "BOT")
+            assert bot.nodes["hold"].running
+    assert capsys.readouterr().err.count("BOT: rebooted, after 0.0 s") == 3
+
+
+async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module that has been rebooted before and ignores the order does not look as if it obeyed."""
+    async with robot(hold) as bot, tool() as session:
+        await bot.reboot()
+        await asyncio.sleep(1)
+        monkeypatch.setattr(bot, "_obey", lambda _command: None)
+        with pytest.raises(
+            TimedOut, match=r"BOT did not confirm REBOOT in 4 s: it is running, heard .* rebooted before"
+        ):
+            await reboot(session, "BOT", timeout=4.0)
+
+
+async def test_reboot_waits_for_the_clean_up() -> None:
+    cleaned_up: list[float] = []
+
+    async def slow(node: r2p.Node) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(0.7)
+            cleaned_up.append(node.now())
+
+    async with robot(slow) as bot, tool() as session:
+        for count in (1, 2):
+            await reboot(session, "BOT")
+            assert len(cleaned_up) == count
+            assert bot.nodes["slow"].running
+
+
+async def test_orders_to_firmware() -> None:
+    async with board() as (power, session):
+        await stop(session, "IMU1")
+        assert power.module.flags == 1
+        await reboot(session, "IMU1")
+        await reboot(session, "IMU1")
+        assert power.module.flags == 2
+        await bootload(session, "IMU1")
+        assert power.module.flags == 6
+        await reboot(session, "IMU1")
+        assert power.module.flags == 2
+
+
+async def test_firmware_that_repeats_nothing_confirms_a_new_start() -> None:
+    async with board(repeats=False) as (power, session):
+        await asyncio.sleep(3)
+        await reboot(session, "IMU1")
+        assert power.module.flags == 2
+        with pytest.raises(TimedOut, match="it is running"):
+            await stop(session, "IMU1")
+        assert power.module.flags == 3  # stopped, and never says so
+
+
+async def test_a_lost_order_is_repeated() -> None:
+    async with robot(hold) as bot, tool() as session:
+        await session.settle()
+        network("lab").loss = 1.0
+        asyncio.get_running_loop().call_later(3.5, setattr, network("lab"), "loss", 0.0)
+        await stop(session, "BOT")
+        assert bot.stopped
+
+
+async def test_a_program_refuses_to_enter_a_boot_loader() -> None:
+    async with robot(hold) as bot, tool() as session:
+        with pytest.raises(TimedOut, match=r"it is running, heard .* program on a PC, those have no boot loader"):
+            await bootload(session, "BOT", timeout=3.0)
+        assert bot.refused["BOOTLOAD"] == 3
+        assert bot.nodes["hold"].running
+
+
+async def test_somebody_unknown() -> None:
+    async with robot(name="ARM"), tool(), tool() as session:
+        with pytest.raises(TimedOut, match=r"nothing was heard of BOT in 2 s; heard of: ARM$"):
+            await stop(session, "BOT", timeout=2.0)
+
+
+async def test_usage() -> None:
+    async with tool() as session:
+        with pytest.raises(Usage, match="the wire carries 7"):
+            await stop(session, "TOOLONGNAME")
+    async with r2p.Module("_tool01", via=[], observer=True) as module:
+        with pytest.raises(Usage, match="give --via"):
+            await stop(Session(module, Settings()), "BOT")

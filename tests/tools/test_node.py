@@ -1,0 +1,87 @@
+"""`r2p node`: nodes by what they publish and subscribe."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+import r2p
+from r2p.msg import Encoder, Led, Velocity3
+from r2p.tools.node import info, list_
+from tests.tools.rig import Firmware, printed, robot, tool
+
+pytestmark = pytest.mark.virtual_time
+
+
+async def drive(node: r2p.Node) -> None:
+    node.advertise("encoder", Encoder, r2p.Periodic(period=0.1, fill=Encoder))
+    node.advertise("leds", Led)
+    node.subscribe("cmd", Velocity3)
+    await asyncio.Event().wait()
+
+
+async def show(node: r2p.Node) -> None:
+    node.subscribe("leds", Led)
+    await asyncio.Event().wait()
+
+
+async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(drive, show), tool() as other, tool() as session:
+        other.node.subscribe("leds", Led)
+        await list_(session)
+        rows = printed(capsys)
+        await list_(session, all=True)
+        everybody = printed(capsys)
+    assert rows == [
+        {"node": "BOT/drive", "publishes": ["encoder", "leds"], "subscribes": ["cmd"]},
+        {"node": "BOT/show", "publishes": [], "subscribes": ["leds"]},
+    ]
+    assert everybody == [*rows, {"node": f"{other.module.name}/tool", "publishes": [], "subscribes": ["leds"]}]
+
+
+async def test_what_firmware_has_is_listed_under_a_question_mark(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        firmware = Firmware("IMU1")
+        firmware.advertise("tilt", 4)
+        await list_(session)
+        assert printed(capsys) == [{"node": "?/?", "publishes": ["tilt"], "subscribes": []}]
+        firmware.alive()
+        await list_(session)
+        captured = capsys.readouterr()
+        assert captured.out == '{"node": "IMU1/?", "publishes": ["tilt"], "subscribes": []}\n'
+        assert "firmware tells one topic each half second" in captured.err
+
+
+async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(drive, show), tool() as session:
+        await info(session, "BOT/drive")
+        await info(session, "drive")
+    one, same = printed(capsys)
+    assert one == same
+    assert one == {
+        "node": "BOT/drive",
+        "module": "running",
+        "link": "memory:lab",
+        "publishes": [
+            {"topic": "encoder", "type": "r2p.msg:Encoder", "size": 4, "class": "periodic"},
+            {"topic": "leds", "type": "r2p.msg:Led", "size": 5, "class": "nrt"},
+        ],
+        "subscribes": [{"topic": "cmd", "type": "r2p.msg:Velocity3", "size": 12}],
+    }
+
+
+async def test_names_that_are_not_one_node() -> None:
+    async with robot(drive), robot(drive, name="ARM"), tool() as session:
+        with pytest.raises(r2p.Error, match="several nodes drive: say which of ARM/drive, BOT/drive"):
+            await info(session, "drive")
+        with pytest.raises(r2p.Error, match="no node ARM/show; known: ARM/drive, BOT/drive"):
+            await info(session, "ARM/show")
+
+
+async def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        await list_(session)
+        with pytest.raises(r2p.Error, match="known: none"):
+            await info(session, "drive")
+    assert "no node is known on memory:lab" in capsys.readouterr().err

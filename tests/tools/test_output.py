@@ -1,0 +1,181 @@
+"""What tools print, and what happens when nobody or a slow somebody reads it."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import yaml
+
+from r2p.tools.output import Output, PipeClosed, flatten
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+RECORD = {"stamp": {"sec": 5, "nsec": 0}, "value": [1.5, -2.0], "name": "on", "poses": [{"x": 0.1}, {"x": "nan"}]}
+
+
+class Terminal(io.StringIO):
+    """A stream that people look at."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.virtual_time
+async def test_json_lines_in_a_pipe() -> None:
+    stream = io.StringIO()
+    output = Output(stream=stream)
+    await output.put(RECORD, "for people")
+    await output.put({"a": 1})
+    assert [json.loads(line) for line in stream.getvalue().splitlines()] == [RECORD, {"a": 1}]
+
+
+@pytest.mark.virtual_time
+async def test_yaml_documents_at_a_terminal_unless_there_is_a_text() -> None:
+    stream = Terminal()
+    output = Output(stream=stream)
+    await output.put(RECORD)
+    await output.put({}, "for people")
+    assert stream.getvalue() == (
+        "stamp:\n  sec: 5\n  nsec: 0\nvalue: [1.5, -2.0]\nname: 'on'\nposes:\n- x: 0.1\n- x: nan\n---\nfor people\n"
+    )
+
+
+@pytest.mark.virtual_time
+async def test_yaml_wherever_it_is_asked_for() -> None:
+    stream = io.StringIO()
+    output = Output("yaml", stream)
+    await output.put(RECORD, "for people")
+    await output.put({"a": 1}, "for people")
+    assert list(yaml.safe_load_all(stream.getvalue())) == [RECORD, {"a": 1}, None]
+
+
+@pytest.mark.virtual_time
+async def test_csv_has_a_header_and_flat_columns() -> None:
+    stream = Terminal()
+    output = Output("csv", stream)
+    await output.put(RECORD, "for people")
+    await output.put({"value": [1, 2], "name": 'a "b", c'})
+    assert stream.getvalue() == (
+        "stamp.sec,stamp.nsec,value[0],value[1],name,poses[0].x,poses[1].x\n"
+        "5,0,1.5,-2.0,on,0.1,nan\n"
+        ',,1,2,"a ""b"", c",,\n'
+    )
+
+
+def test_flatten() -> None:
+    assert flatten({"a": {"b": [{"c": 1}]}, "d": []}) == {"a.b[0].c": 1}
+
+
+ROWS: list[dict[str, Any]] = [
+    {"topic": "leds", "size": 5, "by": ["A/x", "B/y"], "more": 1},
+    {"topic": "odometry", "size": None, "by": []},
+]
+
+
+@pytest.mark.parametrize(
+    ("format", "stream", "text"),
+    [
+        (None, Terminal, "TOPIC     SIZE  BY\nleds      5     A/x B/y\nodometry\n"),
+        ("csv", Terminal, "topic,size,by\nleds,5,A/x B/y\nodometry,,\n"),
+        (
+            None,
+            io.StringIO,
+            '{"topic": "leds", "size": 5, "by": ["A/x", "B/y"]}\n{"topic": "odometry", "size": null, "by": []}\n',
+        ),
+        (
+            "yaml",
+            Terminal,
+            "topic: leds\nsize: 5\nby: [A/x, B/y]\n---\ntopic: odometry\nsize: null\nby: []\n---\n",
+        ),
+    ],
+)
+@pytest.mark.virtual_time
+async def test_table(format: None, stream: type[io.StringIO], text: str) -> None:
+    written = stream()
+    await Output(format, written).table(ROWS, ["topic", "size", "by"])
+    assert written.getvalue() == text
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, io.TextIOWrapper]]:
+    """The reading end as a descriptor, the writing end as a stream."""
+    reading, writing = os.pipe()
+    with open(writing, "w") as stream:  # noqa: PTH123 - a descriptor
+        yield reading, stream
+    try:
+        os.close(reading)
+    except OSError:
+        return
+
+
+@pytest.mark.anyio
+async def test_files_are_written_at_once(tmp_path: Path) -> None:
+    with (tmp_path / "out").open("w") as stream:
+        await Output(stream=stream).put({"a": 1})
+        assert (tmp_path / "out").read_text() == '{"a": 1}\n'
+
+
+@pytest.mark.anyio
+async def test_a_slow_reader_makes_only_the_writer_wait(pipe: tuple[int, io.TextIOWrapper]) -> None:
+    reading, stream = pipe
+    record = {"text": "x" * 500_000}  # more than a pipe holds
+    writing = asyncio.create_task(Output("json", stream).put(record))
+    await asyncio.sleep(0)  # the loop goes on
+
+    def read() -> bytes:
+        data = b""
+        while not data.endswith(b"\n"):
+            data += os.read(reading, 65536)
+        return data
+
+    assert json.loads(await asyncio.to_thread(read)) == record
+    await writing
+
+
+@pytest.mark.anyio
+async def test_a_stuck_writer_can_be_cancelled(pipe: tuple[int, io.TextIOWrapper]) -> None:
+    _, stream = pipe
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0):
+            await Output("json", stream).put({"text": "x" * 500_000})
+
+
+@pytest.mark.anyio
+async def test_a_closed_pipe_is_told_by_the_next_record(pipe: tuple[int, io.TextIOWrapper]) -> None:
+    reading, stream = pipe
+    os.close(reading)
+    with pytest.raises(PipeClosed):
+        await Output("json", stream).put({"a": 1})
+
+
+@pytest.mark.anyio
+async def test_a_closed_pipe_ends_who_waits_for_something_to_print(pipe: tuple[int, io.TextIOWrapper]) -> None:
+    reading, stream = pipe
+    asyncio.get_running_loop().call_soon(os.close, reading)
+    with pytest.raises(PipeClosed):
+        async with Output("json", stream).while_read():
+            await asyncio.Event().wait()
+
+
+@pytest.mark.anyio
+async def test_a_cancelled_writer_stays_cancelled(pipe: tuple[int, io.TextIOWrapper]) -> None:
+    _, stream = pipe
+
+    async def wait() -> None:
+        async with Output("json", stream).while_read():
+            waiting.set()
+            await asyncio.Event().wait()
+
+    waiting = asyncio.Event()
+    task = asyncio.create_task(wait())
+    await waiting.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task

@@ -1,0 +1,230 @@
+"""How tools join, wait, and end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+from typing import TYPE_CHECKING, Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import r2p
+from r2p.msg import Led
+from r2p.tools import session
+from r2p.tools.output import PipeClosed
+from r2p.tools.session import Session, Settings, TimedOut, Usage, execute, join, settings
+from tests.tools.rig import Firmware, robot, tool
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@pytest.fixture(autouse=True)
+def _as_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """No R2P_VIA, no r2p.toml, and the loggers as they were."""
+    monkeypatch.delenv("R2P_VIA", raising=False)
+    monkeypatch.chdir(tmp_path)
+    logger = logging.getLogger("r2p")
+    before = logger.handlers[:], logger.propagate, logger.level
+    yield
+    logger.handlers[:], logger.propagate, logger.level = before
+
+
+# Settings
+
+
+def test_the_command_line_goes_before_the_environment_before_the_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert settings().via == []
+    (tmp_path / "r2p.toml").write_text('via = "tcp:file"')
+    assert settings().via == ["tcp:file"]
+    monkeypatch.setenv("R2P_VIA", "tcp:a serial:b")
+    assert settings().via == ["tcp:a", "serial:b"]
+    assert settings(["tcp:c", "tcp:d"]).via == ["tcp:c", "tcp:d"]
+
+
+def test_what_the_file_holds(tmp_path: Path) -> None:
+    (tmp_path / "r2p.toml").write_text(
+        'via = ["tcp:a", "tcp:b"]\nmodule = "PC1"\n[types]\nleds = "r2p.msg:Led"\n[remap]\nencoder = "enc1"\n'
+    )
+    assert settings() == Settings(["tcp:a", "tcp:b"], {"leds": "r2p.msg:Led"}, {"encoder": "enc1"}, "PC1")
+
+
+@pytest.mark.parametrize("text", ["via = 5", "via", "modul = 'PC1'", "[types]\nleds = 5"])
+def test_a_bad_file_is_told_with_its_name(text: str, tmp_path: Path) -> None:
+    (tmp_path / "r2p.toml").write_text(text)
+    with pytest.raises(Usage, match=re.escape(str(tmp_path / "r2p.toml"))):
+        settings()
+
+
+# On the network
+
+
+@pytest.mark.virtual_time
+async def test_a_tool_is_an_observer_under_a_name_of_its_own() -> None:
+    async with robot() as module, tool() as one, tool() as other:
+        await asyncio.sleep(1)
+        seen = {view.name: view.state for view in module.network.modules() if view.link}
+    assert seen == {one.module.name: "observer", other.module.name: "observer"}
+    assert re.fullmatch("_[a-z0-9]{6}", one.module.name)
+
+
+@pytest.mark.virtual_time
+async def test_without_a_network_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    async with join(Settings()) as alone:
+        await alone.settle()
+    captured = capsys.readouterr()
+    assert "local only" in captured.err
+    assert "--via" in captured.err
+    assert captured.out == ""
+
+
+@pytest.mark.virtual_time
+async def test_a_long_wait_says_what_for(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        with session.waiting("good news"):
+            await asyncio.sleep(0.9)
+        assert capsys.readouterr().err == ""
+        with session.waiting(lambda: "news"):
+            await asyncio.sleep(1.1)
+        assert capsys.readouterr().err == "r2p: waiting for news on memory:lab\n"
+
+
+async def leds(node: r2p.Node) -> None:
+    """Publishes."""
+    publisher = node.advertise("leds", Led)
+    async for _ in node.every(0.1):
+        await publisher.publish(Led())
+
+
+@pytest.mark.virtual_time
+async def test_it_settles_as_soon_as_the_others_have_told_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(leds), tool() as session:
+        start = asyncio.get_running_loop().time()
+        await session.settle()
+        assert asyncio.get_running_loop().time() - start < 1.0
+        assert set(session.module.network.topics()) == {"leds", "log"}
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.virtual_time
+async def test_where_firmware_is_heard_there_may_be_more(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        imu = Firmware()
+        asyncio.get_running_loop().call_later(0.5, imu.advertise, "imu", 26)
+        asyncio.get_running_loop().call_later(1.0, imu.alive)
+        await session.settle()
+        assert set(session.module.network.topics()) == {"imu"}
+    assert "there may be more" in capsys.readouterr().err
+
+
+@pytest.mark.virtual_time
+async def test_it_listens_as_long_as_it_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        start = asyncio.get_running_loop().time()
+        await session.settle(7)
+        assert asyncio.get_running_loop().time() - start == pytest.approx(7)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.virtual_time
+async def test_no_link_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with tool() as session:
+        for link in session.module.links:
+            link.went_down("unplugged")
+        with pytest.raises(r2p.TransportError, match="no connection on memory:lab"):
+            await session.settle()
+
+
+# Ends
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (None, 0, ""),
+        (PipeClosed(), 0, ""),
+        (r2p.TypeMismatch("two layouts"), 1, "r2p: two layouts\n"),
+        (r2p.NodeCrashed("1 node(s) crashed", [ValueError("x")]), 1, "r2p: 1 node(s) crashed\n"),
+        (Usage("not like this"), 2, "not like this"),
+        (r2p.NameTooLong("too long"), 2, "too long"),
+        (TimedOut("nothing came"), 3, "r2p: nothing came\n"),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("grouped", [False, True])
+def test_every_end_has_its_exit_code(error: Exception | None, code: int, text: str, *, grouped: bool) -> None:
+    async def main() -> None:
+        if error is not None:
+            raise ExceptionGroup("a task failed", [error]) if grouped else error
+
+    app = session.group("Test.")
+    app.command("end")(lambda: execute(main))
+    result = CliRunner().invoke(app, ["end"])
+    assert result.exit_code == code
+    assert text in result.stderr
+    assert bool(result.stderr) == bool(text)
+    assert result.stdout == ""
+
+
+def test_a_bug_is_not_hidden() -> None:
+    async def main() -> None:
+        raise ExceptionGroup("", [r2p.Error("mine"), ZeroDivisionError("yours")])
+
+    with pytest.raises(ExceptionGroup):
+        execute(main)
+
+
+def test_what_a_coroutine_function_asks_for_becomes_options() -> None:
+    app = session.group("Test.")
+    seen = []
+
+    @session.command(app, "try")
+    async def try_(session: Session, topic: str, *, count: Annotated[int, typer.Option("--count", "-n")] = 1) -> None:
+        """Try it."""
+        seen.append((topic, count, session.where, session.verbose, session.node.name))
+
+    runner = CliRunner()
+    result = runner.invoke(app, ["try", "leds", "-n", "3", "--via", "memory:a", "--via", "memory:b", "-v"])
+    assert result.exit_code == 0, result.output
+    assert seen == [("leds", 3, "memory:a, memory:b", 1, "try")]
+    assert "Try it." in runner.invoke(app, ["try", "--help"]).stdout
+    assert runner.invoke(app, ["try"]).exit_code == 2
+
+
+def test_a_bad_file_is_a_usage_error(tmp_path: Path) -> None:
+    (tmp_path / "r2p.toml").write_text("via = 5")
+    app = session.group("Test.")
+
+    @session.command(app, "try")
+    async def try_(session: Session) -> None:
+        """Try it."""
+
+    assert CliRunner().invoke(app, ["try"]).exit_code == 2
+
+
+@pytest.mark.parametrize(("verbose", "quiet", "shown"), [(0, 0, "iwe"), (1, 0, "diwe"), (0, 1, "we"), (0, 2, "e")])
+def test_log_records_go_to_stderr(verbose: int, quiet: int, shown: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async def main() -> None:
+        logger = logging.getLogger("r2p.link")
+        logger.debug("d")
+        logger.info("i")
+        logger.warning("w")
+        logging.getLogger("r2p.PC1.blink").error("e")
+
+    execute(main, verbose=verbose, quiet=quiet)
+    lines = {"d": "r2p: d", "i": "r2p: i", "w": "r2p: warning: w", "e": "PC1/blink: error: e"}
+    captured = capsys.readouterr()
+    assert captured.err.splitlines() == [lines[letter] for letter in shown]
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize("text", ["0", "-1s", "5x", "", "nan"])
+def test_a_time_is_more_than_nothing(text: str) -> None:
+    with pytest.raises(typer.BadParameter):
+        session.seconds(text)

@@ -1,0 +1,176 @@
+"""Messages to text and back."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import struct
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from typing import Annotated, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import r2p
+from r2p.msg import IMU, Led, Proximity, Speed2, StampedPose3, Text, Velocity3
+from r2p.tools.output import to_yaml
+from r2p.tools.types import standard_types
+from r2p.tools.values import from_plain, parse, parse_line, pick, shortest_f32, to_plain
+from tests.messages.strategies import messages
+
+
+class Switch(r2p.Message):
+    """Names that YAML 1.1 takes for booleans."""
+
+    on: bool = False
+    y: r2p.f32 = 0.0
+    no: Annotated[str, r2p.Len(8)] = ""
+
+
+class Grid(r2p.Message):
+    """Arrays of all kinds."""
+
+    cells: tuple[tuple[r2p.u8, r2p.u8], tuple[r2p.u8, r2p.u8]] = ((0, 0), (0, 0))
+    poses: tuple[Velocity3, Velocity3] = (Velocity3(), Velocity3())
+    names: tuple[Annotated[str, r2p.Len(2)], Annotated[str, r2p.Len(2)]] = ("", "")
+    far: r2p.f64 = 0.0
+
+
+TYPES: list[type[r2p.Message]] = [*standard_types(), Switch, Grid]
+
+
+@pytest.mark.parametrize("cls", TYPES, ids=lambda cls: cls.__name__)
+@given(data=st.data())
+def test_what_echo_prints_pub_takes(cls: type[r2p.Message], data: st.DataObject) -> None:
+    sent = data.draw(messages(r2p.layout(cls)))
+    plain = to_plain(cls.decode(sent.encode()))
+
+    assert parse_line(cls, json.dumps(plain, allow_nan=False)).encode() == sent.encode()
+    assert parse(cls, [json.dumps(plain, allow_nan=False)]).encode() == sent.encode()
+    assert parse(cls, [to_yaml(plain)]).encode() == sent.encode()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_an_f32_prints_the_shortest_text_that_packs_to_the_same_bytes(bits: int) -> None:
+    packed = struct.pack("<I", bits)
+    value = struct.unpack("<f", packed)[0]
+    if not math.isfinite(value):
+        return
+    text = repr(shortest_f32(value))
+
+    assert struct.pack("<f", float(text)) == packed
+    digits = len(Decimal(text).normalize().as_tuple().digits)
+    for fewer in range(1, digits):
+        for rounding in (ROUND_FLOOR, ROUND_CEILING):
+            shorter = float(Context(prec=fewer, rounding=rounding).create_decimal(Decimal(value)))
+            assert struct.pack("<d", shorter) != struct.pack("<d", value)
+            try:
+                other = struct.pack("<f", shorter)
+            except OverflowError:
+                continue
+            assert other != packed
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        ([], Velocity3()),
+        (["{x: 1.5, w: 0.25}"], Velocity3(x=1.5, w=0.25)),
+        (["x: 1.5\nw: 0.25\n"], Velocity3(x=1.5, w=0.25)),
+        (['{"x": 1.5, "w": 0.25}'], Velocity3(x=1.5, w=0.25)),
+        (["x=1.5", "w=0.25"], Velocity3(x=1.5, w=0.25)),
+        (["{x: 1, y: 2}", "y=3"], Velocity3(x=1.0, y=3.0)),
+        (["x=1e-3", "y=-2E2", "w=+.5"], Velocity3(x=1e-3, y=-200.0, w=0.5)),
+        (["{x: inf, y: -.inf, w: '-Infinity'}"], Velocity3(x=math.inf, y=-math.inf, w=-math.inf)),
+        (["led=0x1f", "value=1e2"], Led(led=31, value=100)),
+        (["led=007", "value=5.0"], Led(led=7, value=5)),
+        (["text=5"], Text(text="5")),
+        (["text=on: {no} 'yes'"], Text(text="on: {no} 'yes'")),
+        (["text="], Text()),
+        (["{text: 1e-3}"], Text(text="1e-3")),
+        (["timestamp.sec=5", "{timestamp: {nsec: 7}, x: 1}"], StampedPose3(timestamp=r2p.Timestamp(5, 7), x=1.0)),
+        (["{timestamp.sec: 5}"], StampedPose3(timestamp=r2p.Timestamp(5, 0))),
+        (["value=[1, -.5]"], Speed2(value=(1.0, -0.5))),
+        (["ranges=[1,2,3,0xffff]"], Proximity(ranges=(1, 2, 3, 65535))),
+        (["{on: yes, y: 1, no: off}"], Switch(on=True, y=1.0, no="off")),
+        (["on=0"], Switch()),
+        (["poses=[{x: 1}, {}]", "names=[a, b]"], Grid(poses=(Velocity3(x=1.0), Velocity3()), names=("a", "b"))),
+    ],
+)
+def test_people_write(texts: list[str], message: r2p.Message) -> None:
+    assert parse(type(message), texts) == message
+
+
+@pytest.mark.parametrize(
+    ("cls", "texts", "complaint"),
+    [
+        (Led, ["valu=1"], "Led has no field valu: it has led, value"),
+        (Led, ["led=-1"], "Led.led takes an integer from 0 to 4294967295, not '-1'"),
+        (Led, ["value=1.5"], "Led.value takes an integer from 0 to 255, not '1.5'"),
+        (Led, ["value="], "Led.value takes an integer from 0 to 255, not nothing"),
+        (Led, ["{led: [1]}"], "Led.led takes an integer from 0 to 4294967295, not a list of 1"),
+        (Led, ["led.x=1"], "Led.led takes an integer from 0 to 4294967295, not a mapping"),
+        (Led, ["{value: nan}"], "Led.value takes an integer from 0 to 255, not 'nan'"),
+        (Led, ["led"], "'led' is no message: write '{x: 1.5, w: 0.25}' or x=1.5 w=0.25"),
+        (Led, ["{led: 1"], "'{led: 1' is no YAML: did not find expected ',' or '}'"),
+        (Led, ["{? [1] : 2}"], "'{? [1] : 2}' is no"),
+        (Velocity3, ["x=1e39"], "Velocity3.x takes a number up to"),
+        (Velocity3, ["x=true"], "Velocity3.x takes a number up to"),
+        (StampedPose3, ["timestamp=5"], "StampedPose3.timestamp takes a mapping of sec, nsec, not '5'"),
+        (StampedPose3, ["timestamp=5", "timestamp.sec=5"], "timestamp.sec: timestamp is given as a value already"),
+        (StampedPose3, ["timestamp.se=5"], "StampedPose3.timestamp has no field se: it has sec, nsec"),
+        (Speed2, ["value=[1]"], "Speed2.value takes a list of 2, not a list of 1"),
+        (Speed2, ["value=[1, x]"], r"Speed2.value[1] takes a number up to"),
+        (Switch, ["on=maybe"], "Switch.on takes true or false, not 'maybe'"),
+        (Switch, ["no=123456789"], "Switch.no takes at most 8 ASCII characters without a NUL, not '123456789'"),
+    ],
+)
+def test_mistakes_are_told(cls: type[r2p.Message], texts: list[str], complaint: str) -> None:
+    with pytest.raises(r2p.MessageError) as caught:
+        parse(cls, texts)
+    assert str(caught.value).startswith(complaint)
+
+
+@pytest.mark.parametrize(
+    "line", ['{"led": 1, "value": true}', '{"led": null}', '{"led": "x"}', "[1]", "{led", '{"led":1}x']
+)
+def test_bad_lines_of_a_stream_are_message_errors(line: str) -> None:
+    with pytest.raises(r2p.MessageError):
+        parse_line(Led, line)
+
+
+@given(st.text())
+def test_any_text_is_a_message_or_a_message_error(text: str) -> None:
+    with contextlib.suppress(r2p.MessageError):
+        parse(Grid, [text])
+    with contextlib.suppress(r2p.MessageError):
+        parse_line(Grid, text)
+
+
+def test_not_a_number_goes_through_as_a_text() -> None:
+    plain = to_plain(IMU(roll=math.nan, pitch=math.inf, yaw=-math.inf))
+    assert [plain[name] for name in ("roll", "pitch", "yaw")] == ["nan", "inf", "-inf"]
+    assert math.isnan(from_plain(IMU, plain).roll)
+
+
+def test_what_meta_adds_is_no_field() -> None:
+    assert parse_line(Led, '{"led": 3, "_": {"topic": "leds"}}') == Led(led=3)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("far", 2.5), ("poses[1].x", 0.5), ("poses[1]", {"x": 0.5, "y": 0.0, "w": 0.0}), ("cells[0][1]", 7)],
+)
+def test_pick(path: str, value: Any) -> None:
+    grid = to_plain(Grid(cells=((0, 7), (0, 0)), poses=(Velocity3(), Velocity3(x=0.5)), far=2.5))
+    assert pick(grid, path) == value
+
+
+@pytest.mark.parametrize("path", ["fat", "poses.x", "cells[2]", "far.x", "poses[0].z"])
+def test_pick_tells_what_there_is(path: str) -> None:
+    with pytest.raises(KeyError, match="there are cells, poses, names, far"):
+        pick(to_plain(Grid()), path)
+    with pytest.raises(KeyError, match=r"there are timestamp\.sec, timestamp\.nsec, x, y, w"):
+        pick(to_plain(StampedPose3()), "z")
