@@ -1,0 +1,243 @@
+"""RTCAN on the wire: identifiers, fragments, the sync frame, and how many bits a frame takes (PROTOCOL.md 6).
+
+    bits 28..23 laxity | 22..7 message id: high byte the topic, low byte the module's id8 | 6..0 fragments left
+
+A frame's length in bits depends on its content: after five equal bits the controller stuffs in a sixth, other one, and
+the CRC is stuffed, too. Counting is done a byte at a time: a table says for each state of the stuffing (which bit came
+last, how often) and each byte which state is next and how many bits were stuffed in.
+"""
+
+from functools import lru_cache
+
+import msgspec
+
+from r2p.errors import DecodeError, MessageError
+
+FRAME_MAX = 8  # bytes in a frame
+PAYLOAD_MAX = 1024  # bytes in a message: 128 fragments
+SLOTS_MAX = 64  # in a cycle: bits in the reservation mask
+
+HRT = 0  # laxity of hard real-time and sync
+SRT_MIN = 1
+SRT_MAX = 62
+NRT = 63
+
+SYNC = 0x00  # high bytes of message ids that are not topics
+MANAGEMENT = 0x01
+FIRST_TOPIC = 0x02
+FIRMWARE_MANAGEMENT = 0x0000  # the message id of management of every module of 2014
+MESSAGE_MASK = 0xFFFF << 7  # a filter for one message id looks at these bits of the identifier
+
+INTERMISSION = 3  # bits between two frames
+TAIL = 10  # bits after the CRC, never stuffed: CRC delimiter, ACK slot, ACK delimiter, end of frame
+
+_MILLISECOND = 1_000_000
+_ALL_SLOTS = (1 << SLOTS_MAX) - 1
+
+
+class Frame(msgspec.Struct, frozen=True, gc=False):
+    """A data frame of CAN 2.0B: its 29-bit identifier and 0 to 8 bytes."""
+
+    id: int
+    data: bytes
+
+
+class Identifier(msgspec.Struct, frozen=True, gc=False):
+    """What the 29 bits say: laxity 0..63, message id 0..0xFFFF, fragments that come after this one 0..127."""
+
+    laxity: int
+    message: int
+    left: int
+
+
+class Sync(msgspec.Struct, frozen=True, gc=False):
+    """What starts a cycle: its counter mod 256, and a mask in which bit i says that slot i is reserved."""
+
+    cycle: int
+    mask: int
+
+
+def encode_identifier(laxity: int, message: int, left: int = 0) -> int:
+    """The 29 bits. Raises `MessageError` when a part does not fit its field."""
+    if not (0 <= laxity <= NRT and 0 <= message <= 0xFFFF and 0 <= left <= 0x7F):
+        raise MessageError(f"laxity {laxity}, message id {message:#x}, {left} fragments left: no identifier has room")
+    return laxity << 23 | message << 7 | left
+
+
+def decode_identifier(identifier: int) -> Identifier:
+    """The parts of 29 bits. Raises `DecodeError` for more."""
+    if identifier >> 29:
+        raise DecodeError(f"{identifier:#x} has more than 29 bits")
+    return Identifier(identifier >> 23, identifier >> 7 & 0xFFFF, identifier & 0x7F)
+
+
+def message_id(high: int, id8: int) -> int:
+    """The id of a topic (or SYNC, MANAGEMENT) at the module `id8`. Raises `MessageError` beyond a byte each."""
+    if not (0 <= high <= 0xFF and 0 <= id8 <= 0xFF):
+        raise MessageError(f"high byte {high}, id8 {id8}: each is a byte")
+    return high << 8 | id8
+
+
+def high_byte(message: int) -> int:
+    """Which topic of its module a message id names."""
+    return message >> 8
+
+
+def id8_of(message: int) -> int:
+    """Which module a message id names."""
+    return message & 0xFF
+
+
+def firmware_message_id(index: int, id8: int) -> int:
+    """The id that firmware of 2014 gives to the topic at this place in its list: only four bits of `index` are left."""
+    return (index & 15) << 12 | (id8 & 15) << 8 | id8 & 0xFF
+
+
+def srt_laxity(remaining: int) -> int:
+    """The laxity of a soft real-time message with `remaining` ns to its deadline, which may be over: 1..62."""
+    return min(max(remaining // _MILLISECOND, SRT_MIN), SRT_MAX)
+
+
+def fragment_count(size: int) -> int:
+    """How many frames carry `size` bytes. Raises `MessageError` beyond 1..1024."""
+    if not 1 <= size <= PAYLOAD_MAX:
+        raise MessageError(f"RTCAN carries 1 to {PAYLOAD_MAX} bytes in a message, not {size}")
+    return (size + FRAME_MAX - 1) // FRAME_MAX
+
+
+def fragments(payload: bytes) -> list[tuple[int, bytes]]:
+    """The frames of a message, in order, as (fragments left, data). Raises `MessageError` beyond 1..1024 bytes."""
+    count = fragment_count(len(payload))
+    if count == 1:
+        return [(0, payload)]
+    return [(count - 1 - i, payload[FRAME_MAX * i : FRAME_MAX * (i + 1)]) for i in range(count)]
+
+
+def encode_sync(cycle: int, mask: int) -> Frame:
+    """The frame that starts a cycle; of the counter 8 bits are left. Raises `MessageError` for a slot beyond 63."""
+    if mask & ~_ALL_SLOTS:
+        raise MessageError(f"reservation mask {mask:#x}: a cycle has at most {SLOTS_MAX} slots")
+    return Frame((cycle & 0xFF) << 7, mask.to_bytes(8, "little"))
+
+
+def decode_sync(frame: Frame) -> Sync:
+    """What the master says. Raises `DecodeError` when this is no sync frame."""
+    if not is_sync(frame.id) or len(frame.data) != FRAME_MAX:
+        raise DecodeError(f"{frame.id:#010x} with {len(frame.data)} bytes is no sync frame")
+    return Sync(frame.id >> 7, int.from_bytes(frame.data, "little"))
+
+
+def is_sync(identifier: int) -> bool:
+    """Laxity 0, high byte 0, no fragments left. With another laxity it is management of firmware without HRT."""
+    return not identifier & ~(0xFF << 7)
+
+
+def frame_bits_min(size: int) -> int:
+    """No frame with `size` bytes of data is shorter: nothing stuffed in. Without intermission."""
+    return _HEADER + 8 * size + _CRC + TAIL
+
+
+def frame_bits_max(size: int) -> int:
+    """No frame with `size` bytes of data is longer: after the first bit, every fourth has one stuffed in."""
+    return frame_bits_min(size) + (_HEADER + 8 * size + _CRC - 1) // 4
+
+
+@lru_cache(maxsize=4096)
+def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
+    """How many bits a data frame takes from its start to its end, those stuffed in included, without intermission.
+
+    `extended=False` is for frames with 11-bit identifiers, which only others send. Raises `MessageError` when the
+    identifier or the data are too long.
+    """
+    state, crc, bits = _header(identifier, len(data), extended)
+    for byte in data:
+        step = _STUFFING[state << 8 | byte]
+        state = step & 7
+        bits += 8 + (step >> 3)
+        crc = (crc << 8 ^ _REMAINDERS[crc >> 7 ^ byte]) & 0x7FFF
+    high = _STUFFING[state << 8 | crc >> 7]
+    low = _stuff(high & 7, crc & 0x7F, 7)
+    return bits + _CRC + (high >> 3) + (low >> 3) + TAIL
+
+
+@lru_cache(maxsize=4096)
+def bits_until_lost(winner: int, loser: int) -> int:
+    """Bits from the start of frame to the end of the one where `loser` gives up: the first in which the two differ.
+
+    Both are 29-bit identifiers, `winner` the lower one.
+    """
+    bit = (winner ^ loser).bit_length() - 1
+    before = 29 - bit if bit > 17 else 31 - bit  # SRR and IDE are sent between bits 18 and 17
+    return before + (_stuff(_START, _arbitration(winner) >> 32 - before, before) >> 3) + 1
+
+
+def wire_bits(frame: Frame) -> str:
+    """The bits of a frame as its sender sends them, `0` dominant, with those stuffed in. Slow: for looking closely."""
+    count = _HEADER + 8 * len(frame.data)
+    bits = (_arbitration(frame.id) << 7 | len(frame.data)) << 8 * len(frame.data) | int.from_bytes(frame.data, "big")
+    bits, count = bits << _CRC | _crc(bits.to_bytes(13, "big")), count + _CRC
+    sent = ""
+    state = _START
+    for bit in f"{bits:0{count}b}":
+        step = _stuff(state, int(bit), 1)
+        state = step & 7
+        sent += bit + str(state >> 2) * (step >> 3)
+    return sent + "1" * TAIL
+
+
+# How bits are counted. The state of the stuffing is (the last bit) << 2 | (how many of it there were) - 1.
+
+_HEADER = 39  # bits: start of frame, 11 of the identifier, SRR, IDE, 18 of the identifier, RTR, 2 reserved, 4 of length
+_CRC = 15
+_START = 1 << 2  # before a frame the bus is recessive; the start of frame is dominant, so how long does not matter
+
+
+def _arbitration(identifier: int) -> int:
+    """The 32 bits from the start of frame to the end of the identifier."""
+    return identifier >> 18 << 20 | 0b11 << 18 | identifier & 0x3FFFF
+
+
+@lru_cache(maxsize=4096)
+def _header(identifier: int, size: int, extended: bool) -> tuple[int, int, int]:
+    """What the bits before the data leave: state of the stuffing, CRC, bits so far."""
+    if identifier >> (29 if extended else 11) or size > FRAME_MAX:
+        raise MessageError(f"identifier {identifier:#x} with {size} bytes: no frame has room")
+    bits = _arbitration(identifier) << 7 | size if extended else identifier << 7 | size
+    count = _HEADER if extended else _HEADER - 20
+    step = _stuff(_START, bits, count)
+    return step & 7, _crc(bits.to_bytes(5, "big")), count + (step >> 3)
+
+
+def _crc(data: bytes) -> int:
+    """CRC-15. Zeros in front leave it as it is."""
+    crc = 0
+    for byte in data:
+        crc = (crc << 8 ^ _REMAINDERS[crc >> 7 ^ byte]) & 0x7FFF
+    return crc
+
+
+def _stuff(state: int, bits: int, count: int) -> int:
+    """Send `count` bits: (how many were stuffed in) << 3 | the state after them."""
+    stuffed = 0
+    for shift in range(count - 1, -1, -1):
+        bit = bits >> shift & 1
+        if bit != state >> 2:
+            state = bit << 2
+        elif state & 3 == 3:
+            stuffed += 1
+            state = (bit ^ 1) << 2
+        else:
+            state += 1
+    return stuffed << 3 | state
+
+
+def _remainder(byte: int) -> int:
+    """What CRC-15 makes of one byte."""
+    crc = byte << 7
+    for _ in range(8):
+        crc = crc << 1 ^ (0x4599 if crc & 0x4000 else 0)
+    return crc & 0x7FFF
+
+
+_STUFFING = tuple(_stuff(state, byte, 8) for state in range(8) for byte in range(256))
+_REMAINDERS = tuple(_remainder(byte) for byte in range(256))

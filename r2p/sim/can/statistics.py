@@ -1,0 +1,69 @@
+"""What the bus carried. It counts records, so it serves for any bus that somebody writes records of."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+from r2p.codecs.rtcan import INTERMISSION
+
+if TYPE_CHECKING:
+    from r2p.sim.can.node import Record
+
+
+class Count:
+    """`frames` that got through and their `bits` (stuffed ones included, without intermission), and what did not."""
+
+    __slots__ = ("bits", "error_bits", "errors", "frames", "lost")
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.bits = 0
+        self.errors = 0  # attempts that ended with an error frame
+        self.error_bits = 0  # ... and the bits they took, error frame included
+        self.lost = 0  # arbitrations lost
+
+    @property
+    def occupied(self) -> int:
+        """Bit times that nobody else could use: everything, with the intermission that follows."""
+        return self.bits + self.error_bits + INTERMISSION * (self.frames + self.errors)
+
+    def add(self, bits: int, failed: bool) -> None:
+        """Count one attempt."""
+        if failed:
+            self.errors += 1
+            self.error_bits += bits
+        else:
+            self.frames += 1
+            self.bits += bits
+
+
+class Statistics:
+    """Counts in all, by message id and by node. A frame that several nodes sent as one counts for each of them."""
+
+    def __init__(self, bit: int, since: int) -> None:
+        """`bit` is the length of one, and `since` the instant from which the load counts, in ns."""
+        self.total = Count()
+        self.by_message: defaultdict[int, Count] = defaultdict(Count)
+        self.by_node: defaultdict[str, Count] = defaultdict(Count)
+        self.since = since
+        self._bit = bit
+
+    def add(self, record: Record) -> None:
+        """Count one attempt."""
+        failed = record.error is not None
+        self.total.add(record.bits, failed)
+        self.by_message[record.frame.id >> 7 & 0xFFFF].add(record.bits, failed)
+        for name in record.senders:
+            self.by_node[name].add(record.bits, failed)
+
+    def add_lost(self, name: str, identifier: int) -> None:
+        """Count an arbitration that this node lost with this identifier."""
+        self.total.lost += 1
+        self.by_message[identifier >> 7 & 0xFFFF].lost += 1
+        self.by_node[name].lost += 1
+
+    def load(self, now: int) -> float:
+        """The share of the time up to `now` in which the bus was occupied: 1.0 is saturated."""
+        elapsed = now - self.since
+        return self.total.occupied * self._bit / elapsed if elapsed > 0 else 0.0

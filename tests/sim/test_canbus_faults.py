@@ -1,0 +1,583 @@
+"""The simulated CAN bus with faults: error frames and counters, collisions, nodes that die or go mad, bus-off."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from r2p.codecs.rtcan import Frame, encode_identifier, wire_bits
+from r2p.sim.can import CanBus, CanController, CanNode, ErrorKind, Record, State
+from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
+
+BIT = 1000  # ns at 1 Mbit/s
+GAP = 3 * BIT
+DELIMITER = 8
+SEQUENCE = 11 * BIT
+
+FRAME = Frame(encode_identifier(10, 0x0205), b"whatever")
+OTHER = Frame(encode_identifier(20, 0x0206), b"anything")
+
+
+def bits(frame: Frame) -> int:
+    return len(wire_bits(frame))
+
+
+class Watch:
+    """Writes down what its controllers hear, and what the bus did."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.bus = CanBus(asyncio.get_running_loop(), **settings)
+        self.records: list[Record] = []
+        self.heard: list[tuple[Any, ...]] = []
+        self.bus.observers.append(self.records.append)
+
+    def attach(self, name: str, **settings: Any) -> CanController:
+        controller = self.bus.attach(CanNode(name, **settings))
+
+        def write(what: str) -> Any:
+            return lambda *args: self.heard.append((what, name, *args))
+
+        controller.on_receive = write("received")
+        controller.on_sent = write("sent")
+        controller.on_lost = write("lost")
+        controller.on_error = write("error")
+        controller.on_state = write("state")
+        return controller
+
+    def of(self, what: str) -> list[tuple[Any, ...]]:
+        return [entry[1:] for entry in self.heard if entry[0] == what]
+
+    @property
+    def outcomes(self) -> list[tuple[Frame, ErrorKind | None]]:
+        return [(record.frame, record.error) for record in self.records]
+
+
+async def at(watch: Watch, instant: int) -> None:
+    await asyncio.sleep((instant - watch.bus.timeline.now()) / 1e9)
+
+
+def counters(controller: CanController) -> tuple[int, int]:
+    return controller.transmit_errors, controller.receive_errors
+
+
+# Error frames
+
+
+def test_how_long_error_flags_overlap() -> None:
+    wire = wire_bits(FRAME)
+    assert error_frame_bits("0101", wire, active=True, others=False) == 6 + 8  # nobody else to notice
+    assert error_frame_bits("0101", wire, active=True, others=True) == 12 + 8  # noticed with the 6th dominant bit
+    assert error_frame_bits("0100", wire, active=True, others=True) == 10 + 8  # two were dominant before the flag
+    assert error_frame_bits("0" * 6, wire, active=True, others=True) == 6 + 8  # noticed by all at once
+    assert error_frame_bits("0101", wire, active=False, others=True) == 11 + 8  # silence: the sixth recessive bit
+    assert error_frame_bits(wire[:-8], wire, active=True, others=True) == 7 + 8  # after the CRC the first bit says it
+    assert bits_until_noticed("0" * 9, wire, "0") == 0
+
+
+def test_flip_and_first_difference() -> None:
+    assert (flip("0110", 2), flip("0110", 4)) == ("00", "0111")
+    assert first_difference(["0110", "0101"]) == 3
+    assert first_difference(["0110", "0110", "1"]) == 1
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("bit", [1, 20, 50, 90])
+async def test_a_bit_error_destroys_the_frame_and_it_is_sent_again(bit: int) -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    watch.bus.disturb_next(bit)
+    a.request(FRAME)
+    await asyncio.sleep(0.01)
+    level = "1" if wire_bits(FRAME)[bit - 1] == "0" else "0"
+    seen = wire_bits(FRAME)[: bit - 1] + level
+    dominant = len(seen) - len(seen.rstrip("0"))
+    error = Record(
+        0, (bit + 12 - dominant + DELIMITER) * BIT, FRAME, ("A",), bit + 12 - dominant + DELIMITER, ErrorKind.BIT
+    )
+    assert watch.records[0] == error
+    again = error.end + GAP
+    assert watch.records[1:] == [Record(again, again + bits(FRAME) * BIT, FRAME, ("A",), bits(FRAME), None)]
+    assert watch.heard == [("sent", "A", FRAME, watch.records[1].end), ("received", "B", FRAME, watch.records[1].end)]
+    assert (counters(a), counters(b)) == ((7, 0), (0, 0))  # +8 and +1, and each -1 for the frame that got through
+    total = watch.bus.statistics.total
+    assert (total.errors, total.error_bits, total.frames) == (1, error.bits, 1)
+
+
+@pytest.mark.virtual_time
+async def test_one_shot_reports_an_error_and_gives_up() -> None:
+    watch = Watch()
+    a, b = watch.attach("A", one_shot=True), watch.attach("B")
+    watch.bus.disturb_next(40)
+    a.request(FRAME)
+    await asyncio.sleep(0.01)
+    assert watch.heard == [("error", "A", FRAME, ErrorKind.BIT, 40 * BIT)]
+    assert a.pending() is None
+    assert (counters(a), counters(b)) == ((8, 0), (0, 1))
+
+
+@pytest.mark.virtual_time
+async def test_noise_hits_its_share_of_frames() -> None:
+    watch = Watch(noise=0.05)
+    a = watch.attach("A", one_shot=True)
+    watch.attach("B")
+    for number in range(1000):
+        await at(watch, number * 300_000)
+        a.request(FRAME)
+    await asyncio.sleep(0.01)
+    failed = [record for record in watch.records if record.error]
+    assert len(watch.records) == 1000
+    assert 25 < len(failed) < 80
+    assert len({record.bits for record in failed}) > 15  # anywhere in the frame
+
+
+@pytest.mark.virtual_time
+async def test_noise_at_one_node_destroys_frames_for_all_until_it_is_error_passive() -> None:
+    watch = Watch()
+    a, deaf = watch.attach("A"), watch.attach("deaf", noise=1.0)
+    good = watch.attach("good")
+    a.request(FRAME)
+    await asyncio.sleep(0.1)
+    assert deaf.state is State.PASSIVE
+    assert watch.outcomes == [(FRAME, ErrorKind.BIT)] * (len(watch.records) - 1) + [(FRAME, None)]
+    assert [name for name, *_ in watch.of("received")] == ["good"]
+    assert good.receive_errors == len(watch.records) - 2
+
+
+@pytest.mark.virtual_time
+async def test_without_another_node_nobody_acknowledges() -> None:
+    watch = Watch()
+    a = watch.attach("A", one_shot=True)
+    a.request(FRAME)
+    await asyncio.sleep(0.01)
+    known = bits(FRAME) - 8  # the acknowledge slot is the 9th bit from the end
+    assert watch.heard == [("error", "A", FRAME, ErrorKind.ACK, known * BIT)]
+    assert watch.records == [Record(0, (known + 14) * BIT, FRAME, ("A",), known + 14, ErrorKind.ACK)]
+
+
+@pytest.mark.virtual_time
+async def test_a_lone_node_tries_for_ever_and_never_goes_to_bus_off() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    b.power_off()
+    a.request(FRAME)
+    await asyncio.sleep(1)
+    assert (a.state, a.transmit_errors) == (State.PASSIVE, 128)
+    assert len(watch.records) > 4000
+    b.power_on()
+    await asyncio.sleep(0.001)
+    assert [frame for _, frame, _ in watch.of("received")] == [FRAME]
+    assert a.state is State.ACTIVE
+    assert [state for name, state, _ in watch.of("state") if name == "A"] == [State.PASSIVE, State.ACTIVE]
+
+
+@pytest.mark.virtual_time
+async def test_an_error_passive_sender_waits_8_bits_longer() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    a.transmit_errors = 200
+    for box in range(2):
+        a.request(FRAME, box)
+    await asyncio.sleep(0.01)
+    first, second = watch.records
+    assert second.start - first.end == GAP + 8 * BIT
+    assert a.state is State.PASSIVE
+    b.request(OTHER)
+    await asyncio.sleep(0.001)
+    assert b.state is State.ACTIVE
+
+
+# Collisions
+
+
+def colliding(*data: bytes) -> list[Frame]:
+    return [Frame(encode_identifier(50, 0x0000), part) for part in data]
+
+
+@pytest.mark.virtual_time
+async def test_one_identifier_with_other_data_is_a_bit_error_for_both() -> None:
+    watch = Watch()
+    a, b, c = (watch.attach(name, one_shot=True) for name in "ABC")
+    first, second = colliding(bytes([0x55] * 8), bytes([0x55] * 3 + [0x54] + [0x55] * 4))
+    a.request(first)
+    b.request(second)
+    await asyncio.sleep(0.01)
+    differs = next(
+        i for i, levels in enumerate(zip(wire_bits(first), wire_bits(second), strict=False)) if len(set(levels)) > 1
+    )
+    known = (differs + 1) * BIT
+    assert watch.heard == [("error", "A", first, ErrorKind.BIT, known), ("error", "B", second, ErrorKind.BIT, known)]
+    (record,) = watch.records
+    assert (record.senders, record.error) == (("A", "B"), ErrorKind.BIT)
+    assert [counters(node) for node in (a, b, c)] == [(8, 0), (8, 0), (0, 1)]
+
+
+@pytest.mark.virtual_time
+async def test_a_collision_of_lengths() -> None:
+    watch = Watch()
+    a, b = (watch.attach(name, one_shot=True) for name in "AB")
+    for controller, frame in zip((a, b), colliding(b"12", b"123"), strict=True):
+        controller.request(frame)
+    await asyncio.sleep(0.01)
+    assert [kind for _, _, kind, _ in watch.of("error")] == [ErrorKind.BIT, ErrorKind.BIT]
+
+
+@pytest.mark.virtual_time
+async def test_colliding_for_ever_ends_when_the_one_that_sees_it_is_error_passive() -> None:
+    watch = Watch()
+    a, b, _ = (watch.attach(name) for name in "ABC")
+    recessive, dominant = colliding(b"\xff", b"\x0f")
+    a.request(recessive)
+    b.request(dominant)
+    await asyncio.sleep(0.1)
+    *collisions, first, second = watch.outcomes
+    assert len(collisions) == 16  # 8 each, up to 128: error passive
+    assert {kind for _, kind in collisions} == {ErrorKind.BIT}
+    assert (first, second) == ((dominant, None), (recessive, None))
+    assert [frame for name, frame, _ in watch.of("received") if name == "C"] == [dominant, recessive]
+    assert a.transmit_errors == 16 * 8 + 8 - 1
+    assert b.transmit_errors == 16 * 8 - 1
+
+
+@pytest.mark.virtual_time
+async def test_error_passive_colliders_do_not_acknowledge() -> None:
+    watch = Watch()
+    a, b = watch.attach("A", one_shot=True), watch.attach("B", one_shot=True)
+    a.transmit_errors = b.transmit_errors = 150
+    a.disturbed(0)
+    b.disturbed(0)
+    for controller, frame in zip((a, b), colliding(b"\xff", b"\x0f"), strict=True):
+        controller.request(frame)
+    await asyncio.sleep(0.1)
+    assert [(name, kind) for name, _, kind, _ in watch.of("error")] == [("A", ErrorKind.BIT), ("B", ErrorKind.ACK)]
+
+
+@pytest.mark.virtual_time
+async def test_the_error_passive_ones_leave_one_after_the_other() -> None:
+    watch = Watch()
+    nodes = [watch.attach(name, one_shot=True) for name in "ABC"]
+    watch.attach("D")
+    for node, frame in zip(nodes, colliding(b"\x80", b"\x01", b"\x00"), strict=True):
+        node.transmit_errors = 150
+        node.disturbed(0)
+        node.request(frame)
+    await asyncio.sleep(0.01)
+    assert [name for name, *_ in watch.of("error")] == ["A", "B"]
+    assert [(name, frame.data) for name, frame, _ in watch.of("received")] == [("D", b"\x00")]
+
+
+# Nodes that lose, go mad, die
+
+
+@pytest.mark.virtual_time
+async def test_a_receiver_can_lose_frames_alone() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    watch.attach("C")
+    b.lose_next(2)
+    for box in range(3):
+        a.request(Frame(FRAME.id + box, b""), box)
+    await asyncio.sleep(0.01)
+    assert [frame.id - FRAME.id for name, frame, _ in watch.of("received") if name == "B"] == [2]
+    assert [frame.id - FRAME.id for name, frame, _ in watch.of("received") if name == "C"] == [0, 1, 2]
+    assert len(watch.of("sent")) == 3
+    assert (b.missed, counters(b)) == (2, (0, 0))
+
+
+@pytest.mark.virtual_time
+async def test_a_share_of_frames_is_lost() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B", loss=0.25)
+    for number in range(1000):
+        await at(watch, number * 300_000)
+        a.request(FRAME)
+    await asyncio.sleep(0.01)
+    assert 200 < b.missed < 300
+    assert len(watch.of("received")) == 1000 - b.missed
+
+
+@pytest.mark.virtual_time
+async def test_a_babbling_node_takes_the_bus() -> None:
+    watch = Watch()
+    mad, b = watch.attach("mad"), watch.attach("B")
+    one_shot = watch.attach("C", one_shot=True)
+    mad.babble(Frame(0, b""))
+    b.request(FRAME)
+    one_shot.request(OTHER)
+    await asyncio.sleep(0.1)
+    assert {record.senders for record in watch.records} == {("mad",)}
+    assert watch.bus.load() > 0.99
+    assert [name for name, *_ in watch.of("lost")] == ["C"]
+    assert not watch.of("sent")  # its software knows nothing of it
+    mad.babble(None)
+    await asyncio.sleep(0.001)
+    assert watch.outcomes[-1] == (FRAME, None)
+
+
+@pytest.mark.virtual_time
+async def test_a_babbling_node_comes_back_from_bus_off_as_mad_as_before() -> None:
+    watch = Watch(noise=1.0)
+    mad = watch.attach("mad")
+    watch.attach("B")
+    mad.babble(FRAME)
+    await asyncio.sleep(0.1)
+    states = [state for name, state, _ in watch.of("state") if name == "mad"]
+    assert states[:4] == [State.PASSIVE, State.BUS_OFF, State.ACTIVE, State.PASSIVE]
+    assert not watch.of("error")
+    mad.power_off()
+    await asyncio.sleep(0.001)
+    mad.power_on()
+    before = len(watch.records)
+    await asyncio.sleep(0.01)
+    assert len(watch.records) == before
+
+
+@pytest.mark.virtual_time
+async def test_a_node_that_dies_in_the_middle_of_its_frame() -> None:
+    watch = Watch()
+    a, b, _ = (watch.attach(name) for name in "ABC")
+    a.request(FRAME)
+    await at(watch, 59 * BIT + 1)
+    a.power_off()
+    b.request(OTHER)
+    await asyncio.sleep(0.01)
+    sent = wire_bits(FRAME)[:60]
+    silent = 6 - (len(sent) - len(sent.rstrip("1")))
+    taken = 60 + silent + 6 + DELIMITER  # all receivers notice at once
+    assert watch.records[0] == Record(0, taken * BIT, FRAME, ("A",), taken, ErrorKind.STUFF)
+    assert watch.records[1].start == taken * BIT + GAP
+    assert watch.heard == [
+        ("sent", "B", OTHER, watch.records[1].end),
+        ("received", "C", OTHER, watch.records[1].end),
+    ]
+    assert b.receive_errors == 1
+    assert a.state is State.DOWN
+    assert not a.request(FRAME)
+
+
+@pytest.mark.virtual_time
+async def test_a_node_that_dies_after_its_frame_was_acknowledged() -> None:
+    watch = Watch()
+    a, _ = watch.attach("A"), watch.attach("B")
+    a.request(FRAME)
+    await at(watch, (bits(FRAME) - 7) * BIT)
+    a.power_off()
+    await asyncio.sleep(0.01)
+    assert watch.heard == [("received", "B", FRAME, bits(FRAME) * BIT)]
+
+
+@pytest.mark.virtual_time
+async def test_a_node_that_dies_while_it_is_decided_who_sends() -> None:
+    watch = Watch()
+    a, b, _ = (watch.attach(name) for name in "ABC")
+    a.request(FRAME)
+    b.request(OTHER)
+    await at(watch, BIT // 2)
+    a.power_off()
+    await asyncio.sleep(0.01)
+    assert watch.outcomes == [(OTHER, None)]
+
+
+@pytest.mark.virtual_time
+async def test_one_of_two_senders_of_the_same_dies() -> None:
+    watch = Watch()
+    a, b, _ = (watch.attach(name) for name in "ABC")
+    a.request(FRAME)
+    b.request(FRAME)
+    await at(watch, 50 * BIT)
+    a.power_off()
+    await asyncio.sleep(0.01)
+    assert watch.outcomes == [(FRAME, None)]
+    assert watch.of("sent") == [("B", FRAME, bits(FRAME) * BIT)]
+
+
+@pytest.mark.virtual_time
+async def test_the_only_receiver_dies_before_it_could_acknowledge() -> None:
+    watch = Watch()
+    a, b = watch.attach("A", one_shot=True), watch.attach("B")
+    a.request(FRAME)
+    await at(watch, 50 * BIT)
+    b.power_off()
+    await asyncio.sleep(0.01)
+    assert watch.heard == [("error", "A", FRAME, ErrorKind.ACK, (bits(FRAME) - 8) * BIT)]
+
+
+@pytest.mark.virtual_time
+async def test_the_only_receiver_dies_after_it_has_acknowledged() -> None:
+    watch = Watch()
+    a, b = watch.attach("A", one_shot=True), watch.attach("B")
+    a.request(FRAME)
+    await at(watch, (bits(FRAME) - 7) * BIT)
+    b.power_off()
+    await asyncio.sleep(0.01)
+    assert watch.heard == [("sent", "A", FRAME, bits(FRAME) * BIT)]
+
+
+@pytest.mark.virtual_time
+async def test_everybody_dies() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    a.request(FRAME)
+    await at(watch, 50 * BIT)
+    b.power_off()
+    a.power_off()
+    a.power_off()
+    await asyncio.sleep(0.01)
+    assert not watch.heard
+    a.power_on()
+    b.power_on()
+    a.request(OTHER)
+    await asyncio.sleep(0.01)
+    assert [name for name, *_ in watch.of("received")] == ["B"]
+
+
+@pytest.mark.virtual_time
+async def test_a_node_that_returns_is_new_and_waits_for_11_recessive_bits() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    a.request(FRAME)
+    a.transmit_errors = 100
+    a.power_off()
+    await at(watch, 1_000_000)
+    a.power_on()
+    assert counters(a) == (0, 0)
+    assert a.pending() is None
+    a.request(OTHER)
+    await asyncio.sleep(0.001)
+    assert [(record.start, record.frame) for record in watch.records] == [(1_000_000 + SEQUENCE, OTHER)]
+    assert watch.of("received") == [("B", OTHER, watch.records[0].end)]
+    assert b.state is State.ACTIVE
+
+
+@pytest.mark.virtual_time
+async def test_what_a_node_was_about_to_hear_dies_with_it() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    b.on_receive = lambda *_: b.power_off()
+    a.on_sent = lambda *_: None
+    watch.attach("C").on_receive = lambda *_: a.power_off()
+    a.request(FRAME)
+    a.request(OTHER, 1)
+    await asyncio.sleep(0.01)
+    assert watch.outcomes == [(FRAME, None)]
+
+
+# Bus-off
+
+
+async def into_bus_off(watch: Watch, node: CanController) -> None:
+    node.transmit_errors = 255
+    watch.bus.disturb_next(30)
+    node.request(FRAME)
+    await asyncio.sleep(0.000_2)
+    assert node.state is State.BUS_OFF
+
+
+@pytest.mark.virtual_time
+async def test_bus_off_gives_up_what_is_pending() -> None:
+    watch = Watch()
+    a, _ = watch.attach("A", recovery=False), watch.attach("B")
+    a.request(OTHER, 1)
+    await into_bus_off(watch, a)
+    assert [(frame, kind) for _, frame, kind, _ in watch.of("error")] == [
+        (OTHER, ErrorKind.BUS_OFF),
+        (FRAME, ErrorKind.BUS_OFF),
+    ]
+    assert not a.request(FRAME)
+    await asyncio.sleep(1)
+    assert a.state is State.BUS_OFF
+
+
+@pytest.mark.virtual_time
+async def test_recovery_on_an_idle_bus_takes_128_times_11_bits() -> None:
+    watch = Watch()
+    a, _ = watch.attach("A"), watch.attach("B")
+    write = a.on_state
+
+    def again(state: State, stamp: int) -> None:
+        write(state, stamp)
+        a.request(OTHER)
+
+    a.on_state = again
+    await into_bus_off(watch, a)
+    await asyncio.sleep(0.01)
+    record, after = watch.records
+    # the delimiter and the intermission of the error frame are the first time
+    assert watch.of("state")[-1] == ("A", State.ACTIVE, record.end + GAP + 127 * SEQUENCE)
+    assert counters(a) == (0, 0)
+    assert (after.start, after.error) == (record.end + GAP + 127 * SEQUENCE, None)
+
+
+@pytest.mark.virtual_time
+async def test_recovery_on_a_saturated_bus_takes_128_frames() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    watch.attach("C")
+    b.babble(OTHER)
+    await into_bus_off(watch, a)
+    failed = next(number for number, record in enumerate(watch.records) if record.error)
+    await asyncio.sleep(0.1)
+    *_, (_, state, recovered) = [entry for entry in watch.of("state") if entry[0] == "A"]
+    assert (state, recovered) == (State.ACTIVE, watch.records[failed + 127].end + GAP)
+
+
+@pytest.mark.virtual_time
+async def test_recovery_counts_the_idle_time_between_frames() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    watch.attach("C")
+    await into_bus_off(watch, a)
+    first = watch.records[0]
+    began = first.end + GAP + 50 * SEQUENCE + SEQUENCE // 2
+    await at(watch, began)
+    b.request(OTHER)
+    await asyncio.sleep(0.01)
+    *_, (_, state, recovered) = watch.of("state")
+    # 1 in the error frame, 50 idle, half of one broken off, 1 in the frame
+    assert (state, recovered) == (State.ACTIVE, watch.records[1].end + GAP + (128 - 52) * SEQUENCE)
+
+
+@pytest.mark.virtual_time
+async def test_restart_by_hand_and_death_in_bus_off() -> None:
+    watch = Watch()
+    a, _ = watch.attach("A", recovery=False), watch.attach("B")
+    a.restart()  # nothing to do
+    await into_bus_off(watch, a)
+    await asyncio.sleep(0.1)
+    a.restart()
+    await asyncio.sleep(0.1)
+    assert watch.of("state")[-1][:2] == ("A", State.ACTIVE)
+    await into_bus_off(watch, a)
+    a.restart()
+    a.power_off()
+    await asyncio.sleep(0.1)
+    assert not a.live
+    assert watch.of("state")[-1][:2] == ("A", State.BUS_OFF)
+
+
+@pytest.mark.virtual_time
+async def test_a_noisy_bus_drives_its_senders_to_bus_off() -> None:
+    watch = Watch(noise=1.0)
+    a, b = watch.attach("A"), watch.attach("B")
+    a.request(FRAME)
+    await asyncio.sleep(0.02)
+    assert [state for name, state, _ in watch.of("state") if name == "A"][:2] == [State.PASSIVE, State.BUS_OFF]
+    assert len(watch.records) == 32  # 8 for each, over 255
+    assert b.receive_errors == 32
+    watch.bus.noise = 0.0  # it can be set at any time
+    for _ in range(40):
+        a.request(FRAME)
+        await asyncio.sleep(0.001)
+    assert b.receive_errors == 0
+
+
+@pytest.mark.virtual_time
+async def test_a_good_frame_takes_the_receive_counter_back_below_passive() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    b.disturbed(200)
+    assert b.state is State.PASSIVE
+    a.request(FRAME)
+    await asyncio.sleep(0.001)
+    assert (b.receive_errors, b.state) == (119, State.ACTIVE)
