@@ -1,0 +1,86 @@
+"""The reference is complete: every public name, every command with its options, every counter; and the site builds."""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import r2p
+from r2p.codecs import debug
+from r2p.tools import main
+from tests.docs.blocks import ROOT, pages
+
+REFERENCE = ROOT / "docs" / "reference"
+COMMAND = ROOT / "docs" / "command.md"
+GUARANTEES = ROOT / "docs" / "guarantees.md"
+
+_ENTRY = re.compile(r"^::: r2p\.(\S+)$", re.MULTILINE)
+_REASON = re.compile(r'(?:lost|counts)\["([^"]+)"\]|_put\(.*"([^"]+)"\)')
+_LINK = re.compile(r"!?\[[^]]*\]\(([^)\s]+)\)")
+
+
+def test_every_public_name_has_an_entry() -> None:
+    entries = [entry for page in REFERENCE.glob("*.md") for entry in _ENTRY.findall(page.read_text())]
+    assert len(entries) == len(set(entries))
+    public = {"run.run" if name == "run" else name for name in r2p.__all__}  # r2p.run is a module, too
+    assert public - set(entries) == set()
+    others = {name for name in entries if "." not in name} - public
+    assert others == {"messages", "errors", "msg", "testing", "codecs"}
+
+
+def _commands() -> Iterator[tuple[str, Any]]:
+    """All commands by the heading that they have."""
+    for name in main.GROUPS | main.COMMANDS:
+        command = main._load(name)
+        if name in main.GROUPS:
+            yield from ((f"r2p {name} {inner}", each) for inner, each in command.commands.items())
+        else:
+            yield f"r2p {name}", command
+
+
+@pytest.mark.parametrize(("heading", "command"), list(_commands()))
+def test_every_option_of_every_command_is_told(heading: str, command: Any) -> None:
+    sections = re.split(r"^## ", COMMAND.read_text(), flags=re.MULTILINE)
+    own = [section for section in sections if section.startswith(f"{heading}\n")]
+    assert own, f"no section {heading}"
+    told = set(re.findall(r"(?<![\w-])--?[a-z][a-z-]*", own[0] + sections[1]))
+    options = {name for each in command.params for name in each.opts if name.startswith("-")}
+    assert options <= told | {"--help", "-h"}
+
+
+def test_no_section_tells_of_a_command_that_is_gone() -> None:
+    told = set(re.findall(r"^## (r2p \S.*)$", COMMAND.read_text(), flags=re.MULTILINE)) - {"r2p.toml"}
+    assert told == {heading for heading, _ in _commands()}
+
+
+def test_every_reason_of_a_loss_is_told() -> None:
+    """Reasons are found in the code by how it counts them; those of lines in the docstring that lists them."""
+    code = [*(ROOT / "r2p" / "transports").glob("*.py"), *(ROOT / "r2p" / "protocols").glob("*.py")]
+    reasons = {one or other for file in code for one, other in _REASON.findall(file.read_text())}
+    for row in re.findall(r"^ *\| ([a-z, ]+) \|", debug.Reader.__doc__ or "", re.MULTILINE):
+        reasons.update(row.split(", "))
+    assert {"link down", "too many peers", "topics forgotten", "checksum", "bad name"} <= reasons
+    told = set(re.findall(r"`([^`\n]+)`", GUARANTEES.read_text()))
+    assert reasons - {"reason"} - told == set()
+
+
+@pytest.mark.parametrize("page", pages()[:2], ids=lambda page: page.name)
+def test_links_of_the_pages_outside_of_docs_lead_somewhere(page: Path) -> None:
+    links = [link.partition("#")[0] for link in _LINK.findall(page.read_text()) if "://" not in link]
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+@pytest.mark.processes
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    """Strictly: a broken link, a page without a place, a name that is not there are errors."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    built = subprocess.run(
+        command, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, timeout=120
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert (tmp_path / "reference" / "nodes" / "index.html").exists()

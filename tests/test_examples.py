@@ -1,0 +1,121 @@
+"""The examples: short, whole programs that do what they say.
+
+They run under virtual time, on a network in memory; `serial_cable.py` at a pseudo terminal, in real time.
+"""
+
+import asyncio
+import csv
+import inspect
+import io
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import r2p
+from r2p.msg import Led
+from r2p.sim.modules import FirmwareModule, Powered, Subscribes
+from r2p.tools.run import load
+
+EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
+LONGEST = 60
+
+
+def _example(name: str) -> dict[str, Any]:
+    return runpy.run_path(str(EXAMPLES[0].parent / f"{name}.py"))
+
+
+async def _run_for(seconds: float, *functions: Any) -> None:
+    async with r2p.Module("PC1") as module:
+        for function in functions:
+            module.start(function)
+        await asyncio.sleep(seconds)
+
+
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
+def test_it_is_short_and_says_what_it_is_for(file: Path) -> None:
+    text = file.read_text()
+    assert text.startswith('"""')
+    assert len(text.splitlines()) <= LONGEST
+
+
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
+def test_the_command_runs_its_nodes(file: Path) -> None:
+    """Those that take a node and nothing else; their names fit."""
+    functions = inspect.getmembers(SimpleNamespace(**runpy.run_path(str(file))), inspect.iscoroutinefunction)
+    nodes = [name for name, function in functions if list(inspect.signature(function).parameters) == ["node"]]
+    assert nodes
+    assert [program.name for program in load(f"{file}:{name}" for name in nodes)] == nodes
+
+
+@pytest.mark.virtual_time
+async def test_blink(capsys: pytest.CaptureFixture[str]) -> None:
+    example = _example("blink")
+    await _run_for(2.2, example["blink"], example["watch"])
+    assert capsys.readouterr().out.splitlines() == [f"Led(led=3, value={value})" for value in (1, 0, 1, 0)]
+
+
+@pytest.mark.virtual_time
+async def test_watch_timeout(capsys: pytest.CaptureFixture[str]) -> None:
+    example = _example("watch_timeout")
+    await _run_for(5, example["joystick"], example["wheels"], example["motors"])
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[:20] == ["PWM2(pwm1=500, pwm2=500)"] * 20
+    assert printed[20:22] == ["no command for 0.3 s: stopped", "PWM2(pwm1=0, pwm2=0)"]
+
+
+@pytest.mark.virtual_time
+async def test_publishers(capsys: pytest.CaptureFixture[str]) -> None:
+    example = _example("publishers")
+    await _run_for(5, example["sensors"], example["reader"])
+    printed = capsys.readouterr().out
+    assert "missed: topic setpoint (reader): no room by the deadline" in printed
+    assert "missed: topic notes" not in printed  # its publisher waits instead
+    assert "lost: " in printed
+
+
+@pytest.mark.virtual_time
+async def test_custom_message(capsys: pytest.CaptureFixture[str]) -> None:
+    example = _example("custom_message")
+    assert r2p.layout(example["Marker"]).size == 45
+    await _run_for(1, example["camera"], example["show"])
+    printed = capsys.readouterr().out.splitlines()
+    assert "refused: Marker.id (u8) takes an integer from 0 to 255, not 300" in printed
+    assert "dock 7 (1.5, 0.0, 0.25)" in printed
+
+
+@pytest.mark.virtual_time
+async def test_logger_csv(capsys: pytest.CaptureFixture[str]) -> None:
+    example = _example("logger_csv")
+    await _run_for(1, example["imu_csv"], example["imu_demo"])
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert len(rows) > 90
+    assert rows[0]["source"] == "PC1/imu_demo"
+    assert rows[0]["acc_z"] == "1000"
+
+
+@pytest.mark.processes
+def test_test_robot(tmp_path: Path) -> None:
+    file = EXAMPLES[0].parent / "test_robot.py"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(tmp_path), str(file)]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert "1 passed" in ended.stdout
+
+
+@pytest.mark.anyio
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
+async def test_serial_cable(capsys: pytest.CaptureFixture[str]) -> None:
+    blinked = asyncio.Event()
+    board = FirmwareModule("LED1", subscribers=[Subscribes("leds", Led, answer=lambda _led: blinked.set())])
+    async with asyncio.timeout(20), Powered(board) as power:
+        device = power.open_pty()
+        robot = asyncio.create_task(_example("serial_cable")["main"](device))
+        await blinked.wait()
+        robot.cancel()
+        await asyncio.gather(robot, return_exceptions=True)
+    assert f"serial:{device} is up" in capsys.readouterr().out
