@@ -15,7 +15,6 @@
 Bad bytes from a wire raise none of these: they are counted in `link.stats` and dropped.
 """
 
-
 from collections.abc import Sequence
 
 

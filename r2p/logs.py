@@ -1,4 +1,7 @@
-"""The topic `log`: what the nodes of a module log goes to whoever subscribes it, at most RATE records a second."""
+"""The topic `log`: what the nodes of a module log goes to whoever subscribes it, at most RATE records a second.
+
+A record is a line of text. A text of several lines is several records, and so is a traceback.
+"""
 
 from r2p.messages import Timestamp
 from r2p.msg import Log
@@ -17,36 +20,34 @@ _TEXT = 128
 class LogTopic:
     """Publishes log records; those beyond the rate are counted in `suppressed`, and the next one says so."""
 
-    def __init__(self, space: TopicSpace) -> None:
+    def __init__(self, space: TopicSpace, remap: dict[str, str] | None = None) -> None:
         self.suppressed = 0
         self._space = space
-        self._node = Node("log", space)
+        self._node = Node("log", space, remap=remap)
         self._publisher = self._node.advertise(TOPIC, Log)
-        self._node.enter()
         self._credit = float(RATE)
         self._at = space.clock.monotonic()
-        self._publishing = False
 
     def publish(self, level: int, node: str, text: str) -> None:
-        """Publish one record; never waits, and never fails."""
-        if self._publishing or not self._admit():
+        """Publish one record a line; never waits, and never fails."""
+        for line in text.splitlines():
+            self._publish_line(level, node, line)
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._node.close()
+
+    def _publish_line(self, level: int, node: str, line: str) -> None:
+        if self._node.closed or not self._admit():
             self.suppressed += 1
             return
         if self.suppressed:
-            text = f"({self.suppressed} suppressed) {text}"
+            line = f"({self.suppressed} suppressed) {line}"
             self.suppressed = 0
-        printable = text.encode("ascii", "replace").replace(b"\0", b"?")[:_TEXT].decode()
-        self._publishing = True  # a miss of the log topic is itself logged
-        try:
-            stamp = Timestamp.from_ns(self._space.clock.now())
-            self._publisher.publish_nowait(
-                Log(stamp=stamp, level=min(level, 255), node=node[:NODE_MAX], text=printable)
-            )
-        finally:
-            self._publishing = False
-
-    def close(self) -> None:
-        self._node.close()
+        text = line.encode("ascii", "replace").replace(b"\0", b"?")[:_TEXT].decode()
+        stamp = Timestamp.from_ns(self._space.clock.now())
+        level = min(max(level, 0), 255)
+        self._publisher.publish_nowait(Log(stamp=stamp, level=level, node=node[:NODE_MAX], text=text))
 
     def _admit(self) -> bool:
         now = self._space.clock.monotonic()

@@ -33,7 +33,7 @@ from r2p.protocols.events import (
     NameConflict,
     Obey,
 )
-from r2p.supervisor import NodeFunction, Supervisor, name_of
+from r2p.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.link import Link, Transport
 from r2p.transports.url import open_transport
@@ -43,6 +43,11 @@ logger = logging.getLogger("r2p.module")
 
 EVENTS = 256
 """Events that an `events()` iteration holds before it loses the oldest."""
+
+_PROMPT = 1.0  # seconds in which a tool's link comes up without a word
+
+PATIENCE = 1.0
+"""Seconds after which the log names the nodes whose clean-up is being waited for."""
 
 
 class LinkUp(msgspec.Struct, frozen=True):
@@ -114,13 +119,21 @@ class Module:
         self._remap = _checked_remap(remap)
         self._with_watchdog = watchdog
         self._supervisors: dict[str, Supervisor] = {}
+        self._crashes: dict[str, Exception] = {}
         self._listeners: list[tuple[deque[ModuleEvent], asyncio.Event]] = []
+        self._transports: list[asyncio.Task[None]] = []
+        self._tasks: asyncio.TaskGroup | None = None
+        self._order: Command | None = None
+        self._obeying: asyncio.Task[None] | None = None
         self._flags = 0
         self._open = False
 
     # Life
 
     async def __aenter__(self) -> Self:
+        """Open it. Raises TransportError for a URL that can't work, and Error when it was open before."""
+        if self._tasks is not None:
+            raise Error(f"module {self.name} was opened before: make a new one")
         loop = asyncio.get_running_loop()
         clock = clock_of(loop)
         self.random = random_of(loop)
@@ -128,56 +141,80 @@ class Module:
         self.space = TopicSpace(self.name, loop, clock)
         self.space.changed = self._topic_changed
         self._changed = asyncio.Event()
-        self._log = None if self.observer else LogTopic(self.space)
+        self._switching = asyncio.Lock()
+        self._log = None if self.observer else LogTopic(self.space, self._remap)
         self._watchdog = Watchdog(loop) if self._with_watchdog and not clock.virtual else None
         self._tasks = asyncio.TaskGroup()
-        self._transports: list[asyncio.Task[None]] = []
         await self._tasks.__aenter__()
         self._open = True
-        try:
-            await self._open_transports()
-        except BaseException:
-            await self._close()
-            raise
         if self._watchdog is not None:
             self._watchdog.start()
+        try:
+            for via in self._via:
+                await self._open_transport(self._tasks, via)
+        except BaseException:
+            await self._close(self._tasks)
+            raise
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self._close()
-        crashed = [each.error for each in self._supervisors.values() if each.error is not None]
+        """End the nodes, then the links. Raises NodeCrashed if nodes crashed; another error on its way gets notes."""
+        if self._tasks is not None:
+            await self._close(self._tasks)
+        crashed = list(self._crashes.values())
         if crashed and (error is None or isinstance(error, asyncio.CancelledError)):
             raise NodeCrashed(f"{len(crashed)} node(s) of module {self.name} crashed", crashed)
+        for crash in crashed:
+            assert error is not None
+            error.add_note(f"before that: {crash!r} {' '.join(crash.__notes__)}")
 
-    async def _open_transports(self) -> None:
-        for via in self._via:
-            transport = open_transport(via) if isinstance(via, str) else via
-            opened = asyncio.Event()
-            running = self._tasks.create_task(transport.run(self, opened.set), name=f"{self.name} {via}")
-            self._transports.append(running)
-            ready = self._tasks.create_task(opened.wait())
-            await asyncio.wait([ready, running], return_when=asyncio.FIRST_COMPLETED)
-            ready.cancel()
+    async def _open_transport(self, tasks: asyncio.TaskGroup, via: str | Transport) -> None:
+        """Let it run, and wait until it works; what it raises cancels the caller, and `_close` raises it."""
+        transport = open_transport(via) if isinstance(via, str) else via
+        opened = self.space.loop.create_future()
 
-    async def _close(self) -> None:
+        def works() -> None:
+            if not opened.done():
+                opened.set_result(None)
+
+        running = tasks.create_task(transport.run(self, works), name=f"{self.name} {via}")
+        self._transports.append(running)
+        await asyncio.wait([opened, running], return_when=asyncio.FIRST_COMPLETED)
+
+    async def _close(self, tasks: asyncio.TaskGroup) -> None:
         if not self._open:
             return
         self._open = False
         try:
-            await asyncio.gather(*(each.stop() for each in self._supervisors.values()))
+            await self._end_nodes()
+        finally:
             if self._log is not None:
                 self._log.close()
-        finally:
-            for task in self._transports:
-                task.cancel()
-            await self._tasks.__aexit__(None, None, None)
-            if self._watchdog is not None:
-                self._watchdog.close()
-            self._changed.set()
-            for _, arrived in self._listeners:
-                arrived.set()
+            for transport in self._transports:
+                transport.cancel()
+            try:
+                await tasks.__aexit__(None, None, None)
+            except BaseExceptionGroup as group:  # of transports: what a node raises, its supervisor keeps
+                raise group.exceptions[0] if len(group.exceptions) == 1 else group from None
+            finally:
+                if self._watchdog is not None:
+                    self._watchdog.close()
+                self._changed.set()
+                for _, arrived in self._listeners:
+                    arrived.set()
+
+    async def _end_nodes(self) -> None:
+        """Cancel all nodes, and wait until each has ended."""
+        tasks = [task for each in self._supervisors.values() if (task := each.cancel()) is not None]
+        if not tasks:
+            return
+        _, pending = await asyncio.wait(tasks, timeout=PATIENCE)
+        if pending:
+            names = ", ".join(sorted(task.get_name() for task in pending))
+            logger.warning("module %s waits for the clean-up of %s", self.name, names)
+            await asyncio.wait(pending)
 
     # Nodes
 
@@ -193,12 +230,14 @@ class Module:
         """Run `function(node, *args)` as a node; its name is the function's unless given, at most 8 characters.
 
         Nodes of higher priority get their messages first. With `restart` a crash restarts it, after a pause that grows.
-        Raises NameTooLong, InvalidName, and Error if the name is taken.
+        Raises NameTooLong, InvalidName, Error if the name is taken, the function none of a node, or the module stopped,
+        and Closed if it is not open.
         """
-        if not self._open:
+        if self._tasks is None or not self._open:
             raise Closed(f"module {self.name} is not open: use it in `async with`")
-        if not asyncio.iscoroutinefunction(function):
-            raise Error(f"{function!r} is no coroutine function: write `async def name(node: r2p.Node) -> None`")
+        if self.stopped:
+            raise Error(f"module {self.name} is stopped: reboot it first")
+        check_function(function)
         name = node_name(name) if name is not None else name_of(function)
         if name in self._supervisors and self._supervisors[name].running:
             raise Error(f"module {self.name} has a node {name} already: give this one another name=")
@@ -210,7 +249,7 @@ class Module:
 
         supervisor = Supervisor(function, args, make_node, restart=restart)
         self._supervisors[name] = supervisor
-        supervisor.start(self._tasks, self._changed.set)
+        supervisor.start(self._tasks, self._node_ended)
         return supervisor.node
 
     @property
@@ -220,24 +259,45 @@ class Module:
 
     async def wait(self) -> None:
         """Wait until all nodes have ended by themselves (not by STOP: a stopped module waits for REBOOT)."""
-        while self._open and (self.stopped or any(each.running for each in self._supervisors.values())):
+        while self._open and (self._held or any(each.running for each in self._supervisors.values())):
             self._changed.clear()
             await self._changed.wait()
 
     async def stop(self) -> None:
         """End all nodes; links and management go on (ALIVE says so)."""
-        self.stopped = True
-        self._set_flags(self._flags | FLAG_STOPPED)
-        await asyncio.gather(*(each.stop() for each in self._supervisors.values()))
+        async with self._switching:
+            self.stopped = True
+            self._set_flags(self._flags | FLAG_STOPPED)
+            await self._end_nodes()
 
     async def reboot(self) -> None:
         """End all nodes and start them from the beginning."""
-        await asyncio.gather(*(each.stop() for each in self._supervisors.values()))
-        for supervisor in self._supervisors.values():
-            supervisor.start(self._tasks, self._changed.set)
-        self.stopped = False
-        self.rebooted = True
-        self._set_flags(FLAG_REBOOTED)
+        if self._tasks is None or not self._open:
+            raise Closed(f"module {self.name} is not open: use it in `async with`")
+        await asyncio.shield(self._tasks.create_task(self._reboot(self._tasks), name=f"{self.name} reboot"))
+
+    async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
+        """In a task of its own: a node that asks for it is ended by it."""
+        async with self._switching:
+            self._set_flags(self._flags | FLAG_STOPPED)  # so that others notice each reboot, not only the first one
+            await self._end_nodes()
+            if not self._open:
+                return
+            self.stopped = False
+            self.rebooted = True
+            for supervisor in self._supervisors.values():
+                supervisor.start(tasks, self._node_ended)
+            self._set_flags(FLAG_REBOOTED)
+
+    @property
+    def _held(self) -> bool:
+        """Whether nodes that have ended may start again."""
+        return self.stopped or self._switching.locked()
+
+    def _node_ended(self, supervisor: Supervisor) -> None:
+        if supervisor.error is not None:
+            self._crashes[supervisor.node.name] = supervisor.error
+        self._changed.set()
 
     # Network
 
@@ -251,12 +311,13 @@ class Module:
         for link in self.links:
             link.query()
 
-    async def events(self) -> AsyncIterator[ModuleEvent]:
-        """What happens to the links and on the network, from now on, until the module closes."""
-        queue: deque[ModuleEvent] = deque(maxlen=EVENTS)
-        arrived = asyncio.Event()
-        listener = (queue, arrived)
+    def events(self) -> AsyncIterator[ModuleEvent]:
+        """What happens to the links and on the network, from this call on, until the module closes."""
+        listener = deque[ModuleEvent](maxlen=EVENTS), asyncio.Event()
         self._listeners.append(listener)
+        return self._iterate(*listener)
+
+    async def _iterate(self, queue: deque[ModuleEvent], arrived: asyncio.Event) -> AsyncIterator[ModuleEvent]:
         try:
             while True:
                 while queue:
@@ -266,11 +327,12 @@ class Module:
                 arrived.clear()
                 await arrived.wait()
         finally:
-            self._listeners.remove(listener)
+            self._listeners.remove((queue, arrived))
 
     # For transports (the Hub)
 
     def attach(self, link: Link) -> None:
+        """A transport has a link, up or not yet."""
         self.links.append(link)
         self.space.links.append(link)
         for topic in list(self.space.topics.values()):
@@ -278,26 +340,34 @@ class Module:
         link.set_flags(self._flags)
 
     def detach(self, link: Link) -> None:
+        """It does not have it any more."""
         self.links.remove(link)
         self.space.links.remove(link)
 
     def link_waits(self, link: Link, reason: str) -> None:
+        """The link can't be had yet."""
         logger.warning("link %s: %s; trying again", link.name, reason)
         self._tell(LinkWaits(link.name, reason))
 
     def listening(self, url: str, address: str) -> None:
+        """A transport takes connections."""
         logger.info("%s takes connections at %s", url, address)
         self._tell(Listening(url, address))
 
     def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
+        """The link went up or down."""
         if link.up:
-            logger.info("link %s is up, after %.1f s; %d messages lost meanwhile", link.name, outage, lost)
+            first = link.stats.ups == 1
+            meanwhile = "" if first else f", after {outage:.1f} s; {lost} messages lost meanwhile"
+            expected = self.observer and first and outage < _PROMPT
+            logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.name, meanwhile)
             self._tell(LinkUp(link.name, outage, lost))
         else:
             logger.warning("link %s is down: %s", link.name, reason)
             self._tell(LinkDown(link.name, reason))
 
     def discovered(self, link: Link, event: Event) -> None:
+        """The discovery of a link found something that concerns the module."""
         match event:
             case Obey():
                 self._obey(event.command)
@@ -317,15 +387,21 @@ class Module:
 
     def _obey(self, command: Command) -> None:
         logger.warning("module %s: %s from the network", self.name, command.name)
-        if not self._open:
+        if self._tasks is None or not self._open:
             return
-        if command is Command.STOP:
-            self._tasks.create_task(self.stop(), name=f"{self.name} stop")
-        elif command is Command.REBOOT:
-            self._tasks.create_task(self.reboot(), name=f"{self.name} reboot")
+        if command is not Command.BOOTLOAD:
+            self._order = command
+            if self._obeying is None or self._obeying.done():
+                self._obeying = self._tasks.create_task(self._obey_orders(self._tasks), name=f"{self.name} orders")
         else:
             self.refused[command.name] = self.refused.get(command.name, 0) + 1
             logger.error("module %s is a program on a PC, it has no boot loader: BOOTLOAD refused", self.name)
+
+    async def _obey_orders(self, tasks: asyncio.TaskGroup) -> None:
+        """One order at a time; of those that come meanwhile the last one counts."""
+        while self._order is not None and self._open:
+            order, self._order = self._order, None
+            await (self.stop() if order is Command.STOP else self._reboot(tasks))
 
     def _check_namesakes(self, link: Link, info: ModuleInfo) -> None:
         """Two who can't hear each other may have one name: whoever hears both tells them."""

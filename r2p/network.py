@@ -128,12 +128,14 @@ class Network:
             heard = max(info.advertised_at or 0, info.requested_at or 0)
             age = (now - heard) / _SECOND
             view.age = age if view.age is None else min(view.age, age)
+        names = {info.instance: info.name for info in link.discovery.modules.values()}
         for endpoint in link.discovery.endpoints.values():
+            module = endpoint.module or names.get(endpoint.instance, "")  # it may be told before its module's name
             view = views.setdefault(endpoint.topic, TopicView(endpoint.topic))
             publishes = endpoint.role == ROLE_PUBLISHES
-            klass = PublisherClass(endpoint.publisher_class or 1) if publishes else None
+            klass = PublisherClass(endpoint.publisher_class & 3 or 1) if publishes else None  # a byte from outside
             (view.publishers if publishes else view.subscribers).append(
-                Endpoint(endpoint.module, endpoint.node, klass, link.name)
+                Endpoint(module, endpoint.node, klass, link.name)
             )
 
 

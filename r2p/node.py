@@ -6,11 +6,13 @@ its function ends, however it ends.
 
 import asyncio
 import logging
+import sys
+import traceback
 from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple, TypeVar, overload
 
 from r2p.clock import Ticker
-from r2p.errors import Error, TransportError
+from r2p.errors import Closed, Error, TransportError
 from r2p.messages import Message, layout
 from r2p.names import topic_name
 from r2p.publisher import (
@@ -52,7 +54,21 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
         kwargs["stacklevel"] = kwargs.get("stacklevel", 1) + 1
         super().log(level, msg, *args, **kwargs)
         if level >= logging.INFO:
-            self._publish(level, str(msg) % args if args else str(msg))
+            self._publish(level, _text(level, msg, args, kwargs.get("exc_info")))
+
+
+def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -> str:
+    """A log record as `logging` would print it, traceback included."""
+    try:
+        text = logging.LogRecord("", level, "", 0, msg, args, None).getMessage()
+    except (TypeError, ValueError):  # arguments that do not fit; logging itself says so on stderr
+        text = f"{msg} {args}"
+    if not exc_info:
+        return text
+    error = exc_info[1] if isinstance(exc_info, tuple) else exc_info
+    if not isinstance(error, BaseException):  # True: the one that is being handled
+        error = sys.exception()
+    return text if error is None else f"{text}\n{''.join(traceback.format_exception(error))}"
 
 
 class Node:
@@ -73,12 +89,17 @@ class Node:
         self.log = NodeLogger(
             logging.getLogger(f"r2p.{space.module}.{name}"), lambda level, text: log(level, name, text)
         )
-        self.publishers: list[AnyPublisher] = []
-        self.subscribers: list[Subscriber[Any]] = []
-        self.crashed: Callable[[Exception], None] = self._raise
+        self.publishers: dict[AnyPublisher, None] = {}
+        """Its open publishers, in order; None means nothing."""
+        self.subscribers: dict[Subscriber[Any], None] = {}
+        """Its open subscribers."""
+        self.closed = False
+        self.crashed: Callable[[Exception], None] = self._log_crash
         """What to do with an error outside the node's own task; its supervisor sets it."""
         self._space = space
         self._remap = remap or {}
+        self._tickers: set[Ticker] = set()
+        self._entered = False
 
     @overload
     def advertise(
@@ -108,25 +129,30 @@ class Node:
 
         `latch` sends the last value to every subscriber that joins later, and again when its module reboots.
         `strict` raises TransportError where a link is known not to give what the class asks for.
-        Raises InvalidName or NameTooLong, MessageError (a type without a layout), TypeMismatch.
+        Raises InvalidName or NameTooLong, MessageError (a type without a layout, a class value without sense),
+        TypeMismatch, and Closed once the node has ended.
         """
         shape = layout(type)
         name = self._resolve(topic)
         self._check_links(name, shape.size, klass, strict=strict)
         where = self._space.open(name, shape)
         publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
-        match klass:
-            case NonRealTime():
-                publisher = Publisher(self._space, self, where, shape, klass, latch=latch)
-            case Sporadic():
-                publisher = SporadicPublisher(self._space, self, where, shape, klass, latch=latch)
-            case Periodic():
-                publisher = PeriodicPublisher(self._space, self, where, shape, klass, latch=latch)
-                publisher.start()
+        try:
+            match klass:
+                case NonRealTime():
+                    publisher = Publisher(self._space, self, where, shape, klass, latch=latch)
+                case Sporadic():
+                    publisher = SporadicPublisher(self._space, self, where, shape, klass, latch=latch)
+                case Periodic():
+                    publisher = PeriodicPublisher(self._space, self, where, shape, klass, latch=latch)
+                    publisher.start()
+        except BaseException:
+            self._space.release(where)
+            raise
         where.publishers.append(publisher)
         for queue in where.queues:
             queue.publisher_joined()
-        self.publishers.append(publisher)
+        self.publishers[publisher] = None
         self._space.changed(where)
         return publisher
 
@@ -180,10 +206,14 @@ class Node:
         `lost`. Messages older than `max_age` seconds are skipped. When nothing comes for `timeout` seconds,
         `on_timeout` is called once; without it, the iteration raises TimeoutError.
         A `callback` is called, in this node's task, from `spin()`.
-        Raises InvalidName or NameTooLong, MessageError (a type without a layout), TypeMismatch.
+        Raises InvalidName or NameTooLong, MessageError (a type without a layout), TypeMismatch, ValueError (a queue
+        without room, a time of 0 or less), and Closed once the node has ended.
         """
         if queue < 1:
             raise ValueError(f"topic {topic}: a queue holds 1 message or more, not {queue}")
+        for option, value in (("max_age", max_age), ("timeout", timeout)):
+            if value is not None and not value > 0:
+                raise ValueError(f"topic {topic}: {option} is in seconds and more than 0, not {value}")
         shape = None if type is None else layout(type)
         where = self._space.open(self._resolve(topic), shape)
         subscriber: Subscriber[Any] = Subscriber(
@@ -199,7 +229,7 @@ class Node:
             timeout=timeout,
             on_timeout=on_timeout,
         )
-        self.subscribers.append(subscriber)
+        self.subscribers[subscriber] = None
         where.join(subscriber)
         self._space.changed(where)
         return subscriber
@@ -207,7 +237,9 @@ class Node:
     async def spin(self, timeout: float | None = None) -> bool:
         """Wait for messages of subscriptions with a callback, and call those; False after `timeout` seconds without.
 
-        Callbacks run in this node's task, one at a time; a coroutine function is awaited.
+        Callbacks run in this node's task, one at a time; a coroutine function is awaited. False also when one of the
+        subscriptions has a time-out of its own, no `on_timeout`, and its time is up.
+        Raises Error if no subscription has a callback.
         """
         deadline = None if timeout is None else self._space.loop.time() + timeout
         while not await self._serve():
@@ -220,58 +252,69 @@ class Node:
         return True
 
     async def every(self, period: float) -> AsyncIterator[Tick]:
-        """Tick each `period` seconds on absolute phase, first after one period; a slow body skips periods, counted."""
-        loop = self._space.loop
-        waiter: asyncio.Future[None] | None = None
-        tick: Tick | None = None
+        """Tick each `period` seconds on absolute phase, first after one period; a slow body skips periods, counted.
 
-        def on_tick(due: int, late: int, skipped: int) -> None:
-            nonlocal tick
-            missed = 0 if tick is None else tick.skipped + 1
-            tick = Tick(due, late / _SECOND, skipped + missed)
+        Raises ValueError for a period under 1 us.
+        """
+        loop, clock = self._space.loop, self._space.clock
+        waiter: asyncio.Future[None] | None = None
+        due = skipped = 0
+
+        def on_tick(scheduled: int, _late: int, lost: int) -> None:
+            nonlocal due, skipped
+            skipped += lost + (due > 0)
+            due = scheduled
             if waiter is not None and not waiter.done():
                 waiter.set_result(None)
 
         ticker = Ticker(loop, round(period * _SECOND), on_tick)
+        self._tickers.add(ticker)
         ticker.start()
         try:
             while True:
-                if tick is None:
+                if not due:
                     waiter = loop.create_future()
                     await waiter
-                current, tick = tick, None
-                if current is not None:
-                    yield current
+                tick = Tick(due, (clock.monotonic() - due) / _SECOND, skipped)
+                due = skipped = 0
+                yield tick
         finally:
             ticker.close()
+            self._tickers.discard(ticker)
 
     def now(self) -> int:
         """UTC in ns; never jumps back."""
         return self._space.clock.now()
 
     def crash(self, error: Exception) -> None:
-        """End this node with an error that arose outside its own task (in a periodic publisher's `fill`)."""
+        """End this node with an error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
         self.crashed(error)
+
+    def forget(self, user: object) -> None:
+        """A publisher or subscriber of the node was closed."""
+        self.publishers.pop(user, None)  # type: ignore[call-overload]  # a dict looks up anything
+        self.subscribers.pop(user, None)  # type: ignore[call-overload]
 
     def enter(self) -> None:
         """The node's function starts: its priority counts from now on."""
+        self._entered = True
         self._space.waker.enter(self.priority)
 
     def close(self) -> None:
         """Close all its publishers and subscribers; the module does so when the node's function has ended."""
-        for publisher in self.publishers:
-            publisher.close()
-        for subscriber in self.subscribers:
-            subscriber.close()
-        self.publishers.clear()
-        self.subscribers.clear()
-        self._space.waker.leave(self.priority)
+        self.closed = True
+        for each in (*self.publishers, *self.subscribers, *self._tickers):
+            each.close()
+        if self._entered:
+            self._entered = False
+            self._space.waker.leave(self.priority)
 
-    @staticmethod
-    def _raise(error: Exception) -> None:
-        raise error
+    def _log_crash(self, error: Exception) -> None:
+        self.log.error("node %s, which does not run: %r", self.name, error, exc_info=error)
 
     def _resolve(self, topic: str) -> str:
+        if self.closed:
+            raise Closed(f"node {self.name} has ended: it can't use topic {topic} any more")
         name = topic_name(topic)
         return topic_name(self._remap.get(name, name))
 
@@ -289,21 +332,24 @@ class Node:
 
     async def _serve(self) -> bool:
         served = False
-        for subscriber in [each for each in self.subscribers if each.callback is not None]:
+        for subscriber in self._listening():
             served |= await subscriber.serve()
         return served
 
     async def _arrival(self) -> None:
         """Wait until a subscription with a callback gets a message."""
-        listening = [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
+        listening = self._listening()
         if not listening:
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
         waiter = self._space.loop.create_future()
-        for subscriber in listening:
-            subscriber.waiter = waiter
         try:
+            for subscriber in listening:
+                subscriber.wait_by(waiter)
             await waiter
         finally:
             for subscriber in listening:
                 if subscriber.waiter is waiter:
                     subscriber.waiter = None
+
+    def _listening(self) -> list[Subscriber[Any]]:
+        return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]

@@ -8,6 +8,7 @@ Each counts its misses, signals them by a callback of its class value, and logs 
 """
 
 import asyncio
+import functools
 from collections import deque
 from collections.abc import Callable
 from typing import Any, ClassVar, Generic, Literal, NoReturn, TypeVar
@@ -122,8 +123,8 @@ class BasePublisher(Generic[M]):
         return len(self._topic.queues) + len(self._topic.outlets)
 
     async def wait_subscriber(self) -> None:
-        """Wait until somebody subscribes."""
-        while not self.subscribers:
+        """Wait until somebody subscribes. Raises Closed if the publisher is closed before."""
+        if not self.subscribers:
             waiter = self._space.loop.create_future()
             self._waiters.append(waiter)
             try:
@@ -157,9 +158,16 @@ class BasePublisher(Generic[M]):
             self._topic.publishers.remove(self)
             self._encode = self._closed
             self._space.release(self._topic)
+            self.node.forget(self)
+            for waiter in self._waiters:
+                if not waiter.done():
+                    waiter.set_exception(self._is_closed())
 
     def _closed(self, message: M) -> NoReturn:
-        raise Closed(f"publisher of {self.topic} is closed: advertise it again")
+        raise self._is_closed()
+
+    def _is_closed(self) -> Closed:
+        return Closed(f"publisher of {self.topic} is closed: advertise it again")
 
     # Called by the topic and its links
 
@@ -210,7 +218,10 @@ class BasePublisher(Generic[M]):
             self._logged = now
             self.node.log.warning("%s (missed %d, late %d so far)", missed, self.missed, self.late)
         if callback is not None:
-            callback(missed)
+            try:
+                callback(missed)
+            except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
+                self.node.crash(error)
 
 
 def _where(sink: Sink | None) -> str:
@@ -271,8 +282,9 @@ class Publisher(BasePublisher[M]):
                     blocked = [sink for sink in blocked if not sink.offer(sample)]
         except TimeoutError:
             for sink in blocked:
-                sink.give_up(sample)
-                self._miss(f"no room for {self._stall} s", sink)
+                if not sink.offer(sample):
+                    sink.give_up(sample)
+                    self._miss(f"no room for {self._stall} s", sink)
         except asyncio.CancelledError:
             for sink in blocked:
                 sink.lost += 1
@@ -289,10 +301,14 @@ async def _room_in(sinks: list[Sink], loop: asyncio.AbstractEventLoop) -> None:
 
     for sink in sinks:
         sink.when_room(wake)
-    await room
+    try:
+        await room
+    finally:
+        for sink in sinks:
+            sink.wait_no_more(wake)
 
 
-class _Pending(msgspec.Struct):
+class _Pending(msgspec.Struct, eq=False):
     """An event that waits for room in `sinks`; `due` is monotonic ns."""
 
     sample: Sample
@@ -319,7 +335,7 @@ class SporadicPublisher(BasePublisher[M]):
         self._on_late = klass.on_late
         self._on_degraded = klass.on_degraded
         self._pending: deque[_Pending] = deque()
-        self._watched: set[Sink] = set()
+        self._watched: dict[Sink, Callable[[], None]] = {}
         self._alarm = Alarm(space.loop, self._overdue)
 
     async def publish(self, message: M) -> None:
@@ -336,7 +352,7 @@ class SporadicPublisher(BasePublisher[M]):
     def publish_nowait(self, message: M) -> bool:
         """Publish an event; False if it has to wait for room somewhere."""
         sample = self._sample(message, self._deadline)
-        blocked = self._topic.deliver(sample, self.node)
+        blocked = self._topic.deliver(sample)
         if blocked is None:
             return True
         if len(self._pending) >= self._limit:
@@ -351,6 +367,8 @@ class SporadicPublisher(BasePublisher[M]):
         super().close()
         while self._pending:
             self._give_up(self._pending.popleft(), "publisher closed")
+        for sink in list(self._watched):
+            self._forget(sink)
         self._alarm.close()
 
     def left(self, sink: Sink) -> None:
@@ -359,11 +377,11 @@ class SporadicPublisher(BasePublisher[M]):
     def _watch(self, sink: Sink) -> None:
         # Called back at the first free place: so whoever has an event waiting has no room for a younger one.
         if sink not in self._watched:
-            self._watched.add(sink)
-            sink.when_room(lambda: self._refill(sink), soon=True)
+            self._watched[sink] = refill = functools.partial(self._refill, sink)
+            sink.when_room(refill, soon=True)
 
     def _refill(self, sink: Sink) -> None:
-        self._watched.discard(sink)
+        self._watched.pop(sink, None)
         for entry in self._pending:
             if sink in entry.sinks:
                 if not sink.offer(entry.sample):
@@ -376,7 +394,9 @@ class SporadicPublisher(BasePublisher[M]):
         for entry in self._pending:
             if sink in entry.sinks:
                 entry.sinks.remove(sink)
-        self._watched.discard(sink)
+        refill = self._watched.pop(sink, None)
+        if refill is not None:
+            sink.wait_no_more(refill)
         self._prune()
 
     def _prune(self) -> None:
@@ -397,7 +417,7 @@ class SporadicPublisher(BasePublisher[M]):
                     self.topic, "no room by the deadline", _where(entry.sinks[0]), (now - entry.due) / _SECOND
                 )
                 self._signal(missed, self._on_late)
-            else:
+            elif entry in self._pending:  # a signal before this one may have closed the publisher
                 self._pending.remove(entry)
                 self._give_up(entry, "no room by the deadline")
         self._arm()
@@ -451,7 +471,7 @@ class PeriodicPublisher(BasePublisher[M]):
             self.close()
             self.node.crash(error)
             return
-        for sink in self._topic.deliver(sample, self.node) or ():
+        for sink in self._topic.deliver(sample) or ():
             sink.force(sample)
             self._miss("no room", sink)
 

@@ -6,11 +6,13 @@ one ends the process at once, and so does a program that has not ended GRACE sec
 
 import asyncio
 import contextlib
+import functools
 import os
 import signal
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
-from typing import TypeVar
+from collections.abc import Awaitable, Callable, Iterable
+from types import FrameType
+from typing import Any, Self, TypeVar
 
 from r2p.module import Module
 from r2p.supervisor import NodeFunction
@@ -18,8 +20,8 @@ from r2p.transports.link import Transport
 
 T = TypeVar("T")
 
-GRACE = 2.0
-"""Seconds that a program has to end in order."""
+GRACE = 1.8
+"""Seconds that a program has to end in order; with what the interpreter takes, it is gone after two."""
 
 
 def run(
@@ -47,15 +49,16 @@ def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
     """Run `main()` on the fastest event loop; None if a signal ended it."""
 
     async def guarded() -> T | None:
-        async with _signals() as interrupted:
-            try:
-                return await main()
-            except asyncio.CancelledError:
-                if interrupted.is_set():
-                    return None
-                raise
+        if not signals.guard(asyncio.get_running_loop(), asyncio.current_task()):
+            return None
+        try:
+            return await main()
+        except asyncio.CancelledError:
+            if signals.received:
+                return None
+            raise
 
-    with asyncio.Runner(loop_factory=loop_factory()) as runner:
+    with _Signals() as signals, asyncio.Runner(loop_factory=loop_factory()) as runner:
         return runner.run(guarded())
 
 
@@ -68,39 +71,49 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
     return uvloop.new_event_loop
 
 
-@contextlib.asynccontextmanager
-async def _signals() -> AsyncIterator[threading.Event]:
-    """Let the first SIGINT or SIGTERM cancel the current task, and set the event."""
-    loop = asyncio.get_running_loop()
-    task = asyncio.current_task()
-    interrupted = threading.Event()
-    ended = threading.Event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
+class _Signals:
+    """Lets the first SIGINT or SIGTERM cancel a task; until the loop is closed, and all its threads have ended.
 
-    def interrupt(number: int) -> None:
-        interrupted.set()
-        for each in numbers:
-            loop.remove_signal_handler(each)
-            signal.signal(each, signal.SIG_DFL)
-        threading.Thread(target=_end_process, args=(number, ended), name="r2p-grace", daemon=True).start()
+    The handlers are Python's, not the loop's, so that they also work while a node blocks the loop. Only the main thread
+    gets signals: in another one this does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.received: list[int] = []
+        self._over = threading.Event()
+        self._ended = threading.Event()
+        self._cancel: Callable[[], object] = lambda: None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            threading.Thread(target=self._enforce, name="r2p-grace", daemon=True).start()
+            self._before = {
+                number: signal.signal(number, self._interrupt) for number in (signal.SIGINT, signal.SIGTERM)
+            }
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._ended.set()
+        self._over.set()
+
+    def guard(self, loop: asyncio.AbstractEventLoop, task: asyncio.Task[object] | None) -> bool:
+        """Cancel this task at the first signal. False if that has come already."""
         if task is not None:
-            task.cancel()
+            self._cancel = functools.partial(loop.call_soon_threadsafe, task.cancel)
+        return not self.received
 
-    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGTERM"):
-        yield interrupted
-        return
-    before = {number: signal.getsignal(number) for number in numbers}
-    for number in numbers:
-        loop.add_signal_handler(number, interrupt, number)
-    try:
-        yield interrupted
-    finally:
-        ended.set()
-        for number in numbers:
-            loop.remove_signal_handler(number)
-            signal.signal(number, before[number])
+    def _interrupt(self, number: int, _frame: FrameType | None) -> None:
+        for each in self._before:
+            signal.signal(each, signal.SIG_DFL)
+        self.received.append(number)
+        self._over.set()
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the end has come by itself
+            self._cancel()
 
-
-def _end_process(number: int, ended: threading.Event) -> None:
-    if not ended.wait(GRACE):
-        os.kill(os.getpid(), number)
+    def _enforce(self) -> None:
+        self._over.wait()
+        if self.received and not self._ended.wait(GRACE):
+            os.kill(os.getpid(), self.received[0])

@@ -6,7 +6,7 @@ Nothing is awaited between taking a message and handing it out, so a cancelled r
 import asyncio
 import inspect
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from r2p.clock import Alarm
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-Callback = Callable[[T], Awaitable[None] | None]
+Callback = Callable[[T], object]
 Keep = Literal["newest", "oldest"]
 
 _SECOND = 1_000_000_000
@@ -80,6 +80,7 @@ class Subscriber(QueueSink, Generic[T]):
         self._closed = False
         self._matches: list[asyncio.Future[None]] = []
         self._silent = False
+        self._credit = 0
         self._timeout = 0 if timeout is None else round(timeout * _SECOND)
         self._heard = space.clock.monotonic()
         self._alarm = Alarm(space.loop, self._check_silence)
@@ -93,8 +94,8 @@ class Subscriber(QueueSink, Generic[T]):
         return len(self._topic.publishers) + self._topic.inlets
 
     async def wait_publisher(self) -> None:
-        """Wait until somebody publishes the topic."""
-        while not self.publishers:
+        """Wait until somebody publishes the topic. Raises Closed if the subscription is closed before."""
+        if not self.publishers:
             waiter = self._space.loop.create_future()
             self._matches.append(waiter)
             try:
@@ -147,15 +148,18 @@ class Subscriber(QueueSink, Generic[T]):
 
     async def fetch(self, timeout: float | None = None) -> T:
         """Wait for one message. Raises TimeoutError after `timeout` seconds, Closed if the subscription is closed."""
-        if not self.queue and timeout is not None:
-            async with asyncio.timeout(timeout):
-                return await self.fetch()
-        while not self._closed:
-            message = self._next()
-            if message is not None:
-                return message
-            await self._arrival()
-        raise Closed(f"the subscription of {self.topic} is closed: subscribe again")
+        if self.queue:
+            await self._use_credit()
+        message = self._next()
+        if message is not None:
+            return message
+        async with asyncio.timeout(timeout):
+            while not self._closed:
+                await self._arrival()
+                message = self._next()
+                if message is not None:
+                    return message
+        raise self._is_closed()
 
     def close(self) -> None:
         """End the subscription; whoever waits for its next message is woken."""
@@ -164,10 +168,15 @@ class Subscriber(QueueSink, Generic[T]):
             self._alarm.close()
             self._topic.leave(self)
             self._space.release(self._topic)
+            self.node.forget(self)
             self.queue.clear()
+            self.queue = deque(maxlen=0)  # what publishers that wait for room still put in is dropped
             self._made_room()
             if self.waiter is not None and not self.waiter.done():
                 self.waiter.set_result(None)
+            for waiter in self._matches:
+                if not waiter.done():
+                    waiter.set_exception(self._is_closed())
 
     async def __aenter__(self) -> "Self":
         return self
@@ -189,9 +198,14 @@ class Subscriber(QueueSink, Generic[T]):
             served = True
             if self.callback is not None and inspect.isawaitable(pending := self.callback(message)):
                 await pending
-            if self.priority < self._waker.top:
-                await self._give_way()
+            await self._use_credit()
         return served
+
+    def wait_by(self, waiter: asyncio.Future[None]) -> None:
+        """Wake this future at the next message."""
+        if self.waiter is not None:
+            raise self._two_readers()
+        self.waiter = waiter
 
     def _next(self) -> T | None:
         """The next good message that waits, or None."""
@@ -226,9 +240,9 @@ class Subscriber(QueueSink, Generic[T]):
 
     async def _arrival(self) -> None:
         """Wait until something is in the queue, or the subscription is closed."""
-        if self.waiter is not None:
-            raise self._two_readers()
-        waiter = self.waiter = self._space.loop.create_future()
+        self._credit = 0
+        waiter = self._space.loop.create_future()
+        self.wait_by(waiter)
         try:
             await waiter
         finally:
@@ -237,6 +251,16 @@ class Subscriber(QueueSink, Generic[T]):
 
     def _two_readers(self) -> RuntimeError:
         return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each")
+
+    def _is_closed(self) -> Closed:
+        return Closed(f"the subscription of {self.topic} is closed: subscribe again")
+
+    async def _use_credit(self) -> None:
+        """Let others run after BURST messages in a row; a node of low priority after each."""
+        self._credit += 1
+        if self._credit >= BURST or self.priority < self._waker.top:
+            self._credit = 0
+            await self._give_way()
 
     async def _give_way(self) -> None:
         if self.priority >= self._waker.top:
@@ -261,7 +285,10 @@ class Subscriber(QueueSink, Generic[T]):
         self.timeouts += 1
         if self._on_timeout is not None:
             self._silent = True
-            self._on_timeout()
+            try:
+                self._on_timeout()
+            except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
+                self.node.crash(error)
             return
         self._heard = now
         self._alarm.set(now + self._timeout)

@@ -5,10 +5,12 @@ ends. Stopping is cancellation, so `try/finally` in the node's function stops th
 """
 
 import asyncio
+import functools
+import inspect
 from collections.abc import Awaitable, Callable
 
 from r2p.clock import random_of
-from r2p.errors import NameTooLong
+from r2p.errors import Error, NameTooLong
 from r2p.names import NODE_MAX, node_name
 from r2p.node import Node
 from r2p.transports.backoff import Backoff
@@ -16,12 +18,21 @@ from r2p.transports.backoff import Backoff
 NodeFunction = Callable[..., Awaitable[object]]
 
 _FIRST_RESTART, _LONGEST_RESTART = 0.5, 30.0  # seconds
+_ENDING = 1.0  # seconds that a node has to end before somebody says so
 _STABLE = 60.0  # seconds after which a crash is the first one again
+
+
+def check_function(function: NodeFunction) -> None:
+    """Raise Error for what can't run as a node."""
+    bare = function.func if isinstance(function, functools.partial) else function
+    if not (inspect.iscoroutinefunction(bare) or inspect.iscoroutinefunction(getattr(bare, "__call__", None))):  # noqa: B004 - looked into, not called
+        raise Error(f"{function!r} is no coroutine function: write `async def name(node: r2p.Node) -> None`")
 
 
 def name_of(function: NodeFunction) -> str:
     """The node name that a function gives: its own, if it fits the wire."""
-    name = getattr(function, "__name__", type(function).__name__)
+    bare = function.func if isinstance(function, functools.partial) else function
+    name = getattr(bare, "__name__", type(bare).__name__)
     if len(name) > NODE_MAX:
         raise NameTooLong(
             f"function name {name!r} is no node name, those have at most {NODE_MAX} characters: give name="
@@ -44,25 +55,39 @@ class Supervisor:
         self._make_node = make_node
         self._restart = restart
         self._task: asyncio.Task[None] | None = None
-        self._outside: Exception | None = None
+        self._stopping = False
 
     @property
     def running(self) -> bool:
         return self._task is not None and not self._task.done()
 
-    def start(self, tasks: asyncio.TaskGroup, ended: Callable[[], None]) -> None:
+    def start(self, tasks: asyncio.TaskGroup, ended: Callable[["Supervisor"], None]) -> None:
         """Start it, or start it again from the beginning; `ended` is called when it has ended for good."""
         if self._task is not None:
             self.node = self._make_node()
         self.error = None
+        self._stopping = False
         self._task = tasks.create_task(self._run(), name=f"{self.node.module}/{self.node.name}")
-        self._task.add_done_callback(lambda _task: ended())
+        self._task.add_done_callback(lambda _task: self._ended(ended))
+
+    def cancel(self) -> asyncio.Task[None] | None:
+        """Ask it to end, once: its clean-up is not disturbed. Its task comes back if it still runs."""
+        if self._task is None or self._task.done():
+            return None
+        if not self._stopping:
+            self._stopping = True
+            self._task.cancel()
+        return self._task
 
     async def stop(self) -> None:
         """Cancel it, and wait for its end."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.wait([self._task])
+        task = self.cancel()
+        if task is not None:
+            await asyncio.wait([task])
+
+    def _ended(self, tell: Callable[["Supervisor"], None]) -> None:
+        self.node.close()  # a task that is cancelled before its first step never comes to do it
+        tell(self)
 
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
@@ -73,7 +98,7 @@ class Supervisor:
             if error is None:
                 return
             self.node.log.error("node %s crashed: %s: %s", self.node.name, type(error).__name__, error, exc_info=error)
-            if not self._restart:
+            if self._stopping or not self._restart:
                 error.add_note(f"in node {self.node.name} of module {self.node.module}")
                 self.error = error
                 return
@@ -85,25 +110,51 @@ class Supervisor:
 
     async def _attempt(self) -> Exception | None:
         """Run the function to its end; what it raised."""
-        node, task = self.node, asyncio.current_task()
-        self._outside = None
-
-        def crash(error: Exception) -> None:
-            if self._outside is None and task is not None:
-                self._outside = error
-                task.cancel()
-
-        node.crashed = crash
-        node.enter()
+        task = asyncio.current_task()
+        assert task is not None
+        attempt = _Attempt(self.node, task)
+        self.node.crashed = attempt.crash
+        self.node.enter()
         try:
-            await self._function(node, *self._args)
-        except asyncio.CancelledError:
-            if self._outside is None or task is None:
+            await self._function(self.node, *self._args)
+        except asyncio.CancelledError as error:
+            if attempt.error is None and task.cancelling():
                 raise
-            task.uncancel()
-            return self._outside
+            return attempt.result(_from_inside(error))
         except Exception as error:  # noqa: BLE001 - the user's code may raise anything
-            return error
+            return attempt.result(error)
         finally:
-            node.close()
-        return self._outside
+            self.node.close()
+        return attempt.result(None)
+
+
+class _Attempt:
+    """One run of a node's function, and what went wrong outside of it: in a `fill`, or in another callback."""
+
+    def __init__(self, node: Node, task: asyncio.Task[None]) -> None:
+        self.error: Exception | None = None
+        self._node = node
+        self._task = task
+
+    def crash(self, error: Exception) -> None:
+        if asyncio.current_task() is self._task and not self._node.closed:
+            raise error
+        if self.error is not None or self._node.closed:
+            self._node.log.error("node %s crashed again: %r", self._node.name, error, exc_info=error)
+            return
+        self.error = error
+        self._task.cancel()
+
+    def result(self, error: Exception | None) -> Exception | None:
+        """What ended the node: the error outside came first, and brought the other one about."""
+        if self.error is None:
+            return error
+        self._task.uncancel()
+        return self.error
+
+
+def _from_inside(cancelled: asyncio.CancelledError) -> Error:
+    """Nobody cancelled the node, but something that it awaited: it would end without a word."""
+    error = Error("something that the node awaited was cancelled")
+    error.__cause__ = cancelled
+    return error

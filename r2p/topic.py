@@ -43,7 +43,10 @@ class Owner(Protocol):
     def log(self) -> logging.LoggerAdapter[logging.Logger]: ...
 
     def crash(self, error: Exception) -> None:
-        """End the node with an error that arose outside its own task."""
+        """End the node with an error of a function that it gave away."""
+
+    def forget(self, user: object) -> None:
+        """A publisher or subscriber of the node was closed."""
 
 
 class Waker:
@@ -115,6 +118,11 @@ class Sink:
     def when_room(self, callback: Callable[[], None], *, soon: bool = False) -> None:
         """Call back once when there is room again: at the first free place (`soon`), else when half is free."""
         raise NotImplementedError
+
+    def wait_no_more(self, callback: Callable[[], None]) -> None:
+        """Undo `when_room`, if it was not called back yet."""
+        if self._room is not None and callback in self._room:
+            self._room.remove(callback)
 
     def give_up(self, sample: Sample) -> None:
         """It made no room in time: lossy until it has."""
@@ -197,6 +205,7 @@ class Advertised(Protocol):
 
     node: Owner
     publisher_class: PublisherClass
+    latch: bool
 
     def joined(self, sink: Sink) -> None:
         """Somebody joined, or came back after a reboot."""
@@ -206,6 +215,13 @@ class Advertised(Protocol):
 
     def degraded(self, link: str, reason: str) -> None:
         """A link that carried the topic does not any more."""
+
+
+class Memory(Protocol):
+    """A link that publishes a topic here, and remembers its last message."""
+
+    def remind(self, topic: "Topic", sink: QueueSink) -> None:
+        """Send the last message to a new subscriber, if the publisher latches it."""
 
 
 class Topic:
@@ -219,6 +235,7 @@ class Topic:
         self.outlets: list[Outlet] = []
         self.inlets = 0
         """Remote publishers."""
+        self.memories: list[Memory] = []
         self._waker = waker
 
     def deliver(self, sample: Sample, own: object = None) -> list[Sink] | None:
@@ -269,6 +286,8 @@ class Topic:
         if isinstance(sink, QueueSink):
             self.queues.append(sink)
             self.queues.sort(key=lambda queue: -queue.priority)
+            for memory in self.memories:
+                memory.remind(self, sink)
         elif sink not in self.outlets:
             self.outlets.append(sink)
         for publisher in self.publishers:

@@ -1,7 +1,8 @@
 """The watchdog: tells which code blocks the event loop, while it blocks it.
 
-A thread asks the loop for a sign of life. Where none comes for LIMIT seconds, it logs the stack that the loop is stuck
-in, once, and afterwards how long it took. One block of 100 ms is ten missed periods of a 100 Hz node: worth a log line.
+A thread asks the loop for a sign of life, four times in each LIMIT. Where none comes for LIMIT seconds, it logs the
+stack that the loop is stuck in, once, and afterwards how long it took. One block of 100 ms is ten missed periods of a
+100 Hz node: worth a log line.
 """
 
 import asyncio
@@ -29,22 +30,25 @@ class Watchdog:
         self._thread = threading.Thread(target=self._watch, name="r2p-watchdog", daemon=True)
 
     def start(self) -> None:
+        """Watch from now on."""
         self._watched = threading.get_ident()
         self._thread.start()
 
     def close(self) -> None:
+        """End the thread, and wait for its end."""
         self._ended.set()
+        self._alive.set()
         self._thread.join()
 
     def _watch(self) -> None:
-        while not self._ended.wait(self._limit):
+        while not self._ended.wait(self._limit / 4):
             self._alive.clear()
             asked = time.monotonic()
             try:
                 self._loop.call_soon_threadsafe(self._alive.set)
             except RuntimeError:  # the loop is closed
                 return
-            if not self._alive.wait(self._limit) and not self._ended.is_set():
+            if not self._ended.is_set() and not self._alive.wait(self._limit):
                 self._report()
                 self._wait_out(asked)
 
@@ -56,6 +60,6 @@ class Watchdog:
         logger.warning("%s has blocked the event loop for over %.0f ms:\n%s", who, self._limit * 1e3, stack.rstrip())
 
     def _wait_out(self, asked: float) -> None:
-        while not self._alive.wait(self._limit) and not self._ended.is_set():
-            pass
-        logger.warning("the event loop runs again after %.0f ms", (time.monotonic() - asked) * 1e3)
+        self._alive.wait()  # close() sets it too
+        if not self._ended.is_set():
+            logger.warning("the event loop runs again after %.0f ms", (time.monotonic() - asked) * 1e3)

@@ -49,7 +49,9 @@ class Exchange:
     def requested(self, now: int, message: management.SubscribeRequest, source: Source) -> None:
         """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
         topic = message.topic
-        self._directory.topic(topic).requested_at = now
+        heard = self._directory.topic(topic)
+        heard.requested_at = now
+        heard.size = heard.size or message.size
         own = self._own.publishers.get(topic)
         peer = self._peers.obtain(source) if own is not None else None
         if own is None or peer is None:

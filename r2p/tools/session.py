@@ -45,6 +45,7 @@ PATIENCE = 1.0
 _SETTLED = 0.3  # seconds without news, after which an r2p peer has told everything
 _FIRMWARE = 1.5  # seconds in which a module that repeats itself each half second should have said something
 _LOOK = 0.05  # seconds between two looks for news
+_LOOPBACK = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 _LINK_UP = 5.0  # seconds that a look at the network waits for the first link
 
 
@@ -109,15 +110,25 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     remap: dict[str, str] = {}
 
 
-def settings(via: list[str] | None = None, directory: Path | None = None) -> Settings:
+def settings(via: list[str] | None = None, directory: Path | None = None, *, tool: bool = False) -> Settings:
     """The settings; precedence for `via`: argument, R2P_VIA, r2p.toml in the directory (default: working directory).
 
+    The last two tell how the robot's program joins. Where that listens, a `tool` beside it connects to it.
     Raises Usage for an r2p.toml that can't be read.
     """
     file = _read((directory or Path.cwd()) / CONFIG)
     from_file = [file.via] if isinstance(file.via, str) else file.via
-    chosen = via or os.environ.get("R2P_VIA", "").split() or from_file
-    return Settings(chosen, file.types, file.remap, file.module)
+    shared = os.environ.get("R2P_VIA", "").split() or from_file
+    return Settings(via or [_beside(url) if tool else url for url in shared], file.types, file.remap, file.module)
+
+
+def _beside(url: str) -> str:
+    """The URL by which a tool on the same machine reaches a program with this one."""
+    scheme, _, address = url.partition(":")
+    if scheme != "tcp-listen":
+        return url
+    host, _, port = address.rpartition(":")
+    return f"tcp:{_LOOPBACK.get(host, host)}:{port}"
 
 
 def _read(path: Path) -> _File:
@@ -254,7 +265,7 @@ def tool(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
         via, verbose, quiet = (given.pop(name) for name in _COMMON)
 
         async def main() -> None:
-            async with join(settings(via), name=name, verbose=verbose) as session:
+            async with join(settings(via, tool=True), name=name, verbose=verbose) as session:
                 await body(session, **given)
 
         execute(main, verbose=verbose, quiet=quiet)

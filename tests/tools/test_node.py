@@ -35,6 +35,7 @@ async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         everybody = printed(capsys)
     assert rows == [
         {"node": "BOT/drive", "publishes": ["encoder", "leds"], "subscribes": ["cmd"]},
+        {"node": "BOT/log", "publishes": ["log"], "subscribes": []},
         {"node": "BOT/show", "publishes": [], "subscribes": ["leds"]},
     ]
     assert everybody == [*rows, {"node": f"{other.module.name}/tool", "publishes": [], "subscribes": ["leds"]}]
@@ -75,7 +76,7 @@ async def test_names_that_are_not_one_node() -> None:
     async with robot(drive), robot(drive, name="ARM"), tool() as session:
         with pytest.raises(r2p.Error, match="several nodes drive: say which of ARM/drive, BOT/drive"):
             await info(session, "drive")
-        with pytest.raises(r2p.Error, match="no node ARM/show; known: ARM/drive, BOT/drive"):
+        with pytest.raises(r2p.Error, match="no node ARM/show; known: ARM/drive, ARM/log, BOT/drive, BOT/log"):
             await info(session, "ARM/show")
 
 

@@ -48,6 +48,25 @@ def test_the_command_line_goes_before_the_environment_before_the_file(
     assert settings(["tcp:c", "tcp:d"]).via == ["tcp:c", "tcp:d"]
 
 
+@pytest.mark.parametrize(
+    ("listens", "connects"),
+    [
+        ("tcp-listen:2323", "tcp:127.0.0.1:2323"),
+        ("tcp-listen:0.0.0.0:2323", "tcp:127.0.0.1:2323"),
+        ("tcp-listen:[::]:2323", "tcp:[::1]:2323"),
+        ("tcp-listen:10.0.0.5:2323", "tcp:10.0.0.5:2323"),
+        ("serial:/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
+    ],
+)
+def test_a_tool_connects_to_where_the_program_of_the_same_file_listens(
+    tmp_path: Path, listens: str, connects: str
+) -> None:
+    (tmp_path / "r2p.toml").write_text(f'via = "{listens}"')
+    assert settings(directory=tmp_path).via == [listens]
+    assert settings(directory=tmp_path, tool=True).via == [connects]
+    assert settings([listens], tmp_path, tool=True).via == [listens]
+
+
 def test_what_the_file_holds(tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text(
         'via = ["tcp:a", "tcp:b"]\nmodule = "PC1"\n[types]\nleds = "r2p.msg:Led"\n[remap]\nencoder = "enc1"\n'

@@ -1,0 +1,314 @@
+"""Nodes: spin, every, remapping, logging, and what is left when a node has ended: nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from pathlib import Path
+
+import pytest
+
+import r2p
+from r2p.msg import Led, Log
+from tests.bench import MS, crashes, hold, joined, led, local, numbers, settle
+
+# Spin
+
+
+@pytest.mark.virtual_time
+async def test_spin_serves_callbacks_and_says_false_on_time_out() -> None:
+    got: list[tuple[str, int]] = []
+    served = []
+
+    async def spinner(node: r2p.Node) -> None:
+        node.subscribe("a", Led, lambda message: got.append(("a", message.led)))
+
+        async def slow(message: Led) -> None:
+            await asyncio.sleep(0.1)
+            got.append(("b", message.led))
+
+        node.subscribe("b", Led, slow)
+        iterated = node.subscribe("c", Led)
+        for _ in range(4):
+            yes = await node.spin(1.0)
+            served.append((yes, node.now()))
+        assert len(iterated.queue) == 1
+
+    async with local() as module:
+        module.start(spinner)
+        start = module.space.clock.now()
+        node = module.start(hold)
+        a, b, c = (node.advertise(topic, Led) for topic in "abc")
+        await a.wait_subscriber()
+        await c.publish(led(9))
+        await settle(0.5)
+        await a.publish(led(1))
+        await b.publish(led(2))
+        await settle(0.5)
+        await a.publish(led(3))
+        await settle(3.0)
+        assert got == [("a", 1), ("b", 2), ("a", 3)]
+        assert [yes for yes, _ in served] == [True, True, False, False]
+        assert [(at - start) // MS for _, at in served] == pytest.approx([600, 1000, 2000, 3000], abs=2)
+
+
+@pytest.mark.virtual_time
+async def test_spin_needs_a_callback() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        node.subscribe("a", Led)
+        with pytest.raises(r2p.Error, match="node hold spins without a callback: give subscribe"):
+            await node.spin()
+
+
+@pytest.mark.virtual_time
+async def test_what_a_callback_raises_comes_out_of_spin() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        leds = node.subscribe("a", Led, lambda message: 1 // message.led)
+        publisher = node.advertise("a", Led)
+        for number in (0, 5):
+            await publisher.publish(led(number))
+        with pytest.raises(ZeroDivisionError):
+            await node.spin()
+        assert len(leds.queue) == 1
+        assert await node.spin()
+
+
+@pytest.mark.virtual_time
+async def test_a_callback_may_close_its_subscription() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        got = []
+
+        def once(message: Led) -> None:
+            got.append(message)
+            leds.close()
+
+        leds = node.subscribe("a", Led, once)
+        node.subscribe("b", Led, got.append)
+        publisher = node.advertise("a", Led)
+        for number in range(3):
+            await publisher.publish(led(number))
+        assert await node.spin(1.0)
+        assert not await node.spin(1.0)
+        assert numbers(got) == [0]
+
+
+@pytest.mark.virtual_time
+async def test_the_time_out_of_a_subscription_ends_a_spin() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        leds = node.subscribe("a", Led, lambda message: None, timeout=0.5)
+        assert not await node.spin()
+        assert leds.timeouts == 1
+        assert leds.waiter is None
+
+
+@pytest.mark.virtual_time
+async def test_a_cancelled_spin_loses_no_message() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        got: list[Led] = []
+        leds = node.subscribe("a", Led, got.append)
+        publisher = node.advertise("a", Led)
+        for turns in range(6):
+            spinning = asyncio.create_task(node.spin())
+            await settle()
+            publisher.publish_nowait(led(turns))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            spinning.cancel()
+            await asyncio.wait([spinning])
+            assert leds.waiter is None
+        await node.spin()
+        assert numbers(got) == list(range(6))
+
+
+# Every
+
+
+@pytest.mark.virtual_time
+async def test_every_ticks_on_absolute_phase_and_counts_what_a_slow_body_skips() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        ticks = []
+        start = module.space.clock.monotonic()
+        async for tick in node.every(0.1):
+            ticks.append(((tick.due - start) // MS, round(tick.late, 6), tick.skipped))
+            if len(ticks) == 2:
+                await asyncio.sleep(0.36)
+            if len(ticks) == 6:
+                break
+        assert ticks == [(100, 0, 0), (200, 0, 0), (500, 0.06, 2), (600, 0, 0), (700, 0, 0), (800, 0, 0)]
+
+
+@pytest.mark.virtual_time
+async def test_every_refuses_a_period_without_sense() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        for period in (0, -1, 1e-9):
+            with pytest.raises(ValueError, match="too short"):
+                await anext(aiter(node.every(period)))
+
+
+def open_files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts file descriptors")
+@pytest.mark.anyio
+async def test_no_ticker_outlives_its_node() -> None:
+    async def broken(node: r2p.Node) -> None:
+        ticks = node.every(0.001)  # what was raised keeps it alive
+        async for _ in ticks:
+            raise ValueError
+
+    async def short(node: r2p.Node) -> None:
+        async for _ in node.every(0.001):
+            return
+
+    async def cancelled(node: r2p.Node) -> None:
+        async for _ in node.every(0.001):
+            await asyncio.Event().wait()
+
+    async def main() -> None:
+        async with local() as module:
+            before = open_files()
+            for function in (broken, short):
+                module.start(function, name=function.__name__)
+            await module.wait()
+            module.start(cancelled, name="late")
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            await module.nodes["late"].stop()
+            assert open_files() == before
+
+    assert len(await crashes(main)) == 1
+
+
+# Names
+
+
+@pytest.mark.virtual_time
+async def test_names_are_checked() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        with pytest.raises(r2p.NameTooLong, match="topic name 'a_very_long_topic' has 17 characters"):
+            node.advertise("a_very_long_topic", Led)
+        with pytest.raises(r2p.InvalidName):
+            node.subscribe("not a topic", Led)
+        assert node.advertise("/leds", Led).topic == "leds"  # as in the thesis
+
+
+@pytest.mark.virtual_time
+async def test_remapping_of_a_module_and_of_a_node() -> None:
+    async with r2p.Module("PC1", via=[], remap={"encoder": "enc0", "/odo": "odo0"}) as module:
+        one = module.start(hold, name="one")
+        two = module.start(hold, name="two", remap={"encoder": "enc2"})
+        assert [node.subscribe("encoder", Led).topic for node in (one, two)] == ["enc0", "enc2"]
+        assert [node.advertise("odo", Led).topic for node in (one, two)] == ["odo0", "odo0"]
+        assert one.subscribe("other", Led).topic == "other"
+        with pytest.raises(r2p.NameTooLong):
+            module.start(hold, name="three", remap={"encoder": "a_very_long_topic"})
+    with pytest.raises(r2p.InvalidName):
+        r2p.Module("PC1", via=[], remap={"encoder": ""})
+
+
+# Logging
+
+
+@pytest.mark.virtual_time
+async def test_a_node_logs_under_its_own_name_and_on_the_topic_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    async with local() as module:
+        node, other = module.start(hold, name="arm"), module.start(hold, name="watch")
+        records = other.subscribe("log", Log)
+        await settle(1.0)
+        node.log.debug("hidden")
+        node.log.info("at %d%%", 50)
+        message = await records.fetch(1.0)
+        assert message == Log(stamp=r2p.Timestamp.from_ns(node.now()), level=20, node="arm", text="at 50%")
+        assert not records.queue
+    record = next(each for each in caplog.records if each.getMessage() == "at 50%")
+    assert (record.name, record.funcName) == (
+        "r2p.PC1.arm",
+        "test_a_node_logs_under_its_own_name_and_on_the_topic_log",
+    )
+
+
+@pytest.mark.virtual_time
+async def test_an_exception_is_logged_with_its_traceback() -> None:
+    async with local() as module:
+        node, other = module.start(hold, name="arm"), module.start(hold, name="watch")
+        records = other.subscribe("log", Log, queue=100)
+        try:
+            raise ValueError("stuck")
+        except ValueError as error:
+            node.log.exception("first")
+            node.log.error("second", exc_info=error)
+            node.log.error("third", exc_info=sys.exc_info())
+        node.log.error("fourth", exc_info=True)  # there is none
+        texts = [Log.decode(sample.data).text for sample in records.queue]
+        assert texts.count("ValueError: stuck") == 3
+        assert [text for text in texts if text in {"first", "second", "third", "fourth"}] == [
+            "first",
+            "second",
+            "third",
+            "fourth",
+        ]
+        assert texts[1] == "Traceback (most recent call last):"
+
+
+# The end
+
+
+@pytest.mark.virtual_time
+async def test_a_node_that_has_ended_takes_no_topics() -> None:
+    async def short(node: r2p.Node) -> None:
+        pass
+
+    async with local() as module:
+        node = module.start(short)
+        await module.wait()
+        assert node.closed
+        with pytest.raises(r2p.Closed, match="node short has ended: it can't use topic leds any more"):
+            node.subscribe("leds", Led)
+        with pytest.raises(r2p.Closed):
+            node.advertise("leds", Led)
+
+
+@pytest.mark.virtual_time
+async def test_a_node_forgets_what_is_closed() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        users = [use("leds", Led) for _ in range(3) for use in (node.advertise, node.subscribe)]
+        for user in users:
+            user.close()
+        assert (list(node.publishers), list(node.subscribers)) == ([], [])
+
+
+@pytest.mark.virtual_time
+async def test_all_that_a_node_opened_is_closed_however_it_ends() -> None:
+    async def opens(node: r2p.Node, how: str) -> None:
+        node.advertise("a", Led)
+        node.advertise("b", Led, r2p.Sporadic(1.0))
+        node.advertise("c", Led, r2p.Periodic(1.0, Led))
+        node.subscribe("d", Led)
+        node.subscribe("e", Led, print, timeout=1.0, on_timeout=print)
+        if how == "raises":
+            raise ValueError
+        if how == "is cancelled":
+            await asyncio.Event().wait()
+
+    async def main() -> None:
+        async with joined("A") as module:
+            for how in ("returns", "raises", "is cancelled"):
+                node = module.start(opens, how, name="n")
+                await settle(1.5)
+                await module.nodes["n"].stop()
+                assert node.closed
+                assert list(module.space.topics) == ["log"]
+
+    assert len(await crashes(main)) == 1

@@ -1,0 +1,196 @@
+"""Topics: who gets a sample, in which order, and who is woken when."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import weakref
+
+import pytest
+
+import r2p
+from r2p.msg import Encoder, Led
+from tests.bench import hold, joined, led, local, settle
+
+
+class Lamp(r2p.Message):
+    """The layout of Led under another name."""
+
+    led: r2p.u32 = 0
+    value: r2p.u8 = 0
+
+
+# Types
+
+
+@pytest.mark.virtual_time
+async def test_one_topic_has_one_layout_in_a_module() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        node.advertise("leds", Led)
+        with pytest.raises(r2p.TypeMismatch, match=r"topic leds is Led \(.*\) in module PC1, not Encoder"):
+            node.subscribe("leds", Encoder)
+        with pytest.raises(r2p.TypeMismatch):
+            node.advertise("leds", Encoder)
+        assert len(node.publishers) == 1
+        assert not node.subscribers
+
+
+@pytest.mark.virtual_time
+async def test_the_same_layout_under_another_name_fits() -> None:
+    async with local() as module:
+        node, other = module.start(hold, name="a"), module.start(hold, name="b")
+        lamps = other.subscribe("leds", Lamp)
+        await node.advertise("leds", Led).publish(Led(led=3, value=1))
+        assert await lamps.fetch() == Lamp(led=3, value=1)
+
+
+@pytest.mark.virtual_time
+async def test_a_topic_without_users_is_forgotten_and_may_have_another_type() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        publisher, subscriber = node.advertise("leds", Led), node.subscribe("leds", Led)
+        publisher.close()
+        with pytest.raises(r2p.TypeMismatch):
+            node.advertise("leds", Encoder)
+        subscriber.close()
+        assert "leds" not in module.space.topics
+        node.advertise("leds", Encoder)
+
+
+@pytest.mark.virtual_time
+async def test_what_fails_leaves_no_topic_behind() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        with pytest.raises(r2p.MessageError):
+            node.advertise("leds", Led, r2p.Sporadic(deadline=0))
+        with pytest.raises(r2p.MessageError):
+            node.advertise("leds", Led, r2p.Periodic(period=-1, fill=Led))
+        with pytest.raises(ValueError, match="too short"):
+            node.advertise("leds", Led, r2p.Periodic(period=1e-9, fill=Led))
+        assert "leds" not in module.space.topics
+        assert not node.publishers
+
+
+# Delivery
+
+
+@pytest.mark.virtual_time
+async def test_all_subscribers_get_the_very_object_that_was_published() -> None:
+    async with local() as module:
+        node, other = module.start(hold, name="a"), module.start(hold, name="b")
+        first, second = other.subscribe("leds", Led), other.subscribe("leds", Led)
+        message = led(1)
+        await node.advertise("leds", Led).publish(message)
+        assert await first.fetch() is message
+        assert await second.fetch() is message
+
+
+@pytest.mark.virtual_time
+async def test_several_publishers_share_a_topic() -> None:
+    async with local() as module:
+        node, other, third = (module.start(hold, name=name) for name in "abc")
+        leds = third.subscribe("leds", Led)
+        await node.advertise("leds", Led).publish(led(1))
+        await other.advertise("leds", Led).publish(led(2))
+        samples = leds.samples()
+        assert [str((await anext(samples)).source) for _ in range(2)] == ["PC1/a", "PC1/b"]
+
+
+@pytest.mark.virtual_time
+async def test_what_came_by_a_link_goes_to_no_link() -> None:
+    async with joined("A") as a, joined("B") as b:
+        publisher = a.start(hold, name="a").advertise("leds", Led)
+        relay = b.start(hold, name="b")
+        leds = relay.subscribe("leds", Led)
+        relay.advertise("leds", Led)  # so that b's link has an outlet for the topic as well
+        back = a.start(hold, name="c").subscribe("leds", Led)
+        await leds.wait_publisher()
+        await settle(1.0)
+        await publisher.publish(led(1))
+        assert await leds.fetch() == led(1)
+        await settle(1.0)
+        assert len(back.queue) == 1  # the local delivery alone
+        assert b.links[0].stats.sent == 0
+
+
+@pytest.mark.virtual_time
+async def test_ten_thousand_topics() -> None:
+    async with local() as module:
+        node, other = module.start(hold, name="a"), module.start(hold, name="b")
+        publishers = [node.advertise(f"t{number}", Led) for number in range(10_000)]
+        subscribers = [other.subscribe(f"t{number}", Led) for number in range(10_000)]
+        for number, publisher in enumerate(publishers):
+            await publisher.publish(led(number))
+        assert [(await each.fetch()).led for each in subscribers] == list(range(10_000))
+        assert len(module.network.topics()) == 10_001  # and `log`
+        for publisher, subscriber in zip(publishers, subscribers, strict=True):
+            publisher.close()
+            subscriber.close()
+        assert list(module.space.topics) == ["log"]
+
+
+@pytest.mark.virtual_time
+async def test_nothing_is_held_after_close() -> None:
+    async with local() as module:
+        node, other = module.start(hold, name="a"), module.start(hold, name="b")
+        publisher = node.advertise("leds", Led, latch=True)
+        event = node.advertise("leds", Led, r2p.Sporadic(deadline=1.0))
+        subscriber = other.subscribe("leds", Led, queue=1)
+        full = other.subscribe("leds", Led, queue=1)  # stays full, with an event waiting for it
+        await publisher.publish(led(1))
+        await event.publish(led(2))
+        held = [weakref.ref(each) for each in (publisher, event, subscriber)]
+        for user in (publisher, event, subscriber):
+            user.close()
+        await settle()
+        del publisher, event, subscriber, user
+        gc.collect()
+        assert [each() for each in held] == [None] * 3
+        assert len(full.queue) == 1
+
+
+# Waking
+
+
+async def awaken(priorities: list[int]) -> list[list[int]]:
+    """Wake one waiting subscriber of each priority; gives those that ran, turn by turn."""
+    turns: list[list[int]] = []
+
+    async def wait(node: r2p.Node) -> None:
+        leds = node.subscribe("leds", Led)
+        await leds.fetch()
+        turns[-1].append(node.priority)
+
+    async with local() as module:
+        for number, priority in enumerate(priorities):
+            module.start(wait, name=f"n{number}", priority=priority)
+        publisher = module.start(hold, name="source", priority=min(priorities)).advertise("leds", Led)
+        await settle()
+        publisher.publish_nowait(led(1))
+        while sum(map(len, turns)) < len(priorities):
+            turns.append([])
+            await asyncio.sleep(0)
+    return [turn for turn in turns if turn]
+
+
+@pytest.mark.virtual_time
+async def test_the_highest_priority_is_woken_at_once_and_the_rest_one_a_turn_highest_first() -> None:
+    assert await awaken([1, 5, 0, 5, 2]) == [[5, 5], [2], [1], [0]]
+
+
+@pytest.mark.virtual_time
+async def test_nodes_of_one_priority_are_all_woken_at_once() -> None:
+    assert await awaken([-3, -3, -3]) == [[-3, -3, -3]]
+
+
+@pytest.mark.virtual_time
+async def test_the_highest_priority_is_that_of_the_nodes_which_still_run() -> None:
+    async with local() as module:
+        important, other = module.start(hold, name="a", priority=9), module.start(hold, name="b", priority=1)
+        await settle()
+        assert module.space.waker.top == 9
+        await module.nodes["a"].stop()
+        assert (important.closed, other.closed) == (True, False)
+        assert module.space.waker.top == 1
+    assert module.space.waker.top == 0

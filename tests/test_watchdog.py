@@ -1,0 +1,86 @@
+"""The watchdog, in real time: each test blocks the loop until the watchdog has said so, at most PATIENCE seconds."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+import r2p
+from r2p.watchdog import Watchdog
+from tests.bench import local
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PATIENCE = 30.0
+
+
+class Reports(logging.Handler):
+    """Collects what the watchdog logs, and tells that something came."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.came = threading.Event()
+        self.again = threading.Event()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+        (self.again if self.came.is_set() else self.came).set()
+
+
+@pytest.fixture
+def reports() -> Iterator[Reports]:
+    handler = Reports()
+    logger = logging.getLogger("r2p.watchdog")
+    logger.addHandler(handler)
+    yield handler
+    logger.removeHandler(handler)
+
+
+async def greedy(node: r2p.Node, came: threading.Event) -> None:
+    assert came.wait(PATIENCE)
+
+
+@pytest.mark.anyio
+async def test_the_stack_of_a_node_that_blocks_the_loop_is_logged_while_it_does(reports: Reports) -> None:
+    async with local() as module:
+        module.start(greedy, reports.came)
+        await module.wait()
+        assert await asyncio.to_thread(reports.again.wait, PATIENCE)
+    assert "task PC1/greedy has blocked the event loop for over 100 ms" in reports.texts[0]
+    assert "assert came.wait(PATIENCE)" in reports.texts[0]
+    assert "the event loop runs again after" in reports.texts[1]
+
+
+@pytest.mark.anyio
+async def test_a_callback_that_blocks_is_logged_too(reports: Reports) -> None:
+    watchdog = Watchdog(asyncio.get_running_loop(), limit=0.01)
+    watchdog.start()
+    asyncio.get_running_loop().call_soon(reports.came.wait, PATIENCE)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    watchdog.close()
+    assert "a callback has blocked the event loop for over 10 ms" in reports.texts[0]
+
+
+@pytest.mark.anyio
+async def test_closing_ends_the_thread_also_while_the_loop_is_blocked(reports: Reports) -> None:
+    watchdog = Watchdog(asyncio.get_running_loop(), limit=0.01)
+    watchdog.start()
+    assert reports.came.wait(PATIENCE)  # blocked from here on, as seen by the watchdog
+    watchdog.close()
+    assert not any(thread.name == "r2p-watchdog" for thread in threading.enumerate())
+    assert len(reports.texts) == 1
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("watched", [True, False])
+async def test_a_module_has_a_watchdog_unless_it_says_no(watched: bool) -> None:
+    async with r2p.Module("PC1", via=[], watchdog=watched):
+        assert any(thread.name == "r2p-watchdog" for thread in threading.enumerate()) == watched
+    assert not any(thread.name == "r2p-watchdog" for thread in threading.enumerate())

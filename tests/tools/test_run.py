@@ -1,0 +1,272 @@
+"""`r2p run`: what it loads, what it says when it can't, and how it ends."""
+
+from __future__ import annotations
+
+import re
+import signal
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+import r2p
+from r2p.tools.run import load
+from r2p.tools.session import Usage
+from tests.tools.rig import listening, process
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+NODES = """
+import asyncio, time
+import r2p
+from r2p.msg import Led
+
+async def blink(node: r2p.Node) -> None:
+    leds = node.advertise("leds", Led)
+    async for tick in node.every(0.02):
+        await leds.publish(Led(led=3))
+
+async def watch(node: r2p.Node) -> None:
+    async for led in node.subscribe("leds", Led):
+        print(node.module, node.name, node.priority, led, flush=True)
+
+async def once(node: r2p.Node) -> None:
+    print("ran", flush=True)
+
+async def crash(node: r2p.Node) -> None:
+    raise LookupError("no motor")
+
+async def motor(node: r2p.Node) -> None:
+    print("ready", flush=True)
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await asyncio.sleep(0)
+        print("stopped", flush=True)
+
+async def stubborn(node: r2p.Node) -> None:
+    print("ready", flush=True)
+    while True:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            print("no", flush=True)
+
+async def blocks(node: r2p.Node) -> None:
+    print("ready", flush=True)
+    time.sleep(3600)
+
+async def a_long_name(node: r2p.Node) -> None:
+    pass
+
+def plain(node: r2p.Node) -> None:
+    pass
+"""
+
+
+@pytest.fixture(autouse=True)
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A file with nodes in the working directory; what a test imports is forgotten after it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    before = set(sys.modules)
+    (tmp_path / "nodes.py").write_text(NODES, encoding="ascii")
+    yield
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+def names(*targets: str) -> list[str]:
+    return [each.name for each in load(targets)]
+
+
+@pytest.mark.parametrize("where", ["nodes.py", "./nodes.py", "nodes"])
+def test_functions_are_found(where: str) -> None:
+    blink, left = load([f"{where}:blink", f"{where}:blink=left"])
+    assert (blink.name, left.name) == ("blink", "left")
+    assert blink.function is left.function
+    assert names(f"{where}:a_long_name=short") == ["short"]
+
+
+def test_a_package_and_what_lies_beside_a_file(tmp_path: Path) -> None:
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "__init__.py").touch()
+    (tmp_path / "robot" / "arm.py").write_text("from nodes import blink, watch", encoding="ascii")
+    (tmp_path / "leg.py").write_text("import nodes\nblink = nodes.blink", encoding="ascii")
+    assert names("robot.arm:watch", "leg.py:blink") == ["watch", "blink"]
+
+
+def test_a_file_may_be_named_like_a_module_that_is_there(tmp_path: Path) -> None:
+    (tmp_path / "signal.py").write_text("async def blink(node): ...", encoding="ascii")
+    assert names("signal.py:blink") == ["blink"]
+    assert signal.SIGINT
+
+
+@pytest.mark.parametrize(
+    ("target", "what_to_do"),
+    [
+        ("nodes.py", "which function? it has blink, watch, once, crash, motor, stubborn, blocks, a_long_name: r2p run"),
+        ("nodes.py:blnk", "nodes.py has no function blnk; did you mean blink?"),
+        ("nodes.py:xyz", "nodes.py has no function xyz; it has blink, "),
+        ("nodes.py:plain", "nodes.py:plain is no node: write `async def plain"),
+        ("nodes.py:Led", "nodes.py:Led is no node"),
+        ("nodes.py:a_long_name", "at most 8 characters; give it another: nodes.py:a_long_name=NAME"),
+        ("nodes.py:blink=much_too_long", "at most 8 characters; give it another: nodes.py:blink=NAME"),
+        ("other.py:blink", "there is no file other.py"),
+        ("dir/nodes:blink", "there is no file dir/nodes"),
+        ("other:blink", "there is no module other here; a file's name ends with .py"),
+        ("nodes.blink", "there is no module nodes.blink"),
+        ("empty.py", "which function? it has no node; write `async def"),
+    ],
+)
+def test_usage_says_what_to_do(tmp_path: Path, target: str, what_to_do: str) -> None:
+    (tmp_path / "empty.py").touch()
+    with pytest.raises(Usage, match=re.escape(what_to_do)):
+        load([target])
+
+
+def test_two_nodes_of_one_name() -> None:
+    with pytest.raises(Usage, match=r"there is a node blink already; give it another: nodes.py:blink=NAME"):
+        load(["nodes.py:blink", "nodes.py:watch", "nodes.py:blink"])
+
+
+@pytest.mark.parametrize("where", ["broken.py", "broken"])
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("def f():\n    return missing\nf()", "NameError: name 'missing' is not defined"),
+        ("import not_there", "ModuleNotFoundError: No module named 'not_there'"),
+        ("x = (", "SyntaxError: '(' was never closed"),
+    ],
+)
+def test_errors_in_the_file_come_with_its_lines_and_none_of_ours(
+    tmp_path: Path, where: str, text: str, error: str
+) -> None:
+    file = tmp_path / "broken.py"
+    file.write_text(text, encoding="ascii")
+    with pytest.raises(r2p.Error) as raised:
+        load([f"{where}:blink"])
+    lines = str(raised.value).splitlines()
+    assert lines[0] == f"can't load {where}:"
+    assert lines[-1] == error
+    files = [line for line in lines if line.strip().startswith("File ")]
+    assert files
+    assert all(str(file) in line for line in files)
+
+
+# As a process
+
+
+def run(*arguments: str, signals: int = 0, number: int = signal.SIGINT) -> tuple[int, str, str]:
+    """`r2p run`; after each of its first `signals` lines it gets a signal. Exit code, output, errors."""
+    with process("run", *arguments) as child:
+        assert child.stdout is not None
+        lines = []
+        for _ in range(signals):
+            lines.append(child.stdout.readline())
+            child.send_signal(number)
+        out, err = child.communicate()
+    return child.returncode, "".join(lines) + out, err
+
+
+@pytest.mark.processes
+def test_it_says_what_runs_and_ends_with_its_nodes() -> None:
+    code, out, err = run("nodes.py:once", "nodes.py:once=again", "--module", "PC7")
+    assert (code, out) == (0, "ran\nran\n")
+    assert err == "r2p: module PC7 runs once, again; links: none, local only (--via joins a network); Ctrl-C ends it\n"
+    assert run("nodes.py:once", "-q")[2] == ""
+
+
+@pytest.mark.processes
+def test_two_processes_with_remapping_and_priority() -> None:
+    with process("run", "nodes.py:blink", "--via", "tcp-listen:0", "--remap", "leds:=lamps") as blink:
+        via = listening(blink)
+        arguments = ("nodes.py:watch=look", "--module", "PC7", "--via", via)
+        names = ("--remap", "leds:=lamps", "--priority", "look=10")
+        code, out, err = run(*arguments, *names, signals=1)
+    assert code == 0
+    assert set(out.splitlines()) == {"PC7 look 10 Led(led=3, value=0)"}
+    assert f"module PC7 runs look; links: {via}; Ctrl-C ends it" in err
+    assert f"link {via} is up" in err
+
+
+@pytest.mark.processes
+def test_r2p_toml(tmp_path: Path) -> None:
+    with process("run", "nodes.py:blink", "--via", "tcp-listen:0") as blink:
+        via = listening(blink)
+        (tmp_path / "r2p.toml").write_text(f'via = "{via}"\nmodule = "PC8"\n[remap]\nlamps = "leds"', encoding="ascii")
+        code, out, _ = run("nodes.py:watch", "--remap", "leds:=leds", signals=1)
+    assert code == 0
+    assert out.startswith("PC8 watch 0 Led")
+
+
+@pytest.mark.processes
+def test_a_crash_is_told_once_and_the_others_run_on() -> None:
+    code, out, err = run("nodes.py:crash", "nodes.py:motor", signals=1)
+    assert (code, out) == (1, "ready\nstopped\n")
+    assert err.count("Traceback") == err.count("LookupError: no motor\n") - 1 == 1
+    assert "ExceptionGroup" not in err
+    assert err.endswith("r2p: 1 node(s) of module " + err.rpartition("of module ")[2])
+
+
+@pytest.mark.processes
+def test_restart_keeps_it_running() -> None:
+    with process("run", "nodes.py:crash", "--restart") as child:
+        assert child.stderr is not None
+        crashes = (line for line in child.stderr if "crash crashed" in line)
+        next(crashes)
+        next(crashes)
+        child.send_signal(signal.SIGTERM)
+        child.communicate()
+    assert child.returncode == 0
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_in_order(number: int) -> None:
+    code, out, err = run("nodes.py:motor", signals=1, number=number)
+    assert (code, out) == (0, "ready\nstopped\n")
+    assert "Traceback" not in err
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_it_at_once(number: int) -> None:
+    assert run("nodes.py:stubborn", signals=2, number=number)[:2] == (-number, "ready\nno\n")
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("node", ["stubborn", "blocks"])
+def test_what_does_not_end_is_ended(node: str) -> None:
+    assert run(f"nodes.py:{node}", signals=1)[0] == -signal.SIGINT
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["nodes.py:missing"], "nodes.py has no function missing"),
+        (["nodes.py:blink", "--module", "TOOLONGNAME"], "the wire carries 7"),
+        (["nodes.py:blink", "--remap", "a=b"], "--remap a=b: write it as OLD:=NEW"),
+        (["nodes.py:blink", "--remap", "a:=b-c"], "use letters, digits and underscores only"),
+        (["nodes.py:blink", "--priority", "blnk=1"], "there is no node blnk; the nodes are blink"),
+        (["nodes.py:blink", "--priority", "blink=high"], "write it as NODE=N, for example blink=10"),
+        ([], "FILE:FUNCTION"),
+    ],
+)
+def test_usage_is_exit_code_2(arguments: list[str], error: str) -> None:
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert error in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.processes
+def test_a_file_that_does_not_load_is_exit_code_1(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text("x = 1 / 0", encoding="ascii")
+    code, _, err = run("broken.py:blink")
+    assert code == 1
+    assert err.startswith("r2p: can't load broken.py:\nTraceback (most recent call last):\n  File")
+    assert err.endswith("ZeroDivisionError: division by zero\n")
