@@ -1,0 +1,343 @@
+"""A module with the firmware of 2014, as its debug line shows it (PROTOCOL.md 3 and 4): bytes in, bytes out.
+
+It says what the recorded firmware says, in the same order: the boot marker, ALIVE, the announcements of its nodes half
+a second later, then one step of repetition each half second; it has no r2p extensions. Three things are not firmware's:
+a line with a wrong checksum is dropped and counted (firmware does not look), bad lines do it no lasting harm, and in
+boot mode there is no loader.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import msgspec
+
+from r2p.codecs import UnknownType, debug, management
+from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
+from r2p.errors import DecodeError, Error
+from r2p.messages import Layout, Message, layout
+from r2p.names import MANAGEMENT, module_name, topic_name
+
+_MS = 1_000_000
+_SECOND = 1_000_000_000
+_BOOT = 10 * _MS  # from REBOOT to the boot marker
+_NODES = 500 * _MS  # from the boot marker to the nodes' first announcements
+_FIRST_STEP = 496 * _MS  # after power on
+_STEP = 528 * _MS  # on a silent line
+_STEP_AFTER_TRAFFIC = 500 * _MS
+_QUIET = 33 * _MS
+_MARKER = b"\r\n\r\n"
+_NO_DEADLINE = 0x7FFFFFFF
+
+Answer = Iterable[tuple[str, Message]]
+
+
+class Publishes(msgspec.Struct, frozen=True):
+    """A publisher of an emulated module.
+
+    Every `period` seconds, while somebody subscribes, it publishes what `fill(time)` gives, None for nothing; `time` is
+    in ns since the module started. Without a period it publishes only what its module is told to.
+    """
+
+    topic: str
+    type: type[Message]
+    period: float | None = None
+    fill: Callable[[int], Message | None] | None = None
+
+
+class Subscribes(msgspec.Struct, frozen=True):
+    """A subscriber of an emulated module. `answer(message)` gives what is published in return, as (topic, message)."""
+
+    topic: str
+    type: type[Message]
+    queue: int = 5
+    answer: Callable[[Any], Answer | None] | None = None
+
+
+class FirmwareModule:
+    """An emulated module. All times are monotonic ns; each method that returns bytes returns what it sends.
+
+    Raises InvalidName or NameTooLong, and MessageError for a type without a layout.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        publishers: Iterable[Publishes] = (),
+        subscribers: Iterable[Subscribes] = (),
+        repeats: bool = True,
+    ) -> None:
+        self.name = module_name(name)
+        self.flags = 0
+        """As in its ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
+        self.halted = False
+        """Whether a SUBSCRIBE_REQUEST with queue length 0 has halted it, as it does firmware; only power helps."""
+        self.sent: Counter[str] = Counter()
+        """Messages by topic, since it was made."""
+        self.received: Counter[str] = Counter()
+        self.last: dict[str, Message] = {}
+        """The last message received on each topic."""
+        self.drops: Counter[str] = Counter()
+        """Lines and messages that it dropped, by reason."""
+        self._publishers = {topic_name(each.topic): _Publisher(each) for each in publishers}
+        self._subscribers = {topic_name(each.topic): _Subscriber(each) for each in subscribers}
+        self._repeats = repeats
+        self._reader = debug.Reader(self.drops)
+        self._out: list[bytes] = []
+        self._booted = 0
+        self._boot_at: int | None = None
+        self._nodes_at: int | None = None
+        self._step_at: int | None = None
+        self._stepped = 0
+        self._steps: list[bytes | None] = []
+        self._heard = 0  # the last management message
+        self._running = False  # its nodes
+
+    # Input
+
+    def power_on(self, now: int, *, boot_mode: bool = False) -> bytes:
+        """Start, or start again after a cut of its power."""
+        self.halted = False
+        self._boot(now, FLAG_BOOT if boot_mode else 0, _FIRST_STEP)
+        return self._take()
+
+    def receive(self, now: int, data: bytes) -> bytes:
+        """Bytes came in by its line."""
+        return b"".join([self.take(now, line) for line in self._reader.feed(data)])
+
+    def take(self, now: int, line: debug.Line) -> bytes:
+        """A line came in; for a module with several lines, each with a `debug.Reader` of its own."""
+        if self.halted or self._boot_at is not None:
+            return b""
+        topic = line.topic.decode()
+        if topic == MANAGEMENT:
+            self._manage(now, line.data)
+        else:
+            self._deliver(now, topic, line.data)
+        return self._take()
+
+    def poll(self, now: int) -> bytes:
+        """Time has passed: call it at `next_deadline()`."""
+        if self._boot_at is not None and now >= self._boot_at:
+            self._boot(self._boot_at, self.flags, _STEP)
+        if self._nodes_at is not None and now >= self._nodes_at:
+            self._start_nodes(now)
+        if self._step_at is not None and now >= self._step_at:
+            self._step(now)
+        for publisher in self._publishers.values():
+            if publisher.is_due(now):
+                message = publisher.filled(now, self._booted)
+                if message is not None:
+                    self._publish(now, publisher, message)
+        return self._take()
+
+    def next_deadline(self) -> int | None:
+        """When it wants to be polled."""
+        if self.halted:
+            return None
+        if self._boot_at is not None:
+            return self._boot_at
+        times = [self._nodes_at, self._step_at, *(publisher.next for publisher in self._publishers.values())]
+        return min((time for time in times if time is not None), default=None)
+
+    def publish(self, now: int, topic: str, message: Message) -> bytes:
+        """Publish a message, if somebody subscribes. Raises Error if that is no topic of its publishers."""
+        publisher = self._publishers.get(topic)
+        if publisher is None:
+            raise Error(f"module {self.name} has no publisher of {topic}: give it one (publishers=[Publishes(...)])")
+        if self._running and not self.halted:
+            self._publish(now, publisher, message)
+        return self._take()
+
+    # Life
+
+    def _boot(self, now: int, flags: int, first_step: int) -> None:
+        self.flags = flags
+        self._booted = now
+        self._boot_at = None
+        self._running = False
+        self._reader = debug.Reader(self.drops)
+        for publisher in self._publishers.values():
+            publisher.next = None
+            publisher.joined = False
+        for subscriber in self._subscribers.values():
+            subscriber.opened = False
+        self._out.append(_MARKER)
+        self._say(now, management.Alive(self.name, flags))
+        self._nodes_at = now + _NODES
+        self._stepped = now
+        self._step_at = now + first_step if self._repeats else None
+        self._steps = []
+
+    def _start_nodes(self, now: int) -> None:
+        self._nodes_at = None
+        self._running = True
+        for publisher in self._publishers.values():
+            publisher.start(now)
+            self._say(now, publisher.advertisement)
+        for subscriber in self._subscribers.values():
+            self._say(now, subscriber.request)
+
+    def _stop(self, now: int) -> None:
+        """The nodes end; of the round of repetition, what the node at hand has is still said."""
+        self._end_nodes()
+        self.flags |= FLAG_STOPPED
+        self._steps = self._steps[-1:] if self._steps and self._steps[-1] is None else self._steps[-2:]
+        self._step_at = now + _STEP if self._repeats else None
+
+    def _end_nodes(self) -> None:
+        self._running = False
+        self._nodes_at = None
+        for publisher in self._publishers.values():
+            publisher.next = None
+
+    def _restart(self, now: int, flags: int) -> None:
+        self._end_nodes()
+        self.flags = flags
+        self._step_at = None
+        self._boot_at = now + _BOOT
+
+    def _step(self, now: int) -> None:
+        """One step of repetition: ALIVE, then node by node what it has, and nothing between two nodes."""
+        if now < self._heard + _QUIET:
+            self._step_at = self._heard + _QUIET
+            return
+        self._stepped = now
+        self._step_at = now + _STEP
+        if not self._steps:
+            self._steps = self._round()
+            self._say(now, management.Alive(self.name, self.flags))
+        elif (message := self._steps.pop()) is not None:
+            self._say_raw(now, message)
+
+    def _round(self) -> list[bytes | None]:
+        """What comes between two ALIVE, the last step first; each publisher and subscriber is a node of its own."""
+        if not self._running:
+            return []
+        messages: list[management.Management] = [each.advertisement for each in self._publishers.values()]
+        messages += [each.request for each in self._subscribers.values()]
+        return [step for message in messages for step in (None, management.encode(message))]
+
+    # Management
+
+    def _manage(self, now: int, data: bytes) -> None:
+        self._heard = now
+        if self._step_at is not None:
+            self._step_at = min(self._step_at, self._stepped + _STEP_AFTER_TRAFFIC)
+        try:
+            message = management.decode(data)
+        except UnknownType:
+            return
+        except DecodeError:
+            self.drops["undecodable"] += 1
+            return
+        match message:
+            case management.Advertise():
+                self._advertised(now, message.topic)
+            case management.SubscribeRequest():
+                self._requested(now, message)
+            case management.SubscribeResponse() if message.topic in self._subscribers:
+                self._subscribers[message.topic].opened = self._running
+            case management.Stop() if message.module == self.name:
+                self._stop(now)
+            case management.Reboot() if message.module == self.name:
+                self._restart(now, FLAG_REBOOTED)
+            case management.Bootload() if message.module == self.name:
+                self._restart(now, FLAG_REBOOTED | FLAG_BOOT)
+
+    def _advertised(self, now: int, topic: str) -> None:
+        subscriber = self._subscribers.get(topic)
+        if subscriber is not None and self._running:
+            self._say(now, subscriber.request)
+
+    def _requested(self, now: int, message: management.SubscribeRequest) -> None:
+        publisher = self._publishers.get(message.topic)
+        if publisher is None or not self._running:
+            return
+        if not publisher.joined and not message.queue:
+            self.halted = True
+            return
+        publisher.joined = True
+        self._say(now, management.SubscribeResponse(message.topic, publisher.layout.size))
+
+    # Data
+
+    def _deliver(self, now: int, topic: str, data: bytes) -> None:
+        subscriber = self._subscribers.get(topic)
+        if subscriber is None or not subscriber.opened or not self._running:
+            self.drops["not subscribed"] += 1
+        elif len(data) != subscriber.layout.size:
+            self.drops["wrong size"] += 1
+        else:
+            self._hand_over(now, subscriber, data)
+
+    def _hand_over(self, now: int, subscriber: "_Subscriber", data: bytes) -> None:
+        try:
+            message = subscriber.layout.decode(data)
+        except DecodeError:  # a text that is none: firmware has no such types
+            self.drops["undecodable"] += 1
+            return
+        topic = subscriber.request.topic
+        self.received[topic] += 1
+        self.last[topic] = message
+        for where, answer in (subscriber.answer and subscriber.answer(message)) or ():
+            self._out.append(self.publish(now, where, answer))
+
+    def _publish(self, now: int, publisher: "_Publisher", message: Message) -> None:
+        if publisher.joined:
+            data = publisher.layout.encode(message)
+            self._out.append(publisher.line(data, self._deadline(now)))
+            self.sent[publisher.advertisement.topic] += 1
+
+    # Output
+
+    def _say(self, now: int, message: management.Management) -> None:
+        self._say_raw(now, management.encode(message))
+
+    def _say_raw(self, now: int, message: bytes) -> None:
+        self._out.append(debug.encode(MANAGEMENT.encode(), message, self._deadline(now)))
+
+    def _deadline(self, now: int) -> int:
+        return (now - self._booted) // 1000 + _NO_DEADLINE
+
+    def _take(self) -> bytes:
+        data = b"".join(self._out)
+        self._out.clear()
+        return data
+
+
+class _Publisher:
+    """A publisher while its module runs."""
+
+    def __init__(self, what: Publishes) -> None:
+        self.layout: Layout[Any] = layout(what.type)
+        self.advertisement = management.Advertise(topic_name(what.topic), self.layout.size)
+        self.line = debug.encoder(self.advertisement.topic.encode())
+        self.joined = False
+        self.next: int | None = None
+        self._period = round(what.period * _SECOND) if what.period is not None and what.fill is not None else None
+        self._fill = what.fill
+
+    def start(self, now: int) -> None:
+        self.next = None if self._period is None else now + self._period
+
+    def is_due(self, now: int) -> bool:
+        return self.next is not None and now >= self.next
+
+    def filled(self, now: int, booted: int) -> Message | None:
+        """This period's message. Sets when the next one is due; those that were missed are skipped."""
+        if self.next is None or self._period is None or self._fill is None:
+            return None
+        self.next += ((now - self.next) // self._period + 1) * self._period
+        return self._fill(now - booted) if self.joined else None
+
+
+class _Subscriber:
+    """A subscriber while its module runs."""
+
+    def __init__(self, what: Subscribes) -> None:
+        self.layout: Layout[Any] = layout(what.type)
+        self.request = management.SubscribeRequest(topic_name(what.topic), self.layout.size, what.queue)
+        self.answer = what.answer
+        self.opened = False

@@ -1,0 +1,281 @@
+"""Running an emulated module: its timer, and the lines that connect it.
+
+Everybody on its lines hears all that the module says, as listeners on one serial line do; what each of them says is
+read apart, so that half a line of one does not spoil the other's.
+"""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Callable
+from types import TracebackType
+from typing import Protocol, Self, cast
+
+from r2p.clock import Alarm, clock_of
+from r2p.codecs import debug
+from r2p.errors import Broken
+from r2p.messages import Message
+from r2p.sim.modules.firmware import FirmwareModule
+from r2p.transports.line import Carrier, LineLink
+from r2p.transports.link import Hub, Transport
+
+BUFFER = 64 * 1024
+"""Bytes that wait for a listener that does not read; beyond that it misses what the module says."""
+
+_CHUNK = 4096
+
+
+class End(Protocol):
+    """One line's end at the module."""
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that were sent and not taken."""
+
+    def send(self, data: bytes) -> None:
+        """Take what the module says, or lose it."""
+
+    def close(self) -> None:
+        """Unplug it."""
+
+
+class Powered:
+    """An emulated module under power, for the time of an `async with` block.
+
+    It starts at the beginning of the block; who connects later misses the boot marker, as with a board.
+    """
+
+    def __init__(self, module: FirmwareModule) -> None:
+        self.module = module
+        self._ends: set[End] = set()
+        self._servers: list[asyncio.Server] = []
+
+    async def __aenter__(self) -> Self:
+        self._loop = asyncio.get_running_loop()
+        self._clock = clock_of(self._loop)
+        self._alarm = Alarm(self._loop, self._poll)
+        self.reset()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._alarm.close()
+        for server in self._servers:
+            server.close()
+        ends = list(self._ends)
+        for end in ends:
+            end.close()
+        await asyncio.gather(*(end.closed for end in ends if isinstance(end, _Client)))
+        for server in self._servers:
+            await server.wait_closed()
+
+    # Lines
+
+    async def listen(self, host: str = "127.0.0.1", port: int = 0) -> tuple[str, int]:
+        """Serve the line on TCP, to any number of clients; gives the address (port 0: any free one)."""
+        server = await self._loop.create_server(lambda: _Client(self), host, port)
+        self._servers.append(server)
+        bound: tuple[str, int] = server.sockets[0].getsockname()[:2]
+        return bound
+
+    def open_pty(self) -> str:
+        """Serve the line on a new pseudo terminal; gives its device name. Raises OSError where there are none."""
+        end = _Pty(self)
+        self._ends.add(end)
+        return end.device
+
+    def wire(self) -> "Wire":
+        """A transport of this process for `Module(via=...)`; works under virtual time."""
+        return Wire(self)
+
+    # The module
+
+    def reset(self, *, boot_mode: bool = False) -> None:
+        """Cut its power for a moment: it starts anew."""
+        self._spread(self.module.power_on(self._clock.monotonic(), boot_mode=boot_mode))
+
+    def publish(self, topic: str, message: Message) -> None:
+        """Let it publish a message; Error if it has no publisher of the topic."""
+        self._spread(self.module.publish(self._clock.monotonic(), topic, message))
+
+    # For the ends
+
+    def plugged(self, end: End) -> None:
+        self._ends.add(end)
+
+    def unplugged(self, end: End) -> None:
+        self._ends.discard(end)
+
+    def heard(self, lines: list[debug.Line]) -> None:
+        """Somebody said this."""
+        now = self._clock.monotonic()
+        self._spread(b"".join([self.module.take(now, line) for line in lines]))
+
+    def _poll(self) -> None:
+        self._spread(self.module.poll(self._clock.monotonic()))
+
+    def _spread(self, data: bytes) -> None:
+        if data:
+            for end in list(self._ends):
+                end.send(data)
+        self._alarm.set(self.module.next_deadline())
+
+
+class _Client(asyncio.Protocol):
+    """A TCP client at the module."""
+
+    def __init__(self, power: Powered) -> None:
+        self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._power = power
+        self._reader = debug.Reader(power.module.drops)
+
+    @property
+    def waiting(self) -> int:
+        return self._transport.get_write_buffer_size()
+
+    def send(self, data: bytes) -> None:
+        if self.waiting < BUFFER:
+            self._transport.write(data)
+
+    def close(self) -> None:
+        self._transport.abort()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        self._power.plugged(self)
+
+    def data_received(self, data: bytes) -> None:
+        self._power.heard(self._reader.feed(data))
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._power.unplugged(self)
+        self.closed.set_result(None)
+
+
+class _Pty:
+    """The master's side of a pseudo terminal; the other side stays open, so users may come and go."""
+
+    def __init__(self, power: Powered) -> None:
+        import tty  # not on Windows
+
+        self._loop = asyncio.get_running_loop()
+        self._power = power
+        self._reader = debug.Reader(power.module.drops)
+        self._unsent = bytearray()
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.device = os.ttyname(self._slave)
+        os.set_blocking(self._master, False)
+        self._loop.add_reader(self._master, self._read)
+
+    @property
+    def waiting(self) -> int:
+        return len(self._unsent)
+
+    def send(self, data: bytes) -> None:
+        if self.waiting >= BUFFER:
+            return
+        if not self._unsent:
+            self._loop.add_writer(self._master, self._write)
+        self._unsent += data
+
+    def close(self) -> None:
+        self._loop.remove_reader(self._master)
+        self._loop.remove_writer(self._master)
+        os.close(self._master)
+        os.close(self._slave)
+        self._power.unplugged(self)
+
+    def _read(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            self._power.heard(self._reader.feed(os.read(self._master, _CHUNK)))
+
+    def _write(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            del self._unsent[: os.write(self._master, self._unsent)]
+        if not self._unsent:
+            self._loop.remove_writer(self._master)
+
+
+class Wire(Transport, Carrier):
+    """A cable between an emulated module and one `Module` of this process; it can be pulled and plugged in again."""
+
+    def __init__(self, power: Powered) -> None:
+        self._power = power
+        self._end = _WireEnd(self)
+        self._reader = debug.Reader(power.module.drops)
+        self._link: LineLink | None = None
+        self._plugged = False
+        self._paused = False
+        self._held: list[bytes] = []
+
+    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+        self._link = link = LineLink(f"wire:{self._power.module.name}", hub)
+        hub.attach(link)
+        try:
+            self.plug_in()
+            opened()
+            await asyncio.get_running_loop().create_future()
+        finally:
+            link.close()
+            hub.detach(link)
+
+    def plug_in(self) -> None:
+        """Connect; a `Module` that opens it does so by itself. Raises Broken while no module has it open."""
+        if self._link is None:
+            raise Broken("this wire has one end only: give it to a Module(via=...) first")
+        if not self._plugged:
+            self._plugged = True
+            self._paused = False
+            self._power.plugged(self._end)
+            self._link.connected(self)
+
+    def pull(self) -> None:
+        """Disconnect. The emulated module does not notice, the other one does."""
+        if self._plugged and self._link is not None:
+            self.close()
+            self._link.disconnected("the wire is pulled")
+
+    def arrive(self, data: bytes) -> None:
+        """The emulated module said this."""
+        if not self._plugged or self._link is None:
+            return
+        if self._paused:
+            self._held.append(data)
+        else:
+            self._link.fed(data)
+
+    # Carrier: the end at the Module
+
+    def send(self, data: bytes) -> None:
+        asyncio.get_running_loop().call_soon(self._power.heard, self._reader.feed(data))
+
+    def pause(self) -> None:
+        self._paused = True
+
+    def resume(self) -> None:
+        self._paused = False
+        held, self._held = self._held, []
+        for data in held:
+            self.arrive(data)
+
+    def close(self) -> None:
+        self._plugged = False
+        self._held.clear()
+        self._power.unplugged(self._end)
+
+
+class _WireEnd:
+    """The end at the emulated module."""
+
+    waiting = 0  # the link at the other end holds back nobody but itself
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+
+    def send(self, data: bytes) -> None:
+        asyncio.get_running_loop().call_soon(self._wire.arrive, data)
+
+    def close(self) -> None:
+        self._wire.pull()

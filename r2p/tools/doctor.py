@@ -1,0 +1,253 @@
+"""`r2p doctor`: what this machine has and lacks for r2p, and what to do about it. It sends nothing to anybody.
+
+Each check is a function that looks at one thing and says what it found; those that read the system's files take the
+root folder, so that tests bring their own.
+"""
+
+import asyncio
+import ctypes
+import os
+import platform
+import socket
+import statistics
+import sys
+import time
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+import r2p
+from r2p.clock import Ticker
+from r2p.names import module_name_from
+from r2p.tools.output import Output
+from r2p.tools.session import Format, Quiet, Usage, Verbose, execute, settings
+
+EXTRAS = {"serial": "pyserial"}
+"""The extras of r2p, and the package that each brings."""
+
+_ROOT = Path("/")
+_ARPHRD_CAN = "280"  # linux/if_arp.h
+_UP = 1  # IFF_UP
+_PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttyS*", "rfcomm*", "cu.usb*")
+_TICK = 1_000_000  # ns
+_SAMPLE = 0.2  # seconds
+_LATE = 1_000_000  # ns; a 99th percentile above it spoils periods of some milliseconds
+
+
+class Check(msgspec.Struct, frozen=True):
+    """One thing that was looked at: what was found, and what to do if it is not `ok`."""
+
+    what: str
+    ok: bool
+    found: str
+    do: str = ""
+
+    def record(self) -> dict[str, Any]:
+        return {"check": self.what, "ok": self.ok, "found": self.found, "do": self.do or None}
+
+    def text(self) -> str:
+        line = f"{'has' if self.ok else 'lacks':<6} {self.what:<11} {self.found}"
+        return line + "".join(f"\n{'':18} > {step}" for step in self.do.split("\n") if step)
+
+
+def command(format: Format = None, verbose: Verbose = 0, quiet: Quiet = 0) -> None:
+    """Tell what this machine has and lacks for r2p, and what to do about it. Sends nothing to anybody."""
+
+    async def main() -> None:
+        output = Output(format)
+        for check in checks():
+            await output.put(check.record(), check.text())
+        check = lateness(await measure())
+        await output.put(check.record(), check.text())
+
+    execute(main, verbose=verbose, quiet=quiet)
+
+
+def checks(root: Path = _ROOT) -> Iterator[Check]:
+    """All checks but the measurement; `root` is the folder that holds `sys` and `dev`."""
+    yield Check("python", True, f"{platform.python_implementation()} {platform.python_version()} on {_system()}")
+    yield Check("r2p", True, f"{r2p.__version__}, here a module is called {module_name_from(socket.gethostname())}")
+    yield configured()
+    yield package("uvloop", "uvloop", "without it messages take about twice the time")
+    yield timerfd()
+    for extra, name in EXTRAS.items():
+        yield package(name, f"r2p[{extra}]", f"the extra {extra}")
+    yield from serial_ports(root)
+    yield network(root)
+    yield from can(root)
+    yield priority()
+    yield governor(root)
+    yield clock()
+
+
+def _system() -> str:
+    return f"{platform.system()} {platform.release()} {platform.machine()}"
+
+
+def configured() -> Check:
+    """How tools join the network."""
+    try:
+        via = settings().via
+    except Usage as error:
+        return Check("network", False, str(error), "mend that file")
+    if via:
+        return Check("network", True, f"tools join by {' '.join(via)}")
+    return Check("network", False, "R2P_VIA and r2p.toml name none", "give --via tcp:HOST:PORT or serial:DEVICE")
+
+
+def package(name: str, requirement: str, why: str) -> Check:
+    try:
+        return Check(name, True, metadata.version(name))
+    except metadata.PackageNotFoundError:
+        return Check(name, False, f"not installed: {why}", f"pip install '{requirement}'")
+
+
+def timerfd() -> Check:
+    """Whether periods come from the kernel's timers."""
+    if sys.platform == "linux" and (hasattr(os, "timerfd_create") or hasattr(ctypes.CDLL(None), "timerfd_create")):
+        return Check("timerfd", True, "periods are exact to some ten microseconds")
+    return Check("timerfd", False, "periods are exact to a millisecond or two; Linux has it")
+
+
+# Wires
+
+
+def serial_ports(root: Path = _ROOT) -> Iterator[Check]:
+    found = (port for pattern in _PORTS for port in sorted((root / "dev").glob(pattern)))
+    ports = [port for port in found if _is_real(root, port)]
+    for port in ports:
+        yield _serial_port(port)
+    if not ports:
+        yield Check("serial", False, "no port: only a cable to the robot needs one", "plug it in; ls /dev/tty*")
+
+
+def _is_real(root: Path, port: Path) -> bool:
+    """Linux shows ports ttyS... that the machine may have, and knows those that it has by their type."""
+    return not port.name.startswith("ttyS") or _read(root / "sys/class/tty" / port.name / "type") not in ("", "0")
+
+
+def _serial_port(port: Path) -> Check:
+    if os.access(port, os.R_OK | os.W_OK):
+        return Check("serial", True, f"{port}, yours to open: --via serial:{port}")
+    group = _group(port)
+    return Check(
+        "serial",
+        False,
+        f"{port} is there, but only for {group}",
+        f"sudo usermod -aG {group} $USER\nthen log in again",
+    )
+
+
+def _group(path: Path) -> str:
+    try:
+        return path.group()
+    except (KeyError, NotImplementedError):  # a group without a name; Windows
+        return str(path.stat().st_gid)
+
+
+def network(root: Path = _ROOT) -> Check:
+    names = [each.name for each in _interfaces(root) if not _is_can(each) and _is_up(each)]
+    if names:
+        return Check("interfaces", True, " ".join(names))
+    return Check("interfaces", False, "no network interface is up", "ip link")
+
+
+def can(root: Path = _ROOT) -> Iterator[Check]:
+    """CAN interfaces, and how to bring up those that are down."""
+    interfaces = [each for each in _interfaces(root) if _is_can(each)]
+    for interface in interfaces:
+        name = interface.name
+        if _is_up(interface):
+            yield Check("CAN", True, f"{name} is up")
+        elif "virtual" in interface.resolve().parts:
+            yield Check("CAN", False, f"{name} is down", f"sudo ip link set {name} up")
+        else:
+            yield Check("CAN", False, f"{name} is down", f"sudo ip link set {name} up type can bitrate 1000000")
+    if not interfaces:
+        yield Check("CAN", False, f"no interface{_can_sockets()}: only RTCAN needs one")
+
+
+def _can_sockets() -> str:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):
+        return ", nor CAN sockets in the kernel"
+    return ""
+
+
+def _interfaces(root: Path) -> list[Path]:
+    folder = root / "sys/class/net"
+    return sorted(folder.iterdir()) if folder.is_dir() else []
+
+
+def _is_can(interface: Path) -> bool:
+    return _read(interface / "type") == _ARPHRD_CAN
+
+
+def _is_up(interface: Path) -> bool:
+    return bool(int(_read(interface / "flags") or "0", 16) & _UP)
+
+
+# Time
+
+
+def priority() -> Check:
+    """Whether programs may ask for real-time scheduling."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return Check("real time", False, "not on this system")
+    soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    if soft == resource.RLIM_INFINITY or soft > 0 or os.geteuid() == 0:
+        allowed = "any priority" if soft <= 0 else f"priorities up to {soft}"
+        return Check("real time", True, f"{allowed}: chrt -f 50 r2p run ...")
+    user = os.environ.get("USER", "$USER")
+    line = f'echo "{user} - rtprio 50" | sudo tee /etc/security/limits.d/r2p.conf'
+    return Check("real time", False, "you may not ask for real-time scheduling", f"{line}\nthen log in again")
+
+
+def governor(root: Path = _ROOT) -> Check:
+    """How the CPUs choose their speed."""
+    files = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
+    governors = sorted({_read(file) for file in files} - {""})
+    if governors in ([], ["performance"]):
+        return Check("CPU speed", True, "constant" if governors else "not up to this system")
+    do = "sudo cpupower frequency-set -g performance"
+    return Check("CPU speed", False, f"changes with the load ({', '.join(governors)}): wake-ups take longer", do)
+
+
+def clock() -> Check:
+    resolution = round(time.get_clock_info("monotonic").resolution * 1e9)
+    ok = resolution <= 1000  # ns
+    return Check("clock", ok, f"resolution {resolution} ns")
+
+
+async def measure() -> list[int]:
+    """How late (ns) ticks of 1 kHz come on this event loop, in 0.2 s."""
+    late: list[int] = []
+    ticker = Ticker(asyncio.get_running_loop(), _TICK, lambda _due, by, _skipped: late.append(by))
+    ticker.start()
+    try:
+        await asyncio.sleep(_SAMPLE)
+    finally:
+        ticker.close()
+    return late
+
+
+def lateness(late: list[int]) -> Check:
+    if len(late) < 2:
+        return Check("timers", False, "not even two ticks of 1 kHz came in 0.2 s: this machine is busy")
+    p99 = statistics.quantiles(late, n=100)[98]
+    found = f"at 1 kHz {statistics.median(late) / 1000:.0f} us late (median), {p99 / 1000:.0f} us (99 %)"
+    do = "" if p99 < _LATE else "end other programs, or give r2p a real-time priority (see above)"
+    return Check("timers", p99 < _LATE, found, do)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""

@@ -1,0 +1,194 @@
+"""`r2p module`: who is on the network, and orders to them.
+
+An order may be lost, so it is repeated until the module's ALIVE confirms it. None of them is an emergency stop.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from itertools import pairwise
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+import r2p
+from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
+from r2p.names import module_name
+from r2p.network import ModuleView
+from r2p.protocols.events import ModuleChanged
+from r2p.tools import session
+from r2p.tools.output import Output
+from r2p.tools.session import Format, Session, TimedOut, Timeout, Usage, Wait
+
+TIMEOUT = 10.0
+"""Seconds that an order has to be confirmed in: firmware with many topics says ALIVE that rarely."""
+
+_FIRST_LOOK = 1.0  # seconds to learn the module's state before it is ordered
+_ROUND = 5.0  # seconds of listening for ALIVE
+_LOOK = 0.02
+_REPEAT = 1.0
+_PROMPT = 0.2  # firmware says ALIVE 10 ms after an order to restart
+
+app = session.group("Modules: list, stop, reboot, bootload.")
+
+Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
+All = Annotated[bool, typer.Option("--all", "-a", help="Also tools, whose names begin with _.")]
+
+
+@session.command(app, "list")
+async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
+    """List the modules: state, kind (r2p or firmware), the link they are on, and seconds since they were heard."""
+    output = Output(format)
+    await session.settle(wait)
+    if wait is None:
+        await _hear_firmware(session)
+    views = [view for view in session.module.network.modules() if view.link and (all or not view.name.startswith("_"))]
+    await output.table([_row(view) for view in views], ["module", "state", "rebooted", "kind", "link", "age"])
+    if not views:
+        session.say(f"no module has been heard on {session.where}")
+
+
+async def _hear_firmware(session: Session) -> None:
+    """Firmware says its name once in a round of all its topics: give it time, if nobody else is at a link."""
+
+    def named() -> bool:
+        known = {view.link for view in session.module.network.modules()}
+        return all(link.name in known for link in session.module.links if link.up)
+
+    with session.waiting("ALIVE of firmware"):
+        await _until(named, _ROUND)
+
+
+async def _until(condition: Callable[[], bool], patience: float) -> bool:
+    """Wait until it is so; False if it is not after `patience` seconds."""
+    loop = asyncio.get_running_loop()
+    end = loop.time() + patience
+    while not condition():
+        if loop.time() >= end:
+            return False
+        await asyncio.sleep(_LOOK)
+    return True
+
+
+@session.command(app, "stop")
+async def stop(session: Session, module: Name, *, timeout: Timeout = None) -> None:
+    """End a module's nodes; reboot starts them again. No emergency stop: it may take a second, or get lost."""
+    await _order(session, r2p.Command.STOP, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_STOPPED))
+
+
+@session.command(app, "reboot")
+async def reboot(session: Session, module: Name, *, timeout: Timeout = None) -> None:
+    """Restart a module's firmware, or the nodes of an r2p module."""
+    await _order(session, r2p.Command.REBOOT, module, timeout, _has_rebooted)
+
+
+@session.command(app, "bootload")
+async def bootload(session: Session, module: Name, *, timeout: Timeout = None) -> None:
+    """Restart a module into its boot loader; reboot leaves it. Programs on a PC have none, and refuse."""
+    await _order(session, r2p.Command.BOOTLOAD, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_BOOT))
+
+
+class _Watch(msgspec.Struct):
+    """What was heard of a module: its flags one after the other, and how long (s) after the order firmware spoke."""
+
+    flags: list[int]
+    delay: float | None = None
+
+
+def _has_rebooted(watch: _Watch) -> bool:
+    """A new start shows in the flags; those of firmware that was rebooted before in an ALIVE right after the order."""
+    if not _restarted(watch.flags[-1]):
+        return False
+    changed = any(_restarted(after) and not _restarted(before) for before, after in pairwise(watch.flags))
+    return changed or (watch.delay is not None and 0 <= watch.delay < _PROMPT)
+
+
+def _restarted(flags: int) -> bool:
+    return flags & (FLAG_REBOOTED | FLAG_STOPPED | FLAG_BOOT) == FLAG_REBOOTED
+
+
+_DONE = {r2p.Command.STOP: "stopped", r2p.Command.REBOOT: "rebooted", r2p.Command.BOOTLOAD: "in its boot loader"}
+
+
+async def _order(
+    session: Session, command: r2p.Command, name: str, timeout: float | None, done: Callable[[_Watch], bool]
+) -> None:
+    module_name(name)
+    if not session.settings.via:
+        raise Usage("there is nobody to order around: give --via tcp:HOST:PORT, or set R2P_VIA")
+    await session.settle(wait=0)
+    loop = asyncio.get_running_loop()
+    started = loop.time()
+    with session.waiting(f"{name} to confirm {command.name}"):
+        try:
+            async with asyncio.timeout(timeout or TIMEOUT), asyncio.TaskGroup() as tasks:
+                flags = [_flags(view) for view in [_find(session, name)] if view is not None]
+                follower = tasks.create_task(_follow(session.module.events(), name, flags))
+                await _confirmed(session, command, name, _Watch(flags), done)
+                follower.cancel()
+        except TimeoutError:
+            raise TimedOut(_what_was_seen(session, command, name, timeout or TIMEOUT)) from None
+    session.say(f"{name}: {_DONE[command]}, after {loop.time() - started:.1f} s")
+
+
+async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, flags: list[int]) -> None:
+    """Note each change of the module's flags."""
+    async for event in events:
+        match event:
+            case ModuleChanged(info=info) if info.name == name:
+                flags.append(info.flags)
+
+
+async def _confirmed(
+    session: Session, command: r2p.Command, name: str, watch: _Watch, done: Callable[[_Watch], bool]
+) -> None:
+    """Send the order, again and again, until the module confirms it."""
+    loop = asyncio.get_running_loop()
+    await _until(lambda: bool(watch.flags), _FIRST_LOOK)
+    ordered = loop.time()
+
+    def is_done() -> bool:
+        view = _find(session, name)
+        watch.delay = None if view is None or view.instance is not None else loop.time() - view.age - ordered
+        return bool(watch.flags) and done(watch)
+
+    while True:
+        session.module.command(command, name)
+        ordered = loop.time()
+        if await _until(is_done, _REPEAT):
+            return
+
+
+def _flags(view: ModuleView) -> int:
+    state = {"stopped": FLAG_STOPPED, "boot": FLAG_BOOT}.get(view.state, 0)
+    return state | (FLAG_REBOOTED if view.rebooted else 0)
+
+
+def _find(session: Session, name: str) -> ModuleView | None:
+    """The module as it was heard last, on whichever link."""
+    views = [view for view in session.module.network.modules() if view.name == name and view.link]
+    return min(views, key=lambda view: view.age, default=None)
+
+
+def _what_was_seen(session: Session, command: r2p.Command, name: str, timeout: float) -> str:
+    view = _find(session, name)
+    if view is None:
+        heard = sorted({view.name for view in session.module.network.modules() if view.state != "observer"})
+        return f"nothing was heard of {name} in {timeout:g} s; heard of: {', '.join(heard) or 'nobody'}"
+    text = f"{name} did not confirm {command.name} in {timeout:g} s: it is {view.state}, heard {view.age:.1f} s ago"
+    if command is r2p.Command.BOOTLOAD and view.instance is not None:
+        text += "; it is a program on a PC, those have no boot loader and refuse"
+    elif command is r2p.Command.REBOOT and view.rebooted:
+        text += "; it had been rebooted before, so its ALIVE may not tell"
+    return text
+
+
+def _row(view: ModuleView) -> dict[str, Any]:
+    return {
+        "module": view.name,
+        "state": view.state,
+        "rebooted": view.rebooted,
+        "kind": "firmware" if view.instance is None else "r2p",
+        "link": view.link,
+        "age": round(view.age, 1),
+    }

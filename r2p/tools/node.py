@@ -1,0 +1,113 @@
+"""`r2p node`: the nodes, and what they publish and subscribe.
+
+Firmware tells its topics, and not which of its nodes have them: they are listed under `MODULE/?`.
+"""
+
+from typing import Annotated, Any
+
+import typer
+
+import r2p
+from r2p.network import nodes_of
+from r2p.tools import session
+from r2p.tools.options import CLASS_NAMES
+from r2p.tools.output import Output
+from r2p.tools.session import Format, Session, Wait
+from r2p.tools.types import Types, type_name
+
+app = session.group("Nodes, and what they publish and subscribe.")
+
+Table = dict[tuple[str, str], tuple[list[str], list[str]]]
+
+
+@session.command(app, "list")
+async def list_(
+    session: Session,
+    *,
+    all: Annotated[bool, typer.Option("--all", "-a", help="Also those of tools.")] = False,
+    wait: Wait = None,
+    format: Format = None,
+) -> None:
+    """List the nodes, and the topics that they publish and subscribe."""
+    output = Output(format)
+    await session.settle(wait)
+    rows = [
+        {"node": f"{module}/{node}", "publishes": publishes, "subscribes": subscribes}
+        for (module, node), (publishes, subscribes) in _nodes(session).items()
+        if all or not module.startswith("_")
+    ]
+    await output.table(rows, ["node", "publishes", "subscribes"])
+    if not rows:
+        session.say(f"no node is known on {session.where}")
+
+
+@session.command(app, "info")
+async def info(
+    session: Session,
+    node: Annotated[str, typer.Argument(metavar="MODULE/NODE", help="NODE alone will do if only one has the name.")],
+    *,
+    wait: Wait = None,
+    format: Format = None,
+) -> None:
+    """Tell what a node publishes and subscribes: types, and the classes of its publishers."""
+    output = Output(format)
+    await session.settle(wait)
+    nodes = _nodes(session)
+    module, name = _find(node, nodes)
+    publishes, subscribes = nodes[module, name]
+    view = next((view for view in session.module.network.modules() if view.name == module), None)
+    await output.put(
+        {
+            "node": f"{module}/{name}",
+            "module": None if view is None else view.state,
+            "link": None if view is None else view.link,
+            "publishes": [_topic(session, topic) | {"class": _class(session, topic, node)} for topic in publishes],
+            "subscribes": [_topic(session, topic) for topic in subscribes],
+        }
+    )
+
+
+def _nodes(session: Session) -> Table:
+    """(module, node) -> topics published, topics subscribed; `?` for what nobody has told."""
+    views = session.module.network.topics().values()
+    table = nodes_of(views)
+    for view in views:
+        for index, (known, links) in enumerate(
+            ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on))
+        ):
+            told = {endpoint.link for endpoint in known}
+            for link in links:
+                if link not in told:
+                    table.setdefault((_only_module(session, link), "?"), ([], []))[index].append(view.name)
+    return dict(sorted(table.items()))
+
+
+def _only_module(session: Session, link: str) -> str:
+    """The name of the module at the other end, if there is just one."""
+    names = {view.name for view in session.module.network.modules() if view.link == link and view.state != "observer"}
+    return names.pop() if len(names) == 1 else "?"
+
+
+def _find(wanted: str, nodes: Table) -> tuple[str, str]:
+    module, _, name = wanted.rpartition("/")
+    found = [key for key in nodes if key[1] == name and module in {"", key[0]}]
+    if len(found) == 1:
+        return found[0]
+    paths = ", ".join(f"{module}/{node}" for module, node in found or nodes)
+    if found:
+        raise r2p.Error(f"there are several nodes {wanted}: say which of {paths}")
+    raise r2p.Error(f"there is no node {wanted}; known: {paths or 'none'}")
+
+
+def _topic(session: Session, topic: str) -> dict[str, Any]:
+    view = session.module.network.topics()[topic]
+    cls = Types(session.settings).of(view)
+    return {"topic": topic, "type": None if cls is None else type_name(cls), "size": view.size or None}
+
+
+def _class(session: Session, topic: str, node: str) -> str | None:
+    """The class of its publisher, where the node has told it."""
+    for endpoint in session.module.network.topics()[topic].publishers:
+        if endpoint.node == node.rpartition("/")[2] and endpoint.publisher_class is not None:
+            return CLASS_NAMES[endpoint.publisher_class]
+    return None

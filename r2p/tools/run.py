@@ -1,0 +1,164 @@
+"""`r2p run`: functions out of files and packages as the nodes of one module."""
+
+import difflib
+import inspect
+import logging
+from collections.abc import Iterable
+from types import ModuleType
+from typing import Annotated
+
+import msgspec
+import typer
+
+import r2p
+from r2p.names import NODE_MAX, node_name, topic_name
+from r2p.supervisor import NodeFunction, check_function, name_of
+from r2p.tools.loading import load_module
+from r2p.tools.session import Quiet, Usage, Verbose, Via, execute, settings
+
+logger = logging.getLogger("r2p.run")
+
+
+class Program(msgspec.Struct, frozen=True):
+    """A function to run as a node of this name."""
+
+    function: NodeFunction
+    name: str
+
+
+def command(
+    functions: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE:FUNCTION[=NAME]",
+            help="blink.py:blink, blink.py:blink=left, package.module:function.",
+            show_default=False,
+        ),
+    ],
+    module: Annotated[
+        str | None, typer.Option(metavar="NAME", help="The module's name; else from r2p.toml or the host name.")
+    ] = None,
+    remap: Annotated[
+        list[str] | None, typer.Option(metavar="OLD:=NEW", help="Rename a topic for all its nodes (may repeat).")
+    ] = None,
+    priority: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NODE=N", help="Nodes of higher priority get their messages first; default 0 (may repeat)."
+        ),
+    ] = None,
+    restart: Annotated[bool, typer.Option("--restart", help="Start a node that crashed again, after a pause.")] = False,
+    via: Via = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = 0,
+) -> None:
+    """Run functions as the nodes of one module, until all have ended or Ctrl-C ends them.
+
+    A node that crashes ends alone, the others run on; the command then exits with 1.
+    """
+
+    async def main() -> None:
+        chosen = settings(via)
+        programs = load(functions)
+        priorities = _priorities(priority or (), programs)
+        names = chosen.remap | _renamed(remap or ())
+        async with r2p.Module(module or chosen.module, via=chosen.via, remap=names) as host:
+            for program in programs:
+                host.start(
+                    program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart
+                )
+            nodes = ", ".join(program.name for program in programs)
+            links = ", ".join(chosen.via) or "none, local only (--via joins a network)"
+            logger.info("module %s runs %s; links: %s; Ctrl-C ends it", host.name, nodes, links)
+            await host.wait()
+
+    execute(main, verbose=verbose, quiet=quiet)
+
+
+def load(targets: Iterable[str]) -> list[Program]:
+    """The functions that these name, as `FILE:FUNCTION[=NAME]` or `package.module:FUNCTION[=NAME]`.
+
+    Raises Usage, which says what to do, and r2p.Error with its traceback when a file can't be executed.
+    """
+    programs: list[Program] = []
+    for target in targets:
+        program = _program(target)
+        if program.name in (other.name for other in programs):
+            raise Usage(f"{target}: there is a node {program.name} already; {_name_it(target)}")
+        programs.append(program)
+    return programs
+
+
+def _program(target: str) -> Program:
+    path, attribute, name = _split(target)
+    function = _function(path, attribute, load_module(path))
+    try:
+        return Program(function, node_name(name) if name else name_of(function))
+    except r2p.NameTooLong as error:
+        raise Usage(f"{target}: a node's name has at most {NODE_MAX} characters; {_name_it(target)}") from error
+
+
+def _split(target: str) -> tuple[str, str, str]:
+    """Path, function (may be empty) and name (may be empty)."""
+    where, _, name = target.partition("=")
+    path, colon, function = where.rpartition(":")
+    return (path, function, name) if colon else (where, "", name)
+
+
+def _name_it(target: str) -> str:
+    return f"give it another: {target.partition('=')[0]}=NAME"
+
+
+def _function(path: str, attribute: str, module: ModuleType) -> NodeFunction:
+    if not attribute:
+        raise Usage(f"{path}: which function? {_choice(path, module)}")
+    function: NodeFunction | None = getattr(module, attribute, None)
+    if function is None:
+        close = difflib.get_close_matches(attribute, _functions(module), n=1)
+        hint = f"did you mean {close[0]}?" if close else _choice(path, module)
+        raise Usage(f"{path} has no function {attribute}; {hint}")
+    try:
+        check_function(function)
+    except r2p.Error as error:
+        raise Usage(f"{path}:{attribute} is no node: write `async def {attribute}(node: r2p.Node)`") from error
+    return function
+
+
+def _choice(path: str, module: ModuleType) -> str:
+    names = _functions(module)
+    if not names:
+        return "it has no node; write `async def blink(node: r2p.Node) -> None`"
+    return f"it has {', '.join(names)}: r2p run {path}:{names[0]}"
+
+
+def _functions(module: ModuleType) -> list[str]:
+    """The coroutine functions that a module defines itself."""
+    return [
+        name
+        for name, value in vars(module).items()
+        if inspect.iscoroutinefunction(value) and value.__module__ == module.__name__
+    ]
+
+
+def _renamed(remap: Iterable[str]) -> dict[str, str]:
+    names: dict[str, str] = {}
+    for each in remap:
+        old, found, new = each.partition(":=")
+        if not found:
+            raise Usage(f"--remap {each}: write it as OLD:=NEW, for example encoder:=encoder1")
+        names[topic_name(old)] = topic_name(new)
+    return names
+
+
+def _priorities(priority: Iterable[str], programs: list[Program]) -> dict[str, int]:
+    names = [program.name for program in programs]
+    priorities: dict[str, int] = {}
+    for each in priority:
+        name, _, number = each.partition("=")
+        if name not in names:
+            raise Usage(f"--priority {each}: there is no node {name}; the nodes are {', '.join(names)}")
+        try:
+            priorities[name] = int(number)
+        except ValueError as error:
+            raise Usage(f"--priority {each}: write it as NODE=N, for example {name}=10") from error
+    return priorities
