@@ -10,4 +10,15 @@ Mark a test, a class or a module, and its `async def` tests run under virtual ti
 `@pytest.mark.virtual_time(seed=7)` gives `r2p.clock.random_of()` another seed. An exception that nobody awaits, in a
 callback or in a forgotten task, fails the test. Works with hypothesis, and next to the plugins of anyio and of
 pytest-asyncio.
+
+The fixture `r2p_network` is an in-memory network (`r2p.testing.network.Network`) for the modules of a robot, with
+faults on demand, and with nodes for the test to speak through:
+
+    @pytest.mark.virtual_time
+    async def test_blink(r2p_network: Network) -> None:
+        r2p_network.loss = 0.05
+        async with r2p_network.module("IMU1") as imu, r2p_network.node("PC1") as node:
+            leds = node.subscribe("leds", Led)
+            imu.start(blink)
+            assert (await leds.fetch(timeout=5)).value == 1
 """

@@ -1,6 +1,6 @@
-"""The pytest plugin behind `@pytest.mark.virtual_time` (see `r2p.testing`).
+"""The pytest plugin behind `@pytest.mark.virtual_time` and the fixture `r2p_network` (see `r2p.testing`).
 
-pytest loads it in every session of an environment that has r2p: so it imports the loop when the first marked test runs.
+pytest loads it in every session of an environment that has r2p: so it imports what it needs when a test needs it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,21 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Coroutine
 
+    from r2p.testing.network import Network
+
     AsyncFunction = Callable[..., Coroutine[Any, Any, object]]
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "virtual_time(*, seed=0): run this async test under virtual time (r2p.sim.run)")
+
+
+@pytest.fixture
+def r2p_network() -> Network:
+    """An in-memory network for the modules of this test."""
+    from r2p.testing.network import Network
+
+    return Network()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -1,1 +1,1 @@
-"""Transports: bytes <-> samples over real I/O. Each is named by a URL; `registry.open_transport` finds its class."""
+"""Transports: bytes <-> samples over real I/O. Each is named by a URL; `url.open_transport` finds its class."""

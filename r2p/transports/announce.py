@@ -2,7 +2,7 @@
 
 import msgspec
 
-from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import CLASS_LATCHES, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery import Discovery
 from r2p.protocols.events import Event
 from r2p.topic import Topic
@@ -16,7 +16,7 @@ class Told(msgspec.Struct, frozen=True):
     size: int = 0
     fingerprint: bytes = bytes(8)
     queue: int = 1
-    endpoints: frozenset[tuple[str, int, int]] = frozenset()  # node, role, publisher class
+    endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
 
 
 NOTHING = Told()
@@ -24,15 +24,19 @@ NOTHING = Told()
 
 def wish_of(topic: Topic) -> Told:
     """What the other ends should know of a topic."""
-    publishers = {(each.node.name, ROLE_PUBLISHES, int(each.publisher_class)) for each in topic.publishers}
-    subscribers = {(each.owner, ROLE_SUBSCRIBES, 0) for each in topic.queues}
+    publishers: dict[tuple[str, int], int] = {}
+    for each in topic.publishers:
+        key = each.node.name, ROLE_PUBLISHES
+        publisher_class = int(each.publisher_class) | (CLASS_LATCHES if each.latch else 0)
+        publishers[key] = max(publisher_class, publishers.get(key, 0))  # a node may have several, of several classes
+    subscribers = {(each.owner, ROLE_SUBSCRIBES): 0 for each in topic.queues}
     return Told(
         publishes=bool(publishers),
         subscribes=bool(subscribers),
         size=topic.layout.size if topic.layout is not None else 0,
         fingerprint=topic.layout.fingerprint if topic.layout is not None else bytes(8),
         queue=min(max((each.limit for each in topic.queues), default=1), 0xFFFF),
-        endpoints=frozenset(publishers | subscribers),
+        endpoints=publishers | subscribers,
     )
 
 
@@ -47,8 +51,9 @@ def announce(discovery: Discovery, now: int, topic: str, told: Told, wish: Told)
         events += discovery.subscribe(now, topic, wish.size, wish.queue, wish.fingerprint)
     elif told.subscribes and not wish.subscribes:
         events += discovery.unsubscribe(now, topic)
-    for node, role, publisher_class in wish.endpoints - told.endpoints:
-        events += discovery.endpoint(now, node, topic, role, publisher_class)
-    for node, role, _class in told.endpoints - wish.endpoints:
+    for (node, role), publisher_class in wish.endpoints.items():
+        if told.endpoints.get((node, role)) != publisher_class:
+            events += discovery.endpoint(now, node, topic, role, publisher_class)
+    for node, role in told.endpoints.keys() - wish.endpoints.keys():
         events += discovery.endpoint_gone(now, node, topic, role)
     return events

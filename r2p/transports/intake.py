@@ -7,19 +7,22 @@ turns of the event loop to make room; one that does not is lossy until it has.
 import asyncio
 from collections import Counter, deque
 from collections.abc import Hashable, Iterable
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import msgspec
 
-from r2p.sample import Sample, Source
-from r2p.topic import PATIENCE, Sink, Topic
+from r2p.sample import Sample
+from r2p.topic import PATIENCE, QueueSink, Sink, Topic
 
 TURN = 64
 """Messages that a link hands out before it lets the event loop run once."""
 
 
 class LinkStats(msgspec.Struct):
-    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions."""
+    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions.
+
+    `sent` are samples that were given to the line, the bus or its buffer, and not thrown away there since.
+    """
 
     sent: int = 0
     received: int = 0
@@ -40,24 +43,27 @@ class Arrival(Protocol):
 
 
 class Inlet(msgspec.Struct):
-    """Where the messages of one topic that come in by a link go; `senders` are the publishers that opened it."""
+    """Where the messages of one topic go, and who may send them: address -> bytes of its messages, 0: any.
+
+    The last message is kept for those who subscribe later: whether it is latched may be told after it came.
+    """
 
     topic: Topic
-    source: Source
-    size: int
-    senders: set[Hashable]
+    senders: dict[Hashable, int]
+    last: Sample | None = None
 
 
 class Receiver(Protocol):
     """The link of an intake."""
 
-    point_to_point: ClassVar[bool]
-
-    def sample(self, inlet: Inlet, arrival: Any) -> Sample:
+    def sample(self, topic: str, arrival: Any) -> Sample:
         """The sample that came in."""
 
     def sender(self, arrival: Any) -> Hashable:
         """The sender's address on a bus; None on a line with one other end."""
+
+    def latched(self, topic: str) -> bool:
+        """Whether a publisher at the other end latches the topic."""
 
     def take_other(self, arrival: Any) -> None:
         """Something came in for which there is no inlet."""
@@ -79,16 +85,20 @@ class Intake:
         self._inlets: dict[bytes, Inlet] = {}
         self._backlog: deque[Any] = deque()
         self._busy = False
+        self._paused = False
+        self._closed = False
         self._patience = 0
 
-    def open(self, topic: Topic, source: Source, size: int, sender: Hashable) -> None:
-        """Take what `sender` publishes: messages of `size` bytes, 0: of any size."""
+    def open(self, topic: Topic, size: int, sender: Hashable) -> None:
+        """Take what `sender` publishes: messages of `size` bytes, 0: of any size. Again: with another size."""
         key = topic.name.encode()
         inlet = self._inlets.get(key)
         if inlet is None:
-            inlet = self._inlets[key] = Inlet(topic, source, size, set())
-        if sender not in inlet.senders:
-            inlet.senders.add(sender)
+            inlet = self._inlets[key] = Inlet(topic, {})
+            topic.memories.append(self)
+        is_new = sender not in inlet.senders
+        inlet.senders[sender] = size
+        if is_new:
             topic.inlets += 1
             for queue in topic.queues:
                 queue.publisher_joined()
@@ -97,62 +107,85 @@ class Intake:
         """Take no more from this sender."""
         inlet = self._inlets.get(name.encode())
         if inlet is not None and sender in inlet.senders:
-            inlet.senders.remove(sender)
+            del inlet.senders[sender]
             inlet.topic.inlets -= 1
             if not inlet.senders:
-                del self._inlets[name.encode()]
+                self.shut_all(name)
 
     def shut_all(self, name: str) -> None:
         """Take no more of this topic."""
         inlet = self._inlets.pop(name.encode(), None)
         if inlet is not None:
             inlet.topic.inlets -= len(inlet.senders)
+            inlet.topic.memories.remove(self)
+
+    def remind(self, topic: Topic, sink: QueueSink) -> None:
+        """Send the last message to a new subscriber, if the publisher latches it."""
+        last = self._inlets[topic.name.encode()].last
+        if last is not None and self._link.latched(topic.name):
+            sink.force(last)
 
     def close(self) -> None:
+        """Forget what was not handed out yet, and take no more."""
+        self._closed = True
         self._backlog.clear()
         for name in list(self._inlets):
             self.shut_all(name.decode())
 
     def take(self, arrivals: Iterable[Arrival]) -> None:
         """Hand out what came in, at most TURN messages in one turn of the loop."""
+        if self._closed:
+            return
         self._backlog.extend(arrivals)
         if not self._busy:
             self._hand_out()
 
     def _hand_out(self) -> None:
         self._busy = True
-        link, backlog, inlets = self._link, self._backlog, self._inlets
+        link, backlog, inlets, lost = self._link, self._backlog, self._inlets, self._stats.lost
         for _ in range(TURN):
             if not backlog:
                 self._busy = False
-                link.resume()
+                self._read_on()
                 return
             arrival = backlog.popleft()
             inlet = inlets.get(arrival.topic)
             if inlet is None:
                 link.take_other(arrival)
-            elif self._belongs(arrival, inlet):
+                continue
+            size = inlet.senders.get(link.sender(arrival))
+            if size is None:
+                lost["not subscribed"] += 1
+            elif size and len(arrival.data) != size:
+                lost["wrong size"] += 1
+            else:
                 self._stats.received += 1
-                sample = link.sample(inlet, arrival)
+                inlet.last = sample = link.sample(inlet.topic.name, arrival)
                 blocked = inlet.topic.deliver(sample)
                 if blocked is not None:
-                    self._patience = PATIENCE
-                    self._loop.call_soon(self._retry, sample, blocked)
-                    link.pause()
+                    self._wait(sample, blocked)
                     return
         self._loop.call_soon(self._hand_out)
-        link.pause()
+        self._read_no_more()
 
-    def _belongs(self, arrival: Arrival, inlet: Inlet) -> bool:
-        if len(arrival.data) != inlet.size and inlet.size:
-            self._stats.lost["wrong size"] += 1
-            return False
-        if not self._link.point_to_point and self._link.sender(arrival) not in inlet.senders:
-            self._stats.lost["not subscribed"] += 1
-            return False
-        return True
+    def _read_no_more(self) -> None:
+        if not self._paused:
+            self._paused = True
+            self._link.pause()
+
+    def _read_on(self) -> None:
+        if self._paused:
+            self._paused = False
+            self._link.resume()
+
+    def _wait(self, sample: Sample, blocked: list[Sink]) -> None:
+        self._patience = PATIENCE
+        self._loop.call_soon(self._retry, sample, blocked)
+        self._read_no_more()
 
     def _retry(self, sample: Sample, blocked: list[Sink]) -> None:
+        if self._closed:
+            return
         self._patience -= 1
         blocked = [sink for sink in blocked if not sink.offer(sample)]
         if blocked and self._patience > 0:

@@ -1,20 +1,27 @@
 """The debug line: one other end that speaks in lines of ASCII (PROTOCOL.md 3), whatever carries the bytes.
 
-Lines that are written in one turn of the event loop go out in one piece. A carrier (TCP connection, serial port) is
-attached while it lives; the link stays over reconnects, so its subscriptions and counters do too.
+The first line that is written in a turn of the event loop goes out at once, the others of that turn in one piece. While
+the carrier (TCP connection, serial port) takes no more, lines wait here, where management can overtake samples and what
+is stale can be thrown away. A carrier is attached while it lives; the link stays over reconnects, so its subscriptions
+and counters do too.
 """
 
 import abc
-from collections.abc import Callable, Iterable
-from typing import ClassVar
+import asyncio
+import contextlib
+from collections import deque
+from typing import TYPE_CHECKING, ClassVar
 
 from r2p.codecs import debug
 from r2p.codecs.management import FLAG_BOOT
 from r2p.names import LOADER_PREFIX, MANAGEMENT
-from r2p.protocols.events import Event, ModuleChanged
 from r2p.sample import Sample
-from r2p.transports.intake import Inlet
+from r2p.topic import Topic
 from r2p.transports.link import Hub, Link
+from r2p.transports.sources import Sources
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 BUFFER = 64 * 1024
 """Bytes that wait for a connection that takes no more, before its publishers have to wait or lose."""
@@ -22,16 +29,22 @@ BUFFER = 64 * 1024
 OPENING = b"\r\n\r\n"
 """Ends whatever the reader at the other end has begun to read."""
 
+_MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
+_CLOSING = 0.5  # seconds for the other end to take what is still buffered
 _NO_DEADLINE = 0x7FFFFFFF
 _WRAP = 0xFFFFFFFF
 
 
 class Carrier(abc.ABC):
-    """A connection that carries the bytes of a line link."""
+    """A connection that carries the bytes of a line link.
+
+    It tells its link `carrier_full()` when it holds bytes that could not be sent at once, `carrier_ready()` when it
+    has none left; in between nothing is given to it, except the last words before `close()`.
+    """
 
     @abc.abstractmethod
     def send(self, data: bytes) -> None:
-        """Send, or buffer what can't be sent at once; may call the link's `carrier_full` and `carrier_ready`."""
+        """Send, or hold what can't be sent at once."""
 
     @abc.abstractmethod
     def pause(self) -> None:
@@ -43,33 +56,70 @@ class Carrier(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Send what is buffered, as far as it goes at once, and close."""
+        """Send what is held, as far as the other end takes it, and close."""
+
+
+class Connection(Carrier):
+    """A carrier that can break. Whoever opened it waits for its end, and closes it in order."""
+
+    def __init__(self) -> None:
+        self.ended = asyncio.Event()
+        """Set when it is gone for good, or was never there."""
+
+    @abc.abstractmethod
+    def abort(self) -> None:
+        """Close at once; does nothing when it is closed."""
+
+    async def aclose(self) -> None:
+        """Close, and wait until it is over; what the other end does not take soon is not sent."""
+        self.close()
+        try:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_CLOSING):
+                    await self.ended.wait()
+        finally:
+            self.abort()
+        await self.ended.wait()
 
 
 class LineLink(Link):
-    """A link over the debug line."""
+    """A link over the debug line.
 
-    longest: ClassVar[int] = 255
+    `buffer` bytes may wait for the carrier. With `piecemeal` it is given one line at a time: so no more than that waits
+    behind one that it has not taken entirely.
+    """
 
-    def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0, buffer: int = BUFFER) -> None:
+    longest: ClassVar[int] = debug.PAYLOAD_MAX
+
+    def __init__(
+        self, name: str, hub: Hub, *, management_rate: float = 250.0, buffer: int = BUFFER, piecemeal: bool = False
+    ) -> None:
         super().__init__(name, hub, management_rate=management_rate)
         self._reader = debug.Reader(self.stats.lost)
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
+        self._sources = Sources(self.discovery, name)
         self._carrier: Carrier | None = None
-        self._lines: list[bytes] = []
+        self._management: deque[bytes] = deque()
+        self._samples: deque[bytes] = deque()
         self._waiting = 0
+        self._corked = False
+        self._blocked = False
         self._limit = buffer
-        self._blocked_carrier = False
+        self._piecemeal = piecemeal
         self._stamp = 0
+        self._unasked: set[str] = set()
 
     # Carrier
 
     def connected(self, carrier: Carrier) -> None:
         """Bytes flow from now on."""
+        if self._closed:
+            carrier.close()
+            return
         self._carrier = carrier
-        self._blocked_carrier = False
+        self._blocked = False
         self._reader = debug.Reader(self.stats.lost)
-        carrier.send(OPENING)
+        self._send(OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
             self.went_up()
 
@@ -85,18 +135,18 @@ class LineLink(Link):
         self.take(self._reader.feed(bytes(data)))
 
     def carrier_full(self) -> None:
-        self._blocked_carrier = True
+        self._blocked = True
 
     def carrier_ready(self) -> None:
-        self._blocked_carrier = False
-        if not self.full:
-            self._made_room()
+        self._blocked = False
+        if not self._corked:
+            self._uncork()
 
     # Link
 
     @property
     def full(self) -> bool:
-        return self._blocked_carrier or self._waiting >= self._limit
+        return self._waiting >= self._limit
 
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
@@ -105,21 +155,38 @@ class LineLink(Link):
             encode = self._encoders[topic]
         except KeyError:
             encode = self._encoders[topic] = debug.encoder(topic.encode())
-        self._put(encode(sample.data, deadline & _WRAP))
+        line = encode(sample.data, deadline & _WRAP)
+        if self._corked or self._blocked:
+            self._samples.append(line)
+            self._waiting += len(line)
+            if self._waiting >= self._limit:
+                self._flush()
+        else:
+            self._send_first(line)
 
-    def write_management(self, data: bytes) -> None:
-        if self._blocked_carrier:
-            self.stats.lost["management"] += 1
+    def write_management(self, data: bytes, *, urgent: bool = False) -> None:
+        if self._waiting >= self._limit + _MANAGEMENT_BUFFER and not urgent:
+            self.stats.lost["management, send buffer full"] += 1
             return
         deadline = self._clock.now() // 1000 + _NO_DEADLINE
-        self._put(debug.encode(MANAGEMENT.encode(), data, deadline & _WRAP))
+        line = debug.encode(MANAGEMENT.encode(), data, deadline & _WRAP)
+        if not (self._corked or self._blocked):
+            self._send_first(line)
+            return
+        self._waiting += len(line)
+        if urgent:
+            self._management.appendleft(line)
+        else:
+            self._management.append(line)
 
-    def sample(self, inlet: Inlet, arrival: debug.Line) -> Sample:
-        return Sample(arrival.data, inlet.source, self._stamp, stamped=False)
+    def sample(self, topic: str, arrival: debug.Line) -> Sample:
+        return Sample(arrival.data, self._sources.of(topic), self._stamp, stamped=False)
 
     def discard(self) -> int:
-        discarded = len(self._lines)
-        self._lines.clear()
+        discarded = len(self._samples)
+        self.stats.sent -= discarded
+        self._management.clear()
+        self._samples.clear()
         self._waiting = 0
         return discarded
 
@@ -132,36 +199,79 @@ class LineLink(Link):
             self._carrier.resume()
 
     def close(self) -> None:
+        self._blocked = False  # the carrier gets all that waits, and after it our good-bye
+        self._flush()
         super().close()
-        if self._carrier is not None:
-            self._flush()
-            self._carrier.close()
+        self._flush()
+        carrier, self._carrier = self._carrier, None
+        if carrier is not None:
+            carrier.close()
 
-    def _put(self, line: bytes) -> None:
-        if not self._lines:
-            self._space.loop.call_soon(self._flush)
-        self._lines.append(line)
-        self._waiting += len(line)
+    def _send_first(self, line: bytes) -> None:
+        self._corked = True
+        self._space.loop.call_soon(self._uncork)
+        self._send(line)
 
-    def _flush(self) -> None:
-        if not self._lines:
-            return
-        data = b"".join(self._lines)
-        self._lines.clear()
-        self._waiting = 0
-        if self._carrier is None:
-            return
-        self.stats.bytes_sent += len(data)
-        self._carrier.send(data)
+    def _uncork(self) -> None:
+        self._corked = False
+        self._flush()
         if self._room and not self.full:
             self._made_room()
 
-    # A module in boot mode takes and gives its loader topic without a handshake (PROTOCOL.md 5).
+    def _flush(self) -> None:
+        while self._waiting and not self._blocked:
+            self._send(self._next_piece())
 
-    def _apply(self, events: Iterable[Event]) -> None:
-        events = list(events)
-        super()._apply(events)
-        for event in events:
-            if isinstance(event, ModuleChanged) and event.info.flags & FLAG_BOOT:
-                self._attach(LOADER_PREFIX + event.info.name)
-                self._open(LOADER_PREFIX + event.info.name, 0)
+    def _next_piece(self) -> bytes:
+        if self._piecemeal:
+            piece = (self._management or self._samples).popleft()
+            self._waiting -= len(piece)
+            return piece
+        piece = b"".join([*self._management, *self._samples])
+        self._management.clear()
+        self._samples.clear()
+        self._waiting = 0
+        return piece
+
+    def _send(self, data: bytes) -> None:
+        if self._carrier is not None:
+            self.stats.bytes_sent += len(data)
+            self._carrier.send(data)
+
+    # The loader's topic flows without a handshake while its module is in boot mode (PROTOCOL.md 5): that of a module at
+    # the other end, or our own.
+
+    def module_changed(self, module: str) -> None:
+        self._sources.forget()
+        topic = self._space.topics.get(LOADER_PREFIX + module)
+        if topic is not None:
+            self._match_loader(topic)
+
+    def set_flags(self, flags: int) -> None:
+        super().set_flags(flags)
+        self.module_changed(self._space.module)
+
+    def topic_changed(self, topic: Topic) -> None:
+        super().topic_changed(topic)
+        if topic.name.startswith(LOADER_PREFIX):
+            self._match_loader(topic)
+
+    def _match_loader(self, topic: Topic) -> None:
+        name = topic.name
+        if self._in_boot_mode(name.removeprefix(LOADER_PREFIX)):
+            self._unasked.add(name)
+            if not topic.publishers:
+                self._detach(name)
+            elif name not in self._outlets:
+                self._attach(name)
+            self._open(name, 0)
+        elif name in self._unasked:
+            self._unasked.remove(name)
+            self._detach(name)
+            self._intake.shut_all(name)
+
+    def _in_boot_mode(self, module: str) -> bool:
+        if module == self._space.module:
+            return bool(self.discovery.flags & FLAG_BOOT)
+        info = self.discovery.modules.get(module)
+        return info is not None and bool(info.flags & FLAG_BOOT)

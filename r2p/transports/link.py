@@ -1,7 +1,7 @@
 """A link: one line, connection or bus as a module sees it, and the discovery that runs on it.
 
-    topic space  ->  Outlet.offer  ->  Link.write
-    wire         ->  Link.take     ->  Inlet  ->  Topic.deliver
+    topic space  ->  LinkOutlet.offer  ->  Link.write
+    wire         ->  Link.take         ->  Intake  ->  Topic.deliver
 
 A transport (what a URL names) makes links, keeps them up, and feeds them. The link's discovery decides what flows:
 nothing is sent for which nobody asked, nothing is taken that nobody opened.
@@ -9,19 +9,22 @@ nothing is sent for which nobody asked, nothing is taken that nobody opened.
 
 import abc
 import random
+from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
 from typing import Any, ClassVar, Protocol
 
 import msgspec
 
 from r2p.clock import Alarm
+from r2p.codecs.management import CLASS_LATCHES, ROLE_PUBLISHES
 from r2p.names import MANAGEMENT
 from r2p.protocols.discovery import Discovery
-from r2p.protocols.events import Command, Event, Joined, Left, Opened, Send, Shut
-from r2p.sample import PublisherClass, Sample, Source
-from r2p.topic import Outlet, Topic, TopicSpace
+from r2p.protocols.events import Command, Event, Joined, Left, ModuleChanged, ModuleGone, Opened, Send, Shut
+from r2p.sample import PublisherClass, Sample
+from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told, announce, wish_of
-from r2p.transports.intake import Arrival, Inlet, Intake, LinkStats
+from r2p.transports.intake import Arrival, Intake, LinkStats
+from r2p.transports.outlet import LinkOutlet
 
 _SECOND = 1_000_000_000
 _MANAGEMENT = MANAGEMENT.encode()
@@ -64,36 +67,6 @@ class Hub(Protocol):
         """Its discovery found something that concerns the module."""
 
 
-class LinkOutlet(Outlet):
-    """One topic on its way out by one link."""
-
-    __slots__ = ("_link", "topic")
-
-    def __init__(self, link: "Link", topic: Topic) -> None:
-        super().__init__(link.name)
-        self._link = link
-        self.topic = topic
-
-    def offer(self, sample: Sample) -> bool:
-        link = self._link
-        if not link.up:
-            self.lost += 1
-            link.stats.lost["link down"] += 1
-            return True
-        if link.full:
-            return False
-        link.write(self.topic.name, sample)
-        return True
-
-    def force(self, sample: Sample) -> None:
-        if not self.offer(sample):
-            self.lost += 1
-            self._link.stats.lost["send buffer full"] += 1
-
-    def when_room(self, callback: Callable[[], None], *, soon: bool = False) -> None:
-        self._link.when_room(callback)
-
-
 class Transport(abc.ABC):
     """What a URL names: it opens links to a hub, and keeps them up until it is cancelled."""
 
@@ -111,8 +84,6 @@ class Link(abc.ABC):
 
     longest: ClassVar[int] = 255
     """Bytes of the longest message."""
-
-    point_to_point: ClassVar[bool] = True
 
     def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0) -> None:
         self.name = name
@@ -132,6 +103,8 @@ class Link(abc.ABC):
         self._outlets: dict[str, LinkOutlet] = {}
         self._intake = Intake(self, hub.space.loop, self.stats)
         self._told: dict[str, Told] = {}
+        self._events: deque[Event] = deque()
+        self._acting = False
         self._room: list[Callable[[], None]] = []
         self._down_at = self._clock.monotonic()
         self._lost_at_down = 0
@@ -165,29 +138,35 @@ class Link(abc.ABC):
         self._lost_at_down = self.stats.lost["link down"]
         self.stats.lost["link down"] += self.discard()
         self._hub.link_changed(self, reason, 0.0, 0)
+        self._made_room()  # whoever waits for it waits for nothing
+        carried = [publisher for outlet in self._outlets.values() for publisher in outlet.topic.publishers]
+        for publisher in carried:
+            publisher.degraded(self.name, reason)
         self._apply(self.discovery.link_down(self._down_at))
-        for outlet in self._outlets.values():
-            for publisher in outlet.topic.publishers:
-                publisher.degraded(self.name, reason)
-        self._made_room()
 
     def close(self) -> None:
         """Say good-bye, and let go of all topics."""
         if self._closed:
             return
-        self._closed = True
         self._apply(self.discovery.leave(self._clock.monotonic()))
+        self._closed = True
         self.up = False
         self._alarm.close()
-        for outlet in self._outlets.values():
-            outlet.topic.leave(outlet)
-        self._outlets.clear()
-        self._intake.close()
         self._made_room()
+        for name in list(self._outlets):
+            self._detach(name)
+        self._intake.close()
 
     def take(self, arrivals: Iterable[Arrival]) -> None:
         """Something came in."""
         self._intake.take(arrivals)
+
+    def latched(self, topic: str) -> bool:
+        """Whether a publisher at the other end latches the topic; only r2p modules tell."""
+        return any(
+            each.topic == topic and each.role == ROLE_PUBLISHES and each.publisher_class & CLASS_LATCHES
+            for each in self.discovery.endpoints.values()
+        )
 
     def take_other(self, arrival: Arrival) -> None:
         if arrival.topic == _MANAGEMENT:
@@ -207,11 +186,11 @@ class Link(abc.ABC):
         """Put a sample into the send buffer; there is room."""
 
     @abc.abstractmethod
-    def write_management(self, data: bytes) -> None:
-        """Put a management message into the send buffer, ahead of the limit for samples; lost if nothing moves."""
+    def write_management(self, data: bytes, *, urgent: bool = False) -> None:
+        """Send a management message before the samples that wait, `urgent` ones before all; lost if nothing moves."""
 
     @abc.abstractmethod
-    def sample(self, inlet: Inlet, arrival: Any) -> Sample:
+    def sample(self, topic: str, arrival: Any) -> Sample:
         """The sample that came in."""
 
     def discard(self) -> int:
@@ -228,11 +207,24 @@ class Link(abc.ABC):
     def resume(self) -> None:
         """Go on reading."""
 
+    def module_changed(self, module: str) -> None:
+        """A module at the other end came, went, or changed its state."""
+
     # For outlets, publishers and the module
+
+    @property
+    def losses(self) -> Counter[str]:
+        """All that was dropped since the link was opened, in both directions, by reason."""
+        return self.stats.lost + self.discovery.counts
 
     def when_room(self, callback: Callable[[], None]) -> None:
         """Call back once when the send buffer has room again."""
         self._room.append(callback)
+
+    def wait_no_more(self, callback: Callable[[], None]) -> None:
+        """Undo `when_room`, if it was not called back yet."""
+        if callback in self._room:
+            self._room.remove(callback)
 
     def guarantee(self, publisher_class: PublisherClass) -> str:
         return "best effort, in order" + (", waits for room" if publisher_class == PublisherClass.NON_REAL_TIME else "")
@@ -282,23 +274,35 @@ class Link(abc.ABC):
         self._apply(self.discovery.poll(self._clock.monotonic()))
 
     def _apply(self, events: Iterable[Event]) -> None:
-        for event in events:
-            match event:
-                case Send():
-                    if self.up:
-                        self.write_management(event.data)
-                case Joined():
-                    self._attach(event.topic)
-                case Left():
-                    self._detach(event.topic)
-                case Opened():
-                    self._open(event.topic, event.size, event.source)
-                case Shut():
-                    self._intake.shut(event.topic, event.source)
-                case _:
-                    self._hub.discovered(self, event)
+        self._events.extend(events)
+        if self._acting:
+            return  # what an event brings about comes after the events before it
+        self._acting = True
+        try:
+            while self._events:
+                self._act(self._events.popleft())
+        finally:
+            self._acting = False
         if not self._closed:
             self._alarm.set(self.discovery.next_deadline())
+
+    def _act(self, event: Event) -> None:
+        match event:
+            case Send(data, urgent):
+                if self.up:
+                    self.write_management(data, urgent=urgent)
+            case Joined(topic):
+                self._attach(topic)
+            case Left(topic):
+                self._detach(topic)
+            case Opened(topic, source, _, size):
+                self._open(topic, size, source)
+            case Shut(topic, source):
+                self._intake.shut(topic, source)
+            case _:
+                if isinstance(event, ModuleChanged | ModuleGone):
+                    self.module_changed(event.info.name)
+                self._hub.discovered(self, event)
 
     def _attach(self, name: str) -> None:
         topic = self._space.topics.get(name)
@@ -320,13 +324,7 @@ class Link(abc.ABC):
     def _open(self, name: str, size: int, sender: Hashable = None) -> None:
         topic = self._space.topics.get(name)
         if topic is not None and topic.queues:
-            size = topic.layout.size if topic.layout is not None else size
-            self._intake.open(topic, self._source(), size, sender)
-
-    def _source(self) -> Source:
-        """Who publishes at the other end: known where only one module was heard."""
-        modules = [info.name for info in self.discovery.modules.values()]
-        return Source(modules[0] if len(modules) == 1 else "", "", self.name)
+            self._intake.open(topic, topic.layout.size if topic.layout is not None else size, sender)
 
     def _made_room(self) -> None:
         callbacks, self._room = self._room, []

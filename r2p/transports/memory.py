@@ -1,27 +1,28 @@
 """The in-memory network: modules of one process on a bus that loses, delays, doubles and reorders as it is told.
 
-All modules that open `memory:NAME` in one event loop share the network NAME. What happens to a message is drawn from
-one seeded generator, so under virtual time a run with the same seed goes the same way.
+All modules that open `memory:NAME` in one event loop share the network NAME; `MemoryNetwork.transport()` joins one
+without a name. What happens to a message is drawn from one seeded generator, so under virtual time a run with the same
+seed goes the same way.
 """
 
 import asyncio
 import random
 import weakref
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Hashable
 from typing import Any, ClassVar
 
 import msgspec
 
+from r2p.clock import random_of
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.sample import PublisherClass, Sample, Source
-from r2p.transports.intake import Inlet
 from r2p.transports.link import Hub, Link, Transport
 from r2p.transports.url import Url, duration
 
 IN_FLIGHT = 1024
-"""Messages that a receiver may have waiting before senders find the network full."""
+"""Messages that may be on their way before senders find the network full."""
 
 
 class Frame(msgspec.Struct, frozen=True, gc=False):
@@ -38,11 +39,30 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     publisher_class: PublisherClass = PublisherClass.NON_REAL_TIME
 
 
+class Port:
+    """One module's socket on a network. A module that is slow to take holds its messages there, still on their way."""
+
+    def __init__(self, network: "MemoryNetwork", receive: Callable[[Frame], None], room: Callable[[], None]) -> None:
+        self.network = network
+        self.receive = receive
+        self.room = room
+        self.held: deque[Frame] = deque()
+        self.paused = False
+
+    def resume(self) -> None:
+        """Take what was held."""
+        self.paused = False
+        while self.held and not self.paused:
+            self.network.landed()
+            self.receive(self.held.popleft())
+
+
 class MemoryNetwork:
     """A network of this process, and its faults: probabilities 0..1, `delay` and `jitter` in seconds.
 
     `reorder` is the probability that a message is held back long enough for the next ones to overtake it. Faults can be
-    changed while it runs; `counts` tells what happened.
+    changed while it runs; `counts` tells what happened. `seed` None: from the random numbers of the event loop that is
+    running at its first fault (under virtual time those of the test's seed).
     """
 
     def __init__(
@@ -53,68 +73,97 @@ class MemoryNetwork:
         reorder: float = 0.0,
         delay: float = 0.0,
         jitter: float = 0.0,
-        seed: int = 0,
+        seed: int | None = None,
     ) -> None:
         self.loss = loss
         self.duplicate = duplicate
         self.reorder = reorder
         self.delay = delay
         self.jitter = jitter
+        self.seed = seed
         self.counts: Counter[str] = Counter()
-        self._random = random.Random(seed)
-        self._ports: dict[int, Callable[[Frame], None]] = {}
-        self._next_port = 1
+        self._random: random.Random | None = None
+        self._ports: dict[int, Port] = {}
+        self._addresses = 0
         self._in_flight = 0
+
+    def transport(self, name: str = "") -> "MemoryTransport":
+        """A place on this network, for `Module(via=...)` of one module."""
+        return MemoryTransport(name, self)
 
     @property
     def full(self) -> bool:
         return self._in_flight >= IN_FLIGHT
 
-    def attach(self, receive: Callable[[Frame], None]) -> int:
-        """Join; gives the port's address."""
-        port, self._next_port = self._next_port, self._next_port + 1
-        self._ports[port] = receive
-        return port
+    def new_address(self) -> int:
+        self._addresses += 1
+        return self._addresses
 
-    def detach(self, port: int) -> None:
-        self._ports.pop(port, None)
+    def plug_in(self, address: int, port: Port) -> None:
+        self._ports[address] = port
+
+    def unplug(self, address: int) -> None:
+        port = self._ports.pop(address, None)
+        if port is not None:
+            self.landed(len(port.held))
+            port.held.clear()
 
     def send(self, frame: Frame) -> None:
         """Send to all other ports."""
-        for port in self._ports:
-            if port != frame.port:
-                self._send_to(port, frame)
+        for address in self._ports:
+            if address != frame.port:
+                self._send_to(address, frame)
 
-    def _send_to(self, port: int, frame: Frame) -> None:
-        draw = self._random.random
-        if self.loss and draw() < self.loss:
+    def landed(self, count: int = 1) -> None:
+        """Messages are not on their way any more."""
+        was_full = self.full
+        self._in_flight -= count
+        if was_full and not self.full:
+            for port in list(self._ports.values()):
+                port.room()
+
+    def _send_to(self, address: int, frame: Frame) -> None:
+        if self._happens(self.loss):
             self.counts["lost"] += 1
             return
         copies = 1
-        if self.duplicate and draw() < self.duplicate:
+        if self._happens(self.duplicate):
             self.counts["duplicated"] += 1
             copies = 2
         for _ in range(copies):
-            delay = self.delay + (self.jitter * draw() if self.jitter else 0.0)
-            if self.reorder and draw() < self.reorder:
+            delay = self.delay + (self.jitter * self._draw() if self.jitter else 0.0)
+            if self._happens(self.reorder):
                 self.counts["reordered"] += 1
                 delay += 2 * (self.delay + self.jitter) + 1e-3
-            self._schedule(delay, port, frame)
+            self._schedule(delay, address, frame)
 
-    def _schedule(self, delay: float, port: int, frame: Frame) -> None:
+    def _happens(self, probability: float) -> bool:
+        return probability > 0 and self._draw() < probability
+
+    def _draw(self) -> float:
+        if self._random is None:
+            self._random = random.Random(random_of().getrandbits(64) if self.seed is None else self.seed)
+        return self._random.random()
+
+    def _schedule(self, delay: float, address: int, frame: Frame) -> None:
         loop = asyncio.get_running_loop()
         self._in_flight += 1
         if delay:
-            loop.call_later(delay, self._arrive, port, frame)
+            loop.call_later(delay, self._arrive, address, frame)
         else:
-            loop.call_soon(self._arrive, port, frame)
+            loop.call_soon(self._arrive, address, frame)
 
-    def _arrive(self, port: int, frame: Frame) -> None:
-        self._in_flight -= 1
-        receive = self._ports.get(port)
-        if receive is not None:
-            self.counts["delivered"] += 1
-            receive(frame)
+    def _arrive(self, address: int, frame: Frame) -> None:
+        port = self._ports.get(address)
+        if port is None:
+            self.landed()
+            return
+        self.counts["delivered"] += 1
+        if port.paused:
+            port.held.append(frame)
+            return
+        self.landed()
+        port.receive(frame)
 
 
 _networks: "weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, MemoryNetwork]]" = (
@@ -129,35 +178,35 @@ def network(name: str) -> MemoryNetwork:
 
 
 class MemoryLink(Link):
-    """One module's port on a memory network."""
+    """One module's place on a memory network; it can be unplugged, and plugged in again."""
 
     longest: ClassVar[int] = 1024
-    point_to_point: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, network: MemoryNetwork) -> None:
         super().__init__(name, hub)
-        self._network = network
-        self._port = 0
+        self.network = network
+        self._address = network.new_address()
+        self._port = Port(network, self._receive, self._made_room)
 
     def connect(self) -> None:
         """Plug in."""
-        self._port = self._network.attach(lambda frame: self.take((frame,)))
+        self.network.plug_in(self._address, self._port)
         self.went_up()
 
     def disconnect(self, reason: str = "unplugged") -> None:
         """Pull the plug."""
-        self._network.detach(self._port)
+        self.network.unplug(self._address)
         self.went_down(reason)
 
     @property
     def full(self) -> bool:
-        return self._network.full
+        return self.network.full
 
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
         self.stats.bytes_sent += len(sample.data)
         frame = Frame(
-            self._port,
+            self._address,
             topic.encode(),
             sample.data,
             sample.source.module,
@@ -167,12 +216,12 @@ class MemoryLink(Link):
             sample.sequence,
             sample.publisher_class,
         )
-        self._network.send(frame)
+        self.network.send(frame)
 
-    def write_management(self, data: bytes) -> None:
-        self._network.send(Frame(self._port, MANAGEMENT.encode(), data))
+    def write_management(self, data: bytes, *, urgent: bool = False) -> None:
+        self.network.send(Frame(self._address, MANAGEMENT.encode(), data))
 
-    def sample(self, inlet: Inlet, arrival: Frame) -> Sample:
+    def sample(self, topic: str, arrival: Frame) -> Sample:
         self.stats.bytes_received += len(arrival.data)
         source = Source(arrival.module, arrival.node, self.name)
         return Sample(arrival.data, source, arrival.stamp, arrival.deadline, arrival.sequence, arrival.publisher_class)
@@ -180,27 +229,34 @@ class MemoryLink(Link):
     def sender(self, arrival: Frame) -> Hashable:
         return arrival.port
 
+    def pause(self) -> None:
+        self._port.paused = True
+
+    def resume(self) -> None:
+        if self._port.paused:
+            self._port.resume()
+
     def close(self) -> None:
         super().close()
-        self._network.detach(self._port)
+        self.network.unplug(self._address)
+
+    def _receive(self, frame: Frame) -> None:
+        self.take((frame,))
 
 
 class MemoryTransport(Transport):
-    """`memory:NAME`; options `loss`, `duplicate`, `reorder` (0..1), `delay`, `jitter` (durations), `seed`."""
+    """A place on a memory network for one module: on the given one, or on the running loop's network of that name."""
 
-    def __init__(self, url: Url) -> None:
-        if not url.address:
-            raise TransportError(f"{url}: give the network a name: memory:lab")
-        self._name = url.address
-        self._faults: dict[str, Any] = dict(url.parsed(_OPTIONS))
-        self.link: MemoryLink | None = None
+    def __init__(self, name: str, network: MemoryNetwork | None = None, faults: dict[str, Any] | None = None) -> None:
+        self._name = name
+        self._network = network
+        self._faults = faults or {}
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
-        networks = _networks.setdefault(asyncio.get_running_loop(), {})
-        shared = networks.get(self._name)
-        if shared is None:
-            shared = networks[self._name] = MemoryNetwork(**self._faults)
-        self.link = link = MemoryLink(f"memory:{self._name}", hub, shared)
+        shared = self._network or network(self._name)
+        for fault, value in self._faults.items():
+            setattr(shared, fault, value)
+        link = MemoryLink(f"memory:{self._name}", hub, shared)
         hub.attach(link)
         try:
             link.connect()
@@ -209,6 +265,16 @@ class MemoryTransport(Transport):
         finally:
             link.close()
             hub.detach(link)
+
+
+def from_url(url: Url) -> MemoryTransport:
+    """`memory:NAME`; options `loss`, `duplicate`, `reorder` (0..1), `delay`, `jitter` (durations), `seed`.
+
+    The options hold for the whole network, from now on.
+    """
+    if not url.address:
+        raise TransportError(f"{url}: give the network a name: memory:lab")
+    return MemoryTransport(url.address, None, dict(url.parsed(_OPTIONS)))
 
 
 def _probability(text: str) -> float:

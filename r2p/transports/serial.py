@@ -1,18 +1,23 @@
 """The debug line over a serial port: a device that vanishes is awaited.
 
-pyserial configures the port; reading and writing go straight to its file descriptor in the event loop.
+pyserial configures the port; reading and writing go straight to its file descriptor in the event loop. A slow line must
+not hide its queue in the kernel, where nothing can be overtaken or thrown away: that gets BUFFERED seconds only.
 """
 
 import asyncio
+import errno
+import fcntl
+import importlib
 import os
 import re
+import termios
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from r2p.errors import TransportError
 from r2p.transports.backoff import Backoff
-from r2p.transports.line import Carrier, LineLink
+from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url
 
@@ -21,22 +26,27 @@ if TYPE_CHECKING:
 
 BAUD = 115200
 
+BUFFERED = 0.05
+"""Seconds of line time that may wait in the kernel, and again in the link before publishers wait: older is stale."""
+
 _CHUNK = 4096
 _BITS_A_BYTE = 10  # 8N1
-_BUFFERED = 0.05  # seconds of line time that may wait here before publishers wait: what is older than that is stale
+_LONGEST_LINE = 576  # bytes
 _MANAGEMENT_SHARE = 0.2
 _MANAGEMENT_LINE = 96  # bytes
+_LONGEST_WAIT = 0.5  # seconds between looks for a device that is not there
 
 
 class SerialTransport(Transport):
     """`serial:DEVICE`, option `baud` (115200)."""
 
     def __init__(self, url: Url) -> None:
-        options = url.parsed({"baud": int})
+        options = url.parsed({"baud": _baud})
         if not url.address:
             raise TransportError(f"{url}: give the device, for example serial:/dev/ttyUSB0")
         self._device = url.address
         self._baud = options.get("baud", BAUD)
+        self._serial = _pyserial()
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         bytes_a_second = self._baud / _BITS_A_BYTE
@@ -44,117 +54,192 @@ class SerialTransport(Transport):
             f"serial:{self._device}",
             hub,
             management_rate=max(1.0, bytes_a_second * _MANAGEMENT_SHARE / _MANAGEMENT_LINE),
-            buffer=max(1024, int(bytes_a_second * _BUFFERED)),
+            buffer=max(_LONGEST_LINE, int(bytes_a_second * BUFFERED)),
+            piecemeal=True,
         )
-        backoff = Backoff(hub.random, longest=0.5)
-        port: _Port | None = None
+        backoff = Backoff(hub.random, longest=_LONGEST_WAIT)
         hub.attach(link)
         opened()
         try:
             while True:
-                try:
-                    port = _Port(_open_port(self._device, self._baud), link)
-                except (OSError, ValueError) as error:
-                    link.unreachable(_explain(self._device, error))
-                else:
+                if await self._connect(link, bytes_a_second):
                     backoff.reset()
-                    await port.lost
                 await asyncio.sleep(backoff.delay())
         finally:
             link.close()
-            if port is not None:
-                port.close()
             hub.detach(link)
 
+    async def _connect(self, link: LineLink, bytes_a_second: float) -> bool:
+        """Use the device until it is gone; False if it can't be had."""
+        try:
+            device = self._open()
+        except (OSError, ValueError, termios.error) as error:
+            link.unreachable(_explain(self._device, error))
+            return False
+        port = _Port(device, link, bytes_a_second)
+        try:
+            port.start()
+            await port.ended.wait()
+        except asyncio.CancelledError:
+            link.close()  # while there is a device to say good-bye on
+            raise
+        finally:
+            await port.aclose()
+        return True
 
-class _Port(Carrier):
+    def _open(self) -> "serial.Serial":
+        device: serial.Serial = self._serial.Serial(self._device, self._baud, timeout=0, exclusive=True)
+        try:
+            os.set_blocking(device.fileno(), False)
+            _tell_end_from_silence(device.fileno())
+        except BaseException:
+            device.close()
+            raise
+        return device
+
+
+class _Port(Connection):
     """An open serial port."""
 
-    def __init__(self, port: "serial.Serial", link: LineLink) -> None:
+    def __init__(self, device: "serial.Serial", link: LineLink, bytes_a_second: float) -> None:
+        super().__init__()
         self._loop = asyncio.get_running_loop()
-        self._port = port
+        self._device = device
+        self._fd: int = device.fileno()
         self._link = link
+        self._bytes_a_second = bytes_a_second
+        self._window = max(_LONGEST_LINE, int(bytes_a_second * BUFFERED))
         self._unsent = bytearray()
-        self._open = True
+        self._timer: asyncio.TimerHandle | None = None
         self._reading = False
-        self.lost: asyncio.Future[str] = self._loop.create_future()
-        os.set_blocking(port.fileno(), False)
+        self._full = False
+        self._closing = False
+
+    def start(self) -> None:
+        """Begin to read, and tell the link."""
         self.resume()
-        link.connected(self)
+        self._link.connected(self)
+
+    # Carrier
 
     def send(self, data: bytes) -> None:
-        if not self._open:
+        if self.ended.is_set():
             return
-        if self._unsent:
-            self._unsent += data
-            return
+        was_empty = not self._unsent
         self._unsent += data
-        self._write()
-        if self._unsent and self._open:
-            self._link.carrier_full()
-            self._loop.add_writer(self._port.fileno(), self._write)
+        if was_empty:
+            self._write()
+            if self._unsent and not self.ended.is_set():
+                self._full = True
+                self._link.carrier_full()
 
     def pause(self) -> None:
-        if self._open and self._reading:
+        if self._reading:
             self._reading = False
-            self._loop.remove_reader(self._port.fileno())
+            self._loop.remove_reader(self._fd)
 
     def resume(self) -> None:
-        if self._open and not self._reading:
+        if not self._reading and not self.ended.is_set():
             self._reading = True
-            self._loop.add_reader(self._port.fileno(), self._read)
+            self._loop.add_reader(self._fd, self._read)
 
     def close(self) -> None:
-        self._close("closed")
+        self._closing = True
+        if not self._unsent:
+            self.abort()
+
+    def abort(self) -> None:
+        self._end("closed")
 
     def _read(self) -> None:
         try:
-            data = os.read(self._port.fileno(), _CHUNK)
+            data = os.read(self._fd, _CHUNK)
         except BlockingIOError:
             return
         except OSError as error:
-            self._close(str(error))
+            self._end(_reason(error))
             return
         if data:
             self._link.fed(data)
         else:
-            self._close("the device is gone")
+            self._end("the device is gone")
 
     def _write(self) -> None:
+        """Fill the kernel's queue up to the window; go on when there is room again."""
+        self._wait_no_more()
         try:
-            sent = os.write(self._port.fileno(), self._unsent)
+            while self._unsent:
+                queued = _queued(self._fd)
+                if queued >= self._window:
+                    self._timer = self._loop.call_later(queued / self._bytes_a_second / 2, self._write)
+                    return
+                del self._unsent[: os.write(self._fd, self._unsent[: self._window - queued])]
         except BlockingIOError:
-            return
+            self._loop.add_writer(self._fd, self._write)
         except OSError as error:
-            self._close(str(error))
-            return
-        del self._unsent[:sent]
-        if not self._unsent:
-            self._loop.remove_writer(self._port.fileno())
+            self._end(_reason(error))
+        else:
+            self._written()
+
+    def _written(self) -> None:
+        if self._closing:
+            self.abort()
+        elif self._full:
+            self._full = False
             self._link.carrier_ready()
 
-    def _close(self, reason: str) -> None:
-        if not self._open:
+    def _wait_no_more(self) -> None:
+        self._loop.remove_writer(self._fd)
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _end(self, reason: str) -> None:
+        if self.ended.is_set():
             return
-        self._open = False
-        self._loop.remove_reader(self._port.fileno())
-        self._loop.remove_writer(self._port.fileno())
-        self._port.close()
+        self.ended.set()
+        self.pause()
+        self._wait_no_more()
+        self._device.close()
         self._link.disconnected(reason)
-        if not self.lost.done():
-            self.lost.set_result(reason)
 
 
-def _open_port(device: str, baud: int) -> "serial.Serial":
+def _pyserial() -> Any:
     try:
-        import serial
+        return importlib.import_module("serial")
     except ImportError as error:
         raise TransportError("serial ports need pyserial: pip install 'r2p[serial]'") from error
-    return serial.Serial(device, baud, timeout=0, exclusive=True)
+
+
+def _baud(text: str) -> int:
+    baud = int(text)
+    if baud <= 0:
+        raise ValueError("bits a second, more than 0")
+    return baud
+
+
+def _tell_end_from_silence(fd: int) -> None:
+    """Let a read of nothing say "try again": pyserial sets the port so that it looks like the end."""
+    attributes = termios.tcgetattr(fd)
+    attributes[6][termios.VMIN] = 1
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)
+
+
+def _queued(fd: int) -> int:
+    """Bytes that the kernel has not sent yet; 0 where the driver does not tell."""
+    try:
+        return int.from_bytes(fcntl.ioctl(fd, termios.TIOCOUTQ, bytes(4)), "little")
+    except OSError:
+        return 0
+
+
+def _reason(error: OSError) -> str:
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def _explain(device: str, error: Exception) -> str:
-    if isinstance(error, OSError) and error.errno == 13:
+    """Why the device can't be had, and what to do."""
+    if isinstance(error, OSError) and error.errno == errno.EACCES:
         return f"{device}: permission denied; add yourself to its group: sudo usermod -aG dialout $USER"
     if not Path(device).exists():
         return f"{device} is not there: plug it in (ls /dev/serial/by-id)"

@@ -1,6 +1,8 @@
 """The debug line over TCP: a client that comes back, and a server for many clients, each a peer of its own."""
 
 import asyncio
+import errno
+import os
 import socket
 import sys
 from collections.abc import Callable
@@ -8,7 +10,7 @@ from typing import cast
 
 from r2p.errors import TransportError
 from r2p.transports.backoff import Backoff
-from r2p.transports.line import BUFFER, Carrier, LineLink
+from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url
 
@@ -16,24 +18,24 @@ PORT = 2323
 """Where `tcp-listen:` listens, and `tcp:HOST` connects, unless told otherwise."""
 
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
-_CONNECT_TIMEOUT = 5.0
+_CONNECT_TIMEOUT = 5.0  # seconds
+_STABLE = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
 _DEAD_AFTER = 5  # seconds
 
 
-_CLOSING = 0.5  # seconds for the other end to take what is still buffered
+class _Tcp(asyncio.BufferedProtocol, Connection):
+    """One TCP connection."""
 
-
-class _Connection(asyncio.BufferedProtocol, Carrier):
-    """One TCP connection; `open_link` gives the link that it carries once the other end's address is known."""
-
-    def __init__(self, open_link: Callable[[str], LineLink]) -> None:
+    def __init__(self) -> None:
+        super().__init__()
         self.link: LineLink | None = None
-        self.closed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        """Done when the connection is gone; says why."""
-        self._open_link = open_link
         self._buffer = bytearray(_CHUNK)
         self._transport: asyncio.Transport | None = None
         self._paused = False
+
+    def open_link(self, peer: str) -> LineLink:
+        """The link that it carries; the other end is there."""
+        raise NotImplementedError
 
     # Carrier
 
@@ -54,15 +56,31 @@ class _Connection(asyncio.BufferedProtocol, Carrier):
     def close(self) -> None:
         if self._transport is not None:
             self._transport.close()
+        else:
+            self.ended.set()
+
+    def abort(self) -> None:
+        if self._transport is not None:
+            self._transport.abort()
+        else:
+            self.ended.set()
+
+    def forget(self) -> None:
+        """It was given up while it was made: the event loop closes it, and uvloop's never tells its end."""
+        self._transport = None
+        self.ended.set()
 
     # BufferedProtocol
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self._transport.set_write_buffer_limits(high=BUFFER)
+        self._transport.set_write_buffer_limits(high=0)  # what can't be sent at once waits in the link
+        peer, own = (self._transport.get_extra_info(name) for name in ("peername", "sockname"))
+        if self.ended.is_set() or not peer or peer == own:  # given up, gone again, or connected to itself
+            self._transport.abort()
+            return
         _find_dead_peers(self._transport.get_extra_info("socket"))
-        host, port = self._transport.get_extra_info("peername")[:2]
-        self.link = self._open_link(f"tcp:{host}:{port}")
+        self.link = self.open_link(f"tcp:{peer[0]}:{peer[1]}")
         self.link.connected(self)
 
     def get_buffer(self, sizehint: int) -> bytearray:
@@ -82,19 +100,9 @@ class _Connection(asyncio.BufferedProtocol, Carrier):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
-        reason = str(exc) if exc else "the other end closed the connection"
         if self.link is not None:
-            self.link.disconnected(reason)
-        if not self.closed.done():
-            self.closed.set_result(reason)
-
-    async def aclose(self) -> None:
-        """Close, and wait until it is over; what the other end does not take soon is not sent."""
-        self.close()
-        await asyncio.wait([self.closed], timeout=_CLOSING)
-        if self._transport is not None:
-            self._transport.abort()
-            await self.closed
+            self.link.disconnected(_explain(exc) if exc else "the other end closed the connection")
+        self.ended.set()
 
 
 def _find_dead_peers(sock: socket.socket) -> None:
@@ -118,31 +126,52 @@ class TcpTransport(Transport):
             raise TransportError(f"{url}: give the other end's address: tcp:HOST:PORT")
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
-        loop = asyncio.get_running_loop()
         link = LineLink(f"tcp:{self._host}:{self._port}", hub)
         backoff = Backoff(hub.random)
-        connection: _Connection | None = None
         hub.attach(link)
         opened()
         try:
             while True:
-                try:
-                    async with asyncio.timeout(_CONNECT_TIMEOUT):
-                        _, connection = await loop.create_connection(
-                            lambda: _Connection(lambda _peer: link), self._host, self._port
-                        )
-                except OSError as error:
-                    link.unreachable(str(error) or "no answer")
-                else:
-                    await connection.closed
-                    if link.stats.bytes_received:
-                        backoff.reset()
+                if await self._connect(link) >= _STABLE:
+                    backoff.reset()
                 await asyncio.sleep(backoff.delay())
         finally:
             link.close()
-            if connection is not None:
-                await connection.aclose()
             hub.detach(link)
+
+    async def _connect(self, link: LineLink) -> float:
+        """One connection from beginning to end; says how many seconds it lasted."""
+        loop = asyncio.get_running_loop()
+        connection = _Outgoing(link)
+        try:
+            try:
+                async with asyncio.timeout(_CONNECT_TIMEOUT):
+                    await loop.create_connection(lambda: connection, self._host, self._port)
+            except BaseException:
+                connection.forget()
+                raise
+            began = loop.time()
+            await connection.ended.wait()
+            return loop.time() - began
+        except OSError as error:
+            link.unreachable(_explain(error))
+            return 0.0
+        except asyncio.CancelledError:
+            link.close()  # while there is a connection to say good-bye on
+            raise
+        finally:
+            await connection.aclose()
+
+
+class _Outgoing(_Tcp):
+    """A connection of the client, for a link that was there before it."""
+
+    def __init__(self, link: LineLink) -> None:
+        super().__init__()
+        self._given = link
+
+    def open_link(self, peer: str) -> LineLink:
+        return self._given
 
 
 class TcpListenTransport(Transport):
@@ -158,24 +187,11 @@ class TcpListenTransport(Transport):
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         loop = asyncio.get_running_loop()
-        clients: set[_Connection] = set()
-
-        def accept() -> _Connection:
-            connection = _Connection(lambda peer: _attached(LineLink(peer, hub), hub))
-            clients.add(connection)
-            connection.closed.add_done_callback(lambda _reason: leave(connection))
-            return connection
-
-        def leave(connection: _Connection) -> None:
-            clients.discard(connection)
-            if connection.link is not None:
-                connection.link.close()
-                hub.detach(connection.link)
-
+        clients: set[_Incoming] = set()
         try:
-            server = await loop.create_server(accept, self._host, self._port)
+            server = await loop.create_server(lambda: _Incoming(hub, clients), self._host, self._port)
         except OSError as error:
-            raise TransportError(f"{self._url}: can't listen: {error.strerror or error}; is it in use?") from error
+            raise TransportError(f"{self._url}: can't listen: {_explain(error)}") from error
         try:
             self.port = server.sockets[0].getsockname()[1]
             hub.listening(str(self._url), f"{self._host}:{self.port}")
@@ -183,20 +199,69 @@ class TcpListenTransport(Transport):
             await loop.create_future()
         finally:
             server.close()
-            await asyncio.gather(*(connection.aclose() for connection in list(clients)))
+            await asyncio.gather(*(client.leave() for client in list(clients)))
+            await server.wait_closed()
 
 
-def _attached(link: LineLink, hub: Hub) -> LineLink:
-    hub.attach(link)
-    return link
+class _Incoming(_Tcp):
+    """A connection of the server, with a link of its own; while that exists, it is one of `clients`."""
+
+    def __init__(self, hub: Hub, clients: "set[_Incoming]") -> None:
+        super().__init__()
+        self._hub = hub
+        self._clients = clients
+
+    def open_link(self, peer: str) -> LineLink:
+        link = LineLink(peer, self._hub)
+        self._clients.add(self)
+        self._hub.attach(link)
+        return link
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._let_go()
+
+    async def leave(self) -> None:
+        """The server closes."""
+        if self.link is not None:
+            self.link.close()
+        try:
+            await self.aclose()
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        if self.link is not None:
+            self._clients.remove(self)
+            self.link.close()
+            self._hub.detach(self.link)
+            self.link = None
+
+
+def _explain(error: Exception) -> str:
+    """What went wrong, and what to do where that is known."""
+    if isinstance(error, TimeoutError) and not error.errno:
+        return "no answer"
+    if not isinstance(error, OSError) or not error.errno or isinstance(error, socket.gaierror):
+        return getattr(error, "strerror", None) or str(error)
+    text = os.strerror(error.errno)
+    hint = _HINTS.get(error.errno)
+    return f"{text}: {hint}" if hint else text
+
+
+_HINTS = {
+    errno.EADDRINUSE: "another program listens there; end it, or take another port",
+    errno.EADDRNOTAVAIL: "this machine does not have that address",
+    errno.EACCES: "ports below 1024 are for root; take another",
+}
 
 
 def _host_port(url: Url) -> tuple[str, int]:
     """The address's host (may be empty) and port."""
-    if url.address.isdecimal():
-        return "", int(url.address)
     host, colon, port = url.address.rpartition(":")
-    if not colon or port.endswith("]"):
+    if url.address.isdecimal():
+        port = url.address
+    elif not colon or port.endswith("]"):
         host, port = url.address, str(PORT)
     if not port.isdecimal() or int(port) > 0xFFFF:
         raise TransportError(f"{url}: {port!r} is no port: give it as {url.scheme}:HOST:PORT")

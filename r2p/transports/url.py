@@ -5,20 +5,23 @@ packages add theirs through the entry-point group `r2p.transports`.
 """
 
 import importlib
+import math
 import re
 from collections.abc import Callable
-from importlib import metadata
-from typing import TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import msgspec
 
 from r2p.errors import TransportError
 from r2p.transports.link import Transport
 
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoints
+
 T = TypeVar("T")
 
 BUILT_IN = {
-    "memory": "r2p.transports.memory:MemoryTransport",
+    "memory": "r2p.transports.memory:from_url",
     "tcp": "r2p.transports.tcp:TcpTransport",
     "tcp-listen": "r2p.transports.tcp:TcpListenTransport",
     "serial": "r2p.transports.serial:SerialTransport",
@@ -76,12 +79,16 @@ def open_transport(text: str) -> Transport:
     Raises TransportError for an unknown scheme or option, and for an extra that is not installed.
     """
     url = parse(text)
-    return _factory(url.scheme)(url)
+    try:
+        factory = _factory(url.scheme)
+    except ImportError as error:
+        raise TransportError(f"transport {url.scheme!r} can't be used here: {error}") from error
+    return factory(url)
 
 
 def schemes() -> list[str]:
     """All schemes that can be used, the ones of other packages included."""
-    return sorted({*BUILT_IN, *(entry.name for entry in metadata.entry_points(group=GROUP))})
+    return sorted({*BUILT_IN, *(entry.name for entry in _added())})
 
 
 def duration(text: str) -> float:
@@ -89,13 +96,24 @@ def duration(text: str) -> float:
     match = re.fullmatch(r"([0-9.eE+-]+)\s*(ns|us|ms|s|)", text.strip())
     if match is None:
         raise ValueError(f"{text!r} is no duration: use 10ms, 20us or seconds")
-    return float(match[1]) * _UNITS[match[2]]
+    seconds = float(match[1]) * _UNITS[match[2]]
+    if not 0.0 <= seconds < math.inf:
+        raise ValueError(f"{text!r} is no duration: it can't be negative or endless")
+    return seconds
 
 
 def _factory(scheme: str) -> Callable[[Url], Transport]:
     if scheme in BUILT_IN:
         module, _, name = BUILT_IN[scheme].partition(":")
         return cast("Callable[[Url], Transport]", getattr(importlib.import_module(module), name))
-    for entry in metadata.entry_points(group=GROUP, name=scheme):
-        return cast("Callable[[Url], Transport]", entry.load())
+    for entry in _added():
+        if entry.name == scheme:
+            return cast("Callable[[Url], Transport]", entry.load())
     raise TransportError(f"unknown transport {scheme!r}: use one of {', '.join(schemes())}")
+
+
+def _added() -> "EntryPoints":
+    """What other packages add."""
+    from importlib import metadata  # not at the top: it takes as long as the rest of r2p
+
+    return metadata.entry_points(group=GROUP)

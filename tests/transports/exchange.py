@@ -1,0 +1,58 @@
+"""One of two processes that exchange every type of message: `python -m tests.transports.exchange NAME PEER URL`.
+
+Prints where it listens, if it does, and `exchanged N` when it has heard all of the other's; ends with its input.
+"""
+
+import asyncio
+import sys
+from collections.abc import AsyncIterator
+
+import r2p
+import r2p.msg
+from r2p.messages import Message, layout
+from r2p.module import ModuleEvent
+from r2p.run import run_main
+
+EVERY: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]
+
+
+def filled(cls: type[Message]) -> Message:
+    """A message of bytes other than zero, as far as its type lets them; texts are text, too."""
+    return layout(cls).decode(bytes(0x31 + at % 0x40 for at in range(layout(cls).size)))
+
+
+async def exchange(node: r2p.Node, peer: str) -> None:
+    subscribers = [node.subscribe(f"{peer}{at}", cls) for at, cls in enumerate(EVERY)]
+    for at, cls in enumerate(EVERY):
+        await node.advertise(f"{node.module}{at}", cls, latch=True).publish(filled(cls))
+    for subscriber, cls in zip(subscribers, EVERY, strict=True):
+        received = await subscriber.fetch()
+        assert received == filled(cls), received
+    say(f"exchanged {len(EVERY)}")
+    await asyncio.to_thread(sys.stdin.read)
+
+
+def say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+async def main(name: str, peer: str, url: str) -> None:
+    module = r2p.Module(name, via=url)
+    events = module.events()
+    async with module:
+        module.start(exchange, peer)
+        if url.startswith("tcp-listen:"):
+            say(await _listening(events))
+        await module.wait()
+
+
+async def _listening(events: AsyncIterator[ModuleEvent]) -> str:
+    async for event in events:
+        if isinstance(event, r2p.Listening):
+            return event.address
+    raise AssertionError("it has closed")
+
+
+if __name__ == "__main__":
+    run_main(lambda: main(*sys.argv[1:]))

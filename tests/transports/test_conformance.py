@@ -1,0 +1,421 @@
+"""What holds on every transport: each test here runs over all of them."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from itertools import count
+from typing import TypeVar
+
+import r2p
+import r2p.msg
+from r2p.messages import Message
+from r2p.module import ModuleEvent
+from r2p.msg import PWM2, Led, Speed3, Text
+from r2p.network import ModuleView
+from r2p.protocols.events import Mismatched, ModuleGone, NameConflict
+from r2p.testing.network import node_in
+from tests.transports.cables import Cable, conforms, conforms_lines
+from tests.transports.exchange import EVERY, filled
+
+E = TypeVar("E")
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Wait for what no event tells. On a real loop it looks again each millisecond."""
+    while not condition():  # noqa: ASYNC110 - there is no event
+        await asyncio.sleep(0.001)
+
+
+async def first(events: AsyncIterator[ModuleEvent], kind: type[E]) -> E:
+    """The next event of a kind."""
+    async for event in events:
+        if isinstance(event, kind):
+            return event
+    raise AssertionError("the module is closed")
+
+
+def other(module: r2p.Module, name: str) -> ModuleView | None:
+    """Another module, as this one knows it."""
+    return next((view for view in module.network.modules() if view.name == name and view.link), None)
+
+
+async def acquainted(a: r2p.Module, b: r2p.Module) -> None:
+    """Wait until each has heard the other's HELLO: what went before may be taken for firmware's."""
+    await until(lambda: other(a, b.name) and other(b, a.name))
+
+
+def module(name: str, via: object) -> r2p.Module:
+    return r2p.Module(name, via=via, watchdog=False)  # type: ignore[arg-type]  # a Transport
+
+
+@asynccontextmanager
+async def two(cable: Cable) -> AsyncIterator[tuple[r2p.Module, r2p.Module]]:
+    async with module("A", cable.a()) as a, module("B", cable.b()) as b:
+        yield a, b
+
+
+@asynccontextmanager
+async def two_nodes(cable: Cable) -> AsyncIterator[tuple[r2p.Node, r2p.Node]]:
+    """A node in module A, and one in module B."""
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        yield alice, bob
+
+
+@conforms
+async def test_every_message_type_both_ways(cable: Cable) -> None:
+    async with two_nodes(cable) as (alice, bob):
+        for sender, receiver in ((alice, bob), (bob, alice)):
+            for number, cls in enumerate(EVERY):
+                topic = f"{sender.module}{number}"
+                publisher, subscriber = sender.advertise(topic, cls), receiver.subscribe(topic, cls)
+                await publisher.wait_subscriber()
+                await subscriber.wait_publisher()
+                message = filled(cls)
+                await publisher.publish(message)
+                assert await subscriber.fetch() == message
+
+
+@conforms
+async def test_the_handshake_whoever_comes_first(cable: Cable) -> None:
+    async with two_nodes(cable) as (alice, bob):
+        late_publisher = bob.subscribe("one", Led)
+        late_subscriber = alice.advertise("two", Led, latch=True)
+        await late_subscriber.publish(Led(led=2))
+        await asyncio.sleep(0)
+        two = bob.subscribe("two", Led)
+        one = alice.advertise("one", Led)
+        await one.wait_subscriber()
+        await one.publish(Led(led=1))
+        assert (await late_publisher.fetch(), await two.fetch()) == (Led(led=1), Led(led=2))
+
+
+@conforms
+async def test_the_handshake_when_both_were_there_before_the_link(cable: Cable) -> None:
+    await cable.cut()
+    async with two_nodes(cable) as (alice, bob):
+        publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+        await cable.mend()
+        await publisher.wait_subscriber()
+        await publisher.publish(Led(led=1))
+        assert await subscriber.fetch() == Led(led=1)
+
+
+@conforms
+async def test_nothing_is_sent_that_nobody_subscribes(cable: Cable) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        silent, heard = alice.advertise("silent", Led), alice.advertise("heard", Led)
+        subscriber = bob.subscribe("heard", Led)
+        for _ in range(100):
+            await silent.publish(Led())
+        await heard.wait_subscriber()
+        await heard.publish(Led())
+        await subscriber.fetch()
+        assert a.links[0].stats.sent == 1
+        assert b.links[0].stats.received == 1
+
+
+@conforms
+async def test_a_latched_value_comes_late_and_after_a_reconnect(cable: Cable) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        publisher = alice.advertise("leds", Led, latch=True)
+        await publisher.publish(Led(led=7))
+        subscriber = bob.subscribe("leds", Led)
+        assert await subscriber.fetch() == Led(led=7)
+        await acquainted(a, b)
+        await cable.cut()
+        await until(lambda: not publisher.subscribers)
+        await cable.mend()
+        assert await subscriber.fetch() == Led(led=7)
+
+
+@conforms
+async def test_topics_flow_again_after_a_reconnect(cable: Cable) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        events = b.events()
+        there, back = alice.advertise("there", Led), bob.advertise("back", Led)
+        there_sub, back_sub = bob.subscribe("there", Led), alice.subscribe("back", Led)
+        for turn in range(3):
+            for publisher, subscriber in ((there, there_sub), (back, back_sub)):
+                await publisher.wait_subscriber()
+                await publisher.publish(Led(led=turn))
+                assert await subscriber.fetch() == Led(led=turn)
+            await acquainted(a, b)
+            await cable.cut()
+            await first(events, r2p.LinkDown)
+            await until(lambda: not there.subscribers + back.subscribers)
+            await cable.mend()
+            await first(events, r2p.LinkUp)
+        assert b.links[0].stats.ups >= 4
+
+
+@conforms
+async def test_a_peer_that_goes_and_comes_back(cable: Cable) -> None:
+    async with module("A", cable.a()) as a, node_in(a) as alice:
+        publisher = alice.advertise("leds", Led)
+        for turn in range(3):
+            async with module("B", cable.b()) as b, node_in(b) as bob:
+                subscriber = bob.subscribe("leds", Led)
+                await publisher.wait_subscriber()
+                await publisher.publish(Led(led=turn))
+                assert await subscriber.fetch() == Led(led=turn)
+                await acquainted(a, b)
+            await until(lambda: not publisher.subscribers and not other(a, "B"))
+
+
+@conforms
+async def test_a_module_that_closes_says_good_bye(cable: Cable) -> None:
+    async with module("B", cable.b()) as b:
+        events = b.events()
+        async with module("A", cable.a()) as a, node_in(a) as alice:
+            alice.advertise("leds", Led)
+            await until(lambda: "leds" in b.network.topics() and other(b, "A"))
+        gone = await first(events, ModuleGone)
+        assert gone.info.name == "A"
+        assert other(b, "A") is None
+
+
+@conforms
+async def test_unsubscribing_stops_the_flow(cable: Cable) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        publisher = alice.advertise("leds", Led)
+        subscriber = bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        await acquainted(a, b)
+        subscriber.close()
+        await until(lambda: not publisher.subscribers)
+        sent = a.links[0].stats.sent
+        await publisher.publish(Led())
+        assert a.links[0].stats.sent == sent
+
+
+@conforms
+async def test_counters(cable: Cable) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        for number in range(100):
+            await publisher.publish(Led(led=number))
+            await subscriber.fetch()
+        out, back = a.links[0], b.links[0]
+        assert (out.stats.sent, back.stats.received, subscriber.lost) == (100, 100, 0)
+        assert out.stats.bytes_sent >= back.stats.bytes_received >= 100 * 5
+        assert not out.losses
+        assert not back.losses
+
+
+@conforms
+async def test_the_source_of_a_sample(cable: Cable) -> None:
+    """On a line it is worked out from what was heard: so the first samples may know less."""
+    async with two(cable) as (a, b), node_in(a, name="blinker") as blinker, node_in(b) as bob:
+        publisher, subscriber = blinker.advertise("leds", Led), bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        samples, source = subscriber.samples(), r2p.Source()
+        while not source.node:
+            await publisher.publish(Led())
+            source = (await anext(samples)).source
+        assert source == r2p.Source("A", "blinker", b.links[0].name)
+
+
+@conforms
+async def test_another_size_is_refused_and_both_are_told(cable: Cable) -> None:
+    await _mismatch(cable, PWM2, Speed3)
+
+
+@conforms
+async def test_another_layout_of_the_same_size_is_refused_and_both_are_told(cable: Cable) -> None:
+    await _mismatch(cable, PWM2, r2p.msg.Float32)
+
+
+async def _mismatch(cable: Cable, ours: type[Message], theirs: type[Message]) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        told = a.events(), b.events()
+        publisher, subscriber = alice.advertise("topic", ours), bob.subscribe("topic", theirs)
+        for events in told:
+            assert (await first(events, Mismatched)).topic == "topic"
+        right = bob.subscribe("right", Led)
+        leds = alice.advertise("right", Led)
+        await leds.wait_subscriber()
+        await publisher.publish(ours())
+        await leds.publish(Led(led=1))
+        assert await right.fetch() == Led(led=1)
+        assert not subscriber.queue
+        assert not publisher.subscribers
+
+
+@conforms
+async def test_two_modules_of_one_name_are_both_told(cable: Cable) -> None:
+    a, b = module("X", cable.a()), module("X", cable.b())
+    told = a.events(), b.events()
+    async with a, b:
+        for events in told:
+            assert (await first(events, NameConflict)).module == "X"
+
+
+@conforms
+async def test_stop_reboot_and_bootload_over_the_link(cable: Cable) -> None:
+    starts: list[r2p.Node] = []
+
+    async def serve(node: r2p.Node) -> None:
+        starts.append(node)
+        async for _ in node.subscribe("leds", Led):
+            pass
+
+    async with two(cable) as (a, b):
+        a.start(serve)
+        await until(lambda: other(b, "A"))
+        b.command(r2p.Command.STOP, "A")
+        await until(lambda: a.stopped and not a.nodes["serve"].running)
+        await until(lambda: (view := other(b, "A")) and view.state == "stopped")
+        b.command(r2p.Command.REBOOT, "A")
+        await until(lambda: len(starts) == 2)
+        await until(lambda: (view := other(b, "A")) and view.state == "running" and view.rebooted)
+        b.command(r2p.Command.BOOTLOAD, "A")
+        await until(lambda: a.refused == {"BOOTLOAD": 1})
+        b.command(r2p.Command.STOP, "OTHER")
+        b.command(r2p.Command.BOOTLOAD, "A")
+        await until(lambda: a.refused == {"BOOTLOAD": 2})
+        assert not a.stopped
+        assert not b.stopped
+        assert a.nodes["serve"].running
+
+
+@conforms
+async def test_a_reader_that_keeps_up_loses_nothing(cable: Cable) -> None:
+    """Non real-time, 20 000 messages of 4 bytes each, as fast as they go."""
+    total = 20_000
+
+    async def send(node: r2p.Node) -> None:
+        publisher = node.advertise("numbers", r2p.msg.Float32, r2p.NonRealTime(stall=20.0))
+        await publisher.wait_subscriber()
+        for number in range(total):
+            await publisher.publish(r2p.msg.Float32(data=float(number)))
+
+    async with two(cable) as (a, b), node_in(b) as bob:
+        subscriber = bob.subscribe("numbers", r2p.msg.Float32)
+        a.start(send)
+        expected = count()
+        async for message in subscriber:
+            assert message.data == next(expected)
+            if message.data == total - 1:
+                break
+        assert subscriber.lost == 0
+        assert not a.links[0].losses
+
+
+@conforms_lines
+async def test_a_peer_that_does_not_read(cable: Cable) -> None:
+    """It costs its publisher `stall` seconds once, a bounded buffer, and nobody else anything."""
+    missed: list[r2p.Missed] = []
+    text = Text(text="x" * 64)
+    async with (
+        r2p.Module("A", via=[cable.a(), "memory:aside"], watchdog=False) as a,
+        module("B", cable.b()) as b,
+        module("C", "memory:aside") as c,
+        node_in(a) as alice,
+        node_in(b) as bob,
+        node_in(c) as carol,
+    ):
+        frozen = next(link for link in a.links if not link.name.startswith("memory"))
+        publisher = alice.advertise("text", Text, r2p.NonRealTime(stall=0.05, on_missed=missed.append))
+        bobs = bob.subscribe("text", Text, queue=5)
+        carols = carol.subscribe("text", Text, queue=5)
+        await until(lambda: publisher.subscribers == 2)
+        cable.freeze()
+        sent = count(1)
+        while not missed:  # until all buffers on the way are full
+            next(sent)
+            await publisher.publish(text)
+            assert await carols.fetch() == text
+        before = next(sent)
+        for _ in range(1000):  # does not stall any more
+            await publisher.publish(text)
+            assert await carols.fetch() == text
+        assert len(missed) == publisher.missed == 1
+        assert missed[0].where == frozen.name
+        assert frozen.stats.lost["send buffer full"] == 1001
+        cable.thaw()
+        received = 0
+        while received < before - 1 - bobs.lost - 1:
+            await bobs.fetch()
+            received += 1
+        latest = Text(text="latest")
+        await until(lambda: not frozen.full)
+        await publisher.publish(latest)
+        while await bobs.fetch() != latest:
+            pass
+
+
+@conforms_lines
+async def test_events_and_periods_that_wait_for_a_link_are_discarded_when_it_breaks(cable: Cable) -> None:
+    degraded: list[r2p.Missed] = []
+    missed: list[r2p.Missed] = []
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        await acquainted(a, b)
+        filler = alice.advertise("text", Text, r2p.NonRealTime(stall=0.01))
+        klass = r2p.Sporadic(deadline=10.0, on_missed=missed.append, on_degraded=degraded.append)
+        publisher = alice.advertise("cmd", Led, klass)
+        texts, commands = bob.subscribe("text", Text), bob.subscribe("cmd", Led)
+        await filler.wait_subscriber()
+        await publisher.wait_subscriber()
+        cable.freeze()
+        while not filler.missed:
+            await filler.publish(Text())
+        assert not publisher.publish_nowait(Led(led=1))  # waits for room
+        await cable.cut()
+        await until(lambda: degraded)
+        await until(lambda: not publisher.subscribers)
+        await cable.mend()
+        await publisher.wait_subscriber()
+        await publisher.publish(Led(led=2))
+        assert await commands.fetch() == Led(led=2)
+        texts.close()
+        assert not missed
+
+
+@conforms
+async def test_closing_while_it_connects(cable: Cable) -> None:
+    await cable.cut()
+    for _ in range(3):
+        async with two(cable) as (a, b):
+            await asyncio.sleep(0)
+        assert not a.links
+        assert not b.links
+
+
+@conforms
+async def test_cancelled_at_any_await(cable: Cable) -> None:
+    """However far it came, a cancelled program leaves no task, link or exception, and its peer goes on."""
+    answered = asyncio.Event()
+
+    async def answer(node: r2p.Node) -> None:
+        publisher = node.advertise("answer", Led)
+        async for question in node.subscribe("question", Led):
+            await publisher.publish(question)
+
+    async def ask() -> None:
+        async with module("B", cable.b()) as b, node_in(b) as bob:
+            publisher, subscriber = bob.advertise("question", Led), bob.subscribe("answer", Led)
+            await publisher.wait_subscriber()
+            await subscriber.wait_publisher()
+            while True:
+                await publisher.publish(Led())
+                await subscriber.fetch()
+                answered.set()
+
+    async with module("A", cable.a()) as a:
+        a.start(answer)
+        others = asyncio.all_tasks()
+        for turns in (*range(12), *range(12, 60, 4)):
+            task = asyncio.create_task(ask())
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            task.cancel()
+            await asyncio.wait([task])
+            assert task.cancelled()
+            await until(lambda: asyncio.all_tasks() == others)  # asyncio accepts connections in tasks of its own
+        task = asyncio.create_task(ask())
+        answered.clear()
+        await answered.wait()
+        task.cancel()
+        await asyncio.wait([task])
+        assert not a.nodes["answer"].error

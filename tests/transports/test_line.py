@@ -1,0 +1,263 @@
+"""The debug line's link by itself, under virtual time: what waits, what overtakes, what is thrown away."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Annotated
+
+import pytest
+
+import r2p
+from r2p.codecs import management as m
+from r2p.msg import Led, Text
+from r2p.testing.network import node_in
+from r2p.transports.line import BUFFER
+from tests.transports.conversation import Script, line, manage
+
+pytestmark = pytest.mark.virtual_time
+
+SUBSCRIBE = m.SubscribeRequest("leds", 5, 1)
+
+
+@asynccontextmanager
+async def scripted() -> AsyncIterator[tuple[Script, r2p.Module, r2p.Node]]:
+    script = Script()
+    async with r2p.Module("PC1", via=script) as module, node_in(module) as node:
+        yield script, module, node
+
+
+def said(script: Script) -> list[str]:
+    """The topics in order; on `R2P` the kinds of messages."""
+    return [type(each.management).__name__ if each.topic == "R2P" else each.topic for each in script.said]
+
+
+async def test_a_person_at_a_terminal_is_understood() -> None:
+    """With a line end of any kind, lower-case digits and what a terminal program says before."""
+    async with scripted() as (script, _, node):
+        subscriber = node.subscribe("leds", Led)
+        response = manage(m.SubscribeResponse("leds", 5, 1)).strip()
+        message = line("leds", Led(led=3, value=0xAB).encode()).strip().lower()
+        script.hear(b"AT\r\n" + response + b"\n\xff" + message + b"\r")
+        assert await subscriber.fetch(timeout=1) == Led(led=3, value=0xAB)
+        assert script.link.losses == {"garbage": 2}
+
+
+async def test_a_stop_overtakes_all_that_waits() -> None:
+    async with scripted() as (script, module, node):
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        script.blocked = True
+        await publisher.publish(Led())  # the carrier takes this one, and then no more
+        script.said.clear()
+        for _ in range(3):
+            await publisher.publish(Led())
+        script.hear(manage(SUBSCRIBE))
+        module.command(r2p.Command.STOP, "IMU1")
+        script.unblock()
+        await asyncio.sleep(0)
+        order = said(script)
+        assert order[0] == "Stop"
+        assert "SubscribeResponse" in order[1:]
+        assert set(order[order.index("leds") :]) == {"leds"}
+        assert len(script.topics("leds")) >= 3
+
+
+async def test_what_waits_for_a_blocked_line_is_bounded() -> None:
+    missed: list[r2p.Missed] = []
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("text", Text, r2p.NonRealTime(stall=0.01, on_missed=missed.append))
+        script.hear(manage(m.SubscribeRequest("text", 64, 1)))
+        await asyncio.sleep(1)
+        script.blocked = True
+        while not missed:
+            await publisher.publish(Text())
+        waiting = script.link._waiting
+        assert BUFFER <= waiting < BUFFER + 200
+        for _ in range(10):
+            await publisher.publish(Text())
+        assert script.link._waiting == waiting
+        for _ in range(1000):
+            script.hear(manage(m.SubscribeRequest("text", 64, 1)))
+        assert script.link._waiting < BUFFER + 10_000
+        losses = script.link.losses
+        assert losses["send buffer full"] == 11
+        assert losses["management, send buffer full"] > 800
+        sent = script.link.stats.sent
+        script.unblock()
+        await asyncio.sleep(0)
+        assert len(script.topics("text")) == sent
+
+
+async def test_one_turn_may_bring_more_than_the_buffer_holds() -> None:
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("text", Text)
+        script.hear(manage(m.SubscribeRequest("text", 64, 1)))
+        assert all(publisher.publish_nowait(Text()) for _ in range(1000))
+        await asyncio.sleep(0)
+        assert len(script.topics("text")) == 1000
+
+
+async def test_what_waited_when_the_line_broke_is_never_sent() -> None:
+    """To firmware, whose subscription outlasts the break."""
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        script.blocked = True
+        for number in range(5):
+            await publisher.publish(Led(led=number))
+        sent = len(script.topics("leds"))
+        script.link.disconnected("broken")
+        await publisher.publish(Led(led=5))
+        script.blocked = False
+        await asyncio.sleep(10)
+        script.link.connected(script)
+        await publisher.publish(Led(led=6))
+        await asyncio.sleep(0)
+        assert script.topics("leds")[sent:] == [Led(led=6).encode()]
+        assert script.link.stats.sent == sent + 1
+        assert script.link.losses == {"link down": 6 - sent}
+
+
+async def test_the_outage_is_told() -> None:
+    async with scripted() as (script, module, node):
+        events = module.events()
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE))
+        script.link.disconnected("broken")
+        for _ in range(3):
+            await publisher.publish(Led())
+        await asyncio.sleep(2.5)
+        script.link.connected(script)
+        told = [await anext(events), await anext(events)]
+        assert told == [r2p.LinkDown("script", "broken"), r2p.LinkUp("script", 2.5, 3)]
+
+
+async def test_closing_sends_what_waits_and_then_the_good_bye() -> None:
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        script.blocked = True
+        for _ in range(5):
+            await publisher.publish(Led())
+    assert len(script.topics("leds")) == 5
+    goodbye = script.said[-1].management
+    assert isinstance(goodbye, m.Hello)
+    assert goodbye.flags & m.HELLO_LEAVING
+
+
+async def test_nothing_happens_after_closing() -> None:
+    """Callbacks that were on their way find a link that is closed."""
+    script = Script()
+    async with r2p.Module("PC1", via=script) as module, node_in(module) as node:
+        link = script.link
+        subscriber = node.subscribe("leds", Led, queue=1)
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE) + manage(m.SubscribeResponse("leds", 5, 1)))
+        script.hear(line("leds", Led().encode()) * 200)  # waits for room, more in the backlog
+        publisher.publish_nowait(Led())  # a line is corked
+    spoken = len(script.said)
+    link.fed(line("leds", Led().encode()))
+    link.carrier_ready()
+    link.connected(script)
+    link.disconnected("late")
+    await asyncio.sleep(10)
+    assert len(script.said) == spoken
+    assert not subscriber.queue
+    assert not link.up
+
+
+async def test_a_slow_reader_does_not_stop_the_line() -> None:
+    """Its own messages are lost, counted; the others' come."""
+    async with scripted() as (script, _, node):
+        slow = node.subscribe("slow", Led, queue=2)
+        fast = node.subscribe("fast", Led)
+        script.hear(manage(m.SubscribeResponse("slow", 5)) + manage(m.SubscribeResponse("fast", 5)))
+        for number in range(500):
+            script.hear(line("slow", Led(led=number).encode()) + line("fast", Led(led=number).encode()))
+        for number in range(500):
+            assert await fast.fetch(timeout=1) == Led(led=number)
+        assert [await slow.fetch(timeout=1), await slow.fetch(timeout=1)] == [Led(led=498), Led(led=499)]
+        assert (slow.lost, fast.lost) == (498, 0)
+
+
+async def test_a_message_of_the_wrong_size_is_dropped() -> None:
+    async with scripted() as (script, _, node):
+        subscriber = node.subscribe("leds", Led)
+        script.hear(manage(m.SubscribeResponse("leds", 5)) + line("leds", bytes(4)) + line("leds", bytes(5)))
+        assert await subscriber.fetch(timeout=1) == Led()
+        assert script.link.losses == {"wrong size": 1}
+
+
+async def test_a_subscriber_without_a_type_follows_a_new_size() -> None:
+    """The module behind the topic was replaced by one with another layout."""
+    async with scripted() as (script, _, node):
+        subscriber = node.subscribe("topic", None)
+        for size in (4, 6):
+            script.hear(manage(m.SubscribeResponse("topic", size)) + line("topic", bytes(size)))
+            assert await subscriber.fetch(timeout=1) == bytes(size)
+        script.hear(line("topic", bytes(4)))
+        assert script.link.losses == {"wrong size": 1}
+        assert subscriber.publishers == 1
+
+
+async def test_a_message_that_is_too_long_for_a_line_is_not_offered() -> None:
+    class Long(r2p.Message):
+        """256 bytes."""
+
+        values: Annotated[tuple[r2p.u64, ...], r2p.Len(32)] = (0,) * 32
+
+    async with scripted() as (script, _, node):
+        node.advertise("long", Long)
+        script.hear(manage(m.SubscribeRequest("long", 256, 1)))
+        await asyncio.sleep(5)
+        assert "long" not in {getattr(each.management, "topic", "") for each in script.said}
+        with pytest.raises(r2p.TransportError, match="256 bytes, and it carries at most 255"):
+            node.advertise("longer", Long, strict=True)
+
+
+async def test_management_gets_through_a_line_that_is_always_busy() -> None:
+    """A lease outlives 20 s of more data than the line takes."""
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("text", Text, r2p.NonRealTime(stall=60.0))
+        script.hear(manage(m.Hello("IMU1", 7)) + manage(m.SubscribeRequest("text", 64, 1)))
+        flood = asyncio.create_task(_flood(publisher))
+        for _ in range(20):
+            script.blocked = True
+            await asyncio.sleep(1)
+            script.hear(manage(m.Hello("IMU1", 7)) + manage(m.SubscribeRequest("text", 64, 1)))
+            script.said.clear()
+            script.unblock()
+            await asyncio.sleep(0)
+            assert "SubscribeResponse" in said(script)[:20]
+        flood.cancel()
+        assert "management, send buffer full" not in script.link.losses
+
+
+async def _flood(publisher: r2p.Publisher[Text]) -> None:
+    while True:
+        await publisher.publish(Text())
+
+
+async def test_user_code_that_raises_does_not_harm_the_link() -> None:
+    """It is the end of its node."""
+
+    def fail(missed: r2p.Missed) -> None:
+        raise ZeroDivisionError(missed.reason)
+
+    async def run(script: Script) -> None:
+        async with r2p.Module("PC1", via=script) as module, node_in(module) as node:
+            node.advertise("leds", Led, r2p.Sporadic(0.1, on_degraded=fail))
+            script.hear(manage(m.Hello("IMU1", 7)) + manage(SUBSCRIBE))
+            script.link.disconnected("broken")
+            assert not script.link.up
+            assert not module.network.modules()[1:]
+            await asyncio.sleep(1)
+            script.link.connected(script)
+            assert script.link.up
+            assert not module.nodes["test"].running
+
+    with pytest.raises(r2p.NodeCrashed):
+        await run(Script())

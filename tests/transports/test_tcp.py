@@ -1,0 +1,298 @@
+"""What only TCP has: addresses, sockets that come and go by the thousand, peers that send anything."""
+
+import asyncio
+import gc
+import os
+import socket
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+import r2p
+from r2p.codecs import management as m
+from r2p.errors import TransportError
+from r2p.msg import Led
+from r2p.protocols.discovery import Discovery
+from r2p.testing.network import node_in
+from r2p.transports import tcp
+from r2p.transports.backoff import Backoff
+from r2p.transports.line import LineLink
+from r2p.transports.tcp import TcpListenTransport, TcpTransport
+from r2p.transports.url import parse
+from tests.transports.cables import GUARD
+from tests.transports.conversation import line, manage
+from tests.transports.test_conformance import until
+
+pytestmark = pytest.mark.anyio
+
+SOAK = int(os.environ.get("R2P_SOAK", "2000"))
+"""Connects and disconnects of a client."""
+SUBSCRIBE = manage(m.SubscribeRequest("leds", 5, 1))
+
+
+def listen() -> TcpListenTransport:
+    return TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
+
+
+async def dial(transport: TcpListenTransport) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    assert transport.port
+    return await asyncio.open_connection("127.0.0.1", transport.port)
+
+
+async def hear(reader: asyncio.StreamReader, topic: str) -> bytes:
+    """The next line of a topic."""
+    while True:
+        heard = await reader.readline()
+        assert heard
+        if f"{topic}:".encode() in heard:
+            return heard
+
+
+async def test_garbage_of_every_kind_and_then_a_good_line() -> None:
+    transport = listen()
+    async with (
+        asyncio.timeout(GUARD),
+        r2p.Module("A", via=transport, watchdog=False) as module,
+        node_in(module) as node,
+    ):
+        publisher = node.advertise("leds", Led)
+        subscriber = node.subscribe("cmd", Led)
+        for rubbish in (b"\0" * 10_000, b"@" * 10_000, b"x" * 10_000_000, bytes(range(256)) * 100, b"@00000000:03cm"):
+            _, writer = await dial(transport)
+            writer.write(rubbish)
+            await writer.drain()
+            writer.write(b"\r\n" + SUBSCRIBE + manage(m.SubscribeResponse("cmd", 5, 1)))
+            writer.write(line("cmd", Led(led=len(rubbish)).encode()))
+            assert await subscriber.fetch() == Led(led=len(rubbish))
+            assert publisher.subscribers == 1
+            (link,) = module.links
+            assert isinstance(link, LineLink)
+            assert len(link._reader._held) < 600
+            assert sum(link.losses.values()) <= 10_000
+            writer.close()
+            await until(lambda: not module.links)
+            assert not publisher.subscribers
+
+
+async def test_a_peer_that_dies_in_the_middle_of_a_line_and_returns() -> None:
+    transport = listen()
+    message = line("cmd", Led(led=1).encode())
+    opened = manage(m.SubscribeResponse("cmd", 5, 1))
+    async with (
+        asyncio.timeout(GUARD),
+        r2p.Module("A", via=transport, watchdog=False) as module,
+        node_in(module) as node,
+    ):
+        subscriber = node.subscribe("cmd", Led)
+        for cut in range(1, len(message) - 2, 5):
+            _, writer = await dial(transport)
+            writer.write(opened + message[:cut])
+            await until(lambda: subscriber.publishers)
+            cast("asyncio.Transport", writer.transport).abort()
+            await until(lambda: not module.links)
+            _, writer = await dial(transport)
+            writer.write(message[cut:] + opened + line("cmd", Led(led=cut).encode()))
+            assert await subscriber.fetch() == Led(led=cut)
+            writer.close()
+            await until(lambda: not module.links)
+
+
+async def test_a_dead_client_returns_to_a_server_that_died_in_a_line() -> None:
+    """The client's reader forgets the half line; the server is whoever listens next on that port."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    listener.setblocking(False)
+    loop = asyncio.get_running_loop()
+    port = listener.getsockname()[1]
+    opened = manage(m.SubscribeResponse("cmd", 5, 1))
+    message = line("cmd", Led(led=9).encode())
+    async with (
+        asyncio.timeout(GUARD),
+        r2p.Module("A", via=f"tcp:127.0.0.1:{port}", watchdog=False) as module,
+        node_in(module) as node,
+    ):
+        subscriber = node.subscribe("cmd", Led)
+        connection, _ = await loop.sock_accept(listener)
+        await loop.sock_sendall(connection, opened + message[:20])
+        await until(lambda: subscriber.publishers)
+        connection.close()
+        connection, _ = await loop.sock_accept(listener)
+        await loop.sock_sendall(connection, message[20:] + message)
+        assert await subscriber.fetch() == Led(led=9)
+        assert module.links[0].losses["garbage"] == 1
+        connection.close()
+        listener.close()
+
+
+async def test_clients_come_and_go_without_a_trace() -> None:
+    transport = listen()
+
+    async def visit() -> None:
+        reader, writer = await dial(transport)
+        writer.write(SUBSCRIBE)
+        await hear(reader, "leds")
+        writer.close()
+        await writer.wait_closed()
+
+    async with (
+        asyncio.timeout(GUARD + SOAK / 100),
+        r2p.Module("A", via=transport, watchdog=False) as module,
+        node_in(module) as node,
+    ):
+        publisher = node.advertise("leds", Led, latch=True)
+        await publisher.publish(Led())
+        traces = [traces_of_links()]
+        for _ in range(2):
+            for _ in range(SOAK // 2 // 20):
+                await asyncio.gather(*(visit() for _ in range(20)))
+            await until(lambda: not module.links)
+            await until(lambda: len(asyncio.all_tasks()) <= 5)
+            traces.append(traces_of_links())
+            assert not publisher.subscribers
+            assert not module.space.links
+        assert traces[0] == traces[1] == traces[2]
+
+
+def traces_of_links() -> tuple[int, int, int]:
+    """Objects of links that live, tasks, and open files."""
+    gc.collect()
+    objects = sum(isinstance(each, LineLink | Discovery | tcp._Tcp) for each in gc.get_objects())
+    return objects, len(asyncio.all_tasks()), len(list(Path("/proc/self/fd").iterdir()))
+
+
+class Patient(Backoff):
+    """Notes what is asked of it, and waits for nothing."""
+
+    resets = 0
+    delays = 0
+
+    def reset(self) -> None:
+        Patient.resets += 1
+
+    def delay(self) -> float:
+        Patient.delays += 1
+        return 0.0
+
+
+async def test_a_peer_that_accepts_and_closes_is_not_hammered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only a connection that lived lets the next try follow at once."""
+    monkeypatch.setattr(tcp, "Backoff", Patient)
+    Patient.resets = Patient.delays = 0
+    accepted = 0
+
+    async def close(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal accepted
+        accepted += 1
+        writer.write(b"welcome\r\n")
+        writer.close()
+
+    server = await asyncio.start_server(close, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    async with asyncio.timeout(GUARD), r2p.Module("A", via=f"tcp:127.0.0.1:{port}", watchdog=False):
+        await until(lambda: accepted >= 10)
+        assert Patient.resets == 0
+        assert Patient.delays >= 9
+        monkeypatch.setattr(tcp, "_STABLE", 0.0)
+        await until(lambda: Patient.resets)
+    server.close()
+    await server.wait_closed()
+
+
+async def test_why_there_is_no_connection_yet_is_told_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    module = r2p.Module("A", via=f"tcp:127.0.0.1:{port}", watchdog=False)
+    events = module.events()
+    async with asyncio.timeout(GUARD), module:
+        assert await anext(events) == r2p.LinkWaits(f"tcp:127.0.0.1:{port}", "Connection refused")
+        server = await asyncio.start_server(_ignore, "127.0.0.1", port)
+        up = await anext(events)
+        assert isinstance(up, r2p.LinkUp)
+        assert up.lost == 0
+    server.close()
+
+
+async def _ignore(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    await reader.read()
+    writer.close()
+
+
+async def test_a_connection_to_itself_is_none() -> None:
+    """A client that tries again and again on its own machine may be given the very port it asks for."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        itself = taken.getsockname()
+    connection = tcp._Outgoing(cast("LineLink", None))  # it must not come to use it
+    async with asyncio.timeout(GUARD):
+        await asyncio.get_running_loop().create_connection(lambda: connection, *itself, local_addr=itself)
+        await connection.ended.wait()
+    assert connection.link is None
+
+
+async def test_an_address_in_use_is_an_error_that_says_so() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        url = f"tcp-listen:127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(TransportError, match=rf"{url}: can't listen: Address already in use: another program"):
+            async with r2p.Module("A", via=url, watchdog=False):
+                raise AssertionError("it is open")
+
+
+async def test_a_host_that_nobody_knows() -> None:
+    with pytest.raises(TransportError, match=r"can't listen: .*(not known|resolution|address)"):
+        async with r2p.Module("A", via="tcp-listen:no.such.host.invalid:0", watchdog=False):
+            raise AssertionError("it is open")
+
+
+async def test_a_server_that_is_cancelled_twice_lets_go_of_its_clients() -> None:
+    """The second time while it waits for a client that does not read."""
+    transport = listen()
+    links = []
+
+    class Hub:
+        """A module's, with an eye on its links."""
+
+        def __init__(self, module: r2p.Module) -> None:
+            self._module = module
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._module, name)
+
+    async with asyncio.timeout(GUARD), r2p.Module("A", watchdog=False) as module, node_in(module) as node:
+        publisher = node.advertise("leds", Led, r2p.NonRealTime(stall=0.01))
+        opened = asyncio.Event()
+        running = asyncio.create_task(transport.run(Hub(module), opened.set))  # type: ignore[arg-type]
+        await opened.wait()
+        _, writer = await dial(transport)
+        writer.write(SUBSCRIBE)
+        await publisher.wait_subscriber()
+        while not publisher.missed:
+            await publisher.publish(Led())
+        links += module.links
+        running.cancel()
+        await until(lambda: links[0]._closed)
+        running.cancel()
+        await asyncio.wait([running])
+        assert running.cancelled()
+        assert not module.links
+        writer.close()
+
+
+@pytest.mark.parametrize(
+    ("url", "address"),
+    [
+        ("tcp-listen:", ("127.0.0.1", 2323)),
+        ("tcp-listen:7", ("127.0.0.1", 7)),
+        ("tcp-listen:0.0.0.0", ("0.0.0.0", 2323)),
+        ("tcp-listen:[::1]:7", ("::1", 7)),
+        ("tcp-listen:[::1]", ("::1", 2323)),
+        ("tcp-listen::7", ("127.0.0.1", 7)),
+    ],
+)
+def test_where_it_listens(url: str, address: tuple[str, int]) -> None:
+    transport = TcpListenTransport(parse(url))
+    assert (transport._host, transport._port) == address
+
+
+@pytest.mark.parametrize("url", ["tcp:host:http", "tcp:host:70000", "tcp:", "tcp:7", "tcp:host:", "tcp:host,x=1"])
+def test_addresses_that_are_none(url: str) -> None:
+    with pytest.raises(TransportError):
+        TcpTransport(parse(url))
