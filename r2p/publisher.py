@@ -120,7 +120,7 @@ class BasePublisher(Generic[M]):
     @property
     def subscribers(self) -> int:
         """Who would get a message now: local queues, and one for each link with subscribers behind it."""
-        return len(self._topic.queues) + len(self._topic.outlets)
+        return len(self._topic.queues) + sum(outlet.reachable for outlet in self._topic.outlets)
 
     async def wait_subscriber(self) -> None:
         """Wait until somebody subscribes. Raises Closed if the publisher is closed before."""

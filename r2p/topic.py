@@ -199,6 +199,11 @@ class Outlet(Sink):
         super().__init__()
         self.link = link
 
+    @property
+    def reachable(self) -> bool:
+        """Whether its link is up."""
+        return True
+
 
 class Advertised(Protocol):
     """A publisher as its topic sees it."""

@@ -205,3 +205,28 @@ async def test_any_type_is_fine_for_a_subscriber_of_bytes_across_a_link() -> Non
         typed = b.start(hold, name="typed").subscribe("leds", Led)
         await publisher.publish(led(2))
         assert await typed.fetch(1.0) == led(2)
+
+
+@pytest.mark.virtual_time
+async def test_what_subscribers_miss_while_their_link_is_down_is_counted() -> None:
+    async with joined("A") as a, joined("B") as b:
+        link = a.links[0]
+        assert isinstance(link, MemoryLink)
+        publisher = a.start(hold).advertise("leds", Led)
+        subscriber = b.start(hold).subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        link.disconnect()
+        for value in range(3):
+            await publisher.publish(led(value))
+        assert publisher.subscribers == 0
+        events = a.events()
+        link.connect()
+        assert await anext(events) == r2p.LinkUp("memory:lab", 0.0, 3)
+        await publisher.wait_subscriber()
+        await publisher.publish(led(9))
+        assert await subscriber.fetch() == led(9)
+        link.disconnect()
+        publisher.close()
+        link.connect()
+        await settle(1.0)
+        assert "leds" not in a.space.topics

@@ -103,6 +103,7 @@ class Link(abc.ABC):
         self._outlets: dict[str, LinkOutlet] = {}
         self._intake = Intake(self, hub.space.loop, self.stats)
         self._told: dict[str, Told] = {}
+        self._lapsed: set[str] = set()
         self._events: deque[Event] = deque()
         self._acting = False
         self._room: list[Callable[[], None]] = []
@@ -121,6 +122,9 @@ class Link(abc.ABC):
         self._unreachable = ""
         self.stats.ups += 1
         self._hub.link_changed(self, "", outage, lost)
+        for name in self._lapsed:
+            self._detach(name)
+        self._lapsed.clear()
         self._apply(self.discovery.link_up(self._clock.monotonic()))
 
     def unreachable(self, reason: str) -> None:
@@ -263,6 +267,8 @@ class Link(abc.ABC):
             wish = msgspec.structs.replace(wish, publishes=False)
         if wish != told:
             self._apply(announce(self.discovery, now, topic.name, told, wish))
+        if not wish.publishes:
+            self._detach(topic.name)
         if not wish.subscribes:
             self._intake.shut_all(topic.name)
         if wish != NOTHING:
@@ -293,8 +299,10 @@ class Link(abc.ABC):
                     self.write_management(data, urgent=urgent)
             case Joined(topic):
                 self._attach(topic)
-            case Left(topic):
+            case Left(topic) if self.up or self._closed:
                 self._detach(topic)
+            case Left(topic):  # until the other end is back, what it does not get is counted
+                self._lapsed.add(topic)
             case Opened(topic, source, _, size):
                 self._open(topic, size, source)
             case Shut(topic, source):

@@ -20,6 +20,10 @@ class LinkOutlet(Outlet):
         self._link = link
         self.topic = topic
 
+    @property
+    def reachable(self) -> bool:
+        return self._link.up
+
     def offer(self, sample: Sample) -> bool:
         link = self._link
         if not link.up:
