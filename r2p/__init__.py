@@ -41,8 +41,9 @@ from r2p.messages import (
     u64,
 )
 from r2p.module import LinkDown, LinkUp, LinkWaits, Listening, Module, ModuleEvent
+from r2p.network import Endpoint, ModuleView, Network, TopicView
 from r2p.node import Node, Tick
-from r2p.protocols.events import Command
+from r2p.protocols.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
 from r2p.publisher import (
     Missed,
     NonRealTime,
@@ -52,7 +53,7 @@ from r2p.publisher import (
     Sporadic,
     SporadicPublisher,
 )
-from r2p.run import run
+from r2p.runner import run, run_main
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.subscriber import Subscriber
 
@@ -64,6 +65,7 @@ __all__ = [
     "Command",
     "Deadlock",
     "DecodeError",
+    "Endpoint",
     "Error",
     "InvalidName",
     "Layout",
@@ -74,10 +76,17 @@ __all__ = [
     "Listening",
     "Message",
     "MessageError",
+    "Mismatched",
     "Missed",
     "Module",
+    "ModuleChanged",
     "ModuleEvent",
+    "ModuleGone",
+    "ModuleInfo",
+    "ModuleView",
+    "NameConflict",
     "NameTooLong",
+    "Network",
     "Node",
     "NodeCrashed",
     "NonRealTime",
@@ -92,6 +101,7 @@ __all__ = [
     "Subscriber",
     "Tick",
     "Timestamp",
+    "TopicView",
     "TransportError",
     "TypeMismatch",
     "f32",
@@ -102,6 +112,7 @@ __all__ = [
     "i64",
     "layout",
     "run",
+    "run_main",
     "u8",
     "u16",
     "u32",

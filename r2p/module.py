@@ -44,6 +44,7 @@ logger = logging.getLogger("r2p.module")
 EVENTS = 256
 """Events that an `events()` iteration holds before it loses the oldest."""
 
+_CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
 
 PATIENCE = 1.0
@@ -363,7 +364,8 @@ class Module:
             logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.name, meanwhile)
             self._tell(LinkUp(link.name, outage, lost))
         else:
-            logger.warning("link %s is down: %s", link.name, reason)
+            abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
+            logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.name, reason)
             self._tell(LinkDown(link.name, reason))
 
     def discovered(self, link: Link, event: Event) -> None:
@@ -380,7 +382,7 @@ class Module:
             case Echoes():
                 logger.error("link %s gives back what we send: switch off local echo at the other end", link.name)
             case ModuleChanged():
-                self._check_namesakes(link, event.info)
+                self._suspect_namesakes(link, event.info)
                 self._tell(event)
             case ModuleGone():
                 self._tell(event)
@@ -403,15 +405,24 @@ class Module:
             order, self._order = self._order, None
             await (self.stop() if order is Command.STOP else self._reboot(tasks))
 
-    def _check_namesakes(self, link: Link, info: ModuleInfo) -> None:
-        """Two who can't hear each other may have one name: whoever hears both tells them."""
-        for other in self.links:
-            namesake = other.discovery.modules.get(info.name) if other is not link else None
-            if namesake is None or None in (info.instance, namesake.instance) or namesake.instance == info.instance:
-                continue
-            for each in (link, other):
-                each.tell_conflict(info.name, namesake.instance or 0, info.instance or 0)
-            self.discovered(link, NameConflict(info.name, namesake.instance, info.instance))
+    def _suspect_namesakes(self, link: Link, info: ModuleInfo) -> None:
+        """Two who can't hear each other may have one name, or one came back before its old link was seen to be down."""
+        others = (other.discovery.modules.get(info.name) for other in self.links if other is not link)
+        if any(other is not None and other.instance != info.instance for other in others):
+            self.space.loop.call_later(_CONFIRMED, self._tell_namesakes, info.name, self.space.clock.monotonic())
+
+    def _tell_namesakes(self, name: str, suspected: int) -> None:
+        """Whoever has heard both since then (monotonic ns) tells them."""
+        found = [(link, info) for link in self.links if (info := link.discovery.modules.get(name)) is not None]
+        heard = {
+            info.instance: link for link, info in found if info.instance is not None and info.last_heard > suspected
+        }
+        if len(heard) < 2 or not self._open:
+            return
+        (one, link), (other, _), *_ = heard.items()
+        for each in heard.values():
+            each.tell_conflict(name, one, other)
+        self.discovered(link, NameConflict(name, one, other))
 
     def _topic_changed(self, topic: Topic) -> None:
         for link in self.links:

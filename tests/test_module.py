@@ -16,6 +16,7 @@ from r2p.module import EVENTS, PATIENCE
 from r2p.msg import Encoder, Led, Log
 from r2p.protocols.events import Mismatched, NameConflict
 from r2p.transports.link import Transport
+from r2p.transports.memory import network
 from tests.bench import collect, crashes, hold, joined, led, local, settle
 
 if TYPE_CHECKING:
@@ -290,6 +291,19 @@ async def test_namesakes_on_two_links_are_told_by_who_hears_both() -> None:
         await settle(3.0)
     for stream in events:
         assert [event.module async for event in stream if isinstance(event, NameConflict)]
+
+
+@pytest.mark.virtual_time
+async def test_a_module_that_comes_back_on_another_link_is_no_namesake() -> None:
+    async with r2p.Module("M", via=["memory:left", "memory:right"]) as hub:
+        events = hub.events()
+        async with r2p.Module("A", via="memory:left") as first:
+            await settle(3.0)
+            network("left").loss = 1.0
+            async with r2p.Module("A", via="memory:right"):
+                assert first.links[0].up
+                await settle(3.0)
+    assert not [event async for event in events if isinstance(event, NameConflict)]
 
 
 @pytest.mark.virtual_time

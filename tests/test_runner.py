@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import pytest
 
 import r2p
-from r2p.run import loop_factory, run_main
+from r2p.runner import loop_factory, run_main
 from tests.bench import settle
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def test_a_second_signal_ends_the_process_at_once(first: int, second: int) -> No
                 ready()
                 await asyncio.Event().wait()
 
-        sys.modules["r2p.run"].GRACE = 3600.0
+        sys.modules["r2p.runner"].GRACE = 3600.0
         r2p.run(hangs)
     """
     assert execute(program, first, second).code == -second
@@ -123,7 +123,7 @@ def test_a_program_that_does_not_end_is_ended(hang: str) -> None:
             finally:
                 {hang}
 
-        sys.modules["r2p.run"].GRACE = 0.05
+        sys.modules["r2p.runner"].GRACE = 0.05
         r2p.run(hangs)
     """
     assert execute(program, signal.SIGTERM).code == -signal.SIGTERM

@@ -16,7 +16,7 @@ from r2p.supervisor import NodeFunction, check_function, name_of
 from r2p.tools.loading import load_module
 from r2p.tools.session import Quiet, Usage, Verbose, Via, execute, settings
 
-logger = logging.getLogger("r2p.run")
+logger = logging.getLogger("r2p.runner")
 
 
 class Program(msgspec.Struct, frozen=True):

@@ -31,7 +31,7 @@ import typer
 
 import r2p
 from r2p.clock import random_of
-from r2p.run import run_main
+from r2p.runner import run_main
 from r2p.tools.output import PipeClosed, abandon_stdout
 from r2p.tools.stderr import log_to_stderr, say
 from r2p.transports.url import duration

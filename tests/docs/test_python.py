@@ -56,7 +56,7 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     def run_coroutine(main: Coroutine[Any, Any, T]) -> T | None:
         return run_bounded(lambda: main)
 
-    monkeypatch.setattr(sys.modules["r2p.run"], "run_main", run_bounded)
+    monkeypatch.setattr(sys.modules["r2p.runner"], "run_main", run_bounded)
     monkeypatch.setattr("r2p.module.open_transport", open_here)
     monkeypatch.setattr(asyncio, "run", run_coroutine)
     monkeypatch.setattr(sys, "argv", ["program"])
