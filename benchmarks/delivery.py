@@ -69,8 +69,15 @@ async def queue_throughput(messages: int) -> float:
 
 async def cyphal_throughput(messages: int) -> float:
     """pycyphal 1.x's loopback transport: send and receive 8 bytes."""
-    from pycyphal.transport import MessageDataSpecifier, Priority, Transfer
-    from pycyphal.transport import InputSessionSpecifier, OutputSessionSpecifier, PayloadMetadata, Timestamp
+    from pycyphal.transport import (
+        InputSessionSpecifier,
+        MessageDataSpecifier,
+        OutputSessionSpecifier,
+        PayloadMetadata,
+        Priority,
+        Timestamp,
+        Transfer,
+    )
     from pycyphal.transport.loopback import LoopbackTransport
 
     transport = LoopbackTransport(1)

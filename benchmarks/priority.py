@@ -39,15 +39,16 @@ async def beside_slow_ones(messages: int, low: int) -> list[float]:
             at = time.perf_counter()
             await publisher.publish(MESSAGE)
             if publisher.sent == messages:
+                ended.set()
                 return
 
+    ended = asyncio.Event()
     async with r2p.Module("BENCH", via=[], watchdog=False) as module:
         module.start(high, priority=10)
         for index in range(low):
             module.start(slow, 0.1 if index % 2 else 0.2, name=f"slow{index}")
-        ended = module.start(produce)
-        while module.nodes[ended.name].running:
-            await asyncio.sleep(0.01)
+        module.start(produce)
+        await ended.wait()
     return taken
 
 
