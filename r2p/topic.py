@@ -6,6 +6,7 @@ woken directly, the others one for each turn of the event loop, so that an impor
 handler steps of unimportant ones.
 """
 
+import abc
 import asyncio
 import heapq
 import itertools
@@ -95,7 +96,7 @@ class Waker:
         self._running = False
 
 
-class Sink:
+class Sink(abc.ABC):
     """What takes samples: a subscriber's queue, or a link's send buffer."""
 
     __slots__ = ("_room", "_room_at", "lost", "patient")
@@ -107,17 +108,17 @@ class Sink:
         self._room: list[Callable[[], None]] | None = None
         self._room_at = 0
 
+    @abc.abstractmethod
     def offer(self, sample: Sample) -> bool:
         """Take the sample if there is room."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def force(self, sample: Sample) -> None:
         """Take the sample even without room, losing and counting one."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def when_room(self, callback: Callable[[], None], *, soon: bool = False) -> None:
         """Call back once when there is room again: at the first free place (`soon`), else when half is free."""
-        raise NotImplementedError
 
     def wait_no_more(self, callback: Callable[[], None]) -> None:
         """Undo `when_room`, if it was not called back yet."""

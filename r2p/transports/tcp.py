@@ -1,5 +1,6 @@
 """The debug line over TCP: a client that comes back, and a server for many clients, each a peer of its own."""
 
+import abc
 import asyncio
 import errno
 import os
@@ -33,9 +34,9 @@ class _Tcp(asyncio.BufferedProtocol, Connection):
         self._transport: asyncio.Transport | None = None
         self._paused = False
 
+    @abc.abstractmethod
     def open_link(self, peer: str) -> LineLink:
         """The link that it carries; the other end is there."""
-        raise NotImplementedError
 
     # Carrier
 
