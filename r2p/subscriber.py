@@ -153,12 +153,17 @@ class Subscriber(QueueSink, Generic[T]):
         message = self._next()
         if message is not None:
             return message
+        if timeout is None:
+            return await self._fetch_next()
         async with asyncio.timeout(timeout):
-            while not self._closed:
-                await self._arrival()
-                message = self._next()
-                if message is not None:
-                    return message
+            return await self._fetch_next()
+
+    async def _fetch_next(self) -> T:
+        while not self._closed:
+            await self._arrival()
+            message = self._next()
+            if message is not None:
+                return message
         raise self._is_closed()
 
     def close(self) -> None:
