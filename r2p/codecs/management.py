@@ -2,7 +2,17 @@
 
 What firmware leaves open is read with tolerance: what stands behind a name's NUL, reserved and unused bytes mean
 nothing, and STOP, REBOOT and BOOTLOAD, of which a tool of 2013 has a layout of its own, are read for their name only.
-Types from 0x50 are r2p's own; their body begins with a version.
+Types from 0x40 are r2p's own; their body begins with a version. Those up to 0x4F stay on an RTCAN bus, among the
+modules that are directly on it. After the version, without gaps (`u32 slot` in ns, all others as their names say):
+
+| type | name | body |
+| --- | --- | --- |
+| 0x40 | NETWORK | `u8 id8; u8 priority; u32 epoch; u64 cycle; u8 slots; u32 slot; i64 utc_offset` (ns) `; u16 utc_error` (us) |
+| 0x41 | CLAIM | `u8 id8; u64 number; u8 priority; u8 flags` (bit 0: the id8 is fixed, 1: electing a master) |
+| 0x42 | RESERVE | `u16 message; u8 serial; u8 fragments; u32 period; u32 phase; u8 flags` (bit 0: round the period down) |
+| 0x43 | GRANT | `u16 message; u8 serial; u8 fragments; u32 period; u32 phase; u64 from_cycle; u32 epoch; u16 lease_ms` |
+| 0x44 | REFUSE | `u16 message; u8 serial; u8 reason; u8 fragments; u32 period; u32 other; u16 rival` |
+| 0x45 | RELEASE | `u16 message` |
 """
 
 import msgspec
@@ -32,9 +42,18 @@ CLASS_NONE = 0
 CLASS_NRT = 1
 CLASS_SRT = 2  # sporadic
 CLASS_HRT = 3  # periodic
+CLASS_LATCHES = 128  # added to the others: new subscribers get its last message
 
 NO_PARAMS = bytes(10)
 ANY_TYPE = bytes(8)
+
+# Claim.flags
+CLAIM_FIXED = 1  # the module can't take another id8
+CLAIM_ELECTING = 2  # it knows no master
+
+NO_PHASE = 0xFFFFFFFF  # Reserve.phase: any
+RESERVE_ROUND_DOWN = 1  # Reserve.flags: or the longest possible period below it
+NO_UTC = 0xFFFF  # Network.utc_error: the offset is not known
 
 _VERSION = 1
 
@@ -129,7 +148,7 @@ class Unsubscribe(msgspec.Struct, frozen=True, gc=False):
 
 
 class Endpoint(msgspec.Struct, frozen=True, gc=False):
-    """A node's publisher or subscriber, or (role + ROLE_GONE) its end. `publisher_class` is CLASS_..."""
+    """A node's publisher or subscriber, or (role + ROLE_GONE) its end. `publisher_class` is CLASS_..., a sum."""
 
     role: int
     instance: int
@@ -146,6 +165,77 @@ class Conflict(msgspec.Struct, frozen=True, gc=False):
     instance_b: int
 
 
+class Network(msgspec.Struct, frozen=True, gc=False):
+    """The RTCAN master tells what all must agree on, and anchors the cycle counter. `slot` is the length of one (ns).
+
+    `utc_offset` is UTC less network time (ns), `utc_error` how far off it may be (us).
+    """
+
+    id8: int
+    priority: int
+    epoch: int
+    cycle: int
+    slots: int
+    slot: int
+    utc_offset: int = 0
+    utc_error: int = NO_UTC
+
+
+class Claim(msgspec.Struct, frozen=True, gc=False):
+    """A module uses this id8; who claimed it with the lower `number` (64 random bits) keeps it. `priority` is that for
+    the election of a master, 0: never; `flags` are CLAIM_...
+    """
+
+    id8: int
+    number: int
+    priority: int = 0
+    flags: int = 0
+
+
+class Reserve(msgspec.Struct, frozen=True, gc=False):
+    """Slots for a periodic message are wanted or, with a `phase`, still wanted. Periods and phases are in slots."""
+
+    message: int
+    serial: int
+    fragments: int
+    period: int
+    phase: int = NO_PHASE
+    flags: int = 0
+
+
+class Grant(msgspec.Struct, frozen=True, gc=False):
+    """The slots whose number, counted from the start of cycle 0, is `phase` modulo `period` (and the next ones, for
+    more fragments) belong to the message for `lease_ms`, from the cycle `from_cycle` on. `serial` is the request's.
+    """
+
+    message: int
+    serial: int
+    fragments: int
+    period: int
+    phase: int
+    from_cycle: int
+    epoch: int
+    lease_ms: int
+
+
+class Refuse(msgspec.Struct, frozen=True, gc=False):
+    """There are no slots; `reason` and what follows are those of `r2p.protocols.rtcan.calendar.Refusal`."""
+
+    message: int
+    serial: int
+    reason: int
+    fragments: int
+    period: int
+    other: int = 0
+    rival: int = 0
+
+
+class Release(msgspec.Struct, frozen=True, gc=False):
+    """The message does not need its slots any more."""
+
+    message: int
+
+
 Management = (
     Alive
     | Stop
@@ -155,12 +245,21 @@ Management = (
     | SubscribeRequest
     | SubscribeResponse
     | Path
+    | Network
+    | Claim
+    | Reserve
+    | Grant
+    | Refuse
+    | Release
     | Hello
     | TypeInfo
     | Unsubscribe
     | Endpoint
     | Conflict
 )
+
+RTCAN_TYPES = range(0x40, 0x50)
+"""Type bytes of what concerns the RTCAN bus itself, and no gateway."""
 
 _PUBSUB = "16s H H 10s"
 _CODEC = Codec[Management](
@@ -173,6 +272,12 @@ _CODEC = Codec[Management](
     Record(SubscribeRequest, 0x22, _PUBSUB),
     Record(SubscribeResponse, 0x23, _PUBSUB),
     Record(Path, 0x31, "7s 8s 16s", may_be_empty=("module", "node", "topic")),
+    Record(Network, 0x40, "B B I Q B I q H", version=_VERSION),
+    Record(Claim, 0x41, "B Q B B", version=_VERSION),
+    Record(Reserve, 0x42, "H B B I I B", version=_VERSION),
+    Record(Grant, 0x43, "H B B I I Q I H", version=_VERSION),
+    Record(Refuse, 0x44, "H B B B I I H", version=_VERSION),
+    Record(Release, 0x45, "H", version=_VERSION),
     Record(Hello, 0x50, "7s I B B H", version=_VERSION),
     Record(TypeInfo, 0x51, "B 16s 8s H", version=_VERSION),
     Record(Unsubscribe, 0x52, "16s I", version=_VERSION),
