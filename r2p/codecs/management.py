@@ -7,12 +7,14 @@ modules that are directly on it. After the version, without gaps (`u32 slot` in 
 
 | type | name | body |
 | --- | --- | --- |
-| 0x40 | NETWORK | `u8 id8; u8 priority; u32 epoch; u64 cycle; u8 slots; u32 slot; i64 utc_offset` (ns) `; u16 utc_error` (us) |
+| 0x40 | NETWORK | `u8 id8; u8 priority; u32 epoch; u64 cycle; u8 slots; u32 slot; i64 utc_offset; u16 utc_error` |
 | 0x41 | CLAIM | `u8 id8; u64 number; u8 priority; u8 flags` (bit 0: the id8 is fixed, 1: electing a master) |
-| 0x42 | RESERVE | `u16 message; u8 serial; u8 fragments; u32 period; u32 phase; u8 flags` (bit 0: round the period down) |
-| 0x43 | GRANT | `u16 message; u8 serial; u8 fragments; u32 period; u32 phase; u64 from_cycle; u32 epoch; u16 lease_ms` |
+| 0x42 | RESERVE | `u16 message; u8 serial; u8 fragments; u32 period; u32 phase; u8 flags` (bit 0: round it down) |
+| 0x43 | GRANT | `u16 message; u8 serial, fragments; u32 period, phase; u64 from_cycle; u32 epoch; u16 lease_ms` |
 | 0x44 | REFUSE | `u16 message; u8 serial; u8 reason; u8 fragments; u32 period; u32 other; u16 rival` |
 | 0x45 | RELEASE | `u16 message` |
+| 0x46 | RENEW | `u8 serial; u8 highs[24]` (of the messages, 0: none) |
+| 0x47 | RENEWED | `u8 id8; u8 serial; u16 lease_ms; u8 highs[24]` |
 """
 
 import msgspec
@@ -53,6 +55,7 @@ CLAIM_ELECTING = 2  # it knows no master
 
 NO_PHASE = 0xFFFFFFFF  # Reserve.phase: any
 RESERVE_ROUND_DOWN = 1  # Reserve.flags: or the longest possible period below it
+RENEW_MAX = 24  # high bytes in a Renew
 NO_UTC = 0xFFFF  # Network.utc_error: the offset is not known
 
 _VERSION = 1
@@ -236,6 +239,22 @@ class Release(msgspec.Struct, frozen=True, gc=False):
     message: int
 
 
+class Renew(msgspec.Struct, frozen=True, gc=False):
+    """The sender still wants the slots that it was granted for its topics with these high bytes (24 bytes, 0: none)."""
+
+    serial: int
+    highs: bytes
+
+
+class Renewed(msgspec.Struct, frozen=True, gc=False):
+    """Those of `highs` are granted to the module `id8` for `lease_ms` more; what it asked for besides is not."""
+
+    id8: int
+    serial: int
+    lease_ms: int
+    highs: bytes
+
+
 Management = (
     Alive
     | Stop
@@ -251,6 +270,8 @@ Management = (
     | Grant
     | Refuse
     | Release
+    | Renew
+    | Renewed
     | Hello
     | TypeInfo
     | Unsubscribe
@@ -278,6 +299,8 @@ _CODEC = Codec[Management](
     Record(Grant, 0x43, "H B B I I Q I H", version=_VERSION),
     Record(Refuse, 0x44, "H B B B I I H", version=_VERSION),
     Record(Release, 0x45, "H", version=_VERSION),
+    Record(Renew, 0x46, "B 24s", version=_VERSION),
+    Record(Renewed, 0x47, "B B H 24s", version=_VERSION),
     Record(Hello, 0x50, "7s I B B H", version=_VERSION),
     Record(TypeInfo, 0x51, "B 16s 8s H", version=_VERSION),
     Record(Unsubscribe, 0x52, "16s I", version=_VERSION),

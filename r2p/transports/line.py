@@ -199,10 +199,9 @@ class LineLink(Link):
             self._carrier.resume()
 
     def close(self) -> None:
-        self._blocked = False  # the carrier gets all that waits, and after it our good-bye
-        self._flush()
+        self._flush(last_words=True)  # the carrier gets all that waits, and after it our good-bye
         super().close()
-        self._flush()
+        self._flush(last_words=True)
         carrier, self._carrier = self._carrier, None
         if carrier is not None:
             carrier.close()
@@ -218,8 +217,8 @@ class LineLink(Link):
         if self._room and not self.full:
             self._made_room()
 
-    def _flush(self) -> None:
-        while self._waiting and not self._blocked:
+    def _flush(self, *, last_words: bool = False) -> None:
+        while self._waiting and (last_words or not self._blocked):
             self._send(self._next_piece())
 
     def _next_piece(self) -> bytes:

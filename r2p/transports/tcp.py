@@ -220,23 +220,17 @@ class _Incoming(_Tcp):
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        self._let_go()
-
-    async def leave(self) -> None:
-        """The server closes."""
-        if self.link is not None:
-            self.link.close()
-        try:
-            await self.aclose()
-        finally:
-            self._let_go()
-
-    def _let_go(self) -> None:
         if self.link is not None:
             self._clients.remove(self)
             self.link.close()
             self._hub.detach(self.link)
             self.link = None
+
+    async def leave(self) -> None:
+        """The server closes."""
+        if self.link is not None:
+            self.link.close()
+        await self.aclose()
 
 
 def _explain(error: Exception) -> str:

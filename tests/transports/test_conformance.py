@@ -35,8 +35,8 @@ async def first(events: AsyncIterator[ModuleEvent], kind: type[E]) -> E:
 
 
 def other(module: r2p.Module, name: str) -> ModuleView | None:
-    """Another module, as this one knows it."""
-    return next((view for view in module.network.modules() if view.name == name and view.link), None)
+    """Another module whose HELLO this one has heard; by an ALIVE alone it may be firmware."""
+    return next((view for view in module.network.modules() if view.name == name and view.link and view.instance), None)
 
 
 async def acquainted(a: r2p.Module, b: r2p.Module) -> None:

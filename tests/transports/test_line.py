@@ -1,6 +1,7 @@
 """The debug line's link by itself, under virtual time: what waits, what overtakes, what is thrown away."""
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Annotated
@@ -120,6 +121,26 @@ async def test_what_waited_when_the_line_broke_is_never_sent() -> None:
         assert script.link.losses == {"link down": 6 - sent}
 
 
+async def test_whoever_waits_for_a_line_that_breaks_waits_no_more() -> None:
+    """A message without a deadline as well as an event with one: both are lost, counted."""
+    async with scripted() as (script, _, node):
+        filler = node.advertise("text", Text, r2p.NonRealTime(stall=3600.0))
+        events = node.advertise("leds", Led, r2p.Sporadic(3600.0))
+        script.hear(manage(m.SubscribeRequest("text", 64, 1)) + manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        script.blocked = True
+        flood = asyncio.create_task(_flood(filler))
+        await asyncio.sleep(1)
+        stalled = filler.sent
+        assert not events.publish_nowait(Led())
+        held = len(script.link._samples)
+        script.link.disconnected("broken")
+        assert script.link.losses["link down"] == held + 1
+        await asyncio.sleep(0)
+        flood.cancel()
+        assert filler.sent > stalled
+
+
 async def test_the_outage_is_told() -> None:
     async with scripted() as (script, module, node):
         events = module.events()
@@ -140,8 +161,11 @@ async def test_closing_sends_what_waits_and_then_the_good_bye() -> None:
         script.hear(manage(SUBSCRIBE))
         await asyncio.sleep(1)
         script.blocked = True
-        for _ in range(5):
+        await publisher.publish(Led())
+        await asyncio.sleep(0)
+        for _ in range(4):
             await publisher.publish(Led())
+        assert len(script.topics("leds")) == 1
     assert len(script.topics("leds")) == 5
     goodbye = script.said[-1].management
     assert isinstance(goodbye, m.Hello)
@@ -177,10 +201,23 @@ async def test_a_slow_reader_does_not_stop_the_line() -> None:
         script.hear(manage(m.SubscribeResponse("slow", 5)) + manage(m.SubscribeResponse("fast", 5)))
         for number in range(500):
             script.hear(line("slow", Led(led=number).encode()) + line("fast", Led(led=number).encode()))
+        turns = asyncio.create_task(_count_turns())
         for number in range(500):
             assert await fast.fetch(timeout=1) == Led(led=number)
+        turns.cancel()
+        assert await turns < 500  # it was waited for once, not for each message
         assert [await slow.fetch(timeout=1), await slow.fetch(timeout=1)] == [Led(led=498), Led(led=499)]
         assert (slow.lost, fast.lost) == (498, 0)
+
+
+async def _count_turns() -> int:
+    """Turns of the event loop until it is cancelled."""
+    turns = 0
+    with contextlib.suppress(asyncio.CancelledError):
+        while True:
+            await asyncio.sleep(0)
+            turns += 1
+    return turns
 
 
 async def test_a_message_of_the_wrong_size_is_dropped() -> None:

@@ -100,7 +100,7 @@ async def test_a_full_network_makes_publishers_wait() -> None:
         network.delay = 1.0
         for number in range(2 * IN_FLIGHT):
             await publisher.publish(Float32(data=float(number)))
-        assert asyncio.get_running_loop().time() >= 1.0
+        assert 1.0 <= asyncio.get_running_loop().time() < 3.0
         assert publisher.missed == 0
         for number in range(2 * IN_FLIGHT):
             assert (await subscriber.fetch(timeout=2)).data == number

@@ -40,10 +40,10 @@ class Board:
         self._fds = master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
-        self.device.unlink(missing_ok=True)
         self.device.symlink_to(os.ttyname(slave))
 
     def pull(self) -> None:
+        self.device.unlink(missing_ok=True)  # first: the kernel gives the pty's name to the next who asks
         for each in self._fds:
             os.close(each)
         self._fds = ()
@@ -140,6 +140,26 @@ def test_the_kernel_tells_what_it_has_queued(board: Board) -> None:
     assert port._queued(board._fds[1]) == 0
     with Path("/dev/null").open() as no_terminal:
         assert port._queued(no_terminal.fileno()) == 0
+
+
+async def test_closing_says_good_bye(board: Board) -> None:
+    board.plug()
+    async with asyncio.timeout(GUARD):
+        async with on(board) as module:
+            await until(lambda: module.links[0].up)
+    goodbye = m.decode(Reader().feed(os.read(board._fds[0], 65536))[-1].data)
+    assert isinstance(goodbye, m.Hello)
+    assert goodbye.flags & m.HELLO_LEAVING
+
+
+def test_silence_does_not_look_like_the_end(board: Board) -> None:
+    """As pyserial sets a port, a read of nothing gives nothing, as does one of a device that is gone."""
+    board.plug()
+    with serial.Serial(str(board.device), timeout=0) as device:
+        os.set_blocking(device.fileno(), False)
+        port._tell_end_from_silence(device.fileno())
+        with pytest.raises(BlockingIOError):
+            os.read(device.fileno(), 1)
 
 
 async def test_a_device_of_another_group(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import r2p
 from r2p.codecs import management as m
+from r2p.codecs.debug import Reader
 from r2p.errors import TransportError
 from r2p.msg import Led
 from r2p.protocols.discovery import Discovery
@@ -245,7 +246,7 @@ async def test_a_host_that_nobody_knows() -> None:
 async def test_a_server_that_is_cancelled_twice_lets_go_of_its_clients() -> None:
     """The second time while it waits for a client that does not read."""
     transport = listen()
-    links = []
+    links_left: list[int] = []
 
     class Hub:
         """A module's, with an eye on its links."""
@@ -259,21 +260,55 @@ async def test_a_server_that_is_cancelled_twice_lets_go_of_its_clients() -> None
     async with asyncio.timeout(GUARD), r2p.Module("A", watchdog=False) as module, node_in(module) as node:
         publisher = node.advertise("leds", Led, r2p.NonRealTime(stall=0.01))
         opened = asyncio.Event()
-        running = asyncio.create_task(transport.run(Hub(module), opened.set))  # type: ignore[arg-type]
+
+        async def run() -> None:
+            try:
+                await transport.run(Hub(module), opened.set)  # type: ignore[arg-type]
+            finally:
+                links_left.append(len(module.links))
+
+        running = asyncio.create_task(run())
         await opened.wait()
         _, writer = await dial(transport)
         writer.write(SUBSCRIBE)
         await publisher.wait_subscriber()
         while not publisher.missed:
             await publisher.publish(Led())
-        links += module.links
+        (link,) = module.links
         running.cancel()
-        await until(lambda: links[0]._closed)
+        await until(lambda: link._closed)
         running.cancel()
         await asyncio.wait([running])
         assert running.cancelled()
-        assert not module.links
+        assert links_left == [0]
         writer.close()
+
+
+async def test_both_ends_say_good_bye() -> None:
+    """Before the connection ends, which would tell the same."""
+    heard: list[bytes] = []
+    over = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        heard.append(await reader.read())
+        writer.close()
+        over.set()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    url = f"tcp:127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    transport = listen()
+    async with asyncio.timeout(GUARD):
+        async with r2p.Module("A", via=[url, transport], watchdog=False) as module:
+            reader, writer = await dial(transport)
+            await until(lambda: [link.up for link in module.links] == [True, True])
+        heard.append(await reader.read())
+        await over.wait()
+    for each in heard:
+        goodbye = m.decode(Reader().feed(each)[-1].data)
+        assert isinstance(goodbye, m.Hello)
+        assert goodbye.flags & m.HELLO_LEAVING
+    writer.close()
+    server.close()
 
 
 @pytest.mark.parametrize(
