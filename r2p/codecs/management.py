@@ -3,7 +3,7 @@
 What firmware leaves open is read with tolerance: what stands behind a name's NUL, reserved and unused bytes mean
 nothing, and STOP, REBOOT and BOOTLOAD, of which a tool of 2013 has a layout of its own, are read for their name only.
 Types from 0x40 are r2p's own; their body begins with a version. Those up to 0x4F stay on an RTCAN bus, among the
-modules that are directly on it. After the version, without gaps (`u32 slot` in ns, all others as their names say):
+modules that are directly on it. After the version, without gaps (`slot` and `utc_offset` in ns, `utc_error` in us):
 
 | type | name | body |
 | --- | --- | --- |
