@@ -38,6 +38,8 @@ LAYOUTS = [
         0x44,
     ),
     (m.Release(0x020A), bytes([1, 0x0A, 2]), 0x45),
+    (m.Renew(7, bytes(range(2, 26))), bytes([1, 7, *range(2, 26)]), 0x46),
+    (m.Renewed(10, 7, 3000, bytes(range(2, 26))), bytes([1, 10, 7, 0xB8, 0x0B, *range(2, 26)]), 0x47),
 ]
 
 
@@ -71,6 +73,8 @@ messages: st.SearchStrategy[m.Management] = st.one_of(
     st.builds(m.Grant, u16, u8, u8, u32, u32, u64, u32, u16),
     st.builds(m.Refuse, u16, u8, u8, u8, u32, u32, u16),
     st.builds(m.Release, u16),
+    st.builds(m.Renew, u8, st.binary(min_size=24, max_size=24)),
+    st.builds(m.Renewed, u8, u8, u16, st.binary(min_size=24, max_size=24)),
 )
 
 

@@ -1,0 +1,229 @@
+"""The calendar of reserved slots at the master: admission and phases of periodic messages.
+
+PROTOCOL.md 6, thesis 4.3.4.
+
+Slots are counted through: slot s of cycle c is number c * slots + s. A reservation of period p, phase f and k fragments
+owns the numbers f .. f + k - 1 and all that differ from them by a multiple of p. Of every two reservations, the sync's
+included (period: the cycle, phase 0, one slot), one period divides the other: so they meet nowhere if they don't meet
+within the shorter of the two periods. That makes the slots one period has left a number of that many bits.
+
+Since slot 0 of every cycle is the sync's, the slots of one occurrence never span two cycles.
+"""
+
+import enum
+import math
+from collections.abc import Iterator
+
+import msgspec
+
+from r2p.codecs.rtcan import SLOTS_MAX
+
+LONGEST_PERIOD = 1 << 16
+"""In slots: about 11 s in slots of 166 us."""
+_MOST = 1024
+
+
+class Reservation(msgspec.Struct, frozen=True):
+    """The slots of one message; `period` and `phase` are in slots, `phase` counts from the start of cycle 0."""
+
+    message: int
+    period: int
+    phase: int
+    fragments: int = 1
+
+    def first_from(self, number: int) -> int:
+        """The first slot number from this one on where an occurrence begins."""
+        return number + (self.phase - number) % self.period
+
+
+class Reason(enum.IntEnum):
+    """Why there are no slots; the numbers are those of the wire."""
+
+    PERIOD = 1
+    OTHER = 2
+    LENGTH = 3
+    FULL = 4
+    TAKEN = 5
+    MANY = 6
+
+
+class Refusal(msgspec.Struct, frozen=True):
+    """No slots for `fragments` every `period`; `other` is the period, of the message `rival`, that matters."""
+
+    message: int
+    reason: Reason
+    period: int
+    fragments: int = 1
+    other: int = 0
+    rival: int = 0
+
+    @property
+    def text(self) -> str:
+        """The reason in words."""
+        match self.reason:
+            case Reason.PERIOD:
+                return f"a period of {self.period} slots neither divides the {self.other} of a cycle nor is a multiple"
+            case Reason.OTHER:
+                return (
+                    f"a period of {self.period} slots neither divides the {self.other} of message "
+                    f"0x{self.rival:04X} nor is a multiple"
+                )
+            case Reason.LENGTH:
+                return f"a period of {self.period} slots: 2 to {LONGEST_PERIOD} are possible, more than the fragments"
+            case Reason.FULL:
+                return f"no {self.fragments} slots in a row are free every {self.period} slots"
+            case Reason.TAKEN:
+                return "its slots were given to another message"
+            case Reason.MANY:
+                return f"there are {_MOST} reservations"
+
+
+class Calendar:
+    """All reservations of a network with cycles of `slots`. Raises ValueError unless those are 2..64."""
+
+    def __init__(self, slots: int) -> None:
+        if not 2 <= slots <= SLOTS_MAX:
+            raise ValueError(f"{slots} slots: a cycle has 2 to {SLOTS_MAX}")
+        self.slots = slots
+        self.changes = 0
+        """Counts admissions and removals."""
+        self._entries: dict[int, Reservation] = {}
+
+    def __iter__(self) -> Iterator[Reservation]:
+        return iter(self._entries.values())
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def get(self, message: int) -> Reservation | None:
+        return self._entries.get(message)
+
+    def admit(
+        self, message: int, period: int, fragments: int = 1, *, round_down: bool = False
+    ) -> Reservation | Refusal:
+        """Reserve slots, from the least possible phase on; `round_down` takes the longest possible period up to this.
+
+        A message that has slots of another period or size gives those back first.
+        """
+        before = self._entries.get(message)
+        if before is not None:
+            if before.fragments == fragments and self._wanted(message, period, round_down) == before.period:
+                return before
+            self.remove(message)
+        wanted = self._wanted(message, period, round_down)
+        refusal = self._impossible(message, wanted, fragments)
+        if refusal is not None:
+            return refusal
+        phase = _first_run(self.free(wanted), fragments)
+        if phase is None:
+            return Refusal(message, Reason.FULL, wanted, fragments)
+        return self._enter(Reservation(message, wanted, phase, fragments))
+
+    def readmit(self, reservation: Reservation) -> Reservation | Refusal:
+        """Enter what another master granted, with its phase."""
+        message, period, phase, fragments = msgspec.structs.astuple(reservation)
+        before = self._entries.get(message)
+        if before == reservation:
+            return before
+        if before is not None:
+            self.remove(message)
+        refusal = self._impossible(message, period, fragments)
+        if refusal is not None:
+            return refusal
+        train = (1 << fragments) - 1 << phase
+        if phase >= period or self.free(period) & train != train:
+            return Refusal(message, Reason.TAKEN, period, fragments)
+        return self._enter(reservation)
+
+    def remove(self, message: int) -> bool:
+        """Give the slots of a message back. False: it has none."""
+        if self._entries.pop(message, None) is None:
+            return False
+        self.changes += 1
+        return True
+
+    def free(self, period: int) -> int:
+        """Bit i: no reservation owns slot number i, nor any number that differs from it by a multiple of the period."""
+        free = (1 << period) - 1 & ~_comb(self.slots, 0, 1, period)
+        for each in self._entries.values():
+            free &= ~_comb(each.period, each.phase, each.fragments, period)
+        return free
+
+    def mask(self, cycle: int) -> int:
+        """The reservation mask of a cycle: bit i says that its slot i is reserved, slot 0 for the sync."""
+        mask = 1
+        start = cycle * self.slots
+        for each in self._entries.values():
+            mask |= occupied(each, start, self.slots)
+        return mask
+
+    def _enter(self, reservation: Reservation) -> Reservation:
+        self._entries[reservation.message] = reservation
+        self.changes += 1
+        return reservation
+
+    def _wanted(self, message: int, period: int, round_down: bool) -> int:
+        """The period, or the longest up to it that goes with all others; the period itself where there is none."""
+        if not round_down or not 1 < period <= LONGEST_PERIOD:
+            return period
+        others = {each.period for each in self._entries.values() if each.message != message} | {self.slots}
+        for shorter in _candidates(period, self.slots):
+            if all(_harmonic(shorter, other) for other in others):
+                return shorter
+        return period
+
+    def _impossible(self, message: int, period: int, fragments: int) -> Refusal | None:
+        if not 1 < period <= LONGEST_PERIOD or not 0 < fragments < period:
+            return Refusal(message, Reason.LENGTH, period, fragments)
+        if not _harmonic(period, self.slots):
+            return Refusal(message, Reason.PERIOD, period, fragments, self.slots)
+        for each in self._entries.values():
+            if not _harmonic(period, each.period):
+                return Refusal(message, Reason.OTHER, period, fragments, each.period, each.message)
+        return Refusal(message, Reason.MANY, period, fragments) if len(self._entries) >= _MOST else None
+
+
+def occupied(reservation: Reservation, start: int, slots: int) -> int:
+    """The slots of a cycle that begins with number `start` and belong to the reservation, as a mask."""
+    period, train = reservation.period, (1 << reservation.fragments) - 1
+    offset = (reservation.phase - start) % period
+    if period >= slots:
+        return train << offset if offset < slots else 0
+    return _comb(period, offset, reservation.fragments, slots)
+
+
+def meet(a: Reservation, b: Reservation) -> bool:
+    """Whether two reservations ever own the same slot, whatever their periods are."""
+    step = math.gcd(a.period, b.period)
+    distance = (b.phase - a.phase) % step
+    return distance < a.fragments or step - distance < b.fragments
+
+
+def _harmonic(a: int, b: int) -> bool:
+    return a % b == 0 or b % a == 0
+
+
+def _candidates(period: int, slots: int) -> Iterator[int]:
+    """Periods up to this one that go with the cycle, the longest first."""
+    yield from range(period - period % slots, 0, -slots)
+    yield from (divisor for divisor in range(min(period, slots - 1), 1, -1) if slots % divisor == 0)
+
+
+def _comb(period: int, phase: int, fragments: int, length: int) -> int:
+    """Bits phase .. phase + fragments - 1, and all that differ by multiples of the period, modulo `length`."""
+    if fragments >= length:
+        return (1 << length) - 1
+    train = (1 << fragments) - 1
+    if period >= length:
+        bits = train << phase % length
+        return (bits | bits >> length) & (1 << length) - 1
+    teeth = ((1 << -(-length // period) * period) - 1) // ((1 << period) - 1)
+    return (train << phase % period) * teeth & (1 << length) - 1
+
+
+def _first_run(free: int, length: int) -> int | None:
+    """Where the first `length` set bits in a row begin."""
+    starts = free
+    for shift in range(1, length):
+        starts &= free >> shift
+    return (starts & -starts).bit_length() - 1 if starts else None

@@ -1,0 +1,296 @@
+"""The parts of an engine put together, and what passes between them: management messages, timers, changes of mode."""
+
+from collections import Counter
+from collections.abc import Callable, Hashable
+from typing import Any
+
+from r2p.codecs import management, rtcan
+from r2p.errors import DecodeError
+from r2p.protocols.rtcan.alarms import Alarms
+from r2p.protocols.rtcan.cycle import Cycle, timing
+from r2p.protocols.rtcan.election import Election, Role
+from r2p.protocols.rtcan.events import Action, Done, Due, Fate, Profile, Ready, Received
+from r2p.protocols.rtcan.identity import Identity, Stage
+from r2p.protocols.rtcan.laxity import LaxityQueue, Outgoing
+from r2p.protocols.rtcan.leases import Grants, Wishes
+from r2p.protocols.rtcan.network import Network
+from r2p.protocols.rtcan.periodic import Agenda, Periodic
+from r2p.protocols.rtcan.profile import Detector, Pacer
+from r2p.protocols.rtcan.reassembly import Reassembly
+from r2p.protocols.rtcan.sending import Mode, Sender
+from r2p.protocols.rtcan.settings import Settings
+
+_DEADLINE = 50_000_000  # of management, ns
+_URGENT = 1_000_000
+_DEPTH = 128  # management messages that wait
+_PAUSE = 500_000  # ns after a bus error, before the same topic is tried again
+_PAUSE_SPREAD = 8_000_000
+
+
+class Core:
+    """All parts of one node. Its owner takes `out` after every call."""
+
+    def __init__(self, settings: Settings) -> None:
+        if settings.id8 is not None and not 0 < settings.id8 < 256:
+            raise ValueError(f"id8 {settings.id8}: it is a byte, and not 0")
+        self.settings = settings
+        self.counts: Counter[str] = Counter()
+        self.out: list[Action] = []
+        self.periodics: dict[int, Periodic] = {}
+        self.timing = timing(settings.slots, settings.cycle, settings.bit_rate)
+        self.timers = Alarms()
+        self.reassembly = Reassembly()
+        self.detector = Detector(settings.profile)
+        self.queue = LaxityQueue(settings.capacity, _DEPTH)
+        self.cycle = Cycle(self.timing, settings.receive_latency)
+        self.identity = Identity(
+            settings.id8,
+            settings.number,
+            settings.listen,
+            self.timers,
+            self.out,
+            self.counts,
+            self._announce,
+            self._stage_changed,
+        )
+        self.pacer = Pacer(self.identity.draw, self.counts)
+        self.agenda = Agenda(self.timing)
+        self.sender = Sender(
+            self.cycle,
+            self.queue,
+            self.agenda,
+            self.out,
+            self.counts,
+            self._turn,
+            self._pause,
+            latency=settings.transmit_latency,
+            coarse=settings.coarse,
+        )
+        self.election = Election(settings.priority, 3 * self.timing.cycle, self.timers)
+        self.grants = Grants(self.cycle, self.timers)
+        self.wishes = Wishes(
+            self.cycle, self.agenda, self.timers, self.periodics, self.out, self._ask, enabled=settings.reserves
+        )
+        self.network = Network(
+            self.cycle,
+            self.sender,
+            self.identity,
+            self.election,
+            self.grants,
+            self.wishes,
+            self.timers,
+            self.periodics,
+            self.out,
+            self.counts,
+            self.say,
+            settings.priority,
+        )
+        self._handlers: dict[type, Callable[[int, Any, int], None]] = {
+            management.Network: self._told,
+            management.Claim: self._claimed,
+            management.Reserve: self._wanted,
+            management.Grant: self._granted,
+            management.Refuse: self._refused,
+            management.Release: self._released,
+            management.Renew: self._renew,
+            management.Renewed: self._renewed,
+        }
+
+    @property
+    def profile(self) -> Profile:
+        return self.detector.profile
+
+    def message_id(self, high: int) -> int:
+        return rtcan.message_id(high, self.identity.id8)
+
+    def settle(self, now: int) -> None:
+        """Use the bus as the state of things allows."""
+        electing = self.election.role is Role.ELECTING
+        self.queue.only = self.message_id(rtcan.MANAGEMENT) if electing else None
+        if self.identity.stage is Stage.LISTENING or self.network.silenced is not None:
+            mode = Mode.SILENT
+        elif not self.cycle.running:
+            mode = Mode.FREE
+        else:
+            mode = Mode.SLOTTED if self.network.verified else Mode.SILENT
+        self.sender.enter(now, mode)
+
+    def discard(self, now: int) -> None:
+        """Give up everything that waits to be sent."""
+        self.pacer.clear()
+        for message in self.sender.discard():
+            if message.handle is not None:
+                self.out.append(Done(message.handle, Fate.DISCARDED, missed=True, at=now))
+        for periodic in self.periodics.values():
+            self.wishes.lapse(periodic, "the node may not send")
+            self.timers.clear(("tick", periodic.high))
+
+    # Management
+
+    def say(self, now: int, message: management.Management) -> None:
+        """Send a management message of our own."""
+        self.manage(now, management.encode(message))
+
+    def manage(self, now: int, data: bytes, *, urgent: bool = False) -> None:
+        """Send a management message; before the others, if it is urgent."""
+        if self.profile is Profile.FIRMWARE:
+            self.pacer.put(data, urgent=urgent)
+        else:
+            self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, urgent=urgent)
+
+    def pace(self, now: int) -> None:
+        """Among firmware: send management if it is quiet."""
+        data = self.pacer.pop(now)
+        if data is not None:
+            self._queue_management(now, rtcan.FIRMWARE_MANAGEMENT, data, urgent=False)
+
+    def hear(self, now: int, received: Received) -> None:
+        """A management message came in: ours to handle, or discovery's."""
+        if received.payload[-1] not in management.RTCAN_TYPES:
+            self.out.append(received)
+            return
+        try:
+            message = management.decode(received.payload)
+        except DecodeError:
+            self.counts["undecodable"] += 1
+            return
+        handler = self._handlers.get(type(message))
+        if handler is not None:
+            handler(now, message, received.source)
+            self.settle(now)
+
+    # Timers
+
+    def expired(self, now: int, key: Hashable) -> None:
+        """A timer ran out."""
+        match key:
+            case "listened":
+                self.detector.decide()
+                self.identity.listened(now)
+            case "claim":
+                self.identity.repeat(now)
+            case "election":
+                self.network.decide(now)
+            case "network":
+                self.network.tell(now)
+            case "renew":
+                self.wishes.renew(now)
+            case "silence":
+                self.network.unsilence(now)
+            case ("granted", int(message)):
+                self.grants.remove(message)
+            case (str(kind), int(high)) if high in self.periodics:
+                self._periodic_timer(now, kind, self.periodics[high])
+
+    def tick(self, now: int, periodic: Periodic) -> None:
+        """Without slots the node's own clock says when a periodic message is due."""
+        if not periodic.active and self.identity.stage is Stage.OWNING and ("tick", periodic.high) not in self.timers:
+            self.timers.set(("tick", periodic.high), now)
+
+    def _periodic_timer(self, now: int, kind: str, periodic: Periodic) -> None:
+        if kind == "ask":
+            self.wishes.request(now, periodic)
+        elif kind == "lease":
+            self.wishes.suspend(periodic, "the master does not answer")
+            self.tick(now, periodic)
+        elif not periodic.active or self.cycle.counter < periodic.from_cycle:
+            at = now if periodic.tick is None else now - (now - periodic.tick) % periodic.interval
+            periodic.tick = at + periodic.interval
+            periodic.ticked = True
+            self.timers.set(("tick", periodic.high), periodic.tick)
+            self.out.append(Due(periodic.high, at, False))
+
+    # What the parts need of each other
+
+    def _turn(self, now: int) -> None:
+        self.network.turn(now)
+        self.settle(now)
+
+    def _pause(self) -> int:
+        return _PAUSE + self.identity.draw(_PAUSE_SPREAD)
+
+    def _announce(self, now: int) -> None:
+        flags = self.identity.flags | (management.CLAIM_ELECTING if self.network.master is None else 0)
+        self.say(now, management.Claim(self.identity.id8, self.identity.number, self.settings.priority, flags))
+
+    def _stage_changed(self, now: int) -> None:
+        stage = self.identity.stage
+        if stage is Stage.LISTENING:
+            self.detector.start()
+            self.discard(now)
+            self.network.resign(now)
+        elif stage is Stage.OWNING:
+            for periodic in self.periodics.values():
+                periodic.message = self.message_id(periodic.high)
+            self.out.append(Ready(self.identity.id8, self.profile))
+            if self.profile is not Profile.FIRMWARE:
+                self.network.owned(now)
+            for periodic in self.periodics.values():
+                self.wishes.want(now, periodic)
+                self.tick(now, periodic)
+        self.settle(now)
+
+    def _queue_management(self, now: int, message: int, data: bytes, *, urgent: bool) -> None:
+        deadline = now + (_URGENT if urgent else _DEADLINE)
+        if self.queue.put(Outgoing(message, data, deadline, drop=False), urgent=urgent):
+            self.sender.kick(now)
+        else:
+            self.counts["management dropped"] += 1
+
+    def _ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
+        if self.election.role is not Role.MASTER:
+            self.say(now, wanted)
+            return
+        id8 = self.identity.id8
+        answer = self._answer(now, wanted, id8)
+        if answer is not None:
+            self._handlers[type(answer)](now, answer, id8)
+
+    def _answer(
+        self, now: int, wanted: management.Reserve | management.Renew, id8: int
+    ) -> management.Grant | management.Refuse | management.Renewed | None:
+        if isinstance(wanted, management.Renew):
+            return self.grants.renew(now, wanted, id8)
+        return self.grants.answer(now, wanted, self.network.epoch or 0)
+
+    def _own(self, message: int) -> Periodic | None:
+        """Our periodic message with this id."""
+        periodic = self.periodics.get(rtcan.high_byte(message))
+        return periodic if periodic is not None and periodic.message == message else None
+
+    def _told(self, now: int, message: management.Network, source: int) -> None:
+        if message.id8 == source:
+            self.network.network(now, message)
+
+    def _claimed(self, now: int, message: management.Claim, source: int) -> None:
+        self.identity.claimed(now, message)
+        self.network.claim(now, message)
+
+    def _wanted(self, now: int, message: management.Reserve, source: int) -> None:
+        if self.election.role is Role.MASTER and rtcan.id8_of(message.message) == source:
+            answer = self._answer(now, message, source)
+            if answer is not None:
+                self.say(now, answer)
+
+    def _renew(self, now: int, message: management.Renew, source: int) -> None:
+        if self.election.role is Role.MASTER:
+            self.say(now, self.grants.renew(now, message, source))
+
+    def _renewed(self, now: int, message: management.Renewed, source: int) -> None:
+        if message.id8 == self.identity.id8 and source == self.network.master:
+            self.wishes.renewed(now, message)
+
+    def _granted(self, now: int, message: management.Grant, source: int) -> None:
+        periodic = self._own(message.message)
+        if periodic is not None and source == self.network.master and message.epoch == self.network.epoch:
+            self.wishes.granted(now, periodic, message)
+
+    def _refused(self, now: int, message: management.Refuse, source: int) -> None:
+        periodic = self._own(message.message)
+        if periodic is not None and source == self.network.master:
+            self.wishes.refused(now, periodic, message)
+            self.tick(now, periodic)
+
+    def _released(self, now: int, message: management.Release, source: int) -> None:
+        if self.election.role is Role.MASTER and rtcan.id8_of(message.message) == source:
+            self.grants.remove(message.message)

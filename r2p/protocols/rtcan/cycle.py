@@ -1,0 +1,200 @@
+"""Slots and cycles: where this node is in which cycle, by its own clock (PROTOCOL.md 6, thesis 4.3.3).
+
+The reference is the start of frame of the sync in slot 0. The master places it on a grid of its own clock; a slave
+takes it from each sync it hears: the reception's stamp, less the exact length of the frame with its stuff bits, less
+its own calibrated latency. A sync that does not come is made up for by the slave's own clock, for at most three cycles.
+"""
+
+import enum
+
+import msgspec
+
+from r2p.codecs import rtcan
+from r2p.codecs.rtcan import Frame
+
+HOLDOVER = 3
+"""Cycles without a sync that a slave bridges."""
+_MICROSECOND = 1000
+_SECOND = 1_000_000_000
+
+
+class Timing(msgspec.Struct, frozen=True):
+    """What all nodes of a network agree on: slots in a cycle, length of a slot (ns), bit time (ns)."""
+
+    slots: int
+    slot: int
+    bit: int
+
+    @property
+    def cycle(self) -> int:
+        """The true length of a cycle (ns)."""
+        return self.slots * self.slot
+
+
+def timing(slots: int = 60, nominal: int = 10_000_000, bit_rate: int = 1_000_000) -> Timing:
+    """The slots of a nominal cycle (ns): whole microseconds each. Raises ValueError when no frame fits in."""
+    slot = nominal // slots // _MICROSECOND * _MICROSECOND
+    bit = _SECOND // bit_rate
+    longest = (rtcan.frame_bits_max(rtcan.FRAME_MAX) + rtcan.INTERMISSION) * bit
+    if slot < longest:
+        raise ValueError(f"slots of {slot // 1000} us are too short for frames of up to {longest // 1000} us")
+    return Timing(slots, slot, bit)
+
+
+class State(enum.Enum):
+    """How the node knows where in the cycle it is."""
+
+    NONE = "no cycle"
+    FOLLOWING = "following"  # the last sync was heard
+    HOLDING = "holding"  # one to three syncs were missed
+    LEADING = "leading"  # the node is the master
+
+
+class Alignment(enum.Enum):
+    """What a sync frame was good for."""
+
+    STARTED = "started"  # there was no cycle before
+    RESUMED = "resumed"  # ... but one that was lost goes on, where it should be by now
+    ALIGNED = "aligned"
+    LATE = "late"  # this cycle has already begun without it
+    REPEATED = "repeated"  # this cycle's sync was already heard
+    FOREIGN = "foreign"  # off the grid, or of another count: another master's
+
+
+class Cycle:
+    """The cycle of one node. `mask` None: it is not known which slots of this cycle are free.
+
+    `counter` is the whole cycle counter once `anchored`; before, only its low 8 bits mean something.
+    """
+
+    def __init__(self, timing: Timing, receive_latency: int = 0) -> None:
+        self.timing = timing
+        self.state = State.NONE
+        self.reference = 0
+        self.counter = 0
+        self.mask: int | None = None
+        self.missed = 0
+        self.anchored = False
+        self._latency = receive_latency
+        self._first = 0
+        self._first_at = 0
+        self._length = 0
+
+    @property
+    def running(self) -> bool:
+        return self.state is not State.NONE
+
+    def slot_at(self, now: int) -> int:
+        """The slot at this instant, counted from the start of this cycle; not limited to it."""
+        return (now - self.reference) // self.timing.slot
+
+    def start_of(self, slot: int) -> int:
+        """When a slot of this cycle begins; may be one of a later cycle."""
+        return self.reference + slot * self.timing.slot
+
+    def number_of(self, slot: int) -> int:
+        """The number of a slot of this cycle, counted from the start of cycle 0."""
+        return self.counter * self.timing.slots + slot
+
+    def network_time(self, now: int) -> int | None:
+        """The time that all nodes share (ns): since the start of cycle 0. None: not known."""
+        if not self.anchored or not self.running:
+            return None
+        return self.counter * self.timing.cycle + now - self.reference
+
+    # At a slave
+
+    def heard(self, frame: Frame, stamp: int) -> Alignment:
+        """A sync frame was received; `stamp` is the instant of the reception interrupt."""
+        sync = rtcan.decode_sync(frame)
+        start = stamp - self._latency - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
+        if self.state is State.NONE:
+            return self._start(start, sync.cycle, sync.mask)
+        cycles, off = self._distance(start)
+        if abs(off) > self.timing.slot or cycles < 0 or (self.counter + cycles) & 0xFF != sync.cycle:
+            return Alignment.FOREIGN
+        if cycles == 0 and self.mask is not None:
+            return Alignment.REPEATED
+        self.counter += cycles
+        self._length = (start - self._first_at) // max(1, self.counter - self._first)
+        self._follow(start, sync.mask)
+        return Alignment.ALIGNED if cycles else Alignment.LATE
+
+    def measured(self) -> int | None:
+        """The length of a cycle by the syncs heard since it started (ns); None before there are two."""
+        return self._length or None
+
+    def roll(self) -> bool:
+        """The next cycle began without a sync. False: that is one too many, the cycle is lost."""
+        self.missed += 1
+        if self.missed > HOLDOVER:
+            self.stop()
+            return False
+        self.state = State.HOLDING
+        self.counter += 1
+        self.reference += self.timing.cycle
+        self.mask = None
+        return True
+
+    def anchor(self, counter: int) -> bool:
+        """NETWORK told a whole counter, of this cycle or a bit earlier. Says whether ours was another one."""
+        whole = _nearest(counter, self.counter)
+        changed = self.anchored and whole != self.counter
+        self._first += whole - self.counter
+        self.counter = whole
+        self.anchored = True
+        return changed
+
+    def stop(self) -> None:
+        """There is no cycle any more."""
+        self.state = State.NONE
+        self.mask = None
+        self._length = 0
+
+    # At the master
+
+    def lead(self, now: int) -> None:
+        """Become the master. The grid and the counter go on if there were any: the next cycle is the first one."""
+        if self.anchored:
+            cycles = -(-(now - self.reference) // self.timing.cycle)
+            self.counter += cycles - 1
+            self.reference += (cycles - 1) * self.timing.cycle
+        else:
+            self.counter = 0
+            self.reference = now - self.timing.cycle
+        self.state = State.LEADING
+        self.anchored = True
+        self.mask = None
+        self.missed = 0
+
+    def advance(self, mask: int) -> Frame:
+        """The next cycle begins: its sync frame."""
+        self.counter += 1
+        self.reference += self.timing.cycle
+        self.mask = mask
+        return rtcan.encode_sync(self.counter, mask)
+
+    def _start(self, start: int, low: int, mask: int) -> Alignment:
+        cycles, off = self._distance(start)
+        counter = self.counter + cycles
+        resumed = self.anchored and counter & 0xFF == low and abs(off) <= self.timing.slot // 4
+        self.counter = max(0, _nearest(counter, low)) if self.anchored else low
+        self._follow(start, mask)
+        self._first, self._first_at = self.counter, start
+        return Alignment.RESUMED if resumed else Alignment.STARTED
+
+    def _follow(self, start: int, mask: int) -> None:
+        self.state = State.FOLLOWING
+        self.reference = start
+        self.mask = mask
+        self.missed = 0
+
+    def _distance(self, start: int) -> tuple[int, int]:
+        """How many cycles after this one a start of frame lies, and by how much off (ns)."""
+        cycles = (start - self.reference + self.timing.cycle // 2) // self.timing.cycle
+        return cycles, start - self.reference - cycles * self.timing.cycle
+
+
+def _nearest(counter: int, low: int) -> int:
+    """The counter with the low 8 bits of `low` that is next to this one: up to 16 before it, or else after it."""
+    return counter + ((low - counter + 16) & 0xFF) - 16

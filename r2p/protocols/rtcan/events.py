@@ -1,0 +1,213 @@
+"""What goes in and out of the RTCAN engine besides frames: orders to the port, messages, news. All values are frozen.
+
+Instants are ns of the node's own monotonic clock. A message id is 16 bits: high byte the topic, low byte the id8.
+"""
+
+import enum
+from collections.abc import Hashable
+
+import msgspec
+
+from r2p.codecs import rtcan
+from r2p.codecs.rtcan import Frame
+
+NEVER = 1 << 62
+"""An instant that does not come."""
+LONG_AGO = -NEVER
+"""An instant before all others."""
+
+
+class Mailbox(enum.IntEnum):
+    """Where a frame waits in the controller. Each holds one frame; HRT goes before SRT before NRT."""
+
+    HRT = 0  # sync and hard real-time
+    SRT = 1  # soft real-time and management
+    NRT = 2
+
+
+class Outcome(enum.Enum):
+    """What became of a frame that the port was told to transmit."""
+
+    SENT = "sent"
+    LOST = "arbitration lost"  # one-shot controllers only
+    ERROR = "bus error"  # destroyed, not acknowledged, or given up in bus-off
+    LATE = "not started"  # withdrawn, or not started by `not_after`: nobody has seen it
+    UNKNOWN = "unknown"  # nothing was heard of it: never sent again
+
+
+class Fate(enum.Enum):
+    """What became of a message."""
+
+    SENT = "sent"
+    UNKNOWN = "unknown"  # sent, but not every frame was confirmed
+    OVERDUE = "overdue"  # dropped: its deadline passed before its first frame
+    FULL = "no room"  # refused: too many wait
+    FAILED = "bus errors"  # given up
+    DISCARDED = "discarded"  # the node may not send, or stopped
+    ABANDONED = "slot missed"  # a frame of a hard real-time message missed its slot
+
+
+class Profile(enum.Enum):
+    """How the modules of a network use the bus (PROTOCOL.md 9)."""
+
+    AUTO = "auto"
+    RTCAN = "rtcan"
+    FIRMWARE = "firmware-2014"  # no sync; management of all modules on one message id
+
+
+# Orders to the port
+
+
+class Transmit(msgspec.Struct, frozen=True, gc=False):
+    """Put this frame into the mailbox, which is empty. Its start of frame must lie between the two instants; answer
+    every one with `Engine.confirm`.
+    """
+
+    frame: Frame
+    mailbox: Mailbox
+    not_before: int
+    not_after: int = NEVER
+
+
+class Withdraw(msgspec.Struct, frozen=True, gc=False):
+    """Take the frame back if it has not started; what comes of it is confirmed as for every frame."""
+
+    mailbox: Mailbox
+
+
+# Messages
+
+
+class Received(msgspec.Struct, frozen=True, gc=False):
+    """A whole message. `identifier` is its first frame's, `stamp` the instant when that frame ended."""
+
+    identifier: int
+    payload: bytes
+    stamp: int
+
+    @property
+    def message(self) -> int:
+        return self.identifier >> 7 & 0xFFFF
+
+    @property
+    def high(self) -> int:
+        """The topic, at that module."""
+        return self.identifier >> 15 & 0xFF
+
+    @property
+    def source(self) -> int:
+        """The sender's id8; 0 for management of firmware of 2014, which does not say."""
+        return self.identifier >> 7 & 0xFF
+
+    @property
+    def laxity(self) -> int:
+        return self.identifier >> 23
+
+    @property
+    def mailbox(self) -> Mailbox:
+        """Its class."""
+        laxity = self.identifier >> 23
+        return Mailbox.HRT if laxity == rtcan.HRT else Mailbox.NRT if laxity == rtcan.NRT else Mailbox.SRT
+
+    def started(self, bit: int) -> int:
+        """The start of the first frame, exact to the stuff bits; `bit` is the bit time in ns. Not cheap: about 5 us."""
+        return self.stamp - rtcan.frame_bits(self.identifier, self.payload[: rtcan.FRAME_MAX]) * bit
+
+
+class Done(msgspec.Struct, frozen=True, gc=False):
+    """A published message is through, or given up. `missed`: not (surely) on the bus by its deadline."""
+
+    handle: Hashable
+    fate: Fate
+    missed: bool
+    at: int
+
+
+class Due(msgspec.Struct, frozen=True, gc=False):
+    """Time for the data of a periodic message: call `Engine.fill`. `at` is its slot's start, or the tick's instant."""
+
+    high: int
+    at: int
+    slotted: bool
+
+
+# News
+
+
+class Ready(msgspec.Struct, frozen=True):
+    """The node has an id8 and may send; the former one's topics are void."""
+
+    id8: int
+    profile: Profile
+
+
+class NewMaster(msgspec.Struct, frozen=True):
+    """Somebody keeps the cycle from now on. `id8` None: firmware, or nobody knows yet."""
+
+    id8: int | None
+    epoch: int
+    own: bool
+
+
+class LostSync(msgspec.Struct, frozen=True):
+    """There is no cycle any more: periodic messages go as soft real-time ones."""
+
+    reason: str
+
+
+class Granted(msgspec.Struct, frozen=True):
+    """A periodic message owns slots. `period`, `phase` in slots; `interval` is the true period in ns."""
+
+    high: int
+    period: int
+    phase: int
+    interval: int
+
+
+class Refused(msgspec.Struct, frozen=True):
+    """The master has no slots for a periodic message; it goes as a soft real-time one. The request is repeated."""
+
+    high: int
+    reason: str
+
+
+class Degraded(msgspec.Struct, frozen=True):
+    """A periodic message lost its slots, and goes as a soft real-time one."""
+
+    high: int
+    reason: str
+
+
+class IdConflict(msgspec.Struct, frozen=True):
+    """Another node uses our id8. `yielded`: it keeps it, and we send nothing until the next `Ready`."""
+
+    id8: int
+    yielded: bool
+
+
+class Silenced(msgspec.Struct, frozen=True):
+    """The network's parameters are not ours: nothing is sent."""
+
+    reason: str
+
+
+class Unsilenced(msgspec.Struct, frozen=True):
+    """The network's parameters are ours after all."""
+
+
+Action = (
+    Transmit
+    | Withdraw
+    | Received
+    | Done
+    | Due
+    | Ready
+    | NewMaster
+    | LostSync
+    | Granted
+    | Refused
+    | Degraded
+    | IdConflict
+    | Silenced
+    | Unsilenced
+)

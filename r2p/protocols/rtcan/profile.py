@@ -1,0 +1,79 @@
+"""What the modules on the bus expect: RTCAN with sync and claims, or firmware of 2014 (PROTOCOL.md 6, 7 and 9).
+
+All firmware modules send management with the very same message id. Two that send at the same moment destroy each
+other's frames; so on their networks management waits until nobody has sent any for a while, and for a random time more.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable
+
+from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Profile
+
+QUIET = 33_000_000
+"""ns without management traffic before any is sent."""
+_SPREAD = 20_000_000
+_MOST = 64
+
+
+class Detector:
+    """Finds out by listening whose network this is."""
+
+    def __init__(self, wanted: Profile) -> None:
+        self.profile = wanted
+        self._wanted = wanted
+        self._firmware = False
+
+    def start(self) -> None:
+        """Listen anew."""
+        self.profile = self._wanted
+        self._firmware = False
+
+    def firmware_heard(self) -> None:
+        """A frame with high byte 0 that is no sync was heard."""
+        self._firmware = True
+
+    def decide(self) -> None:
+        """The time to listen is over."""
+        if self.profile is Profile.AUTO:
+            self.profile = Profile.FIRMWARE if self._firmware else Profile.RTCAN
+
+
+class Pacer:
+    """Management messages that wait for silence. `draw(n)` gives a random number below n."""
+
+    def __init__(self, draw: Callable[[int], int], counts: Counter[str]) -> None:
+        self._draw = draw
+        self._counts = counts
+        self._waiting: deque[bytes] = deque()
+        self._quiet_from = LONG_AGO
+        self._delay = 0
+
+    def put(self, data: bytes, *, urgent: bool = False) -> None:
+        """Send it when it is quiet; the oldest is dropped when there are too many."""
+        if len(self._waiting) >= _MOST:
+            self._waiting.popleft()
+            self._counts["management dropped"] += 1
+        if urgent:
+            self._waiting.appendleft(data)
+        else:
+            self._waiting.append(data)
+
+    def traffic(self, now: int) -> None:
+        """Somebody, or this node, sent a management frame."""
+        self._quiet_from = now
+        self._delay = self._draw(_SPREAD)
+
+    @property
+    def due(self) -> int:
+        """When the next one may go."""
+        return self._quiet_from + QUIET + self._delay if self._waiting else NEVER
+
+    def pop(self, now: int) -> bytes | None:
+        """What may go now."""
+        if self.due > now:
+            return None
+        self.traffic(now)
+        return self._waiting.popleft()
+
+    def clear(self) -> None:
+        self._waiting.clear()

@@ -1,0 +1,204 @@
+"""Which slots belong to whom: admission, phases, removal, masks."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r2p.protocols.rtcan.calendar import LONGEST_PERIOD, Calendar, Reason, Refusal, Reservation, meet, occupied
+
+
+def admitted(calendar: Calendar, message: int, period: int, fragments: int = 1) -> Reservation:
+    outcome = calendar.admit(message, period, fragments)
+    assert isinstance(outcome, Reservation)
+    return outcome
+
+
+def refused(calendar: Calendar, message: int, period: int, fragments: int = 1) -> Refusal:
+    outcome = calendar.admit(message, period, fragments)
+    assert isinstance(outcome, Refusal)
+    return outcome
+
+
+def test_the_schedule_of_the_thesis() -> None:
+    """Three nodes, each with messages every 6, 30 and 60 slots: 39 of 59 slots (thesis 4.4.1, figure 4.12)."""
+    calendar = Calendar(60)
+    phases = [admitted(calendar, period << 8 | node, period).phase for period in (6, 30, 60) for node in (1, 2, 3)]
+    assert phases == [1, 2, 3, 4, 5, 6, 10, 11, 12]
+    assert (calendar.mask(0) >> 1).bit_count() == 39
+    assert calendar.mask(7) == calendar.mask(0) == 0x038E38FF_8E38FFFF  # as written down in the original's hrt.c
+
+
+def test_the_least_phase_from_1_on() -> None:
+    calendar = Calendar(10)
+    assert [admitted(calendar, message, 10).phase for message in range(9)] == [*range(1, 10)]
+    refusal = refused(calendar, 9, 10)
+    assert refusal.reason == Reason.FULL
+    assert refusal.text == "no 1 slots in a row are free every 10 slots"
+    assert calendar.remove(3)
+    assert not calendar.remove(3)
+    assert admitted(calendar, 9, 10).phase == 4
+
+
+def test_fragments_take_slots_in_a_row() -> None:
+    calendar = Calendar(12)
+    assert admitted(calendar, 1, 12, 3).phase == 1
+    assert admitted(calendar, 2, 6, 2).phase == 4  # 4, 5 and 10, 11: not 1..3, nor 6 = 0
+    assert admitted(calendar, 3, 12, 3).phase == 6
+    assert refused(calendar, 4, 12, 2).reason == Reason.FULL
+    assert admitted(calendar, 4, 12).phase == 9
+
+
+@pytest.mark.parametrize(
+    ("period", "fragments", "reason", "text"),
+    [
+        (7, 1, Reason.PERIOD, "a period of 7 slots neither divides the 60 of a cycle nor is a multiple"),
+        (90, 1, Reason.PERIOD, "a period of 90 slots neither divides the 60"),
+        (20, 1, Reason.OTHER, "a period of 20 slots neither divides the 12 of message 0x0102 nor is a multiple"),
+        (0, 1, Reason.LENGTH, "2 to 65536 are possible, more than the fragments"),
+        (1, 1, Reason.LENGTH, "a period of 1 slots"),
+        (6, 6, Reason.LENGTH, "a period of 6 slots"),
+        (6, 0, Reason.LENGTH, ""),
+        (LONGEST_PERIOD + 60, 1, Reason.LENGTH, ""),
+        (12, 11, Reason.FULL, "no 11 slots in a row are free every 12 slots"),
+    ],
+)
+def test_refusals_say_why(period: int, fragments: int, reason: Reason, text: str) -> None:
+    calendar = Calendar(60)
+    admitted(calendar, 0x0102, 12)
+    refusal = refused(calendar, 0x0103, period, fragments)
+    assert refusal.reason == reason
+    assert text in refusal.text
+    assert [each.message for each in calendar] == [0x0102]
+
+
+def test_a_period_is_rounded_down_to_what_is_possible() -> None:
+    calendar = Calendar(60)
+    periods = []
+    for message, period in enumerate((31, 61, 200, 7)):
+        outcome = calendar.admit(message, period, round_down=True)
+        assert isinstance(outcome, Reservation)
+        periods.append(outcome.period)
+    assert periods == [30, 60, 180, 6]
+    outcome = calendar.admit(9, 120, round_down=True)  # 120 does not go with 180
+    assert isinstance(outcome, Reservation)
+    assert outcome.period == 60
+
+
+def test_asking_again_changes_nothing_and_asking_for_something_else_gives_the_old_slots_back() -> None:
+    calendar = Calendar(10)
+    first = admitted(calendar, 1, 10)
+    admitted(calendar, 2, 10)
+    changes = calendar.changes
+    assert calendar.admit(1, 10) == first
+    assert calendar.admit(1, 13, round_down=True) == first
+    assert calendar.changes == changes
+    assert admitted(calendar, 1, 5, 2) == Reservation(1, 5, 3, 2)
+    assert calendar.get(1) == Reservation(1, 5, 3, 2)
+    assert refused(calendar, 1, 3).reason == Reason.PERIOD
+    assert calendar.get(1) is None
+
+
+def test_what_another_master_granted() -> None:
+    calendar = Calendar(10)
+    granted = Reservation(1, 10, 4, 2)
+    assert calendar.readmit(granted) == granted
+    assert calendar.readmit(granted) == granted
+    assert calendar.mask(3) == 0b110001
+    for other in Reservation(2, 10, 5), Reservation(2, 5, 0), Reservation(2, 20, 14), Reservation(2, 10, 9, 2):
+        taken = calendar.readmit(other)
+        assert isinstance(taken, Refusal)
+        assert taken.reason == Reason.TAKEN
+        assert taken.text == "its slots were given to another message"
+    assert len(calendar) == 1
+    assert calendar.readmit(Reservation(1, 20, 14, 2)) == Reservation(1, 20, 14, 2)
+    assert [calendar.mask(cycle) for cycle in range(3)] == [1, 0b110001, 1]
+
+
+def test_periods_of_several_cycles() -> None:
+    calendar = Calendar(4)
+    assert [admitted(calendar, message, 12).phase for message in range(9)] == [1, 2, 3, 5, 6, 7, 9, 10, 11]
+    assert refused(calendar, 9, 4).reason == Reason.FULL
+    for message in (0, 3, 6):
+        calendar.remove(message)
+    assert admitted(calendar, 9, 4).phase == 1
+
+
+@pytest.mark.parametrize("slots", [1, 65])
+def test_cycles_have_2_to_64_slots(slots: int) -> None:
+    with pytest.raises(ValueError, match="2 to 64"):
+        Calendar(slots)
+    assert admitted(Calendar(64), 1, 64, 63).phase == 1
+
+
+requests = st.lists(
+    st.one_of(
+        st.tuples(st.integers(0, 30), st.integers(0, 250), st.integers(1, 9), st.booleans()),  # request
+        st.tuples(st.integers(0, 30), st.integers(1, 4), st.integers(1, 3), st.none()),  # a multiple of the cycle
+        st.integers(0, 30),  # removal
+        st.builds(Reservation, st.integers(0, 30), st.integers(0, 130), st.integers(0, 130), st.integers(0, 9)),
+    ),
+    max_size=60,
+)
+
+
+@given(st.integers(2, 64), requests)
+def test_no_slot_ever_has_two_owners(slots: int, changes: list[object]) -> None:
+    calendar = Calendar(slots)
+    for change in changes:
+        match change:
+            case int(message):
+                calendar.remove(message)
+            case (int(message), int(factor), int(fragments), None):
+                calendar.admit(message, factor * slots, fragments)
+            case (int(message), int(period), int(fragments), bool(round_down)):
+                calendar.admit(message, period, fragments, round_down=round_down)
+            case Reservation():
+                calendar.readmit(change)
+            case _:
+                raise AssertionError(change)
+        all_of_them = [*calendar, Reservation(-1, slots, 0)]
+        assert not any(meet(a, b) for i, a in enumerate(all_of_them) for b in all_of_them[:i])
+    all_of_them = [*calendar, Reservation(-1, slots, 0)]
+    round_trip = min(math.lcm(*(each.period for each in all_of_them)) // slots, 50)
+    for cycle in range(max(1, round_trip)):
+        owners = [0] * slots
+        for each in all_of_them:  # counted one by one, with nothing but the definition
+            for number in range(cycle * slots, (cycle + 1) * slots):
+                owners[number % slots] += (number - each.phase) % each.period < each.fragments
+        assert max(owners) <= 1
+        assert calendar.mask(cycle) == sum(count << slot for slot, count in enumerate(owners))
+
+
+@given(
+    st.integers(1, 40), st.integers(0, 40), st.integers(1, 5), st.integers(1, 40), st.integers(0, 40), st.integers(1, 5)
+)
+def test_meet_is_what_it_says(p: int, f: int, k: int, q: int, g: int, n: int) -> None:
+    def owns(number: int, period: int, phase: int, fragments: int) -> bool:
+        return (number - phase) % period < fragments
+
+    both = any(owns(number, p, f, k) and owns(number, q, g, n) for number in range(math.lcm(p, q)))
+    assert meet(Reservation(1, p, f, k), Reservation(2, q, g, n)) == both
+
+
+@given(st.integers(2, 64), st.data())
+def test_nothing_is_refused_that_would_fit_at_some_phase(slots: int, data: st.DataObject) -> None:
+    calendar = Calendar(slots)
+    divisors = [divisor for divisor in range(2, slots + 1) if slots % divisor == 0]
+    for message in range(data.draw(st.integers(0, 12))):
+        period = data.draw(st.sampled_from(divisors))
+        outcome = calendar.admit(message, period, data.draw(st.integers(1, 3)))
+        if isinstance(outcome, Refusal) and outcome.reason == Reason.FULL:
+            others = [*calendar, Reservation(-1, slots, 0)]
+            for phase in range(period):
+                candidate = Reservation(99, period, phase, outcome.fragments)
+                assert any(meet(candidate, other) for other in others)
+
+
+def test_the_slots_of_one_cycle() -> None:
+    assert occupied(Reservation(1, 6, 4, 2), 60, 12) == 0b110000110000
+    assert occupied(Reservation(1, 24, 16, 2), 12, 12) == 0b110000
+    assert occupied(Reservation(1, 24, 16, 2), 24, 12) == 0
+    assert Reservation(1, 24, 16).first_from(17) == 40
+    assert Reservation(1, 24, 16).first_from(16) == 16

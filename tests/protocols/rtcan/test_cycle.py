@@ -1,0 +1,151 @@
+"""Where a node is in which cycle."""
+
+import pytest
+
+from r2p.codecs import rtcan
+from r2p.protocols.rtcan.cycle import HOLDOVER, Alignment, Cycle, State, timing
+from tests.can_vectors import CanCase, can_cases
+
+TIMING = timing()
+START = 1_000_000_000
+LATENCY = 7_000
+
+
+def heard(cycle: Cycle, start: int, counter: int, mask: int = 0) -> Alignment:
+    """A sync frame whose start of frame was at `start`."""
+    frame = rtcan.encode_sync(counter, mask)
+    return cycle.heard(frame, start + rtcan.frame_bits(frame.id, frame.data) * TIMING.bit + LATENCY)
+
+
+def slave() -> Cycle:
+    return Cycle(TIMING, LATENCY)
+
+
+def test_the_timing_of_the_thesis() -> None:
+    assert (TIMING.slot, TIMING.cycle, TIMING.bit) == (166_000, 9_960_000, 1_000)
+    assert timing(10, 20_000_000, 125_000).bit == 8_000
+    with pytest.raises(ValueError, match="slots of 158 us are too short for frames of up to 160 us"):
+        timing(63)
+
+
+@pytest.mark.parametrize("mask", [0, 1, 0x0123_4567_89AB_CDEF, (1 << 64) - 1])
+def test_the_reference_is_the_start_of_frame_whatever_the_stuffing(mask: int) -> None:
+    cycle = slave()
+    assert heard(cycle, START, 200, mask) is Alignment.STARTED
+    assert (cycle.reference, cycle.counter, cycle.mask, cycle.state) == (START, 200, mask, State.FOLLOWING)
+    assert cycle.slot_at(START + 166_000) == 1
+    assert cycle.slot_at(START + 165_999) == 0
+    assert cycle.start_of(6) == START + 996_000
+
+
+def test_it_follows_the_sync_and_not_its_own_clock() -> None:
+    cycle = slave()
+    heard(cycle, START, 1)
+    assert heard(cycle, START + TIMING.cycle + 480, 2, 0b10) is Alignment.ALIGNED
+    assert (cycle.reference, cycle.counter, cycle.mask) == (START + TIMING.cycle + 480, 2, 0b10)
+    assert cycle.measured() == TIMING.cycle + 480
+
+
+def test_the_counter_goes_on_beyond_8_bits() -> None:
+    cycle = slave()
+    heard(cycle, START, 250)
+    assert cycle.network_time(START) is None
+    assert not cycle.anchor(0x1_0000_00F9)  # told one cycle ago
+    assert cycle.counter == 0x1_0000_00FA
+    for n in range(1, 600):
+        assert heard(cycle, START + n * TIMING.cycle, 250 + n & 0xFF) is Alignment.ALIGNED
+        assert cycle.counter == 0x1_0000_00FA + n
+    assert cycle.network_time(cycle.reference + 5) == (0x1_0000_00FA + 599) * TIMING.cycle + 5
+    assert not cycle.anchor(0x1_0000_00FA + 590)
+    assert cycle.anchor(7 + (0x1_0000_00FA + 599 & 0xFF))
+
+
+def test_missed_syncs_are_bridged_for_three_cycles() -> None:
+    cycle = slave()
+    heard(cycle, START, 255, 0b10)
+    cycle.anchor(255)
+    for n in range(1, HOLDOVER + 1):
+        assert cycle.roll()
+        assert cycle.state is State.HOLDING
+        assert (cycle.counter, cycle.reference, cycle.mask) == (255 + n, START + n * TIMING.cycle, None)
+    assert not cycle.roll()
+    assert not cycle.running
+    assert cycle.network_time(START) is None
+
+
+def test_resynchronised_after_missed_syncs() -> None:
+    cycle = slave()
+    heard(cycle, START, 255)
+    cycle.anchor(255)
+    cycle.roll()
+    cycle.roll()
+    assert heard(cycle, START + 3 * TIMING.cycle + 90, 2, 0b100) is Alignment.ALIGNED
+    assert (cycle.counter, cycle.missed, cycle.mask, cycle.state) == (258, 0, 0b100, State.FOLLOWING)
+    assert cycle.measured() == TIMING.cycle + 30
+
+
+def test_a_sync_that_is_read_late_belongs_to_the_cycle_that_began_without_it() -> None:
+    cycle = slave()
+    heard(cycle, START, 1)
+    cycle.roll()
+    assert heard(cycle, START + TIMING.cycle + 20, 2, 0b100) is Alignment.LATE
+    assert (cycle.counter, cycle.mask, cycle.missed) == (2, 0b100, 0)
+    assert heard(cycle, START + TIMING.cycle + 20, 2, 0b100) is Alignment.REPEATED
+
+
+@pytest.mark.parametrize(
+    ("late", "counter"), [(TIMING.slot + 1, 2), (-TIMING.slot - 1, 2), (0, 3), (0, 1), (TIMING.cycle // 2, 2)]
+)
+def test_a_sync_off_the_grid_is_another_masters(late: int, counter: int) -> None:
+    cycle = slave()
+    heard(cycle, START, 1, 0b10)
+    assert heard(cycle, START + TIMING.cycle + late, counter) is Alignment.FOREIGN
+    assert (cycle.reference, cycle.counter, cycle.mask) == (START, 1, 0b10)
+
+
+def test_a_lost_cycle_starts_anew_with_any_sync_and_keeps_the_count() -> None:
+    cycle = slave()
+    heard(cycle, START, 1)
+    cycle.anchor(0x301)
+    cycle.stop()
+    assert heard(cycle, START + 40 * TIMING.cycle + 4_000_000, 41) is Alignment.STARTED
+    assert cycle.counter == 0x329
+
+
+def test_a_master_keeps_its_grid() -> None:
+    cycle = slave()
+    cycle.lead(START)
+    assert cycle.reference + TIMING.cycle == START
+    frame = cycle.advance(0b1001)
+    assert frame == rtcan.encode_sync(1, 0b1001)  # the original's first cycle is 1, too
+    assert (cycle.reference, cycle.counter, cycle.mask) == (START, 1, 0b1001)
+    for _ in range(300):
+        frame = cycle.advance(0)
+    assert (cycle.counter, frame.id) == (301, (301 & 0xFF) << 7)
+    assert cycle.network_time(START) == TIMING.cycle
+
+
+def test_a_new_master_goes_on_with_the_grid_and_the_count_of_the_old_one() -> None:
+    cycle = slave()
+    heard(cycle, START, 1)
+    cycle.anchor(0x301)
+    for _ in range(HOLDOVER + 1):
+        cycle.roll()
+    now = START + 7 * TIMING.cycle + 5
+    cycle.lead(now)
+    cycle.advance(0)
+    assert (cycle.reference, cycle.counter) == (START + 8 * TIMING.cycle, 0x309)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", can_cases("hrt-time"), ids=str)
+def test_recorded_network_time(case: CanCase) -> None:
+    """The original's formula, with its rounding: (cycle * slots + slot) * slot length + timer."""
+    words = {step.verb: step.words for step in case.steps}
+    clock, slots = int(words["start"][0]), int(words["start"][1])
+    cycle = Cycle(timing(slots, 1_000_000_000 // clock))
+    cycle.lead(0)
+    cycle.counter = int(words["cycle"][0])
+    at = cycle.start_of(int(words["slot"][0])) + int(words["cnt"][0]) * 1_000
+    recorded = case.of("time")[0].fields
+    assert cycle.network_time(at) == recorded["sec"] * 1_000_000_000 + recorded["nsec"]
