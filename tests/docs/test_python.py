@@ -7,6 +7,7 @@ out.
 
 import asyncio
 import contextlib
+import re
 import runpy
 import subprocess
 import sys
@@ -74,6 +75,9 @@ def _chain(block: Block) -> list[Block]:
     return chain
 
 
+_FIXED_PORT = re.compile(r"\bport=[0-9]+")
+
+
 def _shown_output(block: Block) -> str | None:
     """What the page says that the block prints."""
     page = of_page(block.page)
@@ -86,7 +90,7 @@ def test_it_runs(block: Block, programs: Path, capsys: pytest.CaptureFixture[str
     names: dict[str, Any] = {}
     for each in _chain(block):
         file = programs / (each.title or f"{each.name}.py")
-        file.write_text("\n" * (each.line - 1) + each.text)
+        file.write_text("\n" * (each.line - 1) + _FIXED_PORT.sub("port=0", each.text))  # the page's may be in use
         capsys.readouterr()
         names = runpy.run_path(str(file), init_globals=names, run_name="__main__")
     shown = _shown_output(block)
