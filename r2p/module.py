@@ -126,6 +126,7 @@ class Module:
         self._tasks: asyncio.TaskGroup | None = None
         self._order: Command | None = None
         self._obeying: asyncio.Task[None] | None = None
+        self._suspected: set[str] = set()
         self._flags = 0
         self._open = False
 
@@ -287,7 +288,8 @@ class Module:
             self.stopped = False
             self.rebooted = True
             for supervisor in self._supervisors.values():
-                supervisor.start(tasks, self._node_ended)
+                if not supervisor.running:  # one was started meanwhile
+                    supervisor.start(tasks, self._node_ended)
             self._set_flags(FLAG_REBOOTED)
 
     @property
@@ -408,11 +410,15 @@ class Module:
     def _suspect_namesakes(self, link: Link, info: ModuleInfo) -> None:
         """Two who can't hear each other may have one name, or one came back before its old link was seen to be down."""
         others = (other.discovery.modules.get(info.name) for other in self.links if other is not link)
+        if info.name in self._suspected:
+            return
         if any(other is not None and other.instance != info.instance for other in others):
+            self._suspected.add(info.name)
             self.space.loop.call_later(_CONFIRMED, self._tell_namesakes, info.name, self.space.clock.monotonic())
 
     def _tell_namesakes(self, name: str, suspected: int) -> None:
         """Whoever has heard both since then (monotonic ns) tells them."""
+        self._suspected.discard(name)
         found = [(link, info) for link in self.links if (info := link.discovery.modules.get(name)) is not None]
         heard = {
             info.instance: link for link, info in found if info.instance is not None and info.last_heard > suspected

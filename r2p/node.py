@@ -12,9 +12,9 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple, TypeVar, overload
 
 from r2p.clock import Ticker
-from r2p.errors import Closed, Error, TransportError
+from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.messages import Message, layout
-from r2p.names import topic_name
+from r2p.names import MANAGEMENT, topic_name
 from r2p.publisher import (
     AnyPublisher,
     NonRealTime,
@@ -316,7 +316,10 @@ class Node:
         if self.closed:
             raise Closed(f"node {self.name} has ended: it can't use topic {topic} any more")
         name = topic_name(topic)
-        return topic_name(self._remap.get(name, name))
+        name = topic_name(self._remap.get(name, name))
+        if name == MANAGEMENT:
+            raise InvalidName(f"topic {name} is the management's: take another name")
+        return name
 
     def _check_links(
         self, topic: str, size: int, klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool

@@ -464,7 +464,7 @@ class PeriodicPublisher(BasePublisher[M]):
             self._signal(Missed(self.topic, reason, late=late / _SECOND, count=skipped), self._on_late)
         try:
             message = self._fill()
-            if message is None:
+            if message is None or self._encode == self._closed:  # fill may have closed it
                 return
             sample = self._sample(message)
         except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node

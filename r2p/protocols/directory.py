@@ -146,17 +146,17 @@ class Directory:
             info.fingerprint = message.fingerprint if known else info.fingerprint
             info.size = message.size or info.size
 
-    def endpoint(self, message: management.Endpoint) -> EndpointKey | None:
-        """An endpoint exists (its key comes back) or is gone."""
+    def endpoint(self, message: management.Endpoint) -> tuple[EndpointKey | None, EndpointKey | None]:
+        """An endpoint exists or is gone: the key that was entered, and the key that has left the table."""
         role = message.role & ~management.ROLE_GONE
         key = (message.instance, message.node, message.topic, role)
         if message.role & management.ROLE_GONE:
             self.endpoints.pop(key, None)
-            return None
+            return None, key
         module = self.name_of(message.instance)
         info = EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
-        self._put(self.endpoints, key, info, "endpoints forgotten")
-        return key
+        old = self._put(self.endpoints, key, info, "endpoints forgotten")
+        return key, None if old is None else (old.instance, old.node, old.topic, old.role)
 
     def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
         """Enter a value as the latest heard one; what had to go for it comes back."""

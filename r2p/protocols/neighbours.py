@@ -74,7 +74,8 @@ class Neighbours:
         """A publisher or subscriber of a remote node."""
         if message.instance == self._instance:
             return
-        key = self._directory.endpoint(message)
+        key, left = self._directory.endpoint(message)
+        self._timers.clear(("endpoint", left))
         info = self._directory.modules.get(self._directory.name_of(message.instance))
         lease = info.lease if info is not None else LEASE
         if key is not None and lease < FOR_EVER:

@@ -127,7 +127,9 @@ def _beside(url: str) -> str:
     scheme, _, address = url.partition(":")
     if scheme != "tcp-listen":
         return url
-    host, _, port = address.rpartition(":")
+    host, colon, port = address.rpartition(":")
+    if not colon or not port.isdecimal():  # no port: the usual one, or nothing but a port
+        return f"tcp:127.0.0.1:{address}" if address.isdecimal() else f"tcp:{_LOOPBACK.get(address, address)}"
     return f"tcp:{_LOOPBACK.get(host, host)}:{port}"
 
 

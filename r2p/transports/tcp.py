@@ -189,8 +189,9 @@ class TcpListenTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         loop = asyncio.get_running_loop()
         clients: set[_Incoming] = set()
+        closing = asyncio.Event()
         try:
-            server = await loop.create_server(lambda: _Incoming(hub, clients), self._host, self._port)
+            server = await loop.create_server(lambda: _Incoming(hub, clients, closing), self._host, self._port)
         except OSError as error:
             raise TransportError(f"{self._url}: can't listen: {_explain(error)}") from error
         try:
@@ -199,6 +200,7 @@ class TcpListenTransport(Transport):
             opened()
             await loop.create_future()
         finally:
+            closing.set()
             server.close()
             await asyncio.gather(*(client.leave() for client in list(clients)))
             await server.wait_closed()
@@ -207,10 +209,16 @@ class TcpListenTransport(Transport):
 class _Incoming(_Tcp):
     """A connection of the server, with a link of its own; while that exists, it is one of `clients`."""
 
-    def __init__(self, hub: Hub, clients: "set[_Incoming]") -> None:
+    def __init__(self, hub: Hub, clients: "set[_Incoming]", closing: asyncio.Event) -> None:
         super().__init__()
         self._hub = hub
         self._clients = clients
+        self._closing = closing
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if self._closing.is_set():  # accepted just before the server was closed
+            self.ended.set()
+        super().connection_made(transport)
 
     def open_link(self, peer: str) -> LineLink:
         link = LineLink(peer, self._hub)

@@ -3,6 +3,7 @@
 import pytest
 
 from r2p.codecs import management as m
+from r2p.protocols.directory import MOST
 from r2p.protocols.discovery import (
     Command,
     Discovery,
@@ -192,3 +193,15 @@ class TestNames:
                 assert news(discovery.receive(now, event.data)) in ([], [Echoes()])
         theirs = hear(discovery, 60 * S, m.SubscribeRequest("both", 5, 16), m.SubscribeRequest("both", 5, 16))
         assert news(theirs) == [Joined("both", bytes(10), 16)], "the same words from a peer count"
+
+
+def test_endpoints_that_are_forgotten_leave_no_timer() -> None:
+    discovery = Discovery("A", 1)
+    discovery.link_up(0)
+    discovery.receive(0, m.encode(m.Hello("B", 2)))
+    for number in range(3 * MOST):
+        topic = f"t{number}"
+        endpoint = m.Endpoint(m.ROLE_PUBLISHES, 2, "n", topic, m.CLASS_NRT)
+        discovery.receive(number, m.encode(endpoint))
+    assert len(discovery.endpoints) == MOST
+    assert len(discovery._timers._due) <= MOST + 8
