@@ -85,8 +85,6 @@ class Calendar:
         if not 2 <= slots <= SLOTS_MAX:
             raise ValueError(f"{slots} slots: a cycle has 2 to {SLOTS_MAX}")
         self.slots = slots
-        self.changes = 0
-        """Counts admissions and removals."""
         self._entries: dict[int, Reservation] = {}
 
     def __iter__(self) -> Iterator[Reservation]:
@@ -130,17 +128,14 @@ class Calendar:
         refusal = self._impossible(message, period, fragments)
         if refusal is not None:
             return refusal
-        train = (1 << fragments) - 1 << phase
-        if phase >= period or self.free(period) & train != train:
+        train = (1 << fragments) - 1
+        if phase >= period or self.free(period) >> phase & train != train:
             return Refusal(message, Reason.TAKEN, period, fragments)
         return self._enter(reservation)
 
     def remove(self, message: int) -> bool:
         """Give the slots of a message back. False: it has none."""
-        if self._entries.pop(message, None) is None:
-            return False
-        self.changes += 1
-        return True
+        return self._entries.pop(message, None) is not None
 
     def free(self, period: int) -> int:
         """Bit i: no reservation owns slot number i, nor any number that differs from it by a multiple of the period."""
@@ -159,7 +154,6 @@ class Calendar:
 
     def _enter(self, reservation: Reservation) -> Reservation:
         self._entries[reservation.message] = reservation
-        self.changes += 1
         return reservation
 
     def _wanted(self, message: int, period: int, round_down: bool) -> int:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Hashable
 from typing import Any
 
 from r2p.codecs import management, rtcan
+from r2p.codecs.rtcan import Frame
 from r2p.errors import DecodeError
 from r2p.protocols.rtcan.alarms import Alarms
 from r2p.protocols.rtcan.cycle import Cycle, timing
@@ -15,6 +16,7 @@ from r2p.protocols.rtcan.laxity import LaxityQueue, Outgoing
 from r2p.protocols.rtcan.leases import Grants, Wishes
 from r2p.protocols.rtcan.network import Network
 from r2p.protocols.rtcan.periodic import Agenda, Periodic
+from r2p.protocols.rtcan.post import Post
 from r2p.protocols.rtcan.profile import Detector, Pacer
 from r2p.protocols.rtcan.reassembly import Reassembly
 from r2p.protocols.rtcan.sending import Mode, Sender
@@ -55,14 +57,15 @@ class Core:
         )
         self.pacer = Pacer(self.identity.draw, self.counts)
         self.agenda = Agenda(self.timing)
+        self.post = Post(self.queue, self.out, self.counts, self._pause)
         self.sender = Sender(
             self.cycle,
             self.queue,
             self.agenda,
+            self.post,
             self.out,
             self.counts,
             self._turn,
-            self._pause,
             latency=settings.transmit_latency,
             coarse=settings.coarse,
         )
@@ -118,7 +121,7 @@ class Core:
     def discard(self, now: int) -> None:
         """Give up everything that waits to be sent."""
         self.pacer.clear()
-        for message in self.sender.discard():
+        for message in self.post.discard():
             if message.handle is not None:
                 self.out.append(Done(message.handle, Fate.DISCARDED, missed=True, at=now))
         for periodic in self.periodics.values():
@@ -144,6 +147,38 @@ class Core:
         if data is not None:
             self._queue_management(now, rtcan.FIRMWARE_MANAGEMENT, data, urgent=False)
 
+    def listen(self, identifier: int) -> None:
+        """What any frame tells while we only listen."""
+        message = identifier >> 7 & 0xFFFF
+        if rtcan.high_byte(message) == rtcan.SYNC:
+            self.detector.firmware_heard()
+        if message != rtcan.FIRMWARE_MANAGEMENT:
+            self.identity.seen(rtcan.id8_of(message))
+
+    def intruded(self, now: int, identifier: int) -> None:
+        """A frame with our id8 that is not ours."""
+        if identifier >> 7 & 0xFFFF != rtcan.FIRMWARE_MANAGEMENT:
+            self.identity.intruded(now)
+            self.settle(now)
+
+    def low(self, now: int, frame: Frame, stamp: int) -> None:
+        """A frame of management, or in a network of firmware one of a topic whose high byte is as low as that."""
+        message = frame.id >> 7 & 0xFFFF
+        high = rtcan.high_byte(message)
+        firmware = self.profile is Profile.FIRMWARE
+        if high <= rtcan.MANAGEMENT:
+            self.pacer.traffic(now)
+        if high == rtcan.SYNC and not firmware:
+            self.counts["management of firmware"] += 1
+        ours = message == rtcan.FIRMWARE_MANAGEMENT if firmware else high == rtcan.MANAGEMENT
+        if ours:
+            self.reassembly.subscribe(message, management.SIZE)
+        received = self.reassembly.receive(frame, stamp)
+        if received is not None and ours:
+            self.hear(now, received)
+        elif received is not None:
+            self.out.append(received)
+
     def hear(self, now: int, received: Received) -> None:
         """A management message came in: ours to handle, or discovery's."""
         if received.payload[-1] not in management.RTCAN_TYPES:
@@ -165,7 +200,7 @@ class Core:
         """A timer ran out."""
         match key:
             case "listened":
-                self.detector.decide()
+                self.detector.decide(synced=self.cycle.running)
                 self.identity.listened(now)
             case "claim":
                 self.identity.repeat(now)

@@ -17,9 +17,9 @@ transport has to do to drive it:
 4. `receive` every frame of others, never the own ones, with the instant (by the same clock) of the reception interrupt,
    that is the end of the frame plus `receive_latency`. Sync frames must not wait behind a long queue. `filters` says
    which frames are needed; it changes with `Ready`, `IdConflict`, and subscriptions.
-5. After `Ready`, and not before, `publish`, `manage`, `reserve` and let discovery speak. The message id of a topic is
-   `message_id(high, engine.id8)`: it goes into the SUBSCRIBE_RESPONSE. `IdConflict` with `yielded` takes all that back
-   until the next `Ready`, possibly with another id8.
+5. After `Ready`, and not before, `publish`, `manage`, `reserve` and let discovery speak. `topics.HighBytes` picks the
+   high byte of a topic; its message id is `message_id(high, engine.id8)` and goes into the SUBSCRIBE_RESPONSE.
+   `IdConflict` with `yielded` takes all that back until the next `Ready`, possibly with another id8.
 6. Answer each `Due` with `fill`, before the slot.
 
 Without a master, or while it refuses slots, periodic messages go as soft real-time ones with their period as deadline.
@@ -30,6 +30,7 @@ from collections.abc import Hashable, Sequence
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
+from r2p.errors import MessageError
 from r2p.protocols.rtcan.core import Core
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.election import Role
@@ -179,9 +180,9 @@ class Engine:
                 core.settle(now)
             return self._take()
         if identifier >> 7 & 0xFF == self._identity.id8:
-            self._intruded(now, identifier)
+            core.intruded(now, identifier)
         if self._identity.stage is Stage.LISTENING:
-            self._listen(identifier)
+            core.listen(identifier)
         high = identifier >> 15 & 0xFF
         if high > rtcan.MANAGEMENT:
             received = self._reassembly.receive(frame, stamp - self._latency)
@@ -190,7 +191,7 @@ class Engine:
             if received is not None:
                 self._out.append(received)
         elif self._running:
-            self._management(now, frame, stamp)
+            core.low(now, frame, stamp - self._latency)
         return self._take()
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> Sequence[Action]:
@@ -233,16 +234,15 @@ class Engine:
         """Send a message: soft real-time with the instant `deadline`, non real-time without.
 
         When it is overdue it is dropped, or (not `drop`) sent with laxity 1. `Done` tells what became of it, if there
-        is a `handle`. Raises `MessageError` beyond 1..1024 bytes.
+        is a `handle`. Raises `MessageError` beyond 1..1024 bytes, and for high bytes that are not a topic's.
         """
+        _check(high)
         message = Outgoing(self._core.message_id(high), payload, deadline, drop and deadline != NEVER, handle)
         if not self.ready:
             rtcan.fragment_count(len(payload))
             self._refuse(now, message, Fate.DISCARDED)
-        elif self._core.queue.put(message):
-            self._sender.kick(now)
         else:
-            self._refuse(now, message, Fate.FULL)
+            self._send(now, message)
         return self._take()
 
     def manage(self, now: int, data: bytes, *, urgent: bool = False) -> Sequence[Action]:
@@ -269,7 +269,7 @@ class Engine:
         `Due` asks for the data, `lead` ns before the slot. Raises `MessageError` for a size that RTCAN can't carry.
         """
         core = self._core
-        core.message_id(high)
+        _check(high)
         fragments = rtcan.fragment_count(size)
         self._end(now, high)
         message = core.message_id(high) if self.ready else 0
@@ -291,8 +291,7 @@ class Engine:
             self._sender.fill(now, periodic, payload)
         elif payload is not None:
             deadline = now + periodic.interval
-            self._core.queue.put(Outgoing(periodic.message, payload, deadline, handle=periodic.handle))
-            self._sender.kick(now)
+            self._send(now, Outgoing(periodic.message, payload, deadline, handle=periodic.handle))
         periodic.ticked = False
         return self._take()
 
@@ -309,6 +308,12 @@ class Engine:
         actions = self._out[:]
         self._out.clear()
         return actions
+
+    def _send(self, now: int, message: Outgoing) -> None:
+        if self._core.queue.put(message):
+            self._sender.kick(now)
+        else:
+            self._refuse(now, message, Fate.FULL)
 
     def _refuse(self, now: int, message: Outgoing, fate: Fate) -> None:
         missed = message.deadline != NEVER
@@ -329,30 +334,7 @@ class Engine:
             else:
                 core.say(now, management.Release(periodic.message))
 
-    def _intruded(self, now: int, identifier: int) -> None:
-        if identifier >> 7 & 0xFFFF != rtcan.FIRMWARE_MANAGEMENT:
-            self._identity.intruded(now)
-            self._core.settle(now)
 
-    def _listen(self, identifier: int) -> None:
-        if identifier >> 15 & 0xFF == rtcan.SYNC:
-            self._core.detector.firmware_heard()
-        if identifier >> 7 & 0xFFFF != rtcan.FIRMWARE_MANAGEMENT:
-            self._identity.seen(identifier >> 7 & 0xFF)
-
-    def _management(self, now: int, frame: Frame, stamp: int) -> None:
-        """A management frame, or in a network of firmware one of a topic with a high byte as low as that."""
-        message = frame.id >> 7 & 0xFFFF
-        firmware = self._core.profile is Profile.FIRMWARE
-        ours = message == rtcan.FIRMWARE_MANAGEMENT if firmware else message >> 8 == rtcan.MANAGEMENT
-        if message >> 8 <= rtcan.MANAGEMENT:
-            self._core.pacer.traffic(now)
-        if ours:
-            self._reassembly.subscribe(message, management.SIZE)
-        elif message >> 8 == rtcan.SYNC and not firmware:
-            self.counts["management of firmware"] += 1
-        received = self._reassembly.receive(frame, stamp - self._latency)
-        if received is not None and ours:
-            self._core.hear(now, received)
-        elif received is not None:
-            self._out.append(received)
+def _check(high: int) -> None:
+    if not rtcan.FIRST_TOPIC <= high <= 0xFF:
+        raise MessageError(f"high byte {high}: those of topics are {rtcan.FIRST_TOPIC} to 255")

@@ -34,7 +34,7 @@ _NEAR = 4  # cycles that a NETWORK may be late, or the last one be a guess
 
 
 class Network:
-    """The network as this node sees it. `period` and `phase` of nothing are decided here: see `leases`."""
+    """The network as this node sees it. `say(now, message)` sends management; `priority` is that to be the master."""
 
     def __init__(
         self,
@@ -173,7 +173,7 @@ class Network:
             return
         self._told = now
         self._timers.set("network", now + REPEAT)
-        timing, counter = self._cycle.timing, self._cycle.counter
+        timing, counter = self._cycle.timing, self._cycle.counter & (1 << 64) - 1
         offset, error = self.utc_offset, self.utc_error
         self._say(
             now,

@@ -32,10 +32,10 @@ class Detector:
         """A frame with high byte 0 that is no sync was heard."""
         self._firmware = True
 
-    def decide(self) -> None:
-        """The time to listen is over."""
+    def decide(self, *, synced: bool) -> None:
+        """The time to listen is over; `synced` says whether there are sync frames."""
         if self.profile is Profile.AUTO:
-            self.profile = Profile.FIRMWARE if self._firmware else Profile.RTCAN
+            self.profile = Profile.FIRMWARE if self._firmware and not synced else Profile.RTCAN
 
 
 class Pacer:

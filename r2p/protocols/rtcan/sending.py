@@ -6,20 +6,17 @@ slot. Nothing starts unless it ends in its slot: what comes too late stays in th
 
 import enum
 from collections import Counter
-from collections.abc import Callable, Hashable
-
-import msgspec
+from collections.abc import Callable
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import FRAME_MAX, INTERMISSION, Frame
 from r2p.protocols.rtcan.cycle import Cycle, State
-from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Action, Done, Due, Fate, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Action, Due, Fate, Mailbox, Outcome
 from r2p.protocols.rtcan.laxity import LaxityQueue, Outgoing
 from r2p.protocols.rtcan.periodic import Agenda, Periodic
+from r2p.protocols.rtcan.post import GONE, SYNC, Post
 
 _CLOSE = 5  # bits between the hand-over and the last moment
-_ERRORS = 8
-"""Bus errors after which a message is given up."""
 
 
 class Mode(enum.Enum):
@@ -30,23 +27,11 @@ class Mode(enum.Enum):
     SLOTTED = "in slots"
 
 
-class _Sync(msgspec.Struct):
-    """Stands for the sync frame in the mailbox."""
-
-
-class _Gone(msgspec.Struct):
-    """Stands for a message that was discarded while its frame was with the port."""
-
-
-_SYNC = _Sync()
-_GONE = _Gone()
-
-
 class Sender:
     """Fills the mailboxes. `due` says when to call `poll`.
 
     `latency`: ns from handing over a frame to its start. `coarse`: slots in a row that are free count as one, for
-    ports that can't hit a slot. `turn(now)` is called when a cycle is over; `pause()` gives ns to wait after an error.
+    ports that can't hit a slot. `turn(now)` is called when a cycle is over.
     """
 
     def __init__(
@@ -54,10 +39,10 @@ class Sender:
         cycle: Cycle,
         queue: LaxityQueue,
         agenda: Agenda,
+        post: Post,
         out: list[Action],
         counts: Counter[str],
         turn: Callable[[int], None],
-        pause: Callable[[], int],
         *,
         latency: int = 0,
         coarse: bool = False,
@@ -68,17 +53,15 @@ class Sender:
         self._timing = cycle.timing
         self._queue = queue
         self._agenda = agenda
+        self._post = post
         self._out = out
         self._counts = counts
         self._turn = turn
-        self._pause = pause
         self._latency = latency
         self._coarse = coarse
         self._periodics: list[Periodic] = []
-        self._boxes: list[Outgoing | Periodic | _Sync | _Gone | None] = [None, None, None]
         self._done = 0
         self._last = 0
-        self._held = NEVER
         self._all = (1 << self._timing.slots) - 1
         self._longest = [rtcan.frame_bits_max(size) + INTERMISSION for size in range(FRAME_MAX + 1)]
 
@@ -92,17 +75,15 @@ class Sender:
         """There is one less."""
         self._periodics.remove(periodic)
         self._agenda.changed()
-        if self._boxes[Mailbox.HRT] is periodic:
-            self._boxes[Mailbox.HRT] = _GONE
+        if self._post.boxes[Mailbox.HRT] is periodic:
+            self._post.boxes[Mailbox.HRT] = GONE
 
     def enter(self, now: int, mode: Mode) -> None:
         """Use the bus in another way from now on."""
         if mode is self.mode:
             return
         if mode is Mode.SILENT or self.mode is Mode.FREE:
-            for mailbox in Mailbox:
-                if self._boxes[mailbox] is not None:
-                    self._out.append(Withdraw(mailbox))
+            self._post.withdraw()
         self.mode = mode
         self.kick(now)
 
@@ -116,7 +97,8 @@ class Sender:
     def kick(self, now: int) -> None:
         """There may be something new to send."""
         if self.mode is Mode.FREE:
-            self._fill_boxes(now)
+            self._post.fill(now)
+            self.due = self._post.due
         elif self.mode is Mode.SLOTTED or self._cycle.running:
             self._plan(now)
         else:
@@ -126,11 +108,10 @@ class Sender:
         """The cycle begins with this sync frame."""
         start = self._cycle.reference
         last = start + self._timing.slot - (self._longest[FRAME_MAX]) * self._timing.bit
-        if now + self._latency > last or self._boxes[Mailbox.HRT] is not None:
+        if now + self._latency > last or self._post.boxes[Mailbox.HRT] is not None:
             self._counts["syncs not sent"] += 1
             return
-        self._boxes[Mailbox.HRT] = _SYNC
-        self._out.append(Transmit(frame, Mailbox.HRT, start, last))
+        self._post.put(SYNC, frame, Mailbox.HRT, start, last)
 
     def fill(self, now: int, periodic: Periodic, payload: bytes | None) -> None:
         """The data of a periodic message that owns slots; None: nothing this time."""
@@ -141,23 +122,16 @@ class Sender:
             first = slot - self._cycle.number_of(0)
             self._send_periodic(now, periodic, 0, first, current)
 
-    def discard(self) -> list[Outgoing]:
-        """Forget everything that waits; it comes back."""
-        for mailbox in Mailbox.SRT, Mailbox.NRT:
-            if self._boxes[mailbox] is not None:
-                self._boxes[mailbox] = _GONE
-        return self._queue.clear()
-
     def reset(self) -> None:
         """The bus is gone, and all frames with it."""
-        self._boxes = [None, None, None]
+        self._post.boxes = [None, None, None]
         self.due = NEVER
 
     def poll(self, now: int) -> None:
         """The time has come for a slot, or for the next cycle."""
         while self.due <= now:
             if self.mode is Mode.FREE:
-                self._fill_boxes(now)
+                self.kick(now)
                 return
             current = self._cycle.slot_at(now + self._latency)
             if current >= self._last:
@@ -169,20 +143,20 @@ class Sender:
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         """The port says what became of the frame in this mailbox, and when it was over."""
-        item = self._boxes[mailbox]
-        self._boxes[mailbox] = None
+        item = self._post.boxes[mailbox]
+        self._post.boxes[mailbox] = None
         if isinstance(item, Outgoing):
-            self._confirm_queued(now, item, outcome, at)
+            self._post.confirm(now, item, outcome, at, slotted=self.mode is Mode.SLOTTED)
             if self.mode is not Mode.SLOTTED:
                 self.kick(now)
             elif len(self._queue):
                 self._plan(now)
         elif isinstance(item, Periodic):
             self._confirm_periodic(now, item, outcome, at)
-        elif item is _SYNC:
+        elif item is SYNC:
             if outcome is not Outcome.SENT:
                 self._counts["syncs not sent"] += 1
-        elif item is _GONE:
+        elif item is GONE:
             self.kick(now)
         else:
             self._counts["confirmed without need"] += 1
@@ -194,7 +168,7 @@ class Sender:
         cycle, slot_length = self._cycle, self._timing.slot
         bits = self._agenda.bits
         mask = cycle.mask
-        if mask is not None and self._idle and len(self._queue) and self.mode is Mode.SLOTTED:
+        if mask is not None and self._post.idle and len(self._queue) and self.mode is Mode.SLOTTED:
             ahead = now + self._latency - cycle.reference
             # A try would come too late for the slots up to this one; a coarse port may still try in the present one.
             over = ahead // slot_length - 1 if self._coarse else (ahead - self._timing.bit) // slot_length
@@ -202,10 +176,6 @@ class Sender:
         bits &= -2 << self._done
         slot = (bits & -bits).bit_length() - 1 if bits else self._last
         self.due = cycle.reference + min(slot, self._last) * slot_length - self._latency
-
-    @property
-    def _idle(self) -> bool:
-        return self._boxes[1] is None and self._boxes[2] is None
 
     def _run(self, now: int, upto: int, current: int) -> None:
         """Do what is to be done in the slots up to one; it is slot `current` now."""
@@ -227,9 +197,9 @@ class Sender:
     def _try(self, now: int, slot: int) -> None:
         """In a free slot: try the message of the least laxity."""
         mask = self._cycle.mask
-        if mask is None or not self._idle or not 0 < slot < self._timing.slots or mask >> slot & 1:
+        if mask is None or not self._post.idle or not 0 < slot < self._timing.slots or mask >> slot & 1:
             return
-        self._expire(now)
+        self._post.expire(now)
         message = self._queue.best(now)
         if message is None:
             return
@@ -242,7 +212,7 @@ class Sender:
             self._counts["late_to_slot"] += 1
             self._queue.put_back(message)
             return
-        self._hand_over(message, frame, self._cycle.start_of(slot), last)
+        self._post.hand_over(message, frame, self._cycle.start_of(slot), last)
 
     def _latest_start(self, now: int, frame: Frame, end: int) -> int:
         """The last instant at which the frame surely ends in its slot. `end` is the slot after that one."""
@@ -261,7 +231,7 @@ class Sender:
         if periodic.restart():
             self._abandon(now, periodic, "not sent in time")
         for message in self._queue.withdraw(periodic.message):  # from the time before it had slots
-            self._report(message.handle, Fate.OVERDUE, missed=True, at=now)
+            self._post.report(message.handle, Fate.OVERDUE, missed=True, at=now)
         self._out.append(Due(periodic.high, self._cycle.start_of(slot), True))
 
     def _periodic_slot(self, now: int, periodic: Periodic, fragment: int, slot: int, current: int) -> None:
@@ -285,19 +255,18 @@ class Sender:
         last = self._exact_latest_start(frame, slot + 1) if slot == current else LONG_AGO
         if mask is not None and not mask >> slot & 1:
             self._abandon(now, periodic, "not in the mask")
-        elif self._boxes[Mailbox.HRT] is not None:
+        elif self._post.boxes[Mailbox.HRT] is not None:
             self._abandon(now, periodic, "mailbox full")
         elif now + self._latency > last:
             self._counts["late_to_slot"] += 1
             self._abandon(now, periodic, "too late for the slot")
         else:
-            self._boxes[Mailbox.HRT] = periodic
-            self._out.append(Transmit(frame, Mailbox.HRT, self._cycle.start_of(slot), last))
+            self._post.put(periodic, frame, Mailbox.HRT, self._cycle.start_of(slot), last)
 
     def _abandon(self, now: int, periodic: Periodic, reason: str) -> None:
         periodic.restart()
         self._counts["hrt " + reason] += 1
-        self._report(periodic.handle, Fate.ABANDONED, missed=True, at=now)
+        self._post.report(periodic.handle, Fate.ABANDONED, missed=True, at=now)
 
     def _confirm_periodic(self, now: int, periodic: Periodic, outcome: Outcome, at: int) -> None:
         if periodic.payload is None:
@@ -310,61 +279,4 @@ class Sender:
         if periodic.sent == periodic.fragments:
             fate = Fate.UNKNOWN if periodic.unknown else Fate.SENT
             periodic.restart()
-            self._report(periodic.handle, fate, missed=False, at=at)
-
-    # The queue
-
-    def _fill_boxes(self, now: int) -> None:
-        """Without a cycle: one frame of each class is with the port."""
-        if len(self._queue):
-            self._expire(now)
-            if self._boxes[Mailbox.SRT] is None:
-                message = self._queue.best(now, nrt=False)
-                if message is not None:
-                    self._hand_over(message, self._queue.take(message, now), now, message.expiry)
-            if self._boxes[Mailbox.NRT] is None:
-                message = self._queue.best_nrt(now)
-                if message is not None:
-                    self._hand_over(message, self._queue.take(message, now), now, NEVER)
-        if self._held <= now:
-            self._held = NEVER
-        self.due = min(self._queue.next_expiry, self._held)
-
-    def _hand_over(self, message: Outgoing, frame: Frame, first: int, last: int) -> None:
-        mailbox = Mailbox.NRT if frame.id >> 23 == rtcan.NRT else Mailbox.SRT
-        self._boxes[mailbox] = message
-        self._out.append(Transmit(frame, mailbox, first, last))
-
-    def _expire(self, now: int) -> None:
-        for message in self._queue.expire(now):
-            self._report(message.handle, Fate.OVERDUE, missed=True, at=now)
-
-    def _confirm_queued(self, now: int, message: Outgoing, outcome: Outcome, at: int) -> None:
-        if outcome in (Outcome.SENT, Outcome.UNKNOWN):
-            message.unknown = message.unknown or outcome is Outcome.UNKNOWN
-            if self._queue.sent(message):
-                fate = Fate.UNKNOWN if message.unknown else Fate.SENT
-                self._report(message.handle, fate, missed=at > message.deadline, at=at)
-            return
-        if outcome is not Outcome.ERROR:
-            if outcome is Outcome.LOST:
-                self._counts["arbitration lost"] += 1
-            elif self.mode is Mode.SLOTTED:
-                self._counts["late_to_slot"] += 1
-            self._queue.put_back(message)
-            return
-        self._counts["bus errors"] += 1
-        message.errors += 1
-        if message.errors > _ERRORS:
-            self._queue.give_up(message)
-            self._report(message.handle, Fate.FAILED, missed=message.deadline != NEVER, at=at)
-        else:
-            hold = now + self._pause()
-            self._held = hold if self._held == NEVER else max(self._held, hold)
-            self._queue.put_back(message, hold)
-
-    def _report(self, handle: Hashable, fate: Fate, *, missed: bool, at: int) -> None:
-        if missed:
-            self._counts["missed"] += 1
-        if handle is not None:
-            self._out.append(Done(handle, fate, missed, at))
+            self._post.report(periodic.handle, fate, missed=False, at=at)

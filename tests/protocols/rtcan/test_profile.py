@@ -24,12 +24,19 @@ def test_what_is_found(wanted: Profile, firmware: bool, found: Profile) -> None:
     detector.start()
     if firmware:
         detector.firmware_heard()
-    detector.decide()
+    detector.decide(synced=False)
     assert detector.profile is found
     detector.start()
     assert detector.profile is wanted
-    detector.decide()
+    detector.decide(synced=False)
     assert detector.profile is (Profile.RTCAN if wanted is Profile.AUTO else wanted)
+
+
+def test_where_there_are_sync_frames_it_is_no_network_of_firmware_alone() -> None:
+    detector = Detector(Profile.AUTO)
+    detector.firmware_heard()
+    detector.decide(synced=True)
+    assert detector.profile is Profile.RTCAN
 
 
 def test_it_speaks_when_it_is_quiet_and_a_random_time_later() -> None:

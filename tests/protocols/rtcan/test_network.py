@@ -1,0 +1,329 @@
+"""How networks form, and survive: masters, parameters, ids."""
+
+from itertools import pairwise
+
+import pytest
+
+from r2p.codecs import management, rtcan
+from r2p.codecs.rtcan import Frame
+from r2p.protocols.rtcan.election import Role
+from r2p.protocols.rtcan.events import (
+    Action,
+    Degraded,
+    Done,
+    Fate,
+    Granted,
+    IdConflict,
+    LostSync,
+    Mailbox,
+    NewMaster,
+    Outcome,
+    Ready,
+    Silenced,
+    Unsilenced,
+    Withdraw,
+)
+from tests.protocols.rtcan.bus import MS, SECOND, Bus
+from tests.protocols.rtcan.networks import (
+    CYCLE,
+    SLOT,
+    TOPIC,
+    counted,
+    is_sync,
+    network,
+    publish,
+    ready_engine,
+    starts,
+    syncs,
+)
+
+
+def test_the_highest_priority_becomes_the_master_and_all_know_it() -> None:
+    bus = Bus()
+    nodes = network(bus, 3, 7, 7, 0)
+    assert [node.engine.role for node in nodes] == [Role.SLAVE, Role.SLAVE, Role.MASTER, Role.SLAVE]
+    assert {node.engine.master for node in nodes} == {12}
+    assert len({node.engine.epoch for node in nodes}) == 1
+    assert len({node.engine.cycle for node in nodes}) == 1
+    assert {node for _, node in syncs(bus)} == {nodes[2]}
+    times = [node.engine.network_time(node.now) for node in nodes]
+    assert times == [times[0]] * 4
+    assert bus.collisions == 0
+
+
+def test_sync_frames_come_every_cycle_and_count() -> None:
+    bus = Bus()
+    network(bus, 1, 0)
+    at = [start for start, _ in syncs(bus)]
+    assert {b - a for a, b in pairwise(at)} == {CYCLE}
+    counters = [rtcan.decode_sync(frame).cycle for _, frame, _ in bus.sent if is_sync(frame)]
+    assert counters == [n & 0xFF for n in range(1, len(counters) + 1)]  # the original's first is 1, too
+
+
+def test_nobody_sends_before_having_listened() -> None:
+    bus = Bus()
+    network(bus, 1, 2)
+    assert bus.sent[0][0] >= 1_200 * MS
+
+
+def test_a_late_node_joins_and_does_not_disturb() -> None:
+    bus = Bus()
+    master, _ = network(bus, 1, 0)
+    late = bus.add(id8=20, priority=200, offset=-77 * SECOND, ppm=50)
+    bus.start(late)
+    joined = bus.now
+    bus.run(3 * SECOND)
+    assert (late.engine.role, master.engine.role) == (Role.SLAVE, Role.MASTER)
+    assert late.engine.cycle == master.engine.cycle
+    assert late.engine.cycle is not None
+    assert late.engine.cycle > 256  # it has the whole counter
+    at = [start for start, _ in syncs(bus, joined)]
+    assert {b - a for a, b in pairwise(at)} == {CYCLE}
+    mine = [start for start, _, node in bus.sent if node is late]
+    assert mine[0] > joined + 1_200 * MS
+    reference = at[0]
+    assert {(start - reference) % CYCLE // SLOT for start in mine}.isdisjoint({0})
+
+
+def test_without_anybody_to_be_the_master_there_are_no_slots() -> None:
+    bus = Bus()
+    a, b = network(bus, 0, 0)
+    assert [node.engine.role for node in (a, b)] == [Role.NONE, Role.NONE]
+    b.engine.subscribe(rtcan.message_id(TOPIC, 10), 4)
+    publish(a, TOPIC, b"abcd", 20 * MS)
+    sent = bus.now
+    bus.run(MS)
+    assert b.received(TOPIC) == [b"abcd"]
+    assert starts(bus, TOPIC) == [sent]
+
+
+def test_a_node_alone_on_the_bus_gives_up_message_by_message() -> None:
+    """Nobody acknowledges."""
+    bus = Bus()
+    (node,) = network(bus, 0)
+    publish(node, TOPIC, b"a", 5 * SECOND)
+    bus.run(SECOND)
+    assert node.of(Done)[-1].fate is Fate.FAILED
+    assert bus.sent == []
+    other = bus.add(id8=11)
+    bus.start(other)
+    publish(node, TOPIC, b"b", 5 * SECOND)
+    bus.run(MS)
+    assert node.of(Done)[-1].fate is Fate.SENT
+
+
+# Losing sync, losing the master
+
+
+def test_one_missed_sync_silences_soft_messages_for_a_cycle_and_nothing_else() -> None:
+    bus = Bus()
+    _, owner, _ = network(bus, 1, 0, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, MS))
+    bus.run(100 * MS)
+    bus.run_until(lambda: is_sync(bus.sent[-1][1]))
+    bus.run(300_000)
+    owner.deaf = is_sync
+    begin = bus.now
+    bus.run(CYCLE)
+    publish(owner, 6, b"soft", 60 * MS)
+    bus.run(CYCLE)
+    assert starts(bus, 6) == []
+    owner.deaf = lambda frame: False
+    bus.run(2 * CYCLE)
+    assert owner.engine.counts["missed syncs"] == 2
+    assert len(starts(bus, 6)) == 1
+    periodic = [at for at in starts(bus, TOPIC) if at > begin]
+    assert {b - a for a, b in pairwise(periodic)} == {6 * SLOT}
+    assert owner.of(LostSync) == []
+
+
+def test_after_four_cycles_without_sync_it_is_lost_and_found_again() -> None:
+    bus = Bus()
+    master, owner, _ = network(bus, 1, 0, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, MS))
+    bus.run(100 * MS)
+    owner.deaf = is_sync
+    begin = bus.now
+    bus.run(10 * CYCLE)
+    assert len(owner.of(LostSync)) == 1
+    assert owner.of(Degraded) == [Degraded(TOPIC, "no sync for too long")]
+    hard = [at for at in starts(bus, TOPIC, 0) if at > begin]
+    assert 3 * CYCLE < hard[-1] - begin < 5 * CYCLE
+    owner.deaf = lambda frame: False
+    bus.run(200 * MS)
+    assert owner.engine.role is Role.SLAVE
+    assert owner.engine.cycle == master.engine.cycle
+    assert len(owner.of(Granted)) == 2
+    assert starts(bus, TOPIC, 0)[-1] > bus.now - MS - SLOT
+
+
+def test_the_next_best_takes_over_and_everything_goes_on() -> None:
+    bus = Bus()
+    first, second, third, owner = network(bus, 9, 5, 7, 0)
+    told = counted(owner)
+    for node in second, third:
+        node.engine.subscribe(rtcan.message_id(TOPIC, 13), 8)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, MS))
+    counted(second)
+    second.act(second.engine.reserve(second.now, 6, 8, 10 * MS))
+    bus.run(100 * MS)
+    epoch, cycle, grid = owner.engine.epoch, owner.engine.cycle, syncs(bus)[-1][0]
+    phases = {node: node.of(Granted)[-1].phase for node in (owner, second)}
+    bus.kill(first)
+    died = bus.now
+    bus.run(SECOND)
+    assert [node.engine.role for node in (second, third, owner)] == [Role.SLAVE, Role.MASTER, Role.SLAVE]
+    assert {node.engine.master for node in (second, third, owner)} == {12}
+    assert {node.engine.epoch for node in (second, third, owner)} == {epoch}
+    after = syncs(bus, died)
+    assert {node for _, node in after} == {third}
+    assert after[0][0] - died < 10 * CYCLE
+    assert (after[0][0] - grid) % CYCLE < 2_000  # the same grid, but for the drift of no clock here
+    assert owner.engine.cycle is not None
+    assert cycle is not None
+    assert owner.engine.cycle - cycle == pytest.approx(SECOND // CYCLE, abs=2)
+    assert {node: node.of(Granted)[-1].phase for node in (owner, second)} == phases
+    assert third.received(TOPIC)[-1] in told[-2:]
+    assert starts(bus, TOPIC, 0)[-1] > bus.now - 2 * MS
+
+
+def test_a_returning_better_master_does_not_take_over() -> None:
+    bus = Bus()
+    first, second = network(bus, 9, 5)
+    bus.kill(first)
+    bus.add(id8=20)
+    bus.start(bus.nodes[-1])
+    bus.run(SECOND)
+    again = bus.add(id8=10, priority=9)
+    bus.start(again)
+    bus.run(3 * SECOND)
+    assert (second.engine.role, again.engine.role) == (Role.MASTER, Role.SLAVE)
+    assert again.engine.epoch == second.engine.epoch
+
+
+def test_two_masters_that_meet_the_lesser_one_yields_at_once() -> None:
+    """Two networks that did not hear each other are connected."""
+    bus = Bus()
+    groups = [[bus.add(id8=id8, priority=priority) for id8, priority in ((n, n), (n + 1, 0))] for n in (10, 20)]
+    apart = True
+    for group, others in (groups, groups[::-1]):
+        for node in group:
+            node.deaf = lambda frame, others=others: apart and bus.sent[-1][2] in others  # type: ignore[misc]  # bound
+    bus.start(*groups[0])
+    bus.run(3 * MS)
+    bus.start(*groups[1])
+    bus.run(3 * SECOND)
+    roles = [[node.engine.role for node in group] for group in groups]
+    assert roles == [[Role.MASTER, Role.SLAVE]] * 2
+    apart = False
+    met = bus.now
+    bus.run(500 * MS)
+    assert [node.engine.role for group in groups for node in group] == [Role.SLAVE, Role.SLAVE, Role.MASTER, Role.SLAVE]
+    assert {node.engine.master for node in bus.nodes} == {20}
+    assert len({node.engine.epoch for node in bus.nodes}) == 1
+    lesser = [at for at, node in syncs(bus, met) if node is groups[0][0]]
+    assert len(lesser) <= 3
+    assert len({node.engine.cycle for node in bus.nodes}) == 1
+
+
+def test_new_slots_are_not_given_away_before_the_old_owners_have_asked() -> None:
+    bus = Bus()
+    first, second, owner, newcomer = network(bus, 9, 5, 0, 0)
+    counted(owner)
+    counted(newcomer)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
+    bus.run(100 * MS)
+    bus.kill(first)
+    newcomer.act(newcomer.engine.reserve(newcomer.now, 6, 8, 10 * MS))
+    bus.run(SECOND)
+    assert second.engine.role is Role.MASTER
+    assert owner.of(Granted)[-1].phase == 1
+    assert newcomer.of(Granted)[-1].phase == 2
+
+
+# Parameters and ids
+
+
+def test_a_node_with_other_parameters_does_not_transmit() -> None:
+    bus = Bus()
+    master, _ = network(bus, 1, 0)
+    other = bus.add(id8=20, slots=50)
+    bus.start(other)
+    bus.run(3 * SECOND)
+    (silenced,) = other.of(Silenced)
+    assert silenced.reason == "the network has 60 slots of 166 us, this node 50 of 200 us"
+    assert not any(node is other for _, _, node in bus.sent)
+    bus.kill(master)
+    bus.run(5 * SECOND)
+    assert other.of(Unsilenced)
+    assert any(node is other for _, _, node in bus.sent)
+
+
+def test_a_master_that_sends_no_network_is_believed_by_its_cycle() -> None:
+    """Firmware with slots: soft messages go, reservations don't."""
+    bus = Bus()
+    master, node = bus.add(id8=1, priority=1), bus.add(id8=11)
+    other = bus.add(id8=12, slots=50)
+    for each in node, other:
+        each.deaf = lambda frame: frame.id >> 15 & 0xFF == rtcan.MANAGEMENT
+    bus.start(master, other)
+    bus.run(SECOND // 2)
+    bus.start(node)
+    bus.run(5 * SECOND)
+    assert NewMaster(None, 0, False) in node.of(NewMaster)
+    assert "this node's 10000 us" in other.of(Silenced)[0].reason
+    begin = bus.now
+    publish(node, TOPIC, b"x", 50 * MS)
+    bus.run(50 * MS)
+    assert (starts(bus, TOPIC)[0] - syncs(bus, begin)[0][0]) % SLOT == 0
+    assert node.engine.network_time(node.now) is None
+
+
+def test_two_nodes_that_want_the_same_id8() -> None:
+    bus = Bus()
+    a = bus.add(id8=10, number=0x500)
+    bus.start(a)
+    bus.run(2 * SECOND)
+    b = bus.add(id8=10, number=0x400)
+    b.deaf = lambda frame: bus.now < 3 * SECOND + 600 * MS  # it does not hear the other before it claims
+    bus.start(b)
+    bus.run(5 * SECOND)
+    assert IdConflict(10, True) in a.of(IdConflict)
+    assert a.engine.id8 is None
+    assert b.engine.id8 == 10
+    assert not any(node is a for at, _, node in bus.sent if at > bus.now - SECOND)
+    bus.kill(b)
+    bus.run(5 * SECOND)
+    assert len(a.of(Ready)) == 2
+
+
+def test_nodes_that_start_at_the_same_moment_get_different_ids() -> None:
+    bus = Bus()
+    nodes = [bus.add(number=n << 40 | n) for n in range(1, 9)]
+    bus.start()
+    bus.run(4 * SECOND)
+    ids = [node.engine.id8 for node in nodes]
+    assert None not in ids
+    assert len(set(ids)) == 8
+
+
+def test_what_waits_is_discarded_when_the_id8_is_lost() -> None:
+    engine, now = ready_engine()
+    engine.reserve(now, 6, 8, 10 * MS)
+    engine.publish(now, TOPIC, b"1", handle=1)
+    engine.publish(now, TOPIC, b"2", handle=2)
+    claim = management.encode(management.Claim(10, 0))
+    actions: list[Action] = []
+    for left, data in rtcan.fragments(claim):
+        actions += engine.receive(now, Frame(rtcan.encode_identifier(1, 0x010A, left), data), now)
+    assert [(done.handle, done.fate) for done in actions if isinstance(done, Done)] == [
+        (1, Fate.DISCARDED),
+        (2, Fate.DISCARDED),
+    ]
+    assert Withdraw(Mailbox.NRT) in actions
+    assert IdConflict(10, True) in actions
+    assert engine.publish(now, TOPIC, b"3", handle=3) == [Done(3, Fate.DISCARDED, False, now)]
+    assert engine.confirm(now, Mailbox.NRT, Outcome.LATE, now) == ()
+    assert engine.filters() == [(0, 0)]
