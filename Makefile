@@ -1,12 +1,13 @@
-# One .venv for everything, made anew when pyproject.toml changes.
+# One .venv for everything, brought up to date when pyproject.toml changes. `make demo` needs only r2p itself in it.
 
 PYTHON ?= python3
 BIN := .venv/bin
+RUN := .venv/stamp-run
 STAMP := .venv/stamp
 
 .PHONY: demo test lint bench docs clean
 
-demo: $(STAMP)
+demo: $(RUN)
 	$(BIN)/r2p demo
 
 test: $(STAMP) system
@@ -28,10 +29,14 @@ docs: $(STAMP)
 clean:
 	rm -rf .venv site
 
-$(STAMP): pyproject.toml
+$(RUN): pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1'
-	$(BIN)/python -m pip install --quiet --editable '.[all]' --group test --group lint --group docs --group bench
+	$(BIN)/python -m pip install --quiet --editable '.[all]'
+	touch $@
+
+$(STAMP): $(RUN)
+	$(BIN)/python -m pip install --quiet --group test --group lint --group docs --group bench
 	touch $@
 
 # What the tests use of the system: installed where we may, else they say what they skip.

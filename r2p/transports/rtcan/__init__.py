@@ -1,0 +1,1 @@
+"""RTCAN as a transport: one engine, and the ports that carry its frames."""

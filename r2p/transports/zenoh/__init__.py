@@ -1,0 +1,1 @@
+"""zenoh as a transport: between PCs, over any network that zenoh reaches."""
