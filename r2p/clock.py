@@ -5,23 +5,25 @@ An event loop may bring its own clock and its own random numbers, as `loop.clock
 integer nanoseconds.
 
 `Alarm` is one timer that can be moved, for the shell around a protocol. `Ticker` is a period that never drifts: on
-Linux a timerfd, because event loops count their timers in milliseconds.
+Linux a timerfd, because event loops count their timers in milliseconds. So is `ExactAlarm`.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 import random
 import sys
 import time
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 _SECOND: Final = 1_000_000_000
 _SHORTEST_PERIOD: Final = 1_000
+_NO_TIMERFD: Final = (OSError, AttributeError)  # AttributeError: a C library, or a Python, without it
 _RETRY: Final = 1_000_000  # ns; uvloop's timers have whole milliseconds, and may go off half a one early
 
 
@@ -103,16 +105,15 @@ class Alarm:
         self._callback = callback
         self._deadline: int | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._armed = 0  # when the loop's timer goes off; may be before the deadline, when that was put off
+        self._armed: int | None = None  # when it looks; before the deadline, when that was put off
 
     def set(self, deadline: int | None) -> None:
         """Move to this instant of `Clock.monotonic()`, in ns; in the past means as soon as possible. None: off."""
         self._deadline = deadline
-        if self._timer is not None:
+        if self._armed is not None:
             if deadline is not None and self._armed <= deadline:
                 return  # putting it off is frequent, and costs nothing: the timer looks again when it goes off
-            self._timer.cancel()
-            self._timer = None
+            self._disarm()
         if deadline is not None:
             self._arm(deadline, max(0, deadline - self._clock.monotonic()))
 
@@ -127,15 +128,67 @@ class Alarm:
         else:
             self._timer = self._loop.call_later(delay / _SECOND, self._fire)
 
+    def _disarm(self) -> None:
+        self._armed = None
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
     def _fire(self) -> None:
-        self._timer = None
+        armed, self._armed, self._timer = self._armed, None, None
         assert self._deadline is not None  # set(None) cancels the timer
         early = self._deadline - self._clock.monotonic()
         if early > 0:
-            self._arm(self._deadline, max(early, _RETRY) if self._armed == self._deadline else early)
+            self._arm(self._deadline, max(early, _RETRY) if armed == self._deadline else early)
             return
         self._deadline = None
         self._callback()
+
+
+class ExactAlarm(Alarm):
+    """An alarm that comes some ten microseconds late, where there is a timerfd to be had. Has to be closed."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], object]) -> None:
+        super().__init__(loop, callback)
+        self._fd: int | None = None
+        self._inexact = self._clock.virtual or sys.platform != "linux"
+
+    def close(self) -> None:
+        super().close()
+        if self._fd is not None:
+            self._loop.remove_reader(self._fd)
+            os.close(self._fd)
+            self._fd = None
+
+    def _arm(self, deadline: int, delay: int) -> None:
+        if not self._inexact and self._fd is None:
+            self._open()
+        if self._fd is None:
+            super()._arm(deadline, delay)
+            return
+        self._armed = deadline
+        _set_timerfd(self._fd, max(deadline, 1), 0)  # an instant of 0 would switch it off
+
+    def _disarm(self) -> None:
+        super()._disarm()
+        if self._fd is not None:
+            _set_timerfd(self._fd, 0, 0)
+
+    def _open(self) -> None:
+        try:
+            self._fd = _new_timerfd()
+        except _NO_TIMERFD:
+            self._inexact = True
+        else:
+            self._loop.add_reader(self._fd, self._readable, self._fd)
+
+    def _readable(self, fd: int) -> None:
+        try:
+            os.read(fd, 8)
+        except BlockingIOError:  # moved since it went off
+            return
+        if self._armed is not None:
+            self._fire()
 
 
 class Ticker:
@@ -184,7 +237,7 @@ class Ticker:
             return False
         try:
             fd = _open_timerfd(first, self._period)
-        except (OSError, AttributeError):  # AttributeError: a C library, or a Python, without it
+        except _NO_TIMERFD:
             return False
         self._loop.add_reader(fd, self._readable, fd)
         self._fd = fd
@@ -205,24 +258,38 @@ class Ticker:
         self._callback(scheduled, now - scheduled, skipped)  # last: the next tick is safe whatever it raises
 
 
+def _open_timerfd(first: int, period: int) -> int:
+    """A descriptor that becomes readable at `first` and every `period` after it, in ns of the monotonic clock."""
+    fd = _new_timerfd()
+    _set_timerfd(fd, first, period)
+    return fd
+
+
 if sys.version_info >= (3, 13):
 
-    def _open_timerfd(first: int, period: int) -> int:
-        """A descriptor that becomes readable at `first` and every `period` after it, in ns of the monotonic clock."""
-        fd = os.timerfd_create(time.CLOCK_MONOTONIC, flags=os.TFD_NONBLOCK | os.TFD_CLOEXEC)
+    def _new_timerfd() -> int:
+        return os.timerfd_create(time.CLOCK_MONOTONIC, flags=os.TFD_NONBLOCK | os.TFD_CLOEXEC)
+
+    def _set_timerfd(fd: int, first: int, period: int) -> None:
         os.timerfd_settime_ns(fd, flags=os.TFD_TIMER_ABSTIME, initial=first, interval=period)
-        return fd
 
 else:
 
-    def _open_timerfd(first: int, period: int) -> int:
-        """A descriptor that becomes readable at `first` and every `period` after it, in ns of the monotonic clock."""
+    @functools.cache
+    def _ctypes() -> tuple[Any, Any]:
+        """The module, loaded by whoever needs it first, and the C library."""
         import ctypes
 
-        libc = ctypes.CDLL(None, use_errno=True)
+        return ctypes, ctypes.CDLL(None, use_errno=True)
+
+    def _new_timerfd() -> int:
+        ctypes, libc = _ctypes()
         fd: int = libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if fd < 0:
             raise OSError(ctypes.get_errno(), "timerfd_create")
+        return fd
+
+    def _set_timerfd(fd: int, first: int, period: int) -> None:
+        ctypes, libc = _ctypes()
         times = (ctypes.c_long * 4)(*divmod(period, _SECOND), *divmod(first, _SECOND))  # struct itimerspec
         libc.timerfd_settime(fd, 1, times, None)  # 1: TFD_TIMER_ABSTIME
-        return fd

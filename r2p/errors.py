@@ -8,7 +8,7 @@
     ├── TypeMismatch(TypeError)      one topic, two layouts
     ├── TransportError               a transport that can't be made from its URL
     │   ├── Closed                   you closed it
-    │   └── Broken                   the world broke it
+    │   └── Broken                   the world broke it, for good
     ├── NodeCrashed(ExceptionGroup)  what the nodes of a module raised
     └── Deadlock                     virtual time with nothing left to wait for
 
@@ -51,7 +51,11 @@ class Closed(TransportError):
 
 
 class Broken(TransportError):
-    """The world broke it: connection lost, device gone."""
+    """The world broke it, and trying again can't mend it: the module that uses it ends with this.
+
+    r2p's own links don't: they say that they are down, and are tried again for ever. A transport of your own raises it
+    from `run` when what it had is gone for good.
+    """
 
 
 class NodeCrashed(Error, ExceptionGroup[Exception]):

@@ -1,7 +1,11 @@
 """The topic `log`: what the nodes of a module log goes to whoever subscribes it, at most RATE records a second.
 
-A record is a line of text. A text of several lines is several records, and so is a traceback.
+A record is a line of text. A text of several lines is several records, and so is a traceback. Loggers are used from any
+thread: what another one logs is published by the loop's.
 """
+
+import contextlib
+import threading
 
 from r2p.messages import Timestamp
 from r2p.msg import Log
@@ -23,13 +27,18 @@ class LogTopic:
     def __init__(self, space: TopicSpace, remap: dict[str, str] | None = None) -> None:
         self.suppressed = 0
         self._space = space
+        self._thread = threading.get_ident()
         self._node = Node("log", space, remap=remap)
         self._publisher = self._node.advertise(TOPIC, Log)
         self._credit = float(RATE)
         self._at = space.clock.monotonic()
 
     def publish(self, level: int, node: str, text: str) -> None:
-        """Publish one record a line; never waits, and never fails."""
+        """Publish one record a line; never waits, and never fails. From any thread."""
+        if threading.get_ident() != self._thread:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                self._space.loop.call_soon_threadsafe(self.publish, level, node, text)
+            return
         for line in text.splitlines():
             self._publish_line(level, node, line)
 

@@ -8,19 +8,18 @@ import asyncio
 import logging
 import os
 import socket
-from collections import deque
 from collections.abc import AsyncIterator, Iterable
 from types import TracebackType
 from typing import Self
 
-import msgspec
-
+from r2p.bridge import Bridge, BridgeOptions, GatewayStatistics
 from r2p.clock import clock_of, random_of
 from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import Closed, Error, NodeCrashed
+from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
 from r2p.logs import LogTopic
 from r2p.names import module_name, module_name_from, node_name, topic_name
-from r2p.network import Network, describe_mismatch
+from r2p.network import NetworkView, describe_mismatch
 from r2p.node import Node
 from r2p.protocols.events import (
     Command,
@@ -41,46 +40,11 @@ from r2p.watchdog import Watchdog
 
 logger = logging.getLogger("r2p.module")
 
-EVENTS = 256
-"""Events that an `events()` iteration holds before it loses the oldest."""
-
 _CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
 
 PATIENCE = 1.0
 """Seconds after which the log names the nodes whose clean-up is being waited for."""
-
-
-class LinkUp(msgspec.Struct, frozen=True):
-    """A link works (again): after `outage` seconds, in which `lost` messages found it down."""
-
-    link: str
-    outage: float
-    lost: int
-
-
-class LinkDown(msgspec.Struct, frozen=True):
-    """A link works no more."""
-
-    link: str
-    reason: str
-
-
-class LinkWaits(msgspec.Struct, frozen=True):
-    """A link can't be had yet; it is tried again and again."""
-
-    link: str
-    reason: str
-
-
-class Listening(msgspec.Struct, frozen=True):
-    """A transport takes connections."""
-
-    url: str
-    address: str
-
-
-ModuleEvent = LinkUp | LinkDown | LinkWaits | Listening | Mismatched | ModuleChanged | ModuleGone | NameConflict
 
 
 class Module:
@@ -93,6 +57,9 @@ class Module:
     `name` has at most 7 characters (default: from the host name). `via` are transport URLs; None takes those of the
     environment variable R2P_VIA (separated by blanks), and without it the module is local only. `remap` renames
     topics for all its nodes. An `observer` is a tool that only looks: it sends no ALIVE and has no `log` topic.
+
+    With `bridge` it joins its links: it is a gateway (r2p.bridge), and takes part in each network as the gateways there
+    have agreed. BridgeOptions say what it lets through.
     """
 
     def __init__(
@@ -103,6 +70,7 @@ class Module:
         remap: dict[str, str] | None = None,
         observer: bool = False,
         watchdog: bool = True,
+        bridge: bool | BridgeOptions = False,
     ) -> None:
         self.name = module_name(name) if name is not None else module_name_from(socket.gethostname())
         self.observer = observer
@@ -114,14 +82,17 @@ class Module:
         """Its links, also those that are down."""
         self.refused: dict[str, int] = {}
         """Commands that were not obeyed, by name."""
-        self.network = Network(self)
+        self.network = NetworkView(self)
         """What it knows of the network."""
         self._via = _urls(via)
         self._remap = _checked_remap(remap)
         self._with_watchdog = watchdog
+        self._bridging = BridgeOptions() if bridge is True else bridge or None
+        self._bridge: Bridge | None = None
         self._supervisors: dict[str, Supervisor] = {}
         self._crashes: dict[str, Exception] = {}
-        self._listeners: list[tuple[deque[ModuleEvent], asyncio.Event]] = []
+        self._events = EventHub()
+        self._space: TopicSpace | None = None
         self._transports: list[asyncio.Task[None]] = []
         self._tasks: asyncio.TaskGroup | None = None
         self._order: Command | None = None
@@ -140,8 +111,11 @@ class Module:
         clock = clock_of(loop)
         self.random = random_of(loop)
         self.instance = self.random.getrandbits(32)
-        self.space = TopicSpace(self.name, loop, clock)
-        self.space.changed = self._topic_changed
+        self._space = TopicSpace(self.name, loop, clock)
+        self._space.changed = self._topic_changed
+        if self._bridging is not None:
+            self._bridge = Bridge(self._space, self.instance, self._bridging, self._port_changed)
+            self._space.make_topic = self._bridge.make_topic
         self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
@@ -172,6 +146,32 @@ class Module:
             assert error is not None
             error.add_note(f"before that: {crash!r} {' '.join(crash.__notes__)}")
 
+    def gateway_statistics(self) -> GatewayStatistics:
+        """What it has forwarded so far, and where.
+
+        Raises Closed before it is open, and Error if it is no gateway (`bridge`).
+        """
+        self._running()
+        if self._bridge is None:
+            raise Error(f"module {self.name} is no gateway: make it with bridge=True")
+        return self._bridge.statistics()
+
+    @property
+    def space(self) -> TopicSpace:
+        """Its topics. Raises Closed before it is opened."""
+        if self._space is None:
+            raise self._not_open()
+        return self._space
+
+    def _running(self) -> asyncio.TaskGroup:
+        """The owner of its tasks. Raises Closed unless it is open."""
+        if self._tasks is None or not self._open:
+            raise self._not_open()
+        return self._tasks
+
+    def _not_open(self) -> Closed:
+        return Closed(f"module {self.name} is not open: use it in `async with`")
+
     async def _open_transport(self, tasks: asyncio.TaskGroup, via: str | Transport) -> None:
         """Let it run, and wait until it works; what it raises cancels the caller, and `_close` raises it."""
         transport = open_transport(via) if isinstance(via, str) else via
@@ -201,11 +201,12 @@ class Module:
             except BaseExceptionGroup as group:  # of transports: what a node raises, its supervisor keeps
                 raise group.exceptions[0] if len(group.exceptions) == 1 else group from None
             finally:
+                if self._bridge is not None:
+                    self._bridge.close()
                 if self._watchdog is not None:
                     self._watchdog.close()
                 self._changed.set()
-                for _, arrived in self._listeners:
-                    arrived.set()
+                self._events.close()
 
     async def _end_nodes(self) -> None:
         """Cancel all nodes, and wait until each has ended."""
@@ -235,8 +236,7 @@ class Module:
         Raises NameTooLong, InvalidName, Error if the name is taken, the function none of a node, or the module stopped,
         and Closed if it is not open.
         """
-        if self._tasks is None or not self._open:
-            raise Closed(f"module {self.name} is not open: use it in `async with`")
+        tasks = self._running()
         if self.stopped:
             raise Error(f"module {self.name} is stopped: reboot it first")
         check_function(function)
@@ -247,11 +247,11 @@ class Module:
         log = self._log.publish if self._log is not None else _no_log
 
         def make_node() -> Node:
-            return Node(name, self.space, priority=priority, remap=names, log=log)
+            return Node(name, self.space, priority=priority, remap=names, log=log, events=self._events)
 
         supervisor = Supervisor(function, args, make_node, restart=restart)
         self._supervisors[name] = supervisor
-        supervisor.start(self._tasks, self._node_ended)
+        supervisor.start(tasks, self._node_ended)
         return supervisor.node
 
     @property
@@ -274,9 +274,8 @@ class Module:
 
     async def reboot(self) -> None:
         """End all nodes and start them from the beginning."""
-        if self._tasks is None or not self._open:
-            raise Closed(f"module {self.name} is not open: use it in `async with`")
-        await asyncio.shield(self._tasks.create_task(self._reboot(self._tasks), name=f"{self.name} reboot"))
+        tasks = self._running()
+        await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))
 
     async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
         """In a task of its own: a node that asks for it is ended by it."""
@@ -305,32 +304,26 @@ class Module:
     # Network
 
     def command(self, command: Command, module: str) -> None:
-        """Send STOP, REBOOT or BOOTLOAD to another module, by all links. None of them is an emergency stop."""
+        """Send STOP, REBOOT or BOOTLOAD to another module, by all links. None of them is an emergency stop.
+
+        Raises NameTooLong or InvalidName, and Closed if this module is not open.
+        """
+        self._running()
         for link in self.links:
             link.command(command, module_name(module))
 
     def query(self) -> None:
-        """Ask all others to repeat what they publish and subscribe."""
+        """Ask all others to repeat what they publish and subscribe. Raises Closed if this module is not open."""
+        self._running()
         for link in self.links:
             link.query()
 
     def events(self) -> AsyncIterator[ModuleEvent]:
-        """What happens to the links and on the network, from this call on, until the module closes."""
-        listener = deque[ModuleEvent](maxlen=EVENTS), asyncio.Event()
-        self._listeners.append(listener)
-        return self._iterate(*listener)
+        """What happens to the links and on the network, from this call on, until the module closes.
 
-    async def _iterate(self, queue: deque[ModuleEvent], arrived: asyncio.Event) -> AsyncIterator[ModuleEvent]:
-        try:
-            while True:
-                while queue:
-                    yield queue.popleft()
-                if not self._open:
-                    return
-                arrived.clear()
-                await arrived.wait()
-        finally:
-            self._listeners.remove((queue, arrived))
+        Who reads too slowly loses the oldest of 256 events.
+        """
+        return self._events.listen()
 
     # For transports (the Hub)
 
@@ -338,6 +331,8 @@ class Module:
         """A transport has a link, up or not yet."""
         self.links.append(link)
         self.space.links.append(link)
+        if self._bridge is not None:
+            self._bridge.attach(link)
         for topic in list(self.space.topics.values()):
             link.topic_changed(topic)
         link.set_flags(self._flags)
@@ -346,16 +341,26 @@ class Module:
         """It does not have it any more."""
         self.links.remove(link)
         self.space.links.remove(link)
+        if self._bridge is not None:
+            self._bridge.detach(link)
 
     def link_waits(self, link: Link, reason: str) -> None:
         """The link can't be had yet."""
         logger.warning("link %s: %s; trying again", link.name, reason)
-        self._tell(LinkWaits(link.name, reason))
+        self._events.tell(LinkWaits(link.name, reason))
+
+    def link_notice(self, link: Link, kind: str, text: str, *, trouble: bool) -> None:
+        """Something on the link is worth telling."""
+        logger.log(logging.WARNING if trouble else logging.INFO, "link %s: %s", link.name, text)
+        self._events.tell(LinkNotice(link.name, kind, text))
+
+    def _port_changed(self, link: Link, kind: str, text: str, trouble: bool) -> None:
+        self.link_notice(link, f"gateway: {kind}", text, trouble=trouble)
 
     def listening(self, url: str, address: str) -> None:
         """A transport takes connections."""
         logger.info("%s takes connections at %s", url, address)
-        self._tell(Listening(url, address))
+        self._events.tell(Listening(url, address))
 
     def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
         """The link went up or down."""
@@ -364,11 +369,13 @@ class Module:
             meanwhile = "" if first else f", after {outage:.1f} s; {lost} messages lost meanwhile"
             expected = self.observer and first and outage < _PROMPT
             logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.name, meanwhile)
-            self._tell(LinkUp(link.name, outage, lost))
+            self._events.tell(LinkUp(link.name, outage, lost))
         else:
             abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
             logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.name, reason)
-            self._tell(LinkDown(link.name, reason))
+            self._events.tell(LinkDown(link.name, reason))
+        if self._bridge is not None:
+            self._bridge.link_changed(link)
 
     def discovered(self, link: Link, event: Event) -> None:
         """The discovery of a link found something that concerns the module."""
@@ -377,17 +384,17 @@ class Module:
                 self._obey(event.command)
             case Mismatched():
                 logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
-                self._tell(event)
+                self._events.tell(event)
             case NameConflict():
                 logger.error("link %s: two modules carry the name %s: rename one (--module)", link.name, event.module)
-                self._tell(event)
+                self._events.tell(event)
             case Echoes():
                 logger.error("link %s gives back what we send: switch off local echo at the other end", link.name)
             case ModuleChanged():
                 self._suspect_namesakes(link, event.info)
-                self._tell(event)
+                self._events.tell(event)
             case ModuleGone():
-                self._tell(event)
+                self._events.tell(event)
 
     def _obey(self, command: Command) -> None:
         logger.warning("module %s: %s from the network", self.name, command.name)
@@ -438,11 +445,6 @@ class Module:
         self._flags = flags
         for link in self.links:
             link.set_flags(flags)
-
-    def _tell(self, event: ModuleEvent) -> None:
-        for queue, arrived in self._listeners:
-            queue.append(event)
-            arrived.set()
 
 
 def _urls(via: str | Transport | Iterable[str | Transport] | None) -> list[str | Transport]:

@@ -10,7 +10,8 @@ from r2p.errors import InvalidName, NameTooLong
 MODULE_MAX = 7
 NODE_MAX = 8
 TOPIC_MAX = 16
-TRANSPORT_MAX = 8
+NAMESPACED_MAX = 2 * TOPIC_MAX + 1
+"""`robot1/encoder`: a robot's topic on a network of several, which only links without the wire's limit carry."""
 
 MANAGEMENT = "R2P"
 LOADER_PREFIX = "BOOT_"
@@ -29,8 +30,15 @@ def node_name(name: str) -> str:
 
 
 def topic_name(name: str) -> str:
-    """Check a topic's name: 1 to 16 characters of `[A-Za-z0-9_]`; a leading slash, as in the thesis, is taken off."""
-    return _checked("topic", name.removeprefix("/"), TOPIC_MAX)
+    """Check a topic's name: 1 to 16 characters of `[A-Za-z0-9_]`; a leading slash, as in the thesis, is taken off.
+
+    It may be in a namespace, as `robot1/encoder`, of which the same holds.
+    """
+    name = name.removeprefix("/")
+    namespace, _, inner = name.partition("/")
+    if name.count("/") != 1:
+        return _checked("topic", name, TOPIC_MAX)
+    return f"{_checked('namespace', namespace, TOPIC_MAX)}/{_checked('topic', inner, TOPIC_MAX)}"
 
 
 def module_name_from(hostname: str) -> str:

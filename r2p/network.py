@@ -4,13 +4,12 @@ r2p modules tell everything; firmware tells its name and its topics, one step ea
 belong to. Ages say how old the knowledge is.
 """
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES
-from r2p.messages import Layout
+from r2p.messages import Layout, Message
 from r2p.protocols.events import Mismatched, ModuleInfo
 from r2p.sample import PublisherClass
 
@@ -65,8 +64,8 @@ class ModuleView(msgspec.Struct):
     instance: int | None
 
 
-class Network:
-    """The views of one module; each call looks anew."""
+class NetworkView:
+    """The views of one module; each call looks anew. Raises Closed before the module is open."""
 
     def __init__(self, module: "Module") -> None:
         self._module = module
@@ -74,9 +73,9 @@ class Network:
     def modules(self) -> list[ModuleView]:
         """All modules, this one first, then by name; observers included."""
         module = self._module
+        now = module.space.clock.monotonic()
         state = "observer" if module.observer else "stopped" if module.stopped else "running"
         own = ModuleView(module.name, state, module.rebooted, 0.0, "", module.instance)
-        now = module.space.clock.monotonic()
         others = [
             ModuleView(
                 info.name,
@@ -100,6 +99,24 @@ class Network:
         for link in self._module.links:
             self._add_link(views, link)
         return dict(sorted(views.items()))
+
+    def nodes(self) -> dict[tuple[str, str], tuple[list[str], list[str]]]:
+        """(module, node) -> the topics that it publishes, and those that it subscribes; in order."""
+        table: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
+        for view in self.topics().values():
+            for index, endpoints in enumerate((view.publishers, view.subscribers)):
+                for endpoint in endpoints:
+                    entry = table.setdefault((endpoint.module, endpoint.node), ([], []))
+                    _add(entry[index], view.name)
+        return dict(sorted(table.items()))
+
+    async def message_type(self, fingerprint: bytes) -> type[Message] | None:
+        """A message class of this layout, from whoever on the network has it and can be asked; may take a second."""
+        for link in list(self._module.links):
+            found = await link.message_type(fingerprint) if link.up else None
+            if found is not None:
+                return found
+        return None
 
     def _add_own(self, view: TopicView, topic: "Topic") -> None:
         view.age = 0.0
@@ -160,14 +177,3 @@ def _state(info: ModuleInfo) -> str:
 def _add(names: list[str], name: str) -> None:
     if name not in names:
         names.append(name)
-
-
-def nodes_of(topics: Iterable[TopicView]) -> dict[tuple[str, str], tuple[list[str], list[str]]]:
-    """(module, node) -> topics that it publishes, topics that it subscribes."""
-    table: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
-    for view in topics:
-        for index, endpoints in enumerate((view.publishers, view.subscribers)):
-            for endpoint in endpoints:
-                entry = table.setdefault((endpoint.module, endpoint.node), ([], []))
-                _add(entry[index], view.name)
-    return dict(sorted(table.items()))

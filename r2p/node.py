@@ -11,20 +11,14 @@ import traceback
 from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple, TypeVar, overload
 
+from r2p.classes import NonRealTime, Periodic, Sporadic, check_class
 from r2p.clock import Ticker
 from r2p.errors import Closed, Error, InvalidName, TransportError
+from r2p.events import EventHub, ModuleEvent
 from r2p.messages import Message, layout
 from r2p.names import MANAGEMENT, topic_name
-from r2p.publisher import (
-    AnyPublisher,
-    NonRealTime,
-    Periodic,
-    PeriodicPublisher,
-    Publisher,
-    Sporadic,
-    SporadicPublisher,
-)
-from r2p.subscriber import Callback, Keep, Subscriber
+from r2p.publisher import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
+from r2p.subscriber import Callback, Keep, Subscriber, check_options
 from r2p.topic import TopicSpace, pause
 
 M = TypeVar("M", bound=Message)
@@ -82,6 +76,7 @@ class Node:
         priority: int = 0,
         remap: dict[str, str] | None = None,
         log: Callable[[int, str, str], None] = lambda _level, _node, _text: None,
+        events: EventHub | None = None,
     ) -> None:
         self.name = name
         self.module = space.module
@@ -98,6 +93,7 @@ class Node:
         """What to do with an error outside the node's own task; its supervisor sets it."""
         self._space = space
         self._remap = remap or {}
+        self._events = events or EventHub()
         self._tickers: set[Ticker] = set()
         self._entered = False
 
@@ -134,6 +130,7 @@ class Node:
         """
         shape = layout(type)
         name = self._resolve(topic)
+        check_class(name, klass)
         self._check_links(name, shape.size, klass, strict=strict)
         where = self._space.open(name, shape)
         publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
@@ -206,14 +203,10 @@ class Node:
         `lost`. Messages older than `max_age` seconds are skipped. When nothing comes for `timeout` seconds,
         `on_timeout` is called once; without it, the iteration raises TimeoutError.
         A `callback` is called, in this node's task, from `spin()`.
-        Raises InvalidName or NameTooLong, MessageError (a type without a layout), TypeMismatch, ValueError (a queue
-        without room, a time of 0 or less), and Closed once the node has ended.
+        Raises InvalidName or NameTooLong, MessageError (a type without a layout, an option without sense),
+        TypeMismatch, and Closed once the node has ended.
         """
-        if queue < 1:
-            raise ValueError(f"topic {topic}: a queue holds 1 message or more, not {queue}")
-        for option, value in (("max_age", max_age), ("timeout", timeout)):
-            if value is not None and not value > 0:
-                raise ValueError(f"topic {topic}: {option} is in seconds and more than 0, not {value}")
+        check_options(topic, queue=queue, keep=keep, callback=callback, max_age=max_age, timeout=timeout)
         shape = None if type is None else layout(type)
         where = self._space.open(self._resolve(topic), shape)
         subscriber: Subscriber[Any] = Subscriber(
@@ -239,7 +232,8 @@ class Node:
 
         Callbacks run in this node's task, one at a time; a coroutine function is awaited. False also when one of the
         subscriptions has a time-out of its own, no `on_timeout`, and its time is up.
-        Raises Error if no subscription has a callback.
+        A node of periodic publishers spins, too: their `fill` is called meanwhile.
+        Raises Error if there is neither: nothing would ever be called.
         """
         deadline = None if timeout is None else self._space.loop.time() + timeout
         while not await self._serve():
@@ -286,6 +280,17 @@ class Node:
         """UTC in ns; never jumps back."""
         return self._space.clock.now()
 
+    def network_time(self) -> int | None:
+        """The time in ns that all nodes on the module's RTCAN bus share, of the first one of several.
+
+        None: there is no bus, or no master on it.
+        """
+        return next((time for link in self._space.links if (time := link.network_time()) is not None), None)
+
+    def events(self) -> AsyncIterator[ModuleEvent]:
+        """What happens to the module's links and on the network, from this call on, as `Module.events`."""
+        return self._events.listen()
+
     def crash(self, error: Exception) -> None:
         """End this node with an error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
         self.crashed(error)
@@ -329,7 +334,9 @@ class Node:
             if reason and not strict:
                 self.log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
             elif strict and link.best_effort(klass.publisher_class):
-                reason = link.guarantee(klass.publisher_class)
+                reason = link.guarantee(topic, klass.publisher_class)
+            elif strict and isinstance(klass, Periodic):
+                reason = link.inadmissible(size, klass.period)
             if reason and strict:
                 raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
 
@@ -342,7 +349,7 @@ class Node:
     async def _arrival(self) -> None:
         """Wait until a subscription with a callback gets a message."""
         listening = self._listening()
-        if not listening:
+        if not listening and not any(isinstance(each, PeriodicPublisher) for each in self.publishers):
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
         waiter = self._space.loop.create_future()
         try:

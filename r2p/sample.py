@@ -8,6 +8,7 @@ import enum
 
 import msgspec
 
+from r2p.codecs.attachment import Clock
 from r2p.messages import Message
 
 
@@ -39,7 +40,9 @@ class Sample(msgspec.Struct, gc=False):
     `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none). `stamped` says whether the stamp is the
     sender's, or else the reception's. `sequence` counts the messages of one publisher from 1; 0 where the link
     does not carry it.
-    `message` is None until somebody decodes a sample that came over a link.
+    `message` is None until somebody decodes a sample that came over a link. `drop_late`: a link that could not send it
+    by its deadline gives it up, and does not send it late. `hops` counts the gateways that it has crossed; `clock` says
+    how the stamp was translated from another clock, and how well.
     """
 
     data: bytes
@@ -50,3 +53,6 @@ class Sample(msgspec.Struct, gc=False):
     publisher_class: PublisherClass = PublisherClass.NON_REAL_TIME
     message: Message | None = None
     stamped: bool = True
+    drop_late: bool = True
+    hops: int = 0
+    clock: Clock | None = None

@@ -10,10 +10,10 @@ from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from r2p.clock import Alarm
-from r2p.errors import Closed, DecodeError
+from r2p.errors import Closed, DecodeError, MessageError
 from r2p.messages import Layout
 from r2p.sample import Sample
-from r2p.topic import BURST, Owner, QueueSink, Topic, TopicSpace, pause
+from r2p.topic import BURST, Owner, QueueSink, Topic, TopicSpace, number, pause, seconds
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -26,6 +26,21 @@ Callback = Callable[[T], object]
 Keep = Literal["newest", "oldest"]
 
 _SECOND = 1_000_000_000
+_SHORTEST = 1e-6  # s
+
+
+def check_options(
+    topic: str, *, queue: object, keep: object, callback: object, max_age: object, timeout: object
+) -> None:
+    """Raise MessageError for options of `Node.subscribe` without sense."""
+    number(topic, "queue", queue)
+    if keep not in ("newest", "oldest"):
+        raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {keep!r}")
+    if callback is not None and not callable(callback):
+        raise MessageError(f"topic {topic}: a callback is a function, not {callback!r}: options are given by name")
+    for option, value in (("max_age", max_age), ("timeout", timeout)):
+        if value is not None:
+            seconds(topic, option, value, least=_SHORTEST)
 
 
 class _GuardedQueue(deque[Sample]):
@@ -132,8 +147,8 @@ class Subscriber(QueueSink, Generic[T]):
             credit = BURST if self.priority >= self._waker.top else 1
             while queue:
                 sample = queue.popleft()
-                if self._room is not None and len(queue) <= self._room_at:
-                    self._made_room()
+                if self._room is not None:
+                    self.refill()
                 message = sample.message
                 if fussy or message.__class__ is not kind:
                     message = self._examine(sample)
@@ -175,8 +190,7 @@ class Subscriber(QueueSink, Generic[T]):
             self._space.release(self._topic)
             self.node.forget(self)
             self.queue.clear()
-            self.queue = deque(maxlen=0)  # what publishers that wait for room still put in is dropped
-            self._made_room()
+            self.refill()
             if self.waiter is not None and not self.waiter.done():
                 self.waiter.set_result(None)
             for waiter in self._matches:
@@ -217,8 +231,8 @@ class Subscriber(QueueSink, Generic[T]):
         queue = self.queue
         while queue:
             sample = queue.popleft()
-            if self._room is not None and len(queue) <= self._room_at:
-                self._made_room()
+            if self._room is not None:
+                self.refill()
             message: T | None = self._examine(sample)
             if message is not None:
                 return message

@@ -9,13 +9,14 @@ import functools
 import inspect
 from collections.abc import Awaitable, Callable
 
+from r2p.backoff import Backoff
 from r2p.clock import random_of
 from r2p.errors import Error, NameTooLong
 from r2p.names import NODE_MAX, node_name
 from r2p.node import Node
-from r2p.transports.backoff import Backoff
 
 NodeFunction = Callable[..., Awaitable[object]]
+"""What `Module.start` runs: `async def blink(node: r2p.Node) -> None`; more arguments are given to `start`."""
 
 _FIRST_RESTART, _LONGEST_RESTART = 0.5, 30.0  # seconds
 _ENDING = 1.0  # seconds that a node has to end before somebody says so
@@ -30,7 +31,11 @@ def check_function(function: NodeFunction) -> None:
 
 
 def name_of(function: NodeFunction) -> str:
-    """The node name that a function gives: its own, if it fits the wire."""
+    """The node name that a function gives: its own.
+
+    Raises NameTooLong or InvalidName if that does not fit the wire, and Error for what can't run as a node.
+    """
+    check_function(function)
     bare = function.func if isinstance(function, functools.partial) else function
     name = getattr(bare, "__name__", type(bare).__name__)
     if len(name) > NODE_MAX:

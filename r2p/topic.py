@@ -6,23 +6,25 @@ woken directly, the others one for each turn of the event loop, so that an impor
 handler steps of unimportant ones.
 """
 
-import abc
 import asyncio
 import heapq
 import itertools
 import logging
 import types
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Protocol
 
 from r2p.clock import Clock
-from r2p.errors import TypeMismatch
+from r2p.errors import MessageError, TypeMismatch
 from r2p.messages import Layout
+from r2p.room import Room, Sink
 from r2p.sample import PublisherClass, Sample
 
 BURST = 16
 """Messages that publish() or an iteration handles before it lets the event loop run once."""
+
+_LONGEST = 1e9  # s
 
 PATIENCE = 4
 """Turns of the event loop that a link waits for a full queue before it goes on without it."""
@@ -96,54 +98,10 @@ class Waker:
         self._running = False
 
 
-class Sink(abc.ABC):
-    """What takes samples: a subscriber's queue, or a link's send buffer."""
-
-    __slots__ = ("_room", "_room_at", "lost", "patient")
-
-    def __init__(self) -> None:
-        self.lost = 0
-        self.patient = True
-        """Whether publishers and links wait for room in it; False while it is considered lossy."""
-        self._room: list[Callable[[], None]] | None = None
-        self._room_at = 0
-
-    @abc.abstractmethod
-    def offer(self, sample: Sample) -> bool:
-        """Take the sample if there is room."""
-
-    @abc.abstractmethod
-    def force(self, sample: Sample) -> None:
-        """Take the sample even without room, losing and counting one."""
-
-    @abc.abstractmethod
-    def when_room(self, callback: Callable[[], None], *, soon: bool = False) -> None:
-        """Call back once when there is room again: at the first free place (`soon`), else when half is free."""
-
-    def wait_no_more(self, callback: Callable[[], None]) -> None:
-        """Undo `when_room`, if it was not called back yet."""
-        if self._room is not None and callback in self._room:
-            self._room.remove(callback)
-
-    def give_up(self, sample: Sample) -> None:
-        """It made no room in time: lossy until it has."""
-        self.patient = False
-        self.force(sample)
-        self.when_room(self._recover)
-
-    def _recover(self) -> None:
-        self.patient = True
-
-    def _made_room(self) -> None:
-        callbacks, self._room, self._room_at = self._room, None, 0
-        for callback in callbacks or ():
-            callback()
-
-
 class QueueSink(Sink):
     """The bounded queue of one subscriber; the topic fills it, the subscriber empties it."""
 
-    __slots__ = ("_waker", "keep_oldest", "limit", "node", "priority", "queue", "waiter")
+    __slots__ = ("_room", "_waker", "keep_oldest", "limit", "lossy", "node", "priority", "queue", "waiter")
 
     def __init__(self, waker: Waker, node: Owner, limit: int, priority: int, *, lossy: bool, keep_oldest: bool) -> None:
         super().__init__()
@@ -152,9 +110,11 @@ class QueueSink(Sink):
         self.limit = limit
         self.priority = priority
         self.keep_oldest = keep_oldest
+        self.lossy = lossy
         self.patient = not lossy
         self.queue: deque[Sample] = deque()
         self.waiter: asyncio.Future[None] | None = None
+        self._room: Room | None = None  # only while somebody waits: whoever takes a message out looks for it
 
     def offer(self, sample: Sample) -> bool:
         if len(self.queue) >= self.limit:
@@ -170,11 +130,19 @@ class QueueSink(Sink):
             self.queue.popleft()
             self._put(sample)
 
-    def when_room(self, callback: Callable[[], None], *, soon: bool = False) -> None:
+    def room(self) -> Room:
         if self._room is None:
-            self._room = []
-        self._room.append(callback)
-        self._room_at = max(self._room_at, self.limit - 1 if soon else self.limit // 2)
+            self._room = Room()
+        return self._room
+
+    def refill(self) -> None:
+        room = self._room
+        if room is not None:
+            room.serve()
+            if len(self.queue) <= self.limit // 2:
+                room.recover()
+            if not room:
+                self._room = None
 
     @property
     def owner(self) -> str:
@@ -194,16 +162,18 @@ class QueueSink(Sink):
 class Outlet(Sink):
     """A remote subscriber: one topic on its way out by one link."""
 
-    __slots__ = ("link",)
+    __slots__ = ("carrier", "link")
 
-    def __init__(self, link: str) -> None:
+    def __init__(self, link: str, carrier: object) -> None:
         super().__init__()
         self.link = link
+        self.carrier = carrier
+        """The link itself; topics only tell one from another."""
 
     @property
-    def reachable(self) -> bool:
-        """Whether its link is up."""
-        return True
+    def owner(self) -> str:
+        """The name of its link."""
+        return self.link
 
 
 class Advertised(Protocol):
@@ -216,11 +186,14 @@ class Advertised(Protocol):
     def joined(self, sink: Sink) -> None:
         """Somebody joined, or came back after a reboot."""
 
-    def left(self, sink: Sink) -> None:
-        """Somebody left."""
-
     def degraded(self, link: str, reason: str) -> None:
         """A link that carried the topic does not any more."""
+
+    def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
+        """A link gave up a message that it had taken; `late` is in seconds."""
+
+    def link_late(self, link: str, reason: str, late: float = 0.0) -> None:
+        """A link sent a message after its deadline."""
 
 
 class Memory(Protocol):
@@ -244,10 +217,10 @@ class Topic:
         self.memories: list[Memory] = []
         self._waker = waker
 
-    def deliver(self, sample: Sample, own: object = None) -> list[Sink] | None:
+    def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
         """Queue the sample wherever there is room; the sinks that are worth waiting for come back.
 
-        `own` is the publishing node: its own queues never make it wait.
+        `own` is the publishing node: its own queues never make it wait. `driver` is a link that gets it another way.
         """
         waker = self._waker
         blocked: list[Sink] | None = None
@@ -272,14 +245,14 @@ class Topic:
                 elif not waiter.done():
                     waiter.set_result(None)
         if self.outlets and not sample.source.link:
-            blocked = self._send(sample, blocked)
+            blocked = self._send(sample, blocked, driver)
         return blocked
 
-    def _send(self, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
+    def _send(self, sample: Sample, blocked: list[Sink] | None, driver: object) -> list[Sink] | None:
         for outlet in self.outlets:
-            if outlet.offer(sample):
+            if outlet.carrier is driver or (not outlet.room().line(sample) and outlet.offer(sample)):
                 continue
-            if not outlet.patient:
+            if not outlet.patient and sample.publisher_class == PublisherClass.NON_REAL_TIME:
                 outlet.force(sample)
             elif blocked is None:
                 blocked = [outlet]
@@ -299,18 +272,44 @@ class Topic:
         for publisher in self.publishers:
             publisher.joined(sink)
 
+    def welcome(self, sink: "QueueSink | Outlet") -> None:
+        """One more subscriber at the other end of a link that has joined before, or the same one after a restart."""
+        for publisher in self.publishers:
+            publisher.joined(sink)
+
     def leave(self, sink: QueueSink | Outlet) -> None:
         if isinstance(sink, QueueSink):
             self.queues.remove(sink)
         else:
             self.outlets.remove(sink)
+        sink.room().dismiss(sink)
+
+    def publisher_of(self, sample: Sample) -> "Advertised | None":
+        """Who published this sample here: for late news of it."""
         for publisher in self.publishers:
-            publisher.left(sink)
+            if publisher.node.name == sample.source.node and publisher.publisher_class == sample.publisher_class:
+                return publisher
+        return None
 
     @property
     def idle(self) -> bool:
         """Nobody in this module publishes or subscribes it."""
         return not (self.publishers or self.queues)
+
+    @property
+    def slotted(self) -> Sequence[object]:
+        """Those for whose messages a link may ask, if they are periodic: a bus with slots of its own."""
+        return self.publishers
+
+    @property
+    def wanted(self) -> bool:
+        """Whether what others publish is to be let in."""
+        return bool(self.queues)
+
+    @property
+    def in_use(self) -> bool:
+        """Whether links have to do with it."""
+        return bool(self.outlets or self.inlets)
 
 
 class LinkView(Protocol):
@@ -319,8 +318,8 @@ class LinkView(Protocol):
     @property
     def name(self) -> str: ...
 
-    def guarantee(self, publisher_class: PublisherClass) -> str:
-        """What the class means on this link, in words."""
+    def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
+        """What the class means on this link for the topic, in words."""
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
         """Whether the link gives less than the class asks for."""
@@ -328,8 +327,26 @@ class LinkView(Protocol):
     def refusal(self, size: int) -> str | None:
         """Why messages of `size` bytes can't be sent on this link."""
 
+    def inadmissible(self, size: int, period: float) -> str | None:
+        """Why there can never be slots for messages of `size` bytes each `period` seconds."""
+
+    def network_time(self) -> int | None:
+        """The time (ns) that all nodes of the link's network share. None: it has none, or it is not known."""
+
     async def admission(self, topic: str) -> None:
         """Wait until the link has admitted the topic."""
+
+
+def number(topic: str, option: str, value: object) -> None:
+    """Raise MessageError for what is no number of messages."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise MessageError(f"topic {topic}: {option} is a number of messages, 1 or more, not {value!r}")
+
+
+def seconds(topic: str, option: str, value: object, *, least: float) -> None:
+    """Raise MessageError for what is no duration that a clock can count."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= _LONGEST:
+        raise MessageError(f"topic {topic}: {option} is in seconds, {least:g} to {_LONGEST:g}, not {value!r}")
 
 
 class TopicSpace:
@@ -342,6 +359,8 @@ class TopicSpace:
         self.waker = Waker(loop)
         self.topics: dict[str, Topic] = {}
         self.links: list[LinkView] = []
+        self.make_topic: Callable[[str, Waker], Topic] = Topic
+        """Makes the topics; a gateway has a kind of its own."""
         self.changed: Callable[[Topic], None] = lambda _topic: None
         """Called after a publisher or a subscriber of this module has come or gone."""
 
@@ -349,7 +368,7 @@ class TopicSpace:
         """The topic of that name; raises TypeMismatch if it has another layout here (`None` fits any)."""
         topic = self.topics.get(name)
         if topic is None:
-            topic = self.topics[name] = Topic(name, self.waker)
+            topic = self.topics[name] = self.make_topic(name, self.waker)
         if layout is not None:
             if topic.layout is None:
                 topic.layout = layout
@@ -365,5 +384,5 @@ class TopicSpace:
         self.changed(topic)
         if topic.idle:
             topic.layout = None
-            if not topic.outlets and not topic.inlets:
+            if not topic.in_use:
                 self.topics.pop(topic.name, None)

@@ -9,13 +9,20 @@ import asyncio
 import logging
 import sys
 import threading
-import time
 import traceback
+from pathlib import Path
+from types import FrameType
+
+from r2p.clock import clock_of
 
 logger = logging.getLogger("r2p.watchdog")
 
 LIMIT = 0.1
 """Seconds that the loop may be blocked."""
+
+_RUNS_IT = {each.__file__ for each in (asyncio.base_events, asyncio.events, asyncio.runners)} | {
+    str(Path(__file__).with_name("supervisor.py"))
+}
 
 
 class Watchdog:
@@ -24,6 +31,7 @@ class Watchdog:
     def __init__(self, loop: asyncio.AbstractEventLoop, limit: float = LIMIT) -> None:
         self._loop = loop
         self._limit = limit
+        self._clock = clock_of(loop)
         self._alive = threading.Event()
         self._ended = threading.Event()
         self._watched = 0
@@ -43,7 +51,7 @@ class Watchdog:
     def _watch(self) -> None:
         while not self._ended.wait(self._limit / 4):
             self._alive.clear()
-            asked = time.monotonic()
+            asked = self._clock.monotonic()
             try:
                 self._loop.call_soon_threadsafe(self._alive.set)
             except RuntimeError:  # the loop is closed
@@ -56,10 +64,17 @@ class Watchdog:
         task = asyncio.current_task(self._loop)
         who = f"task {task.get_name()}" if task is not None else "a callback"
         frame = sys._current_frames().get(self._watched)  # noqa: SLF001 - documented, for exactly this use
-        stack = "".join(traceback.format_stack(frame)) if frame is not None else "(no stack)\n"
-        logger.warning("%s has blocked the event loop for over %.0f ms:\n%s", who, self._limit * 1e3, stack.rstrip())
+        stack = _own_part(frame) if frame is not None else "(no stack)"
+        logger.warning("%s has blocked the event loop for over %.0f ms:\n%s", who, self._limit * 1e3, stack)
 
-    def _wait_out(self, asked: float) -> None:
+    def _wait_out(self, asked: int) -> None:
         self._alive.wait()  # close() sets it too
         if not self._ended.is_set():
-            logger.warning("the event loop runs again after %.0f ms", (time.monotonic() - asked) * 1e3)
+            logger.warning("the event loop runs again after %.0f ms", (self._clock.monotonic() - asked) / 1e6)
+
+
+def _own_part(frame: FrameType) -> str:
+    """The stack from where a node or a callback begins; what runs it is always the same."""
+    stack = traceback.extract_stack(frame)
+    begin = max((at for at, each in enumerate(stack, 1) if each.filename in _RUNS_IT), default=0)
+    return "".join(traceback.format_list(stack[begin:] or stack)).rstrip()

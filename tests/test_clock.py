@@ -10,7 +10,7 @@ from typing import NoReturn
 import pytest
 
 import r2p.clock
-from r2p.clock import Alarm, SystemClock, Ticker, clock_of, random_of
+from r2p.clock import Alarm, ExactAlarm, SystemClock, Ticker, clock_of, random_of
 from r2p.sim import VirtualLoop, run
 
 MS = 1_000_000
@@ -155,14 +155,59 @@ async def test_a_closed_alarm_is_silent() -> None:
 
 
 @pytest.mark.anyio
+@pytest.mark.parametrize("kind", [Alarm, ExactAlarm])
 @pytest.mark.parametrize("delay", [0, 300_000, 1_400_000, 2_490_000])
-async def test_alarm_is_never_early_on_a_real_loop(delay: int) -> None:
+async def test_alarm_is_never_early_on_a_real_loop(delay: int, kind: type[Alarm]) -> None:
     loop = asyncio.get_running_loop()
     went_off = asyncio.Event()
     deadline = clock_of().monotonic() + delay
-    Alarm(loop, went_off.set).set(deadline)
+    alarm = kind(loop, went_off.set)
+    alarm.set(deadline)
     await went_off.wait()
     assert clock_of().monotonic() >= deadline
+    alarm.close()
+
+
+@pytest.fixture(params=["timerfd", "no timerfd"])
+def exact(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_descriptors() -> NoReturn:
+        raise OSError(errno.EMFILE, "no descriptor")
+
+    if request.param == "no timerfd":
+        monkeypatch.setattr(r2p.clock, "_new_timerfd", no_descriptors)
+
+
+@pytest.mark.anyio
+@pytest.mark.usefixtures("exact")
+@pytest.mark.parametrize(
+    "delays",
+    [(5, 1), (1, 5), (3, None, 2), (2, 4, 3), (-3_000_000_000,)],
+    ids=lambda delays: " ".join(map(str, delays)),
+)
+async def test_the_last_deadline_counts_on_a_real_loop(delays: tuple[int | None, ...]) -> None:
+    loop = asyncio.get_running_loop()
+    rung: list[int] = []
+    both = asyncio.Semaphore(0)
+
+    def ring() -> None:
+        rung.append(clock_of().monotonic())
+        both.release()
+
+    now = clock_of().monotonic()
+    deadlines = [None if delay is None else now + delay * MS for delay in delays]
+    last = deadlines[-1]
+    assert last is not None
+    alarm = ExactAlarm(loop, ring)
+    for deadline in deadlines:
+        alarm.set(deadline)
+    await both.acquire()
+    alarm.set(now + 20 * MS)
+    await both.acquire()
+    alarm.set(now + 40 * MS)
+    alarm.close()
+    assert last <= rung[0]
+    assert now + 20 * MS <= rung[1]
+    assert len(rung) == 2
 
 
 # Ticker

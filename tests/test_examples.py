@@ -7,7 +7,10 @@ import asyncio
 import csv
 import inspect
 import io
+import math
+import re
 import runpy
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -17,8 +20,10 @@ from typing import Any
 import pytest
 
 import r2p
-from r2p.msg import Led
+from r2p.msg import Led, Odometry, Text
 from r2p.sim.modules import FirmwareModule, Powered, Subscribes
+from r2p.sim.robots.emulated import Triskar2
+from r2p.testing.network import node_in
 from r2p.tools.run import load
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
@@ -96,6 +101,79 @@ async def test_logger_csv(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(rows) > 90
     assert rows[0]["source"] == "PC1/imu_demo"
     assert rows[0]["acc_z"] == "1000"
+
+
+@pytest.mark.virtual_time
+async def test_teleop(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Keys drive the robot, and its end stops it."""
+    example = _example("teleop")
+    keys = iter("wwa")
+    monkeypatch.setitem(example["keys"].__globals__, "typed", lambda: next(keys, ""))
+    async with Triskar2("memory:teleop") as robot, r2p.Module("PC1", via="memory:teleop") as pc:
+        node = pc.start(example["keys"])
+        await asyncio.sleep(3)
+        assert robot.pose[1] > 0.5
+        await pc.nodes[node.name].stop()
+        await asyncio.sleep(1)
+        before = robot.pose
+        await asyncio.sleep(1)
+        assert robot.pose == pytest.approx(before, abs=1e-3)
+    assert "Pose3(" in capsys.readouterr().out
+
+
+@pytest.mark.virtual_time
+async def test_square() -> None:
+    """By odometry: each corner is where it should be."""
+    example = _example("square")
+    nearest = dict.fromkeys(example["CORNERS"], math.inf)
+    async with Triskar2("memory:square", seed=4) as robot, r2p.Module("PC1", via="memory:square") as pc:
+        pc.start(example["square"])
+        for _ in range(150):
+            await asyncio.sleep(0.1)
+            for corner in nearest:
+                nearest[corner] = min(nearest[corner], math.dist(corner, robot.pose[:2]))
+    assert max(nearest.values()) < 0.06
+
+
+@pytest.mark.virtual_time
+async def test_gateway(capsys: pytest.CaptureFixture[str]) -> None:
+    """What the robot has reaches the PC, but for the log; and an empty battery is told."""
+    gateway = asyncio.create_task(_example("gateway")["main"]("memory:robot", "memory:lan"))
+    async with Triskar2("memory:robot") as robot, r2p.Module("PC1", via="memory:lan") as pc:
+        robot.hardware.battery.charge = 0.1
+        async with node_in(pc) as node:
+            told = node.subscribe("odometry", Odometry)
+            assert (await told.fetch(10)).pose.x == pytest.approx(0, abs=1e-3)
+            await asyncio.sleep(12)
+    gateway.cancel()
+    await asyncio.gather(gateway, return_exceptions=True)
+    printed = capsys.readouterr().out
+    assert re.search(r"^battery: \d+ %, 23\.\d V$", printed, re.MULTILINE)
+    assert re.search(r"^odometry: \d+ from memory:robot to memory:lan", printed, re.MULTILINE)
+    assert "log: " not in printed
+
+
+@pytest.mark.anyio
+async def test_own_transport(capsys: pytest.CaptureFixture[str]) -> None:
+    example = _example("own_transport")
+    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
+        for each in (one, other):
+            each.bind(("127.0.0.1", 0))
+        here, there = one.getsockname()[1], other.getsockname()[1]
+    async with (
+        asyncio.timeout(20),
+        r2p.Module("UDP1", via=example["Udp"](here, there)) as first,
+        r2p.Module("UDP2", via=example["Udp"](there, here)) as second,
+        node_in(first) as node,
+    ):
+        texts = node.subscribe("hello", Text)
+        for module in (first, second):
+            module.start(example["hello"])
+        heard = {(await texts.fetch()).text}
+        while len(heard) < 2:
+            heard.add((await texts.fetch()).text)
+    assert heard == {"hello from UDP1", "hello from UDP2"}
+    assert "hello from UDP1" in capsys.readouterr().out
 
 
 @pytest.mark.processes

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import threading
+from typing import TYPE_CHECKING
 
 import pytest
 
 import r2p
 from r2p.logs import RATE
 from r2p.msg import Led, Log
+from r2p.topic import Topic
 from tests.bench import hold, led, local, settle
+
+if TYPE_CHECKING:
+    from r2p.room import Sink
 
 
 def texts(records: r2p.Subscriber[Log]) -> list[str]:
@@ -114,3 +120,32 @@ async def test_the_log_topic_can_be_remapped_and_ends_with_the_module() -> None:
         assert texts(records) == ["here"]
     node.log.info("nobody hears this")
     assert list(module.space.topics) == []
+
+
+@pytest.mark.anyio
+async def test_what_another_thread_logs_is_published_in_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: set[int] = set()
+    deliver = Topic.deliver
+
+    def watched(topic: Topic, sample: r2p.Sample, own: object = None) -> list[Sink] | None:
+        threads.add(threading.get_ident())
+        return deliver(topic, sample, own)
+
+    monkeypatch.setattr(Topic, "deliver", watched)
+    async with r2p.Module("PC1", via=[], watchdog=False) as module:
+        node = module.start(hold)
+        records = module.start(hold, name="watch").subscribe("log", Log)
+        await asyncio.to_thread(node.log.warning, "from a thread")
+        assert (await records.fetch(30.0)).text == "from a thread"
+    assert threads == {threading.get_ident()}
+
+
+def test_a_thread_may_log_when_the_loop_is_closed() -> None:
+    async def main() -> r2p.Node:
+        async with r2p.Module("PC1", via=[], watchdog=False) as module:
+            return module.start(hold)
+
+    node = asyncio.run(main())
+    thread = threading.Thread(target=node.log.warning, args=("too late",))
+    thread.start()
+    thread.join()

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import r2p
-from r2p.module import EVENTS, PATIENCE
+from r2p.events import EVENTS
+from r2p.module import PATIENCE
 from r2p.msg import Encoder, Led, Log
 from r2p.protocols.events import Mismatched, NameConflict
 from r2p.transports.link import Transport
@@ -57,6 +58,14 @@ async def test_a_module_is_opened_once() -> None:
         module.start(hold)
     with pytest.raises(r2p.Closed):
         await module.reboot()
+    with pytest.raises(r2p.Closed, match="use it in `async with`"):
+        module.query()
+    with pytest.raises(r2p.Closed):
+        module.command(r2p.Command.STOP, "IMU1")
+    with pytest.raises(r2p.Closed):
+        module.network.modules()
+    with pytest.raises(r2p.Closed):
+        module.network.topics()
     async with module:
         with pytest.raises(r2p.Error, match="was opened before"):
             await module.__aenter__()

@@ -28,7 +28,7 @@ def test_as_long_as_the_field(check: Check, longest: int) -> None:
 
 
 @pytest.mark.parametrize(("check", "longest"), KINDS)
-@pytest.mark.parametrize("name", ["", " ", "a b", "a-b", "a/b", "é", "²", "a\n", "a\0", "à" * 40])
+@pytest.mark.parametrize("name", ["", " ", "a b", "a-b", "a/b/c", "é", "²", "a\n", "a\0", "à" * 40])
 def test_other_characters_are_refused(check: Check, longest: int, name: str) -> None:
     with pytest.raises(InvalidName, match="use letters, digits and underscores only") as caught:
         check(name)
@@ -45,11 +45,21 @@ def test_the_error_says_what_it_names() -> None:
 def test_one_leading_slash_of_a_topic_is_taken_off() -> None:
     assert topic_name("/leds") == topic_name("leds") == "leds"
     assert topic_name("/" + "x" * 16) == "x" * 16
-    for name in ("//leds", "/", "leds/", "/a/b"):
+    for name in ("//leds", "/", "leds/", "/a/b/c"):
         with pytest.raises(InvalidName):
             topic_name(name)
     with pytest.raises(InvalidName):
         module_name("/PC1")
+
+
+def test_a_topic_may_be_in_a_namespace() -> None:
+    assert topic_name("/robot1/leds") == topic_name("robot1/leds") == "robot1/leds"
+    assert topic_name(f"{'x' * 16}/{'y' * 16}") == f"{'x' * 16}/{'y' * 16}"
+    for name in (f"{'x' * 17}/y", f"x/{'y' * 17}"):
+        with pytest.raises(NameTooLong):
+            topic_name(name)
+    with pytest.raises(InvalidName):
+        node_name("a/b")
 
 
 @given(st.text(max_size=20))

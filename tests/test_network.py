@@ -9,7 +9,7 @@ from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import layout
 from r2p.msg import Led
-from r2p.network import Endpoint, ModuleView, describe_mismatch, nodes_of
+from r2p.network import Endpoint, ModuleView, describe_mismatch
 from r2p.protocols.events import Mismatched, Shape
 from tests.bench import hold, joined, local, settle
 
@@ -61,7 +61,7 @@ async def test_what_a_link_tells() -> None:
         await settle(1.0)
         assert tool.network.topics()["leds"].publishers == []
         assert {each.name: each.state for each in tool.network.modules()}["A"] == "stopped"
-        assert nodes_of(tool.network.topics().values()) == {
+        assert tool.network.nodes() == {
             ("A", "log"): (["log"], []),
             ("B", "log"): (["log"], []),
             ("B", "show"): ([], ["leds"]),

@@ -322,3 +322,12 @@ async def test_the_management_topic_is_not_for_nodes() -> None:
             node.advertise("R2P", Led)
         with pytest.raises(r2p.InvalidName):
             node.subscribe("/R2P", None)
+
+
+@pytest.mark.virtual_time
+async def test_a_node_of_periodic_publishers_spins() -> None:
+    async with local() as module:
+        node = module.start(hold)
+        publisher = node.advertise("a", Led, r2p.Periodic(0.1, Led))
+        assert not await node.spin(timeout=1.05)
+        assert publisher.sent == 10

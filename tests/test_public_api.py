@@ -11,7 +11,7 @@ import pytest
 import r2p
 
 NUMBERS = {"f32", "f64", "i8", "i16", "i32", "i64", "u8", "u16", "u32", "u64"}
-UNIONS = {"ModuleEvent"}
+UNIONS = {"ModuleEvent", "NodeFunction"}
 
 
 def test_the_public_names_are_there_and_listed_once() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
+from typing import Any
 
 import pytest
 
@@ -178,6 +180,36 @@ async def test_publishing_from_a_thread() -> None:
         thread.join()
 
 
+BAD = 0.0, -1.0, 1e-9, math.nan, math.inf, 1e300, "1", True, None
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("klass", "options", "match"),
+    [
+        *((r2p.Sporadic, {"deadline": bad}, "deadline is in seconds, 1e-06 to 1e[+]09, not") for bad in BAD),
+        *((r2p.Periodic, {"period": bad, "fill": Led}, "period is in seconds, 1e-06 to") for bad in BAD),
+        *((r2p.NonRealTime, {"stall": bad}, "stall is in seconds, 0 to") for bad in (-1, math.nan, math.inf, None)),
+        *((r2p.Periodic, {"period": 1, "fill": Led, "lead": bad}, "lead is in seconds") for bad in (-1, math.nan)),
+        *((r2p.Sporadic, {"deadline": 1, "pending": bad}, "pending is a number") for bad in (0, -1, 1.5, True, None)),
+        (r2p.Sporadic, {"deadline": 1, "late": "sned"}, "late is 'drop' or 'send', not 'sned'"),
+        (r2p.Periodic, {"period": 1, "fill": Led()}, "fill is a function that gives the message, not Led"),
+        (r2p.NonRealTime, {"on_missed": "me"}, "on_missed is a function that takes an r2p.Missed, not 'me'"),
+        (lambda: r2p.Sporadic, {}, "give a class value, such as r2p.Sporadic"),
+        (lambda: None, {}, "give a class value"),
+    ],
+)
+async def test_a_class_value_without_sense_is_refused_and_leaves_nothing(
+    klass: Any, options: dict[str, Any], match: str
+) -> None:
+    async with local() as module:
+        node = module.start(hold)
+        with pytest.raises(r2p.MessageError, match=f"^topic leds: {match}"):
+            node.advertise("leds", Led, klass(**options))
+        assert "leds" not in module.space.topics
+        assert not node.publishers
+
+
 # Non real-time
 
 
@@ -344,3 +376,119 @@ async def test_several_tasks_publish_at_once() -> None:
         for start in (0, 100, 200, 300):
             mine = [each for each in numbers(got) if start <= each < start + 100]
             assert mine == sorted(mine)
+
+
+@pytest.mark.virtual_time
+async def test_who_waits_first_is_served_first() -> None:
+    """Three that always have something to say, and a reader that is slower than each: all get their share."""
+    got = []
+
+    async def reader(node: r2p.Node) -> None:
+        async for message in node.subscribe("leds", Led, queue=2):
+            await asyncio.sleep(0.1)
+            got.append(message.led)
+
+    async def publish(node: r2p.Node, number: int) -> None:
+        publisher = node.advertise("leds", Led, r2p.NonRealTime(stall=STALL))
+        await publisher.wait_subscriber()
+        while True:
+            await publisher.publish(led(number))
+
+    async with local() as module:
+        module.start(reader)
+        for number in range(3):
+            module.start(publish, number, name=f"pub{number}")
+        await settle(10.0)
+        assert len(got) > 90
+        assert all({*got[begin : begin + 3]} == {0, 1, 2} for begin in range(3, len(got) - 2))
+        publishers = module.space.topics["leds"].publishers
+        assert [publisher.missed for publisher in publishers] == [0, 0, 0]  # type: ignore[attr-defined]
+
+
+@pytest.mark.virtual_time
+async def test_tasks_of_one_publisher_do_not_overtake_each_other() -> None:
+    async with local() as module:
+        node, other = pair(module)
+        leds = other.subscribe("leds", Led, queue=4)
+        publisher = node.advertise("leds", Led)
+        async with asyncio.TaskGroup() as tasks:
+            for number in range(20):
+                tasks.create_task(publisher.publish(led(number)))
+            await settle(0.1)
+            got = []
+            for number in range(20, 40):  # while those still wait
+                got.append((await leds.fetch()).led)
+                tasks.create_task(publisher.publish(led(number)))
+                await settle()
+            got += [(await leds.fetch()).led for _ in range(20)]
+        assert got == list(range(40))
+
+
+@pytest.mark.virtual_time
+async def test_when_one_has_waited_long_enough_nobody_waits_any_more() -> None:
+    async with local() as module:
+        node, other = pair(module)
+        leds = other.subscribe("leds", Led, queue=1)
+        missed = Recorder()
+        publisher = node.advertise("leds", Led, r2p.NonRealTime(stall=STALL, on_missed=missed))
+        await publisher.publish(led(0))
+        first = asyncio.create_task(publisher.publish(led(1)))
+        await settle(0.5 * STALL)
+        second = asyncio.create_task(publisher.publish(led(2)))
+        await settle(0.6 * STALL)
+        assert first.done()
+        assert second.done()
+        assert (drain(leds), leds.lost, publisher.missed) == ([2], 2, 2)
+        assert missed.reasons == ["no room for 1.0 s"] * 2
+
+
+@pytest.mark.virtual_time
+async def test_an_event_gets_the_first_place_and_events_keep_their_order() -> None:
+    async with local() as module:
+        node, other = pair(module)
+        leds = other.subscribe("leds", Led, queue=1)
+        bulk = node.advertise("leds", Led)
+        alarms = [node.advertise("leds", Led, r2p.Sporadic(1.0)) for _ in range(2)]
+        await bulk.publish(led(0))
+        waiting = [asyncio.create_task(bulk.publish(led(number))) for number in (8, 9)]
+        await settle()
+        for number in range(1, 7):
+            assert not alarms[number % 2].publish_nowait(led(number))
+        assert [(await leds.fetch()).led for _ in range(9)] == [0, 1, 2, 3, 4, 5, 6, 8, 9]
+        await asyncio.gather(*waiting)
+        assert not leds._room  # nothing is left behind
+
+
+@pytest.mark.virtual_time
+async def test_a_message_that_several_did_not_get_is_one_that_was_missed() -> None:
+    missed = Recorder()
+    async with local() as module:
+        node, other = pair(module)
+        third = module.start(hold, name="third")
+        full = [other.subscribe("a", Led, queue=1), third.subscribe("a", Led, queue=1)]
+        full += [other.subscribe("b", Led, queue=1), third.subscribe("b", Led, queue=1)]
+        state = node.advertise("a", Led, r2p.NonRealTime(stall=STALL, on_missed=missed))
+        event = node.advertise("b", Led, r2p.Sporadic(0.5, on_missed=missed))
+        for publisher in (state, event):
+            await publisher.publish(led(1))
+        state.publish_nowait(led(2))
+        await event.publish(led(2))
+        await state.publish(led(3))
+        assert (state.missed, event.missed, [each.lost for each in full]) == (2, 1, [2, 2, 1, 1])
+        assert {each.where for each in missed.calls} == {"sub, third"}
+        assert [each.count for each in missed.calls] == [1, 1, 1]
+
+
+@pytest.mark.virtual_time
+async def test_one_message_may_be_missed_here_and_there() -> None:
+    missed = Recorder()
+    async with local() as module:
+        node, other = pair(module)
+        other.subscribe("leds", Led, queue=1)
+        publisher = node.advertise("leds", Led, r2p.Sporadic(0.5, on_missed=missed))
+        await publisher.publish(led(1))
+        await publisher.publish(led(2))
+        publisher.link_missed("can", "never sent", 0.0, publisher.sent)
+        await settle(1.0)
+        assert [(each.where, each.count) for each in missed.calls] == [("can", 1), ("sub", 0)]
+        assert publisher.missed == 1

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
 import r2p
 from r2p.msg import Led
 from r2p.transports.memory import IN_FLIGHT, MemoryLink, network
-from tests.bench import Recorder, drain, elapsed, hold, joined, led, local, pair, settle
+from tests.bench import Recorder, crashes, drain, elapsed, hold, joined, led, local, pair, settle
 
 STALL = 1.0
 
@@ -22,7 +22,7 @@ async def test_guarantees_tell_what_the_class_means_on_each_link() -> None:
         node, _ = pair(module)
         assert node.advertise("a", Led).guarantees == {
             "": "waits for room in every queue",
-            "memory:lab": module.links[0].guarantee(r2p.PublisherClass.NON_REAL_TIME),
+            "memory:lab": module.links[0].guarantee("leds", r2p.PublisherClass.NON_REAL_TIME),
         }
         assert "best effort" in node.advertise("b", Led, r2p.Sporadic(1.0)).guarantees["memory:lab"]
         assert "absolute phase" in node.advertise("c", Led, r2p.Periodic(1.0, Led)).guarantees[""]
@@ -70,6 +70,28 @@ async def test_losing_a_link_is_signalled_as_degraded(caplog: pytest.LogCaptureF
 
 
 @pytest.mark.virtual_time
+async def test_a_signal_that_raises_while_a_link_goes_down_crashes_its_node_and_not_the_link() -> None:
+    def broken(missed: r2p.Missed) -> None:
+        raise ValueError(missed.reason)
+
+    async def main() -> None:
+        async with joined("A") as a, joined("B") as b:
+
+            async def cuts(node: r2p.Node) -> None:
+                await node.advertise("leds", Led, r2p.NonRealTime(on_degraded=broken)).wait_subscriber()
+                a.links[0].went_down("cut")
+                assert not a.links[0].discovery.modules
+                await asyncio.Event().wait()
+
+            b.start(hold).subscribe("leds", Led)
+            a.start(cuts)
+            await a.wait()
+
+    (error,) = await crashes(main)
+    assert repr(error) == "ValueError('cut')"
+
+
+@pytest.mark.virtual_time
 async def test_publish_waits_for_a_links_send_buffer_too() -> None:
     async with joined("A") as a, joined("B") as b:
         publisher = a.start(hold).advertise("leds", Led, r2p.NonRealTime(stall=STALL))
@@ -103,16 +125,17 @@ async def test_a_link_that_makes_no_room_in_time_is_lossy_until_it_has(monkeypat
         assert missed.calls == [r2p.Missed("leds", "no room for 1.0 s", where="memory:lab")]
         link = a.links[0]
         assert link.stats.lost["send buffer full"] == 10
-        assert len(link._room) == 1  # it recovers by itself, and nobody else waits
+        assert len(link.room.recoveries) == 1  # it recovers by itself, and nobody else waits
+        assert not link.room.claims
         full = False
-        link._made_room()
+        link.made_room()
         await publisher.publish(led(20))
         full = True
         publishing = asyncio.create_task(publisher.publish(led(21)))
         await settle(0.5 * STALL)
         assert not publishing.done()  # it is waited for again
         full = False
-        link._made_room()
+        link.made_room()
         await publishing
         await settle()
         assert drain(leds) == [20, 21]
@@ -230,3 +253,86 @@ async def test_what_subscribers_miss_while_their_link_is_down_is_counted() -> No
         link.connect()
         await settle(1.0)
         assert "leds" not in a.space.topics
+
+
+@pytest.mark.virtual_time
+async def test_the_driver_of_a_periodic_publisher_sends_the_sample_itself() -> None:
+    async with joined("A") as a, joined("B") as b:
+        publisher = a.start(hold).advertise("leds", Led, r2p.Periodic(0.1, Led))
+        leds = b.start(hold).subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        link = a.links[0]
+        assert publisher.drive(link, 0.1)
+        sent = link.stats.sent
+        assert publisher.tick(0, 0, 0) is not None
+        await settle(1.0)
+        assert (link.stats.sent, drain(leds)) == (sent, [])
+        publisher.undrive(link)
+        await settle(0.15)
+        assert len(drain(leds)) == 1
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("late", ["drop", "send"])
+async def test_a_link_is_asked_for_room_and_told_what_late_means(
+    late: Literal["drop", "send"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[r2p.Sample] = []
+    monkeypatch.setattr(MemoryLink, "takes", lambda _link, sample: asked.append(sample))
+    async with joined("A") as a, joined("B") as b:
+        publisher = a.start(hold).advertise("leds", Led, r2p.Sporadic(0.5, late=late))
+        b.start(hold).subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        assert not publisher.publish_nowait(led(1))
+        assert [sample.drop_late for sample in asked] == [late == "drop"]
+
+
+@pytest.mark.virtual_time
+async def test_a_link_that_does_not_wait_leaves_those_alone_who_do() -> None:
+    """A reader that is too slow for both: what comes over the link is lossy, the module's own publisher waits."""
+    got = []
+
+    async def reader(node: r2p.Node) -> None:
+        async for message in node.subscribe("leds", Led, queue=4):
+            await asyncio.sleep(0.1)
+            got.append(message)
+
+    async def publish(node: r2p.Node, value: int) -> None:
+        publisher = node.advertise("leds", Led)
+        await publisher.wait_subscriber()
+        while True:
+            await publisher.publish(Led(value=value))
+            await asyncio.sleep(0.02)
+
+    async with joined("A") as a, joined("B") as b:
+        a.start(reader)
+        a.start(publish, 1, name="near")
+        b.start(publish, 2, name="far")
+        await settle(20.0)
+        (near,) = a.space.topics["leds"].publishers
+        assert isinstance(near, r2p.Publisher)
+        assert near.missed == 0
+        (leds,) = a.space.topics["leds"].queues
+        assert leds.patient
+        assert leds.lost > 100
+        assert {each.value for each in got} == {1, 2}
+
+
+@pytest.mark.virtual_time
+async def test_a_link_keeps_nothing_of_a_reader_that_left() -> None:
+    async with joined("A") as a, joined("B") as b:
+        publisher = a.start(hold).advertise("leds", Led)
+        other = b.start(hold)
+        slow, quick = other.subscribe("leds", Led, queue=1), other.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        for number in range(5):
+            await publisher.publish(led(number))
+            await settle(0.1)
+        assert slow.lost == 4
+        intake: Any = b.links[0]._intake
+        assert intake._lossy == {slow}
+        slow.close()
+        assert not intake._lossy
+        await publisher.publish(led(5))
+        await settle()
+        assert drain(quick) == list(range(6))

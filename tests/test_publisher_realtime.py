@@ -8,7 +8,7 @@ import pytest
 
 import r2p
 from r2p.msg import Encoder, Led
-from tests.bench import MS, Recorder, crashes, drain, elapsed, hold, led, local, pair, settle
+from tests.bench import MS, SECOND, Recorder, crashes, drain, elapsed, hold, led, local, pair, settle
 
 # Sporadic
 
@@ -147,14 +147,6 @@ async def test_a_subscriber_that_leaves_takes_its_pending_events_along() -> None
         assert (drain(rest), missed.calls) == ([1], [])
 
 
-@pytest.mark.parametrize("klass", [r2p.Sporadic(0.0), r2p.Sporadic(-1.0), r2p.Sporadic(1.0, pending=0)])
-@pytest.mark.virtual_time
-async def test_a_sporadic_class_without_sense_is_refused(klass: r2p.Sporadic) -> None:
-    async with local() as module:
-        with pytest.raises(r2p.MessageError, match="deadline > 0 s and pending >= 1"):
-            module.start(hold).advertise("leds", Led, klass)
-
-
 # Periodic
 
 
@@ -211,8 +203,7 @@ class Blocked:
         self.clock = module.space.clock
 
     def by(self, seconds: float) -> None:
-        elapsed = self.clock.monotonic() / 1e9 + seconds
-        self.clock.move_to(elapsed)  # type: ignore[attr-defined]  # the virtual clock's
+        self.clock.move_to(self.clock.monotonic() + round(seconds * SECOND))  # type: ignore[attr-defined]  # the virtual clock's
 
 
 @pytest.mark.virtual_time
@@ -273,3 +264,46 @@ async def test_a_periodic_publisher_ends_with_its_node() -> None:
         module.start(short)
         await settle(2.0)
         assert len(calls) == 3
+
+
+@pytest.mark.virtual_time
+async def test_a_driver_is_the_clock_until_it_lets_go() -> None:
+    slots, other_slots = object(), object()
+    async with local() as module:
+        node, other = pair(module)
+        leds = other.subscribe("leds", Led)
+        values = iter([led(1), led(2), None, led(4)])
+        publisher = node.advertise("leds", Led, r2p.Periodic(0.1, values.__next__, lead=0.002))
+        assert publisher.lead == 0.002
+        await settle(0.15)
+        assert publisher.drive(slots, 0.05)
+        assert publisher.drive(slots, 0.08)  # another period
+        assert not publisher.drive(other_slots, 0.1)
+        await settle(1.0)
+        assert (publisher.period, drain(leds)) == (0.08, [1])
+        sample = publisher.tick(module.space.clock.monotonic(), 0, 0)
+        assert sample is not None
+        assert (Led.decode(sample.data), sample.sequence, drain(leds)) == (led(2), 2, [2])
+        assert publisher.tick(module.space.clock.monotonic(), 0, 0) is None
+        publisher.undrive(other_slots)
+        assert publisher.period == 0.08
+        publisher.undrive(slots)
+        await settle(0.15)
+        assert (publisher.period, drain(leds)) == (0.1, [4])
+        assert publisher.drive(other_slots, 0.1)
+        publisher.close()
+        assert not publisher.drive(slots, 0.1)
+        assert publisher.tick(0, 0, 0) is None
+
+
+@pytest.mark.virtual_time
+async def test_late_news_of_a_link_is_counted_and_signalled() -> None:
+    missed, late = Recorder(), Recorder()
+    async with local() as module:
+        node, _ = pair(module)
+        publisher = node.advertise("leds", Led, r2p.Sporadic(1.0, on_missed=missed, on_late=late))
+        publisher.link_missed("can", "no slot", 0.5)
+        publisher.link_late("can", "sent late", 0.25)
+        assert missed.calls == [r2p.Missed("leds", "no slot", where="can", late=0.5)]
+        assert late.calls == [r2p.Missed("leds", "sent late", where="can", late=0.25)]
+        assert (publisher.missed, publisher.late) == (1, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import pytest
@@ -55,11 +56,17 @@ async def test_a_full_queue_drops_for_its_own_subscriber_only(keep: str, left: l
 @pytest.mark.virtual_time
 @pytest.mark.parametrize(
     ("options", "text"),
-    [({"queue": 0}, "1 message or more"), ({"max_age": 0}, "max_age"), ({"timeout": -1.0}, "timeout")],
+    [
+        *(({"queue": bad}, "queue is a number of messages, 1 or more") for bad in (0, -1, 1.5, math.nan, None, True)),
+        *(({"max_age": bad}, "max_age is in seconds, 1e-06 to") for bad in (0, math.nan, math.inf, "1")),
+        *(({"timeout": bad}, "timeout is in seconds, 1e-06 to") for bad in (-1.0, 1e-9, math.nan, math.inf)),
+        ({"keep": "latest"}, "keep is 'newest' or 'oldest', not 'latest'"),
+        ({"callback": 5}, "a callback is a function, not 5: options are given by name"),
+    ],
 )
 async def test_options_without_sense_are_refused(options: dict[str, Any], text: str) -> None:
     async with local() as module:
-        with pytest.raises(ValueError, match=text):
+        with pytest.raises(r2p.MessageError, match=text):
             pair(module, **options)
         assert list(module.space.topics["leds"].queues) == []
 

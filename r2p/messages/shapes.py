@@ -142,15 +142,25 @@ class Len(msgspec.Struct, frozen=True):
 
 
 u8 = Annotated[int, Scalar("u8", "B")]
+"""An integer of 1 byte: 0 to 255."""
 u16 = Annotated[int, Scalar("u16", "H")]
+"""An integer of 2 bytes: 0 to 65 535."""
 u32 = Annotated[int, Scalar("u32", "I")]
+"""An integer of 4 bytes: 0 to 4 294 967 295."""
 u64 = Annotated[int, Scalar("u64", "Q")]
+"""An integer of 8 bytes: 0 to 2**64 - 1."""
 i8 = Annotated[int, Scalar("i8", "b")]
+"""An integer of 1 byte: -128 to 127."""
 i16 = Annotated[int, Scalar("i16", "h")]
+"""An integer of 2 bytes: -32 768 to 32 767."""
 i32 = Annotated[int, Scalar("i32", "i")]
+"""An integer of 4 bytes: -2**31 to 2**31 - 1."""
 i64 = Annotated[int, Scalar("i64", "q")]
+"""An integer of 8 bytes: -2**63 to 2**63 - 1."""
 f32 = Annotated[float, Scalar("f32", "f")]
+"""A float of 4 bytes: 24 bits of precision, up to 3.4e38; rounded when it is packed."""
 f64 = Annotated[float, Scalar("f64", "d")]
+"""A float of 8 bytes: what a Python float is."""
 
 BOOL = Scalar("bool", "?")
 HINTS: dict[str, Any] = {

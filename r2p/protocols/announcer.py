@@ -3,7 +3,7 @@
 import msgspec
 
 from r2p.codecs import management
-from r2p.codecs.management import NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.directory import FOR_EVER, LEASE
 from r2p.protocols.events import Shape
 from r2p.protocols.outbox import Outbox
@@ -20,8 +20,9 @@ class Own(msgspec.Struct, frozen=True):
     def type(self, topic: str, role: int) -> management.TypeInfo:
         return management.TypeInfo(role, topic, self.shape.fingerprint, self.shape.size)
 
-    def request(self, topic: str) -> management.SubscribeRequest:
-        return management.SubscribeRequest(topic, self.shape.size, self.queue)
+
+Relayed = management.Hello | management.Alive | management.Endpoint
+"""What a gateway passes on of other modules."""
 
 
 class Announcer:
@@ -35,13 +36,15 @@ class Announcer:
         self.publishers: dict[str, Own] = {}
         self.subscribers: dict[str, Own] = {}
         self.r2p = False
+        self.answered: set[str] = set()
+        """The subscribed topics that somebody publishes to us."""
         self._module = module
         self._instance = instance
         self._observer = observer
         self._schedule = schedule
         self._outbox = outbox
         self._endpoints: dict[tuple[str, str, int], int] = {}
-        self._items: dict[tuple[Kind, tuple[str | int, ...]], Item] = {}
+        self._relayed: dict[tuple[str | int, ...], management.Management] = {}
 
     def publish(self, topic: str, own: Own) -> bool:
         """Announce a publisher of the topic. Says whether that is news."""
@@ -74,9 +77,24 @@ class Announcer:
                 self.once(Kind.ENDPOINT_GONE, node, topic, role)
 
     def once(self, kind: Kind, *key: str | int) -> None:
-        """Say it as soon as the rate allows, if the link is up."""
+        """Say it as soon as the rate allows, if the link is up. What waits already is not said twice."""
         if self._outbox.up:
             self._schedule.add(Item(kind, key, once=True))
+
+    def relay(self, message: Relayed) -> None:
+        """Say what another module has said on another link, as soon as the rate allows."""
+        if not self._outbox.up:
+            return
+        match message:
+            case management.Hello(module) | management.Alive(module):
+                key: tuple[str | int, ...] = (type(message).__name__, module)
+            case management.Endpoint(role, instance, node, topic):
+                key = (instance, node, topic, role & ~ROLE_GONE)
+        if isinstance(message, management.Hello):
+            lease = max(message.lease_ms, 3 * self._schedule.relay_time // 1_000_000)
+            message = msgspec.structs.replace(message, lease_ms=min(lease, 0xFFFF))
+        self._relayed[key] = message
+        self._schedule.relay(Item(Kind.RELAY, key, once=True))
 
     def follow(self, *, r2p: bool) -> None:
         """Endpoints are only told while there are r2p modules to hear it."""
@@ -102,6 +120,11 @@ class Announcer:
         lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // 1_000_000
         return management.Hello(self._module, self._instance, flags | tool, 0, lease)
 
+    def request(self, topic: str, own: Own) -> management.SubscribeRequest:
+        """Our request; r2p modules are told whether anybody has answered yet."""
+        unanswered = self.r2p and topic not in self.answered
+        return management.SubscribeRequest(topic, own.shape.size, own.queue, UNANSWERED if unanswered else NO_PARAMS)
+
     def _enter(self, table: dict[str, Own], kind: Kind, topic: str, own: Own) -> bool:
         if table.get(topic) == own:
             return False
@@ -117,14 +140,10 @@ class Announcer:
 
     def _add(self, kind: Kind, *key: str | int) -> None:
         """Say it as soon as possible, and again and again."""
-        self._drop(kind, *key)
-        item = self._items[kind, key] = Item(kind, key)
-        self._schedule.add(item)
+        self._schedule.add(Item(kind, key))
 
     def _drop(self, kind: Kind, *key: str | int) -> None:
-        item = self._items.pop((kind, key), None)
-        if item is not None:
-            self._schedule.drop(item)
+        self._schedule.drop(Item(kind, key))
 
     def _messages(self, item: Item) -> list[management.Management]:
         match item.kind, item.key:
@@ -133,7 +152,7 @@ class Announcer:
                 return self._typed(own, topic, ROLE_PUBLISHES, _advertise(topic, own))
             case Kind.SUBSCRIBER, (str(topic),):
                 own = self.subscribers[topic]
-                return self._typed(own, topic, ROLE_SUBSCRIBES, own.request(topic))
+                return self._typed(own, topic, ROLE_SUBSCRIBES, self.request(topic, own))
             case Kind.UNSUBSCRIBE, (str(topic),):
                 return [management.Unsubscribe(topic, self._instance)]
             case Kind.CONFLICT, (str(module), int(a), int(b)):
@@ -143,6 +162,8 @@ class Announcer:
                 return [management.Endpoint(role, self._instance, node, topic, publisher_class)]
             case Kind.ENDPOINT_GONE, (str(node), str(topic), int(role)):
                 return [management.Endpoint(role | ROLE_GONE, self._instance, node, topic)]
+            case Kind.RELAY, key:
+                return [self._relayed.pop(key)]
             case kind, _:
                 return self._presence(management.HELLO_QUERY if kind is Kind.QUERY else 0)
 

@@ -65,6 +65,8 @@ class Directory:
         self.modules: dict[str, ModuleInfo] = {}
         self.topics: dict[str, TopicInfo] = {}
         self.endpoints: dict[EndpointKey, EndpointInfo] = {}
+        self.generation = 0
+        """Another number means that modules or endpoints have changed."""
         self._counts = counts
         self._names: dict[int, str] = {}
         self._starts: dict[str, _Starts] = {}
@@ -105,6 +107,7 @@ class Directory:
         before = self.modules.get(info.name)
         if before is not None and before.instance is not None and before.instance != info.instance:
             self._forget_instance(before.instance)
+        self.generation += before is None or _who(before) != _who(info)
         forgotten = self._put(self.modules, info.name, info, "modules forgotten")
         if info.instance is not None:
             self._names[info.instance] = info.name
@@ -115,6 +118,7 @@ class Directory:
     def remove(self, info: ModuleInfo) -> None:
         """A module is gone, and its endpoints with it."""
         if self.modules.pop(info.name, None) is not None:
+            self.generation += 1
             self._forget(info)
 
     def count_swaps(self, now: int, before: ModuleInfo | None, instance: int) -> int:
@@ -151,12 +155,20 @@ class Directory:
         role = message.role & ~management.ROLE_GONE
         key = (message.instance, message.node, message.topic, role)
         if message.role & management.ROLE_GONE:
-            self.endpoints.pop(key, None)
+            self.forget_endpoint(key)
             return None, key
         module = self.name_of(message.instance)
         info = EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
+        self.generation += self.endpoints.get(key) != info
         old = self._put(self.endpoints, key, info, "endpoints forgotten")
         return key, None if old is None else (old.instance, old.node, old.topic, old.role)
+
+    def forget_endpoint(self, key: EndpointKey) -> None:
+        self.generation += self.endpoints.pop(key, None) is not None
+
+    def forget_endpoints(self) -> None:
+        self.generation += 1
+        self.endpoints.clear()
 
     def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
         """Enter a value as the latest heard one; what had to go for it comes back."""
@@ -176,4 +188,8 @@ class Directory:
     def _forget_instance(self, instance: int) -> None:
         self._names.pop(instance, None)
         for key in [key for key in self.endpoints if key[0] == instance]:
-            del self.endpoints[key]
+            self.forget_endpoint(key)
+
+
+def _who(info: ModuleInfo) -> tuple[object, ...]:
+    return (info.instance, info.observer, info.source)

@@ -12,7 +12,8 @@ from typing import Any
 from r2p.codecs import UnknownType, management
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
-from r2p.protocols.announcer import Announcer, Own
+from r2p.protocols.announcer import Announcer, Own, Relayed
+from r2p.protocols.demand import Demand, HeardDemand
 from r2p.protocols.directory import Directory, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.events import (
     Command,
@@ -72,6 +73,7 @@ class Discovery:
 
     `rate` is the most management messages a second that nobody asked for, `burst` how many of them may go at once,
     `quiet` the time (s) without management traffic before something is repeated. An `observer` sends no ALIVE.
+    `counts` is the counter to use, where its owner wants to see it grow.
 
     Every method takes `now` (monotonic ns) and gives back what to do, in order; call `poll` at `next_deadline()`.
     """
@@ -85,8 +87,9 @@ class Discovery:
         burst: int = 32,
         quiet: float = 0.0,
         observer: bool = False,
+        counts: Counter[str] | None = None,
     ) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter() if counts is None else counts
         """Received messages that were dropped, by reason."""
         self._module = module
         self._instance = instance
@@ -107,6 +110,7 @@ class Discovery:
             self._outbox,
             self.counts,
         )
+        self._demand: HeardDemand | None = None
         self._handlers: dict[type, Callable[[int, Any, Source], None]] = {
             management.Alive: self._neighbours.alive,
             management.Stop: self._stop,
@@ -144,6 +148,11 @@ class Discovery:
         """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
         return self._directory.endpoints
 
+    @property
+    def generation(self) -> int:
+        """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
+        return self._directory.generation
+
     # What the module has and wants
 
     def set_flags(self, now: int, flags: int) -> list[Event]:
@@ -159,6 +168,8 @@ class Discovery:
         """The module publishes this topic: messages of `size` bytes. `params` are the transport's."""
         if self._announcer.publish(topic, Own(Shape(size, fingerprint), params)):
             self._exchange.retyped(topic, ROLE_SUBSCRIBES)
+            for source in self._demand.who(topic, ROLE_SUBSCRIBES) if self._demand is not None else ():
+                self._exchange.requested(now, management.SubscribeRequest(topic, size, 1), source)  # was heard before
         return self._go_on(now)
 
     def withdraw(self, now: int, topic: str) -> list[Event]:
@@ -209,7 +220,24 @@ class Discovery:
         self._announcer.once(Kind.CONFLICT, module, instance_a, instance_b)
         return self._go_on(now)
 
+    # For gateways
+
+    def demand(self) -> Demand:
+        """What others offer and want; kept from the first call on."""
+        if self._demand is None:
+            self._demand = HeardDemand(self._timers, self._directory)
+        return self._demand
+
+    def relay(self, now: int, message: Relayed) -> list[Event]:
+        """Pass on what a module on another link has said."""
+        self._announcer.relay(message)
+        return self._go_on(now)
+
     # The link
+
+    def pace(self, rate: float, burst: int, quiet: float) -> None:
+        """Speak at another rate from now on: for links that learn only in use what the others bear."""
+        self._schedule.pace(rate, burst, round(quiet * _SECOND))
 
     def link_up(self, now: int) -> list[Event]:
         """The other end can be reached: introduce yourself, ask, and announce everything."""
@@ -223,6 +251,8 @@ class Discovery:
         self._schedule.stop()
         self._neighbours.interrupted(now)
         self._exchange.interrupted()
+        if self._demand is not None:
+            self._demand.interrupted()
         return self._outbox.take()
 
     def leave(self, now: int) -> list[Event]:
@@ -262,6 +292,8 @@ class Discovery:
             handler = self._handlers.get(type(message))
             if handler is not None and not self._neighbours.is_echo(now, data):
                 handler(now, message, source)
+                if self._demand is not None:
+                    self._demand.heard(now, message, source)
         return self._outbox.take()
 
     def _go_on(self, now: int) -> list[Event]:
@@ -274,10 +306,12 @@ class Discovery:
                 self._exchange.lease_over(source, topic)
             case ("module", str(name)):
                 self._neighbours.expired(now, name)
+            case ("demand", str(topic), int(role), source) if self._demand is not None:
+                self._demand.expired(topic, role, source)
             case ("peer", source):
                 self._exchange.memory_over(source)
             case ("endpoint", (int(instance), str(node), str(topic), int(role))):
-                self.endpoints.pop((instance, node, topic, role), None)
+                self._directory.forget_endpoint((instance, node, topic, role))
 
     # Orders
 

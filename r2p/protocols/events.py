@@ -137,4 +137,38 @@ class ModuleGone(msgspec.Struct, frozen=True):
     info: ModuleInfo
 
 
-Event = Send | Joined | Left | Opened | Shut | Obey | Mismatched | NameConflict | Echoes | ModuleChanged | ModuleGone
+class Declare(msgspec.Struct, frozen=True):
+    """Keep this liveliness token, for as long as we live or until `Undeclare`."""
+
+    key: str
+
+
+class Undeclare(msgspec.Struct, frozen=True):
+    """Keep it no more."""
+
+    key: str
+
+
+class Parted(msgspec.Struct, frozen=True):
+    """One remote subscriber is gone; if it was the last one, `Left` follows. Told where they are told apart."""
+
+    topic: str
+    source: Source
+
+
+Event = (
+    Send
+    | Joined
+    | Left
+    | Opened
+    | Shut
+    | Obey
+    | Mismatched
+    | NameConflict
+    | Echoes
+    | ModuleChanged
+    | ModuleGone
+    | Declare
+    | Undeclare
+    | Parted
+)

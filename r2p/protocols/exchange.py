@@ -8,7 +8,7 @@ so two that disagree don't argue.
 from collections import Counter
 
 from r2p.codecs import management
-from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.announcer import Announcer, Own
 from r2p.protocols.directory import LEASE, Directory
 from r2p.protocols.events import Joined, Left, Mismatched, ModuleInfo, Opened, Shape, Shut, Source
@@ -44,7 +44,7 @@ class Exchange:
         if peer.is_r2p(now):
             self._outbox.say(own.type(topic, ROLE_SUBSCRIBES))
         if self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
-            self._outbox.say(own.request(topic))
+            self._outbox.say(self._own.request(topic, own))
 
     def requested(self, now: int, message: management.SubscribeRequest, source: Source) -> None:
         """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
@@ -62,7 +62,8 @@ class Exchange:
         if theirs is not None and not self._fits(peer, topic, ROLE_SUBSCRIBES, theirs):
             return
         self._outbox.say(management.SubscribeResponse(topic, own.shape.size, max(message.queue, 1), own.params))
-        if self._peers.join(peer, topic):
+        unanswered = peer.is_r2p(now) and message.params == UNANSWERED
+        if self._peers.join(now, peer, topic, unanswered=unanswered):
             self._outbox.tell(Joined(topic, message.params, message.queue, source))
         self._renew(now, peer, topic)
 
@@ -76,6 +77,7 @@ class Exchange:
         info.size = message.size or info.size
         if peer.opened.get(topic) != (message.params, message.size):
             peer.opened[topic] = (message.params, message.size)
+            self._own.answered.add(topic)
             self._outbox.tell(Opened(topic, source, message.params, message.size))
 
     def typed(self, now: int, message: management.TypeInfo, source: Source) -> None:
@@ -124,6 +126,9 @@ class Exchange:
         peer = self._peers.obtain(info.source)
         if peer is None:
             return
+        if not peer.is_r2p(now):  # nor was it firmware that asked before the link was down
+            for topic in [topic for topic, stale in peer.requests.items() if stale]:
+                self._end(peer, topic)
         if is_new and peer.r2p_until:  # the first HELLO of all may just be later than its module's requests
             peer.mark_stale()
         peer.meet(now, info)
@@ -219,6 +224,8 @@ class Exchange:
 
     def _shut(self, peer: Peer, topic: str) -> None:
         if peer.opened.pop(topic, None) is not None:
+            if not any(topic in each.opened for each in self._peers.all()):
+                self._own.answered.discard(topic)
             self._outbox.tell(Shut(topic, peer.source))
 
 

@@ -54,6 +54,8 @@ class Neighbours:
 
     def alive(self, now: int, message: management.Alive, source: Source) -> None:
         """Any module shows its state."""
+        if message.module.startswith("_"):
+            return  # a gateway looks for loops: no module is called that, and tools send no ALIVE
         if message.module == self._module and not self._is_namesake(now):
             return
         before, info = self._directory.alive(now, message, source)
@@ -64,11 +66,19 @@ class Neighbours:
     def hello(self, now: int, message: management.Hello, source: Source) -> None:
         """An r2p module, maybe this very one."""
         if (message.module, message.instance) == (self._module, self._instance):
-            self._heard_ourselves(now)
+            if not message.hops:  # else a gateway does not know yet that we are on both sides of it
+                self._heard_ourselves(now)
+        elif self._is_nearer(message):
+            pass  # a gateway does not know yet that the module is on both sides of it
         elif message.flags & management.HELLO_LEAVING:
             self._leaving(now, message, source)
         else:
             self._present(now, message, source)
+
+    def _is_nearer(self, message: management.Hello) -> bool:
+        """Whether the module is known to be nearer than a gateway says."""
+        info = self._directory.modules.get(message.module)
+        return info is not None and info.instance == message.instance and info.hops < message.hops
 
     def endpoint(self, now: int, message: management.Endpoint, source: Source) -> None:
         """A publisher or subscriber of a remote node."""
@@ -101,7 +111,7 @@ class Neighbours:
 
     def interrupted(self, now: int) -> None:
         """The link is down: nobody can be heard."""
-        self._directory.endpoints.clear()
+        self._directory.forget_endpoints()
         self._echoing_until = 0
         for info in [info for info in self._directory.modules.values() if info.r2p]:
             self._gone(now, info)

@@ -14,13 +14,17 @@ from r2p.protocols.events import ModuleInfo, Shape, Source
 MOST = 4096
 """Peers on one link."""
 
+ANSWERED = 1_000_000_000
+"""Ns after which an answer has come, or was lost: less than a round of repetition."""
+
 
 class Peer(msgspec.Struct, eq=False):
     """One address on the link.
 
     `direct`: the r2p modules there, by name (several share an address where a line has more than two ends). `lease` in
     ns, None: as long as the module lives. `requests`: the topics subscribed, and whether the module restarted since;
-    `permanent`: those that are no leases. The keys of `types` and `refused` are topic and role.
+    `joined_at`: when that was told last (ns); `permanent`: those that are no leases. The keys of `types` and `refused`
+    are topic and role.
     """
 
     source: Source
@@ -28,6 +32,7 @@ class Peer(msgspec.Struct, eq=False):
     r2p_until: int = 0
     lease: int | None = None
     requests: dict[str, bool] = msgspec.field(default_factory=dict)
+    joined_at: dict[str, int] = msgspec.field(default_factory=dict)
     permanent: set[str] = msgspec.field(default_factory=set)
     opened: dict[str, tuple[bytes, int]] = msgspec.field(default_factory=dict)
     types: dict[tuple[str, int], Shape] = msgspec.field(default_factory=dict)
@@ -79,19 +84,27 @@ class Peers:
     def all(self) -> list[Peer]:
         return list(self._peers.values())
 
-    def join(self, peer: Peer, topic: str) -> bool:
-        """The peer subscribes the topic. Says whether that is new, or as good as new."""
+    def join(self, now: int, peer: Peer, topic: str, *, unanswered: bool) -> bool:
+        """The peer subscribes the topic. Says whether that is new, or as good as new.
+
+        So it is when the peer is still `unanswered` a while after the last time: the answer was lost, and with it what
+        was sent before the peer took anything.
+        """
         stale = peer.requests.get(topic)
         peer.requests[topic] = False
         if stale is None:
             self._subscribed[topic] += 1
-        return stale is not False
+        elif not stale and not (unanswered and now - peer.joined_at[topic] >= ANSWERED):
+            return False
+        peer.joined_at[topic] = now
+        return True
 
     def end(self, peer: Peer, topic: str) -> bool:
         """The peer's subscription is over. Says whether it was the last one of the topic."""
         if peer.requests.pop(topic, None) is None:
             return False
         peer.permanent.discard(topic)
+        del peer.joined_at[topic]
         self._subscribed[topic] -= 1
         if self._subscribed[topic]:
             return False

@@ -5,7 +5,7 @@ places to visit without waiting (`_eager`) to a full round: fifty wishes at once
 """
 
 import heapq
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from enum import Enum, auto
 
@@ -34,15 +34,15 @@ class Kind(Enum):
     ENDPOINT_GONE = auto()
     UNSUBSCRIBE = auto()
     CONFLICT = auto()
+    RELAY = auto()
 
 
-class Item(msgspec.Struct, eq=False):
-    """One thing to announce: again and again, or `once`. Not alive: withdrawn, forgotten when its turn comes."""
+class Item(msgspec.Struct, frozen=True):
+    """One thing to announce: again and again, or `once`. What is to be said is looked up when its turn comes."""
 
     kind: Kind
     key: tuple[str | int, ...] = ()
     once: bool = False
-    alive: bool = True
 
 
 class Bucket:
@@ -65,10 +65,11 @@ class Schedule:
     """What to announce next, and when. Each call costs the same, however much there is to repeat."""
 
     def __init__(self, rate: float, burst: int, quiet: int) -> None:
-        self._bucket = Bucket(rate, max(burst, _MOST))
-        self._quiet = quiet
-        self._fresh: deque[Item] = deque()
-        self._ring: deque[Item] = deque()
+        self.pace(rate, burst, quiet)
+        self._fresh: OrderedDict[Item, None] = OrderedDict()
+        self._ring: OrderedDict[Item, None] = OrderedDict()
+        self._relayed: OrderedDict[Item, None] = OrderedDict()
+        self._relay_next = True
         self._count = 0
         self._eager = 0
         self._step_at = 0
@@ -76,27 +77,43 @@ class Schedule:
         self._presence_sent = -_SECOND
         self._traffic_at = -_SECOND
 
+    def pace(self, rate: float, burst: int, quiet: int) -> None:
+        """Go at another rate from now on."""
+        self._bucket = Bucket(rate, max(burst, _MOST))
+        self._quiet = quiet
+
     def add(self, item: Item) -> None:
-        """Announce it as soon as the rate allows, and unless `once` for ever."""
-        self._fresh.append(item)
+        """Announce it as soon as the rate allows, and unless `once` for ever. What waits for its turn keeps it."""
+        if item in self._fresh:
+            return
+        self.drop(item)
+        self._fresh[item] = None
         self._count += not item.once
 
+    def relay(self, item: Item) -> None:
+        """Announce once what is another's: in turn with what is our own. What waits for its turn keeps it."""
+        self._relayed[item] = None
+
     def drop(self, item: Item) -> None:
-        item.alive = False
-        self._count -= not item.once
+        """Announce it no more."""
+        for items in (self._fresh, self._ring):
+            if item in items:
+                del items[item]
+                self._count -= not item.once
 
     def start(self, now: int) -> None:
         """The link is up: introduce yourself, then everything."""
         self.stop()
-        self._fresh.append(Item(Kind.QUERY, once=True))
+        self._fresh[Item(Kind.QUERY, once=True)] = None
         self._eager = self._count
         self._step_at = now + self._interval
         self._presence_at = now + self._presence_period
 
     def stop(self) -> None:
         """Nothing is due any more; what was to be said once is forgotten."""
-        self._ring.extend(item for item in self._fresh if item.alive and not item.once)
+        self._ring.update((item, None) for item in self._fresh if not item.once)
         self._fresh.clear()
+        self._relayed.clear()
         self._eager = 0
 
     def repeat(self, now: int) -> None:
@@ -111,26 +128,29 @@ class Schedule:
 
     def due(self) -> int:
         """When there is something to announce (ns)."""
-        _drop_dead(self._fresh)
-        return max(0 if self._fresh else self._turn_at(), self._bucket.ready_at(_MOST))
+        return max(0 if self._fresh or self._relayed else self._turn_at(), self._bucket.ready_at(_MOST))
 
     def pop(self, now: int) -> Item | None:
         """What to announce now, if anything; say with `sent` what it cost."""
         if self.due() > now:
             return None
         if self._fresh:
-            item = self._fresh.popleft()
+            item, _ = self._fresh.popitem(last=False)
             if not item.once:
-                self._ring.append(item)
+                self._ring[item] = None
             return item
+        if self._relayed and (self._relay_next or self._turn_at() > now):
+            self._relay_next = False
+            return self._relayed.popitem(last=False)[0]
+        self._relay_next = True
         self._step_at = now + self._interval
-        _drop_dead(self._ring)
         if self._presence_at <= now or not self._ring:
             self._presence_sent, self._presence_at = now, now + self._presence_period
             return Item(Kind.PRESENCE, once=True)
         self._eager -= self._eager > 0
-        self._ring.rotate(-1)
-        return self._ring[-1]
+        item = next(iter(self._ring))
+        self._ring.move_to_end(item)
+        return item
 
     def sent(self, now: int, count: int) -> None:
         self._bucket.take(now, count)
@@ -141,6 +161,11 @@ class Schedule:
         """How long it takes to repeat everything (ns)."""
         slot = max(self._interval, _MOST * self._bucket.gap, self._quiet)
         return max(_ROUND, (self._count + 1) * slot)
+
+    @property
+    def relay_time(self) -> int:
+        """How long it takes until all that is relayed has had its turn (ns)."""
+        return 2 * _MOST * self._bucket.gap * len(self._relayed)
 
     @property
     def _interval(self) -> int:
@@ -204,8 +229,3 @@ class Timers:
             return
         self._pushed += 1
         heapq.heappush(self._heap, (due, self._pushed, key))
-
-
-def _drop_dead(items: deque[Item]) -> None:
-    while items and not items[0].alive:
-        items.popleft()

@@ -4,23 +4,28 @@ A group of commands is a module with `app`, a `session.group(...)`; a single com
 function as Typer takes it. How they join the network, and end: see `r2p.tools.session`.
 """
 
+import errno
 import importlib
 import os
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
 from r2p.tools.output import abandon_stdout
+from r2p.tools.stderr import say
 
 GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
     "node": ("r2p.tools.node", "Nodes, and what they publish and subscribe."),
     "module": ("r2p.tools.module", "Modules: list, stop, reboot, bootload."),
+    "bus": ("r2p.tools.bus", "An RTCAN bus: its load, its frames, its slots."),
 }
 COMMANDS = {
     "run": ("r2p.tools.run", "Run functions as the nodes of a module."),
+    "gateway": ("r2p.tools.gateway", "Join links to one network: a robot's bus, a debug line, zenoh."),
+    "sim": ("r2p.tools.sim", "An emulated robot, without hardware."),
     "doctor": ("r2p.tools.doctor", "Tell what this machine has and lacks for r2p."),
     "demo": ("r2p.tools.demo", "Show r2p at work, without hardware."),
 }
@@ -51,6 +56,10 @@ def main() -> None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - stays open
     try:
         app(prog_name="r2p")
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        _say_unwritable(error)
     except KeyboardInterrupt:  # before a command has taken care of signals itself
         raise SystemExit(0) from None
     except SystemExit as error:
@@ -67,6 +76,14 @@ def _flush() -> None:
         sys.stdout.flush()
     except BrokenPipeError:
         abandon_stdout()
+    except OSError as error:
+        _say_unwritable(error)
+
+
+def _say_unwritable(error: OSError) -> NoReturn:
+    abandon_stdout()
+    say(f"can't write the output: {error.strerror}")
+    raise SystemExit(1) from error
 
 
 def _show_version(wanted: bool) -> None:

@@ -14,8 +14,6 @@ import typer
 import r2p
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.names import module_name
-from r2p.network import ModuleView
-from r2p.protocols.events import ModuleChanged
 from r2p.tools import session
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, TimedOut, Timeout, Usage, Wait
@@ -39,7 +37,7 @@ All = Annotated[bool, typer.Option("--all", "-a", help="Also tools, whose names 
 async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
     """List the modules: state, kind (r2p or firmware), the link they are on, and seconds since they were heard."""
     output = Output(format)
-    await session.settle(wait)
+    await session.settle(wait, of="modules")
     if wait is None:
         await _hear_firmware(session)
     views = [view for view in session.module.network.modules() if view.link and (all or not view.name.startswith("_"))]
@@ -135,7 +133,7 @@ async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, flags: list
     """Note each change of the module's flags."""
     async for event in events:
         match event:
-            case ModuleChanged(info=info) if info.name == name:
+            case r2p.ModuleChanged(info=info) if info.name == name:
                 flags.append(info.flags)
 
 
@@ -159,12 +157,12 @@ async def _confirmed(
             return
 
 
-def _flags(view: ModuleView) -> int:
+def _flags(view: r2p.ModuleView) -> int:
     state = {"stopped": FLAG_STOPPED, "boot": FLAG_BOOT}.get(view.state, 0)
     return state | (FLAG_REBOOTED if view.rebooted else 0)
 
 
-def _find(session: Session, name: str) -> ModuleView | None:
+def _find(session: Session, name: str) -> r2p.ModuleView | None:
     """The module as it was heard last, on whichever link."""
     views = [view for view in session.module.network.modules() if view.name == name and view.link]
     return min(views, key=lambda view: view.age, default=None)
@@ -183,7 +181,7 @@ def _what_was_seen(session: Session, command: r2p.Command, name: str, timeout: f
     return text
 
 
-def _row(view: ModuleView) -> dict[str, Any]:
+def _row(view: r2p.ModuleView) -> dict[str, Any]:
     return {
         "module": view.name,
         "state": view.state,

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 
 import r2p
-from r2p.network import nodes_of
 from r2p.tools import session
 from r2p.tools.options import CLASS_NAMES
 from r2p.tools.output import Output
@@ -69,23 +68,16 @@ async def info(
 
 def _nodes(session: Session) -> Table:
     """(module, node) -> topics published, topics subscribed; `?` for what nobody has told."""
-    views = session.module.network.topics().values()
-    table = nodes_of(views)
-    for view in views:
+    table = session.module.network.nodes()
+    for view in session.module.network.topics().values():
         for index, (known, links) in enumerate(
             ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on))
         ):
             told = {endpoint.link for endpoint in known}
             for link in links:
                 if link not in told:
-                    table.setdefault((_only_module(session, link), "?"), ([], []))[index].append(view.name)
+                    table.setdefault((session.only_module(link), "?"), ([], []))[index].append(view.name)
     return dict(sorted(table.items()))
-
-
-def _only_module(session: Session, link: str) -> str:
-    """The name of the module at the other end, if there is just one."""
-    names = {view.name for view in session.module.network.modules() if view.link == link and view.state != "observer"}
-    return names.pop() if len(names) == 1 else "?"
 
 
 def _find(wanted: str, nodes: Table) -> tuple[str, str]:

@@ -5,14 +5,14 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from r2p.sample import PublisherClass
+import r2p
 from r2p.tools.session import seconds, settings
 from r2p.tools.types import complete_type
 
 CLASS_NAMES = {
-    PublisherClass.NON_REAL_TIME: "nrt",
-    PublisherClass.SPORADIC: "sporadic",
-    PublisherClass.PERIODIC: "periodic",
+    r2p.PublisherClass.NON_REAL_TIME: "nrt",
+    r2p.PublisherClass.SPORADIC: "sporadic",
+    r2p.PublisherClass.PERIODIC: "periodic",
 }
 """The three classes as --class names them."""
 
@@ -20,7 +20,7 @@ CLASS_NAMES = {
 class ClassChoice(msgspec.Struct, frozen=True):
     """A publisher class, and its period or deadline in seconds."""
 
-    publisher_class: PublisherClass
+    publisher_class: r2p.PublisherClass
     time: float = 0.0
 
 

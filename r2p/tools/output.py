@@ -26,6 +26,10 @@ class PipeClosed(Exception):
     """Nobody reads our output any more: the end, exit code 0."""
 
 
+class Unwritable(Exception):
+    """The output can't be written, to a full disk for example: exit code 1."""
+
+
 class Output:
     """Writes records to stdout, each as soon as it is there.
 
@@ -84,6 +88,12 @@ class Output:
         async with self._lock:
             await self._write(text)
 
+    async def remark(self, text: str) -> None:
+        """Write a line for people; other formats are without. Raises PipeClosed."""
+        if self.format == "text":
+            async with self._lock:
+                await self._write(text + "\n")
+
     def _record(self, record: Record, text: str | None) -> str:
         match self.format:
             case "json":
@@ -115,6 +125,8 @@ class Output:
                 data = data[os.write(fd, data[:_ATOMIC]) :]
         except BrokenPipeError as error:
             raise PipeClosed from error
+        except OSError as error:
+            raise Unwritable(f"can't write the output: {error.strerror}") from error
 
 
 def waitable(stream: TextIO) -> int | None:

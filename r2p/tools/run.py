@@ -1,5 +1,6 @@
 """`r2p run`: functions out of files and packages as the nodes of one module."""
 
+import contextlib
 import difflib
 import inspect
 import logging
@@ -12,7 +13,6 @@ import typer
 
 import r2p
 from r2p.names import NODE_MAX, node_name, topic_name
-from r2p.supervisor import NodeFunction, check_function, name_of
 from r2p.tools.loading import load_module
 from r2p.tools.session import Quiet, Usage, Verbose, Via, execute, settings
 
@@ -22,7 +22,7 @@ logger = logging.getLogger("r2p.runner")
 class Program(msgspec.Struct, frozen=True):
     """A function to run as a node of this name."""
 
-    function: NodeFunction
+    function: r2p.NodeFunction
     name: str
 
 
@@ -93,7 +93,7 @@ def _program(target: str) -> Program:
     path, attribute, name = _split(target)
     function = _function(path, attribute, load_module(path))
     try:
-        return Program(function, node_name(name) if name else name_of(function))
+        return Program(function, node_name(name) if name else r2p.name_of(function))
     except r2p.NameTooLong as error:
         raise Usage(f"{target}: a node's name has at most {NODE_MAX} characters; {_name_it(target)}") from error
 
@@ -109,16 +109,17 @@ def _name_it(target: str) -> str:
     return f"give it another: {target.partition('=')[0]}=NAME"
 
 
-def _function(path: str, attribute: str, module: ModuleType) -> NodeFunction:
+def _function(path: str, attribute: str, module: ModuleType) -> r2p.NodeFunction:
     if not attribute:
         raise Usage(f"{path}: which function? {_choice(path, module)}")
-    function: NodeFunction | None = getattr(module, attribute, None)
+    function: r2p.NodeFunction | None = getattr(module, attribute, None)
     if function is None:
         close = difflib.get_close_matches(attribute, _functions(module), n=1)
         hint = f"did you mean {close[0]}?" if close else _choice(path, module)
         raise Usage(f"{path} has no function {attribute}; {hint}")
     try:
-        check_function(function)
+        with contextlib.suppress(r2p.InvalidName):  # it may be given another one
+            r2p.name_of(function)
     except r2p.Error as error:
         raise Usage(f"{path}:{attribute} is no node: write `async def {attribute}(node: r2p.Node)`") from error
     return function

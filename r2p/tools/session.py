@@ -31,8 +31,7 @@ import typer
 
 import r2p
 from r2p.clock import random_of
-from r2p.runner import run_main
-from r2p.tools.output import PipeClosed, abandon_stdout
+from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout
 from r2p.tools.stderr import log_to_stderr, say
 from r2p.transports.url import duration
 
@@ -138,7 +137,9 @@ def _read(path: Path) -> _File:
         return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
     except FileNotFoundError:
         return _File()
-    except (OSError, ValueError) as error:  # unreadable, no TOML, or other keys
+    except msgspec.ValidationError as error:
+        raise Usage(f"{path}: {error}; it knows {', '.join(_File.__struct_fields__)}") from error
+    except (OSError, ValueError) as error:  # unreadable, or no TOML
         raise Usage(f"{path}: {error}") from error
 
 
@@ -178,11 +179,17 @@ class Session:
         finally:
             timer.cancel()
 
-    async def settle(self, wait: float | None = None) -> None:
+    def only_module(self, link: str) -> str:
+        """The name of the module at the other end of a link; "?" if there is not just one."""
+        views = self.module.network.modules()
+        names = {view.name for view in views if view.link == link and view.state != "observer"}
+        return names.pop() if len(names) == 1 else "?"
+
+    async def settle(self, wait: float | None = None, *, of: str = "topics") -> None:
         """Listen to the network until the others have told what they have, or for `wait` seconds.
 
-        r2p modules are asked and answer at once; firmware repeats itself step by step, so there may be more to come,
-        which is said. Raises r2p.TransportError if no link comes up.
+        `of` is what it listens for, in words. r2p modules are asked and answer at once; firmware repeats itself step
+        by step, so there may be more to come, which is said. Raises r2p.TransportError if no link comes up.
         """
         if not self.settings.via:
             return
@@ -201,7 +208,7 @@ class Session:
             if loop.time() - news_at > _SETTLED and not self._expects_more():
                 return
         if self._hears_firmware():
-            self.say("firmware tells one topic each half second: there may be more, listen longer with --wait 5")
+            self.say(f"firmware tells one thing each half second: there may be more {of}, listen longer with --wait 5")
 
     async def _link_up(self) -> None:
         loop = asyncio.get_running_loop()
@@ -301,13 +308,19 @@ def _no_options() -> None:
     """A group has no options of its own."""
 
 
-def execute(main: Callable[[], Awaitable[object]], *, verbose: int = 0, quiet: int = 0) -> None:
-    """Run a command on the fastest event loop until it ends or a signal ends it; errors become exit codes."""
-    log_to_stderr(verbose - quiet)
-    try:
-        run_main(main)
-    except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - sorted out by _explain, or raised again
-        _explain(error)
+def execute(
+    main: Callable[[], Awaitable[object]],
+    *,
+    verbose: int = 0,
+    quiet: int = 0,
+    run: Callable[[Callable[[], Awaitable[object]]], object] | None = None,
+) -> None:
+    """Run a command until it ends or a signal ends it; errors become exit codes. `run`: how, else `r2p.run_main`."""
+    with log_to_stderr(verbose - quiet):
+        try:
+            (run or r2p.run_main)(main)
+        except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - sorted out by _explain, or raised again
+            _explain(error)
 
 
 def _explain(error: BaseException) -> None:
@@ -322,7 +335,7 @@ def _explain(error: BaseException) -> None:
         if isinstance(leaf, TimedOut):
             say(str(leaf))
             raise typer.Exit(3) from leaf
-    if not all(isinstance(leaf, r2p.Error) for leaf in leaves):
+    if not all(isinstance(leaf, r2p.Error | Unwritable) for leaf in leaves):
         raise error
     for leaf in leaves:
         say(leaf.message if isinstance(leaf, r2p.NodeCrashed) else str(leaf))

@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 
@@ -45,9 +46,17 @@ _HANDLER = _Stderr()
 _HANDLER.setFormatter(_Short())
 
 
-def log_to_stderr(level: int) -> None:
-    """Log records of r2p go to stderr: INFO and up, each -v or -q moves that by one level."""
+@contextlib.contextmanager
+def log_to_stderr(level: int) -> Iterator[None]:
+    """In the block log records of r2p go to stderr: INFO and up, each -v or -q moves that by one level."""
     logger = logging.getLogger("r2p")
-    logger.addHandler(_HANDLER)  # only once, however often
+    propagate, before = logger.propagate, logger.level
+    logger.addHandler(_HANDLER)
     logger.propagate = False
     logger.setLevel(max(logging.DEBUG, min(logging.INFO - 10 * level, logging.CRITICAL)))
+    try:
+        yield
+    finally:
+        logger.removeHandler(_HANDLER)
+        logger.propagate = propagate
+        logger.setLevel(before)

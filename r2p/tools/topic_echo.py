@@ -8,7 +8,6 @@ import typer
 
 import r2p
 from r2p.names import topic_name
-from r2p.network import TopicView
 from r2p.tools.options import Count, Once, Topics, TypeName
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, Timeout, Usage
@@ -105,7 +104,7 @@ class _Reader:
     async def records(self) -> AsyncIterator[tuple[dict[str, Any], r2p.Sample]]:
         """Each message as a record, with its sample."""
         async for sample in watched(self._session, self._subscriber):
-            yield self._record(sample), sample
+            yield await self._record(sample), sample
 
     def tell_losses(self) -> None:
         """Say what is missing in the output."""
@@ -114,10 +113,10 @@ class _Reader:
         if self._subscriber.undecodable:
             self._session.say(f"{self._subscriber.undecodable} messages of {self.topic} are of another type")
 
-    def _record(self, sample: r2p.Sample) -> dict[str, Any]:
+    async def _record(self, sample: r2p.Sample) -> dict[str, Any]:
         record = self._decoded(sample)
         if record is None:
-            self._look(sample)
+            await self._look(sample)
             record = self._decoded(sample)
         return {"data": sample.data.hex()} if record is None else record
 
@@ -130,14 +129,14 @@ class _Reader:
             self._cls, self._look_at = None, 0
             return None
 
-    def _look(self, sample: r2p.Sample) -> None:
+    async def _look(self, sample: r2p.Sample) -> None:
         """Look for the type that the peer tells, at most once a second."""
         now = self._session.node.now()
         if now < self._look_at:
             return
         self._look_at = now + _SECOND
-        view = self._session.module.network.topics().get(self.topic, TopicView(self.topic))
-        self._cls = self._types.of(view)
+        view = self._session.module.network.topics().get(self.topic, r2p.TopicView(self.topic))
+        self._cls = await self._types.learn(self._session, view)
         if self._cls is None and not self._told:
             self._told = True
             size = len(sample.data)

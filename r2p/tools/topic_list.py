@@ -7,7 +7,6 @@ import typer
 
 import r2p
 from r2p.names import topic_name
-from r2p.network import Endpoint, TopicView
 from r2p.tools.options import CLASS_NAMES, Topic
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, Wait
@@ -40,7 +39,7 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
         raise r2p.Error(f"nobody publishes or subscribes {topic}; known topics: {', '.join(views) or 'none'}")
     if view.mismatch:
         session.say(f"{topic} has different types: some of those below can't hear each other")
-    await output.put(_details(session, view))
+    await output.put(await _details(session, view))
 
 
 async def find(
@@ -78,13 +77,13 @@ def _wanted(what: str) -> tuple[int, bytes | None]:
     return layout.size, layout.fingerprint
 
 
-def _match(view: TopicView, size: int, fingerprint: bytes | None) -> str | None:
+def _match(view: r2p.TopicView, size: int, fingerprint: bytes | None) -> str | None:
     if fingerprint is not None and view.fingerprint is not None:
         return "type" if view.fingerprint == fingerprint else None
     return "size" if size and view.size == size else None
 
 
-def _row(session: Session, view: TopicView, types: Types) -> dict[str, Any]:
+def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
     cls = types.of(view)
     return {
         "topic": view.name,
@@ -95,29 +94,23 @@ def _row(session: Session, view: TopicView, types: Types) -> dict[str, Any]:
     }
 
 
-def _endpoints(session: Session, known: list[Endpoint], links: list[str]) -> list[dict[str, Any]]:
+def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) -> list[dict[str, Any]]:
     """Those known by node; for the other links somebody: the only module there, or `?`."""
     told = {each.link for each in known}
     found = [
         {"node": f"{each.module or '?'}/{each.node}", "class": _class_name(each), "link": each.link} for each in known
     ]
     return found + [
-        {"node": f"{_only_module(session, link)}/?", "class": None, "link": link} for link in links if link not in told
+        {"node": f"{session.only_module(link)}/?", "class": None, "link": link} for link in links if link not in told
     ]
 
 
-def _only_module(session: Session, link: str) -> str:
-    """The name of the module at the other end, if there is just one."""
-    names = [view.name for view in session.module.network.modules() if view.link == link and view.state != "observer"]
-    return names[0] if len(names) == 1 else "?"
-
-
-def _class_name(endpoint: Endpoint) -> str | None:
+def _class_name(endpoint: r2p.Endpoint) -> str | None:
     return None if endpoint.publisher_class is None else CLASS_NAMES[endpoint.publisher_class]
 
 
-def _details(session: Session, view: TopicView) -> dict[str, Any]:
-    cls = Types(session.settings).of(view)
+async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
+    cls = await Types(session.settings).learn(session, view)
     publishers = _endpoints(session, view.publishers, view.published_on)
     subscribers = _endpoints(session, view.subscribers, view.subscribed_on)
     details: dict[str, Any] = {
@@ -135,20 +128,20 @@ def _details(session: Session, view: TopicView) -> dict[str, Any]:
     return details
 
 
-def _fields(cls: type[r2p.Message] | None, view: TopicView) -> list[str]:
+def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> list[str]:
     """`name:kind` of each field; of an unknown type the names of the types that have its size."""
     if cls is not None:
         return r2p.layout(cls).schema.split()
     return [f"maybe {name}" for name in of_size(view.size)]
 
 
-def _guarantees(session: Session, view: TopicView) -> dict[str, str]:
+def _guarantees(session: Session, view: r2p.TopicView) -> dict[str, str]:
     """What each link gives to the classes that are published, as far as they are known."""
     classes = {each.publisher_class for each in view.publishers if each.publisher_class is not None}
     guarantees = {}
     for link in session.module.links:
         for publisher_class in sorted(classes or {r2p.PublisherClass.NON_REAL_TIME}):
             refusal = link.refusal(view.size)
-            text = f"not carried: {refusal}" if refusal else link.guarantee(publisher_class)
+            text = f"not carried: {refusal}" if refusal else link.guarantee(view.name, publisher_class)
             guarantees[f"{link.name} {CLASS_NAMES[publisher_class]}"] = text
     return guarantees

@@ -6,8 +6,6 @@ from typing import Annotated, Any
 import typer
 
 import r2p
-from r2p.publisher import BasePublisher
-from r2p.sample import PublisherClass
 from r2p.tools.input import lines
 from r2p.tools.options import ClassChoice, Count, Once, Rate, Topic, TypeName, class_choice
 from r2p.tools.session import PATIENCE, Session, TimedOut, Timeout, Usage
@@ -16,6 +14,8 @@ from r2p.tools.values import parse, parse_line
 
 STDIN = "-"
 DEFAULT_RATE = 1.0
+
+_AnyPublisher = r2p.Publisher[Any] | r2p.SporadicPublisher[Any] | r2p.PeriodicPublisher[Any]
 
 
 async def pub(
@@ -33,7 +33,10 @@ async def pub(
     klass: Annotated[
         ClassChoice | None,
         typer.Option(
-            "--class", parser=class_choice, metavar="CLASS", help="nrt (default), periodic:10ms or sporadic:20ms."
+            "--class",
+            parser=class_choice,
+            metavar="CLASS",
+            help="nrt (non real-time, the default: waits for room), periodic:10ms or sporadic:20ms.",
         ),
     ] = None,
     timeout: Timeout = None,
@@ -43,8 +46,8 @@ async def pub(
     Once a second unless told otherwise; fields that are left out are zero. With --once, -n or stdin it waits for a
     subscriber first, at most --timeout. Ctrl-C ends it.
     """
-    klass = klass or ClassChoice(PublisherClass.NON_REAL_TIME)
-    periodic = klass.publisher_class is PublisherClass.PERIODIC
+    klass = klass or ClassChoice(r2p.PublisherClass.NON_REAL_TIME)
+    periodic = klass.publisher_class is r2p.PublisherClass.PERIODIC
     from_stdin = message == [STDIN]
     if periodic and (from_stdin or rate is not None):
         raise Usage("--class periodic:TIME says when to publish: it takes neither --rate nor stdin")
@@ -130,11 +133,11 @@ class _Job:
                 await anext(ticks)
 
     def _advertise(self) -> r2p.Publisher[Any] | r2p.SporadicPublisher[Any]:
-        if self._klass.publisher_class is PublisherClass.SPORADIC:
+        if self._klass.publisher_class is r2p.PublisherClass.SPORADIC:
             return self._session.node.advertise(self._topic, self._cls, r2p.Sporadic(self._klass.time))
         return self._session.node.advertise(self._topic, self._cls)
 
-    async def _found_subscriber(self, publisher: BasePublisher[Any], *, needed: bool) -> None:
+    async def _found_subscriber(self, publisher: _AnyPublisher, *, needed: bool) -> None:
         """Wait for a subscriber if one is needed; else only say that there is none, if so after a second."""
         if not needed:
             asyncio.get_running_loop().call_later(PATIENCE, self._note_subscribers, publisher)
@@ -146,6 +149,6 @@ class _Job:
             except TimeoutError:
                 raise TimedOut(f"nobody subscribed {self._topic} for {self._timeout:g} s") from None
 
-    def _note_subscribers(self, publisher: BasePublisher[Any]) -> None:
+    def _note_subscribers(self, publisher: _AnyPublisher) -> None:
         if not publisher.subscribers:
             self._session.say(f"nobody subscribes {self._topic} yet; publishing all the same")

@@ -243,14 +243,18 @@ class _Delay:
     def __init__(self, window: int) -> None:
         self._delays: deque[float] = deque(maxlen=window)
         self._source = r2p.Source()
+        self._start = "publish"
+        self._error: int | None = None
 
     def note(self, sample: r2p.Sample, now: int) -> None:
-        if not sample.stamped:
+        if not sample.stamped and not sample.hops:
             raise r2p.Error(
                 f"no stamps: link {sample.source.link} does not carry when a message was published, only its reception "
                 "is known here"
             )
         self._source = sample.source
+        self._start = "publish" if sample.stamped else "on the first gateway's link"
+        self._error = None if sample.clock is None else sample.clock.error
         self._delays.append((now - sample.stamp) / _SECOND)
 
     def report(self, lost: int) -> tuple[Report, str] | None:
@@ -262,12 +266,15 @@ class _Delay:
             "mean": round(statistics.fmean(self._delays), _PRECISE),
             **_spread(self._delays),
             "window": len(self._delays),
-            "from": f"{self._source} publish",
+            "from": f"{self._source} {self._start}",
             "to": "this tool",
             "clocks": clocks,
             "lost_here": lost,
         }
         text = f"{_ms(record['mean'])}, {_spread_text(record)}; from {record['from']} to {record['to']}, {clocks}"
+        if self._error is not None:
+            record["clock_error"] = self._error / _SECOND
+            text += f"; network time is UTC within +-{_ms(self._error / _SECOND)}"
         return record, text
 
 

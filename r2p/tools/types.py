@@ -1,17 +1,18 @@
 """The type of a topic: given, written in r2p.toml, told by its publisher, or else unknown.
 
-A peer tells the fingerprint of a layout, not the layout: it is looked up among `r2p.msg` and the classes that r2p.toml
-names.
+A peer tells the fingerprint of a layout. It is looked up among `r2p.msg` and the classes that r2p.toml names; then, on
+zenoh, whoever has such a type is asked for its fields.
 """
 
 import difflib
 
 import r2p
-from r2p.network import TopicView
 from r2p.tools.loading import load_module
 from r2p.tools.session import Session, Settings, Usage
 
 STANDARD = "r2p.msg"
+LEARNT = "r2p.messages.schemas"
+"""The module of classes that were made from what another module told."""
 
 
 def load_type(text: str) -> type[r2p.Message]:
@@ -40,7 +41,9 @@ def standard_types() -> list[type[r2p.Message]]:
 
 
 def type_name(cls: type[r2p.Message]) -> str:
-    """How `--type` names a class."""
+    """How `--type` names a class; just its name if another module told of it."""
+    if cls.__module__ == LEARNT:
+        return cls.__name__
     module = STANDARD if cls.__module__.startswith(f"{STANDARD}.") else cls.__module__
     return f"{module}:{cls.__name__}"
 
@@ -51,18 +54,30 @@ class Types:
     def __init__(self, settings: Settings) -> None:
         self._by_topic = settings.types
         self._by_fingerprint: dict[bytes, type[r2p.Message]] | None = None
+        self._learnt: dict[bytes, type[r2p.Message]] = {}
 
     def stated(self, topic: str, given: str | None) -> type[r2p.Message] | None:
         """The type that the user states: `given` by --type, or in r2p.toml. Raises Usage."""
         text = given or self._by_topic.get(topic)
         return None if text is None else load_type(text)
 
-    def of(self, view: TopicView) -> type[r2p.Message] | None:
+    def of(self, view: r2p.TopicView) -> type[r2p.Message] | None:
         """The type of a topic as far as it is stated or told. Raises Usage for an r2p.toml that names nothing."""
         stated = self.stated(view.name, None)
         if stated is not None or view.fingerprint is None:
             return stated
         return self.by_fingerprint(view.fingerprint)
+
+    async def learn(self, session: Session, view: r2p.TopicView) -> type[r2p.Message] | None:
+        """As `of`; a type that is not known here is asked for on the network, where the transport can carry it."""
+        known = self.of(view)
+        if known is not None or view.fingerprint is None:
+            return known
+        if view.fingerprint not in self._learnt:
+            found = await session.module.network.message_type(view.fingerprint)
+            if found is not None:
+                self._learnt[view.fingerprint] = found
+        return self._learnt.get(view.fingerprint)
 
     def by_fingerprint(self, fingerprint: bytes) -> type[r2p.Message] | None:
         """The known class of that layout."""
@@ -95,8 +110,8 @@ async def find(session: Session, topic: str, given: str | None) -> type[r2p.Mess
     if stated is not None:
         return stated
     await session.settle()
-    view = session.module.network.topics().get(topic, TopicView(topic))
-    found = types.of(view)
+    view = session.module.network.topics().get(topic, r2p.TopicView(topic))
+    found = await types.learn(session, view)
     if found is None:
         size = f" ({view.size} bytes; of that size: {', '.join(of_size(view.size)) or 'none in r2p.msg'})" * bool(
             view.size

@@ -12,8 +12,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 from r2p.errors import MessageError
-from r2p.messages import Array, Chars, Layout, Message, Nested, Scalar, Shape, layout
-from r2p.messages.shapes import show
+from r2p.messages import Array, Chars, Layout, Message, Nested, Scalar, Shape, layout, show
 
 M = TypeVar("M", bound=Message)
 

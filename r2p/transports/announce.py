@@ -2,8 +2,8 @@
 
 import msgspec
 
-from r2p.codecs.management import CLASS_LATCHES, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.protocols.discovery import Discovery
+from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.protocols.door import Door
 from r2p.protocols.events import Event
 from r2p.topic import Topic
 
@@ -16,6 +16,7 @@ class Told(msgspec.Struct, frozen=True):
     size: int = 0
     fingerprint: bytes = bytes(8)
     queue: int = 1
+    params: bytes = NO_PARAMS
     endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
 
 
@@ -40,11 +41,11 @@ def wish_of(topic: Topic) -> Told:
     )
 
 
-def announce(discovery: Discovery, now: int, topic: str, told: Told, wish: Told) -> list[Event]:
+def announce(discovery: Door, now: int, topic: str, told: Told, wish: Told) -> list[Event]:
     events: list[Event] = []
     retyped = (wish.size, wish.fingerprint) != (told.size, told.fingerprint)
-    if wish.publishes and (retyped or not told.publishes):
-        events += discovery.advertise(now, topic, wish.size, wish.fingerprint)
+    if wish.publishes and (retyped or not told.publishes or wish.params != told.params):
+        events += discovery.advertise(now, topic, wish.size, wish.fingerprint, wish.params)
     elif told.publishes and not wish.publishes:
         events += discovery.withdraw(now, topic)
     if wish.subscribes and (retyped or not told.subscribes):

@@ -1,25 +1,28 @@
 """What comes in by a link, on its way to the topics: only what was opened, and a few messages at a time.
 
 A slow reader must not stop a line that others share, and a fast one should lose nothing. So a full queue gets PATIENCE
-turns of the event loop to make room; one that does not is lossy until it has.
+turns of the event loop to make room; one that does not is lossy, for this link, until it has plenty.
 """
 
 import asyncio
+import functools
 from collections import Counter, deque
 from collections.abc import Hashable, Iterable
 from typing import Any, Protocol
 
 import msgspec
 
+from r2p.room import Claim, Sink
 from r2p.sample import Sample
-from r2p.topic import PATIENCE, QueueSink, Sink, Topic
+from r2p.topic import PATIENCE, QueueSink, Topic
 
 TURN = 64
 """Messages that a link hands out before it lets the event loop run once."""
 
 
 class LinkStats(msgspec.Struct):
-    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions.
+    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions; `faults`
+    what went wrong on the line or the bus, by kind, whether anything was lost by it or not.
 
     `sent` are samples that were given to the line, the bus or its buffer, and not thrown away there since.
     """
@@ -30,6 +33,7 @@ class LinkStats(msgspec.Struct):
     bytes_received: int = 0
     ups: int = 0
     lost: Counter[str] = msgspec.field(default_factory=Counter)
+    faults: Counter[str] = msgspec.field(default_factory=Counter)
 
 
 class Arrival(Protocol):
@@ -51,6 +55,25 @@ class Inlet(msgspec.Struct):
     topic: Topic
     senders: dict[Hashable, int]
     last: Sample | None = None
+
+
+class Inlets(Protocol):
+    """What a link lets in: `Intake`, or one of a transport's own."""
+
+    def open(self, topic: Topic, size: int, sender: Hashable) -> None:
+        """Take what `sender` publishes: messages of `size` bytes, 0: of any size. Again: with another size."""
+
+    def shut(self, name: str, sender: Hashable) -> None:
+        """Take no more from this sender."""
+
+    def shut_all(self, name: str) -> None:
+        """Take no more of this topic."""
+
+    def take(self, arrivals: Iterable[Arrival]) -> None:
+        """Hand out what came in."""
+
+    def close(self) -> None:
+        """Forget what was not handed out yet, and take no more."""
 
 
 class Receiver(Protocol):
@@ -75,6 +98,15 @@ class Receiver(Protocol):
         """Go on reading."""
 
 
+class _Arrived(Claim):
+    """What came in, and waits in line with what this module publishes; whether it was placed is looked up each turn."""
+
+    __slots__ = ()
+
+    def settled(self, sink: Sink, refusal: str) -> None:
+        pass
+
+
 class Intake:
     """The inlets of one link, and the way through them."""
 
@@ -88,6 +120,7 @@ class Intake:
         self._paused = False
         self._closed = False
         self._patience = 0
+        self._lossy: set[Sink] = set()
 
     def open(self, topic: Topic, size: int, sender: Hashable) -> None:
         """Take what `sender` publishes: messages of `size` bytes, 0: of any size. Again: with another size."""
@@ -162,8 +195,7 @@ class Intake:
                 self._stats.received += 1
                 inlet.last = sample = link.sample(inlet.topic.name, arrival)
                 blocked = inlet.topic.deliver(sample)
-                if blocked is not None:
-                    self._wait(sample, blocked)
+                if blocked is not None and self._wait(sample, blocked):
                     return
         self._loop.call_soon(self._hand_out)
         self._read_no_more()
@@ -178,19 +210,26 @@ class Intake:
             self._paused = False
             self._link.resume()
 
-    def _wait(self, sample: Sample, blocked: list[Sink]) -> None:
+    def _wait(self, sample: Sample, blocked: list[Sink]) -> bool:
+        """Wait for room in these sinks; False if none of them is worth it."""
+        for sink in self._lossy.intersection(blocked):
+            sink.force(sample)
+        patient = [sink for sink in blocked if sink not in self._lossy]
+        if not patient:
+            return False
         self._patience = PATIENCE
-        self._loop.call_soon(self._retry, sample, blocked)
+        self._loop.call_soon(self._look, _Arrived(sample, patient))
         self._read_no_more()
+        return True
 
-    def _retry(self, sample: Sample, blocked: list[Sink]) -> None:
-        if self._closed:
-            return
+    def _look(self, claim: _Arrived) -> None:
         self._patience -= 1
-        blocked = [sink for sink in blocked if not sink.offer(sample)]
-        if blocked and self._patience > 0:
-            self._loop.call_soon(self._retry, sample, blocked)
+        if claim.lacking and self._patience > 0 and not self._closed:
+            self._loop.call_soon(self._look, claim)
             return
-        for sink in blocked:
-            sink.give_up(sample)
-        self._hand_out()
+        for sink in claim.withdraw():
+            sink.force(claim.sample)
+            self._lossy.add(sink)
+            sink.room().recoveries.append(functools.partial(self._lossy.discard, sink))
+        if not self._closed:
+            self._hand_out()

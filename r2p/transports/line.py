@@ -1,9 +1,9 @@
 """The debug line: one other end that speaks in lines of ASCII (PROTOCOL.md 3), whatever carries the bytes.
 
 The first line that is written in a turn of the event loop goes out at once, the others of that turn in one piece. While
-the carrier (TCP connection, serial port) takes no more, lines wait here, where management can overtake samples and what
-is stale can be thrown away. A carrier is attached while it lives; the link stays over reconnects, so its subscriptions
-and counters do too.
+the carrier (TCP connection, serial port) takes no more, lines wait here, where management can overtake samples. Those
+of real-time publishers never do: each goes out at once, before all that wait, or its publisher keeps it and watches the
+time. A carrier is attached while it lives; the link stays over reconnects, so its subscriptions and counters do too.
 """
 
 import abc
@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, ClassVar
 from r2p.codecs import debug
 from r2p.codecs.management import FLAG_BOOT
 from r2p.names import LOADER_PREFIX, MANAGEMENT
-from r2p.sample import Sample
-from r2p.topic import Topic
+from r2p.room import LINK_DOWN
+from r2p.sample import PublisherClass, Sample
+from r2p.topic import Advertised, Topic
+from r2p.transports.announce import NOTHING
 from r2p.transports.link import Hub, Link
 from r2p.transports.sources import Sources
 
@@ -31,8 +33,10 @@ OPENING = b"\r\n\r\n"
 
 _MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
 _CLOSING = 0.5  # seconds for the other end to take what is still buffered
+_SECOND = 1_000_000_000
 _NO_DEADLINE = 0x7FFFFFFF
 _WRAP = 0xFFFFFFFF
+_NRT = PublisherClass.NON_REAL_TIME
 
 
 class Carrier(abc.ABC):
@@ -107,6 +111,7 @@ class LineLink(Link):
         self._limit = buffer
         self._piecemeal = piecemeal
         self._stamp = 0
+        self._held: tuple[str, Sample] | None = None
         self._unasked: set[str] = set()
 
     # Carrier
@@ -127,6 +132,7 @@ class LineLink(Link):
         """Bytes do not flow any more."""
         self._carrier = None
         self.went_down(reason)
+        self._lose_held()
 
     def fed(self, data: bytes | memoryview) -> None:
         """Bytes came in."""
@@ -139,6 +145,8 @@ class LineLink(Link):
 
     def carrier_ready(self) -> None:
         self._blocked = False
+        self._see_held_off()
+        self.made_room()  # before the bytes that wait fill the carrier again
         if not self._corked:
             self._uncork()
 
@@ -148,6 +156,9 @@ class LineLink(Link):
     def full(self) -> bool:
         return self._waiting >= self._limit
 
+    def takes(self, sample: Sample) -> bool:
+        return self._waiting < self._limit if sample.publisher_class == _NRT else not self._blocked
+
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
         deadline = sample.deadline // 1000 if sample.deadline else sample.stamp // 1000 + _NO_DEADLINE
@@ -156,13 +167,16 @@ class LineLink(Link):
         except KeyError:
             encode = self._encoders[topic] = debug.encoder(topic.encode())
         line = encode(sample.data, deadline & _WRAP)
-        if self._corked or self._blocked:
+        real_time = sample.publisher_class != _NRT
+        if self._blocked or (self._corked and not real_time):
             self._samples.append(line)
             self._waiting += len(line)
             if self._waiting >= self._limit:
                 self._flush()
-        else:
-            self._send_first(line)
+            return
+        self._send_at_once(line)
+        if real_time:
+            self._hold(topic, sample)
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         if self._waiting >= self._limit + _MANAGEMENT_BUFFER and not urgent:
@@ -171,7 +185,7 @@ class LineLink(Link):
         deadline = self._clock.now() // 1000 + _NO_DEADLINE
         line = debug.encode(MANAGEMENT.encode(), data, deadline & _WRAP)
         if not (self._corked or self._blocked):
-            self._send_first(line)
+            self._send_at_once(line)
             return
         self._waiting += len(line)
         if urgent:
@@ -206,16 +220,17 @@ class LineLink(Link):
         if carrier is not None:
             carrier.close()
 
-    def _send_first(self, line: bytes) -> None:
-        self._corked = True
-        self._space.loop.call_soon(self._uncork)
+    def _send_at_once(self, line: bytes) -> None:
+        if not self._corked:
+            self._corked = True
+            self._space.loop.call_soon(self._uncork)
         self._send(line)
 
     def _uncork(self) -> None:
         self._corked = False
         self._flush()
-        if self._room and not self.full:
-            self._made_room()
+        if self.room:
+            self.made_room()
 
     def _flush(self, *, last_words: bool = False) -> None:
         while self._waiting and (last_words or not self._blocked):
@@ -237,11 +252,39 @@ class LineLink(Link):
             self.stats.bytes_sent += len(data)
             self._carrier.send(data)
 
+    # The sample of a real-time publisher that the carrier could not send at once: it is on its way when all is sent.
+
+    def _hold(self, topic: str, sample: Sample) -> None:
+        if self._blocked or not self.up:
+            self._held = topic, sample
+        if not self.up:
+            self._lose_held()
+
+    def _see_held_off(self) -> None:
+        held, self._held = self._held, None
+        if held is not None:
+            topic, sample = held
+            late = self._clock.now() - sample.deadline
+            if sample.deadline and late > 0 and (publisher := self._publisher(topic, sample)) is not None:
+                publisher.link_late(self.name, "sent late", late / _SECOND)
+
+    def _lose_held(self) -> None:
+        held, self._held = self._held, None
+        if held is not None:
+            self.stats.sent -= 1
+            self.stats.lost[LINK_DOWN] += 1
+            publisher = self._publisher(*held)
+            if publisher is not None:
+                publisher.link_missed(self.name, LINK_DOWN, sequence=held[1].sequence)
+
+    def _publisher(self, topic: str, sample: Sample) -> Advertised | None:
+        where = self._space.topics.get(topic)
+        return None if where is None else where.publisher_of(sample)
+
     # The loader's topic flows without a handshake while its module is in boot mode (PROTOCOL.md 5): that of a module at
     # the other end, or our own.
 
     def module_changed(self, module: str) -> None:
-        self._sources.forget()
         topic = self._space.topics.get(LOADER_PREFIX + module)
         if topic is not None:
             self._match_loader(topic)
@@ -259,7 +302,7 @@ class LineLink(Link):
         name = topic.name
         if self._in_boot_mode(name.removeprefix(LOADER_PREFIX)):
             self._unasked.add(name)
-            if not topic.publishers:
+            if not self._told.get(name, NOTHING).publishes:
                 self._detach(name)
             elif name not in self._outlets:
                 self._attach(name)

@@ -16,14 +16,20 @@ from typing import Any, ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
-from r2p.codecs.management import CLASS_LATCHES, ROLE_PUBLISHES
-from r2p.names import MANAGEMENT
+from r2p.codecs.attachment import Clock
+from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, ROLE_PUBLISHES
+from r2p.messages import Message
+from r2p.names import MANAGEMENT, TOPIC_MAX
+from r2p.protocols.announcer import Relayed
 from r2p.protocols.discovery import Discovery
+from r2p.protocols.door import Door
 from r2p.protocols.events import Command, Event, Joined, Left, ModuleChanged, ModuleGone, Opened, Send, Shut
+from r2p.room import LINK_DOWN, Room
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told, announce, wish_of
-from r2p.transports.intake import Arrival, Intake, LinkStats
+from r2p.transports.intake import Arrival, Inlets, Intake, LinkStats
+from r2p.transports.losses import Losses
 from r2p.transports.outlet import LinkOutlet
 
 _SECOND = 1_000_000_000
@@ -63,8 +69,28 @@ class Hub(Protocol):
     def link_changed(self, link: "Link", reason: str, outage: float, lost: int) -> None:
         """It went up or down; on the way up: s that it was down, messages lost by that."""
 
+    def link_notice(self, link: "Link", kind: str, text: str, *, trouble: bool) -> None:
+        """Something is worth telling the user, who need not do anything about it unless it is `trouble`."""
+
     def discovered(self, link: "Link", event: Event) -> None:
         """Its discovery found something that concerns the module."""
+
+
+class Gate(Protocol):
+    """What a gateway has to say about one of its links."""
+
+    def heard(self, data: bytes) -> bool:
+        """A management message, before discovery gets it; True if it concerns gateways only."""
+
+    def wish(self, topic: Topic, own: Told) -> Told:
+        """What the other ends are to be told of a topic, with what is wanted for other links."""
+
+    @property
+    def speaks(self) -> bool:
+        """Whether discovery may say anything: where two links lead to one network, only one of them does."""
+
+    def looked(self) -> None:
+        """Discovery may have learnt something."""
 
 
 class Transport(abc.ABC):
@@ -75,7 +101,7 @@ class Transport(abc.ABC):
         """Attach links and keep them alive for ever; on cancellation close and detach them.
 
         Calls `opened()` once it works, or works on its way by itself: the module's `async with` waits for that. Raises
-        TransportError for what waiting can't mend, such as an address in use.
+        TransportError for what waiting can't mend, such as an address in use; Broken if it had worked before.
         """
 
 
@@ -84,29 +110,36 @@ class Link(abc.ABC):
 
     longest: ClassVar[int] = 255
     """Bytes of the longest message."""
+    longest_name: ClassVar[int] = TOPIC_MAX
+    """Characters of the longest topic's name."""
+    passes_probes: ClassVar[bool] = True
+    """Whether there may be gateways of firmware on it."""
 
-    def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0) -> None:
-        self.name = name
+    def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: Door | None = None) -> None:
+        self.name = _unlike(name, {each.name for each in hub.space.links})
         self.up = False
-        self.stats = LinkStats()
-        self.discovery = Discovery(
+        self.gate: Gate | None = None
+        """Set by a gateway."""
+        self.stats = LinkStats(lost=Losses(name, hub.space.clock))
+        self.discovery: Door = discovery or Discovery(
             hub.space.module,
             hub.instance,
             rate=management_rate,
             burst=max(4, int(management_rate / 4)),
             observer=hub.observer,
+            counts=Losses(name, hub.space.clock),
         )
         self._hub = hub
         self._space = hub.space
         self._clock = hub.space.clock
         self._alarm = Alarm(hub.space.loop, self._poll)
         self._outlets: dict[str, LinkOutlet] = {}
-        self._intake = Intake(self, hub.space.loop, self.stats)
+        self._intake: Inlets = Intake(self, hub.space.loop, self.stats)
         self._told: dict[str, Told] = {}
         self._lapsed: set[str] = set()
         self._events: deque[Event] = deque()
         self._acting = False
-        self._room: list[Callable[[], None]] = []
+        self.room = Room()
         self._down_at = self._clock.monotonic()
         self._lost_at_down = 0
         self._unreachable = ""
@@ -142,11 +175,11 @@ class Link(abc.ABC):
         self._lost_at_down = self.stats.lost["link down"]
         self.stats.lost["link down"] += self.discard()
         self._hub.link_changed(self, reason, 0.0, 0)
-        self._made_room()  # whoever waits for it waits for nothing
         carried = [publisher for outlet in self._outlets.values() for publisher in outlet.topic.publishers]
+        self._apply(self.discovery.link_down(self._down_at))
+        self.room.refuse_all(LINK_DOWN)  # whoever waits for it waits for nothing
         for publisher in carried:
             publisher.degraded(self.name, reason)
-        self._apply(self.discovery.link_down(self._down_at))
 
     def close(self) -> None:
         """Say good-bye, and let go of all topics."""
@@ -156,7 +189,7 @@ class Link(abc.ABC):
         self._closed = True
         self.up = False
         self._alarm.close()
-        self._made_room()
+        self.room.refuse_all("link closed")
         for name in list(self._outlets):
             self._detach(name)
         self._intake.close()
@@ -174,9 +207,14 @@ class Link(abc.ABC):
 
     def take_other(self, arrival: Arrival) -> None:
         if arrival.topic == _MANAGEMENT:
-            self._apply(self.discovery.receive(self._clock.monotonic(), arrival.data, self.sender(arrival)))
+            self.manage(arrival.data, self.sender(arrival))
         else:
             self.stats.lost["not subscribed"] += 1
+
+    def manage(self, data: bytes, source: Hashable) -> None:
+        """A management message came in from this address."""
+        if self.gate is None or not self.gate.heard(data):
+            self._apply(self.discovery.receive(self._clock.monotonic(), data, source))
 
     # For subclasses
 
@@ -211,26 +249,28 @@ class Link(abc.ABC):
     def resume(self) -> None:
         """Go on reading."""
 
+    def made_room(self) -> None:
+        """To be called whenever `takes` may say something else: whoever waits gets the room, in order."""
+        self.room.serve()
+        if not self.full:
+            self.room.recover()
+
     def module_changed(self, module: str) -> None:
         """A module at the other end came, went, or changed its state."""
 
     # For outlets, publishers and the module
+
+    def takes(self, sample: Sample) -> bool:
+        """Whether there is room for this very sample now; asked before each `write`."""
+        return not self.full
 
     @property
     def losses(self) -> Counter[str]:
         """All that was dropped since the link was opened, in both directions, by reason."""
         return self.stats.lost + self.discovery.counts
 
-    def when_room(self, callback: Callable[[], None]) -> None:
-        """Call back once when the send buffer has room again."""
-        self._room.append(callback)
-
-    def wait_no_more(self, callback: Callable[[], None]) -> None:
-        """Undo `when_room`, if it was not called back yet."""
-        if callback in self._room:
-            self._room.remove(callback)
-
-    def guarantee(self, publisher_class: PublisherClass) -> str:
+    def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
+        """What the class means here for this topic, in words."""
         return "best effort, in order" + (", waits for room" if publisher_class == PublisherClass.NON_REAL_TIME else "")
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
@@ -239,8 +279,28 @@ class Link(abc.ABC):
     def refusal(self, size: int) -> str | None:
         return f"{size} bytes, and it carries at most {self.longest} in a message" if size > self.longest else None
 
+    def inadmissible(self, size: int, period: float) -> str | None:
+        """Why there can never be slots for messages of `size` bytes each `period` seconds."""
+        return None
+
+    def network_time(self) -> int | None:
+        """The time (ns) that all nodes of the network share. None: it has none, or it is not known."""
+        return None
+
+    def translation(self) -> Clock | None:
+        """How that time is translated to UTC here, and how well. None: there is none, or it is not known."""
+        return None
+
+    def params(self, topic: str) -> bytes | None:
+        """What the others need to know to receive a topic from us. None: it can't be published here."""
+        return NO_PARAMS
+
     async def admission(self, topic: str) -> None:
         """Best effort is admitted at once."""
+
+    async def message_type(self, fingerprint: bytes) -> type[Message] | None:
+        """A message class of this layout, from a module on the link that has it; where such things can be asked."""
+        return None
 
     def command(self, command: Command, module: str) -> None:
         """Send STOP, REBOOT or BOOTLOAD to a module."""
@@ -249,6 +309,10 @@ class Link(abc.ABC):
     def tell_conflict(self, module: str, instance_a: int, instance_b: int) -> None:
         """Tell two modules that they carry one name."""
         self._apply(self.discovery.conflict(self._clock.monotonic(), module, instance_a, instance_b))
+
+    def relay(self, message: Relayed) -> None:
+        """Pass on what a module on another link has said."""
+        self._apply(self.discovery.relay(self._clock.monotonic(), message))
 
     def query(self) -> None:
         """Ask everybody to repeat what they publish and subscribe."""
@@ -263,8 +327,12 @@ class Link(abc.ABC):
         now = self._clock.monotonic()
         told = self._told.pop(topic.name, NOTHING)
         wish = wish_of(topic)
-        if wish.publishes and self.refusal(wish.size):
-            wish = msgspec.structs.replace(wish, publishes=False)
+        if self.gate is not None:
+            wish = self.gate.wish(topic, wish)
+        if len(topic.name) > self.longest_name:
+            wish = NOTHING
+        params = self.params(topic.name) if wish.publishes and not self.refusal(wish.size) else None
+        wish = msgspec.structs.replace(wish, publishes=params is not None, params=params or NO_PARAMS)
         if wish != told:
             self._apply(announce(self.discovery, now, topic.name, told, wish))
         if not wish.publishes:
@@ -291,11 +359,13 @@ class Link(abc.ABC):
             self._acting = False
         if not self._closed:
             self._alarm.set(self.discovery.next_deadline())
+            if self.gate is not None:
+                self.gate.looked()
 
     def _act(self, event: Event) -> None:
         match event:
             case Send(data, urgent):
-                if self.up:
+                if self.up and (self.gate is None or self.gate.speaks):
                     self.write_management(data, urgent=urgent)
             case Joined(topic):
                 self._attach(topic)
@@ -321,8 +391,7 @@ class Link(abc.ABC):
             outlet = self._outlets[name] = LinkOutlet(self, topic)
             topic.join(outlet)
         else:
-            for publisher in topic.publishers:
-                publisher.joined(outlet)
+            topic.welcome(outlet)
 
     def _detach(self, name: str) -> None:
         outlet = self._outlets.pop(name, None)
@@ -331,10 +400,10 @@ class Link(abc.ABC):
 
     def _open(self, name: str, size: int, sender: Hashable = None) -> None:
         topic = self._space.topics.get(name)
-        if topic is not None and topic.queues:
+        if topic is not None and topic.wanted:
             self._intake.open(topic, topic.layout.size if topic.layout is not None else size, sender)
 
-    def _made_room(self) -> None:
-        callbacks, self._room = self._room, []
-        for callback in callbacks:
-            callback()
+
+def _unlike(name: str, taken: set[str]) -> str:
+    """A name that tells two links apart that lead to the same place."""
+    return next(each for each in (name, *(f"{name}#{n}" for n in range(2, len(taken) + 3))) if each not in taken)

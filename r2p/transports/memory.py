@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from r2p.clock import random_of
+from r2p.codecs.attachment import Clock
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.sample import PublisherClass, Sample, Source
@@ -37,6 +38,9 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     deadline: int = 0
     sequence: int = 0
     publisher_class: PublisherClass = PublisherClass.NON_REAL_TIME
+    stamped: bool = True
+    hops: int = 0
+    clock: Clock | None = None
 
 
 class Port:
@@ -186,7 +190,7 @@ class MemoryLink(Link):
         super().__init__(name, hub)
         self.network = network
         self._address = network.new_address()
-        self._port = Port(network, self._receive, self._made_room)
+        self._port = Port(network, self._receive, self.made_room)
 
     def connect(self) -> None:
         """Plug in."""
@@ -215,6 +219,9 @@ class MemoryLink(Link):
             sample.deadline,
             sample.sequence,
             sample.publisher_class,
+            sample.stamped,
+            sample.hops + bool(sample.source.link),
+            sample.clock,
         )
         self.network.send(frame)
 
@@ -224,7 +231,17 @@ class MemoryLink(Link):
     def sample(self, topic: str, arrival: Frame) -> Sample:
         self.stats.bytes_received += len(arrival.data)
         source = Source(arrival.module, arrival.node, self.name)
-        return Sample(arrival.data, source, arrival.stamp, arrival.deadline, arrival.sequence, arrival.publisher_class)
+        return Sample(
+            arrival.data,
+            source,
+            arrival.stamp,
+            arrival.deadline,
+            arrival.sequence,
+            arrival.publisher_class,
+            stamped=arrival.stamped,
+            hops=arrival.hops,
+            clock=arrival.clock,
+        )
 
     def sender(self, arrival: Frame) -> Hashable:
         return arrival.port

@@ -1,9 +1,9 @@
 """One topic on its way out by one link: what a link looks like to publishers."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from r2p.sample import Sample
+from r2p.room import LINK_DOWN, Room
+from r2p.sample import PublisherClass, Sample
 from r2p.topic import Outlet, Topic
 
 if TYPE_CHECKING:
@@ -11,12 +11,16 @@ if TYPE_CHECKING:
 
 
 class LinkOutlet(Outlet):
-    """One topic on its way out by one link. Nobody waits for a link that is down: what it is given is lost, counted."""
+    """One topic on its way out by one link.
+
+    Nobody waits for a link that is down. What it is given is lost, counted; real-time publishers are told of each
+    sample, the others were told when it went down.
+    """
 
     __slots__ = ("_link", "topic")
 
     def __init__(self, link: "Link", topic: Topic) -> None:
-        super().__init__(link.name)
+        super().__init__(link.name, link)
         self._link = link
         self.topic = topic
 
@@ -27,21 +31,25 @@ class LinkOutlet(Outlet):
     def offer(self, sample: Sample) -> bool:
         link = self._link
         if not link.up:
-            self.lost += 1
-            link.stats.lost["link down"] += 1
+            if sample.publisher_class != PublisherClass.NON_REAL_TIME:
+                return False
+            self.force(sample)
             return True
-        if link.full:
+        if not link.takes(sample):
             return False
         link.write(self.topic.name, sample)
         return True
 
     def force(self, sample: Sample) -> None:
-        if not self.offer(sample):
+        link = self._link
+        if link.up and not link.full:
+            link.write(self.topic.name, sample)
+        else:
             self.lost += 1
-            self._link.stats.lost["send buffer full"] += 1
+            link.stats.lost["send buffer full" if link.up else LINK_DOWN] += 1
 
-    def when_room(self, callback: Callable[[], None], *, soon: bool = False) -> None:
-        self._link.when_room(callback)
+    def room(self) -> Room:
+        return self._link.room
 
-    def wait_no_more(self, callback: Callable[[], None]) -> None:
-        self._link.wait_no_more(callback)
+    def refill(self) -> None:
+        self._link.made_room()

@@ -1,7 +1,8 @@
 """The debug line over a serial port: a device that vanishes is awaited.
 
 pyserial configures the port; reading and writing go straight to its file descriptor in the event loop. A slow line must
-not hide its queue in the kernel, where nothing can be overtaken or thrown away: that gets BUFFERED seconds only.
+not hide its queue in the kernel, where nothing can be overtaken or thrown away: that gets IN_KERNEL seconds only. What
+real-time publishers have to say waits with them until then.
 """
 
 import asyncio
@@ -15,8 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from r2p.backoff import Backoff
 from r2p.errors import TransportError
-from r2p.transports.backoff import Backoff
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url
@@ -27,11 +28,15 @@ if TYPE_CHECKING:
 BAUD = 115200
 
 BUFFERED = 0.05
-"""Seconds of line time that may wait in the kernel, and again in the link before publishers wait: older is stale."""
+"""Seconds of line time that may wait in the link before publishers wait."""
+
+IN_KERNEL = 0.02
+"""Seconds of line time that may wait in the kernel: so late a sample may be that was taken in time."""
 
 _CHUNK = 4096
 _BITS_A_BYTE = 10  # 8N1
 _LONGEST_LINE = 576  # bytes
+_SMALLEST_WINDOW = 32  # bytes
 _MANAGEMENT_SHARE = 0.2
 _MANAGEMENT_LINE = 96  # bytes
 _LONGEST_WAIT = 0.5  # seconds between looks for a device that is not there
@@ -108,7 +113,7 @@ class _Port(Connection):
         self._fd: int = device.fileno()
         self._link = link
         self._bytes_a_second = bytes_a_second
-        self._window = max(_LONGEST_LINE, int(bytes_a_second * BUFFERED))
+        self._window = max(_SMALLEST_WINDOW, int(bytes_a_second * IN_KERNEL))
         self._unsent = bytearray()
         self._timer: asyncio.TimerHandle | None = None
         self._reading = False

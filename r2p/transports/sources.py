@@ -1,7 +1,7 @@
 """Who publishes a topic at the other end of a link, as far as that is known there."""
 
 from r2p.codecs.management import ROLE_PUBLISHES
-from r2p.protocols.discovery import Discovery
+from r2p.protocols.door import Door
 from r2p.sample import Source
 
 
@@ -11,24 +11,20 @@ class Sources:
     r2p modules tell which of their nodes publish a topic. Where nobody did, and only one module was heard, it is that.
     """
 
-    def __init__(self, discovery: Discovery, link: str) -> None:
+    def __init__(self, discovery: Door, link: str) -> None:
         self._discovery = discovery
         self._link = link
         self._known: dict[str, Source] = {}
-        self._endpoints = 0
+        self._generation = -1
 
     def of(self, topic: str) -> Source:
-        if len(self._discovery.endpoints) != self._endpoints:
-            self.forget()
+        if self._generation != self._discovery.generation:
+            self._generation = self._discovery.generation
+            self._known.clear()
         source = self._known.get(topic)
         if source is None:
             source = self._known[topic] = self._find(topic)
         return source
-
-    def forget(self) -> None:
-        """Modules came or went."""
-        self._known.clear()
-        self._endpoints = len(self._discovery.endpoints)
 
     def _find(self, topic: str) -> Source:
         modules = self._discovery.modules.values()

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Callable
 from typing import cast
 
+from r2p.backoff import Backoff
 from r2p.errors import TransportError
-from r2p.transports.backoff import Backoff
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url
@@ -268,4 +268,14 @@ def _host_port(url: Url) -> tuple[str, int]:
         host, port = url.address, str(PORT)
     if not port.isdecimal() or int(port) > 0xFFFF:
         raise TransportError(f"{url}: {port!r} is no port: give it as {url.scheme}:HOST:PORT")
-    return host.strip("[]"), int(port)
+    host = host.strip("[]")
+    try:
+        host.encode("idna")
+        is_name = host.isprintable()
+    except UnicodeError:
+        is_name = False
+    if not is_name:
+        raise TransportError(
+            f"{url}: {host!r} is no host name: between its dots are 1 to 63 letters, digits or hyphens"
+        )
+    return host, int(port)

@@ -122,6 +122,24 @@ class TestLeases:
         assert joined(discovery, 3601 * S), "after a gap the latched value is due again"
         assert not joined(discovery, 3602 * S)
 
+    def test_what_was_asked_before_a_gap_by_r2p_without_a_hello_ends_with_its_next_one(self) -> None:
+        discovery = started()
+        assert joined(discovery, S)  # its HELLO was lost
+        discovery.link_down(2 * S)
+        discovery.link_up(3 * S)
+        assert Left("leds") in hear(discovery, 3 * S, PC2)
+        assert joined(discovery, 3 * S)
+
+    def test_what_is_asked_after_a_gap_counts_also_before_the_hello(self) -> None:
+        discovery = started()
+        assert joined(discovery, S)
+        discovery.link_down(2 * S)
+        discovery.link_up(3 * S)
+        assert joined(discovery, 3 * S)
+        assert Left("leds") not in hear(discovery, 3 * S, PC2)
+        ends = [now for now, event in run(discovery, 3 * S, 30 * S) if isinstance(event, Left)]
+        assert ends == [8 * S], "a lease from now on"
+
     @pytest.mark.parametrize(("lease_ms", "ns"), [(100, 5 * S), (5000, 5 * S), (12000, 12 * S)])
     def test_r2p_subscribes_for_a_while(self, lease_ms: int, ns: int) -> None:
         discovery = started()
@@ -257,15 +275,55 @@ class TestLeases:
         assert hello.lease_ms == lease
 
 
+class TestLostAnswers:
+    UNANSWERED = m.SubscribeRequest("leds", 5, 8, m.UNANSWERED)
+
+    def joins(self, discovery: Discovery, now: int) -> bool:
+        return any(isinstance(event, Joined) for event in hear(discovery, now, self.UNANSWERED))
+
+    def test_r2p_that_has_heard_no_answer_joins_again(self) -> None:
+        discovery = started()
+        hear(discovery, S, PC2)
+        assert self.joins(discovery, S)
+        assert not self.joins(discovery, S + SOON), "the answer may be on its way"
+        assert self.joins(discovery, 3 * S)
+        assert not joined(discovery, 5 * S)
+
+    def test_firmware_never_does(self) -> None:
+        discovery = started()
+        assert self.joins(discovery, S)
+        assert not self.joins(discovery, 3 * S)
+
+    def test_our_own_request_tells_until_it_is_answered(self) -> None:
+        discovery = started()
+        plain = m.SubscribeRequest("cmd", 12, 5)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12))) == [plain], "firmware is told nothing"
+        hear(discovery, S, PC2)
+        unanswered = m.SubscribeRequest("cmd", 12, 5, m.UNANSWERED)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == unanswered
+        hear(discovery, S, RESPONSE)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == plain
+        discovery.unsubscribe(S, "cmd")
+        discovery.subscribe(S, "cmd", 12, 5)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == unanswered
+
+    def test_a_publisher_that_left_has_answered_no_more(self) -> None:
+        discovery = started()
+        hear(discovery, S, PC2, RESPONSE, m.Hello("PC2", PEER, m.HELLO_LEAVING))
+        hear(discovery, S, m.Hello("PC2", PEER + 1))
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == m.SubscribeRequest("cmd", 12, 5, m.UNANSWERED)
+
+
 class TestTypes:
     def test_types_go_before_what_they_belong_to_but_only_to_r2p(self) -> None:
         discovery = started()
         hear(discovery, S, PC2)
         mine = [m.TypeInfo(m.ROLE_PUBLISHES, "leds", ONE, 5), m.TypeInfo(m.ROLE_SUBSCRIBES, "cmd", TWO, 12)]
         repeated = sent(discovery.poll(S))
-        assert repeated[2:] == [mine[0], m.Advertise("leds", 5), mine[1], m.SubscribeRequest("cmd", 12, 5)]
+        unanswered = m.SubscribeRequest("cmd", 12, 5, m.UNANSWERED)
+        assert repeated[2:] == [mine[0], m.Advertise("leds", 5), mine[1], unanswered]
         assert sent(hear(discovery, S, REQUEST)) == [mine[0], m.SubscribeResponse("leds", 5, 8)]
-        assert sent(hear(discovery, S, m.Advertise("cmd", 12))) == [mine[1], m.SubscribeRequest("cmd", 12, 5)]
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12))) == [mine[1], unanswered]
         assert sent(hear(discovery, S, REQUEST, source=0x28)) == [m.SubscribeResponse("leds", 5, 8)]
 
     def test_a_subscriber_of_another_type_is_refused(self) -> None:

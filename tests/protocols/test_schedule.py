@@ -3,8 +3,10 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
+from r2p.codecs import management as m
+from r2p.protocols.discovery import Discovery
 from r2p.protocols.schedule import Bucket, Item, Kind, Schedule, Timers
-from tests.protocols.wire import MS, S
+from tests.protocols.wire import MS, S, run, sent
 
 
 @given(
@@ -90,6 +92,36 @@ class TestSchedule:
                 schedule.sent(now, 1)
         assert kinds[:2] == [Kind.QUERY, Kind.PUBLISHER]
         assert Kind.UNSUBSCRIBE not in kinds
+
+    def test_what_comes_and_goes_while_the_link_is_down_leaves_nothing_behind(self) -> None:
+        discovery = Discovery("PC1", 1)
+        for n in range(1000):
+            discovery.advertise(n, f"t{n}", 5)
+            discovery.withdraw(n, f"t{n}")
+        discovery.advertise(1000, "t", 5)
+        assert len(discovery._schedule._fresh) == 1
+        assert len(discovery._schedule._ring) == 0
+
+    def test_what_waits_to_be_said_once_is_said_once(self) -> None:
+        discovery = Discovery("PC1", 1, rate=1, burst=2)
+        discovery.link_up(0)
+        for n in range(1000):
+            discovery.conflict(n, "IMU1", 1, 2)
+            discovery.set_flags(n, n % 2)
+        kinds = [type(message) for _, event in run(discovery, 1000, 100 * S) for message in sent([event])]
+        assert kinds.count(m.Conflict) == 1
+        assert len(discovery._schedule._fresh) == 0
+
+    def test_a_new_type_of_what_was_announced_goes_first(self) -> None:
+        schedule = Schedule(1000, 100, 0)
+        items = [Item(Kind.PUBLISHER, (f"t{n}",)) for n in range(4)]
+        for item in items:
+            schedule.add(item)
+        while (schedule.pop(0)) is not None:
+            schedule.sent(0, 1)
+        schedule.add(items[2])
+        assert schedule.pop(S) == items[2]
+        assert schedule._count == len(items)
 
     def test_presence_leaves_room_on_a_slow_line(self) -> None:
         schedule = Schedule(1, 2, 0)

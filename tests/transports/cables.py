@@ -1,7 +1,7 @@
 """Two modules and something between them that can be cut, mended and frozen: one class for each transport.
 
-`@conforms` runs one and the same test over all of them: memory and an in-process line under virtual time, TCP and
-serial ports on asyncio's loop and on uvloop's.
+`@conforms` runs one and the same test over all of them: memory, a simulated CAN bus and an in-process line under
+virtual time, TCP, serial ports and zenoh on asyncio's loop and on uvloop's.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ import msgspec
 import pytest
 import uvloop
 
-from r2p.sim import VirtualLoop
+from r2p.sim import SimCan, VirtualLoop
 from r2p.transports.line import Carrier, LineLink
 from r2p.transports.link import Hub, Link, Transport
 from r2p.transports.memory import MemoryLink, MemoryNetwork
@@ -110,6 +110,25 @@ class _Attached(Transport):
                 self._attached(link)
 
         await self._inner.run(Telling(), opened)
+
+
+class SimCable(Cable):
+    """A simulated CAN bus; power can fail."""
+
+    async def __aenter__(self) -> Self:
+        self._bus = SimCan(seed=1)
+        return self
+
+    def a(self) -> Transport:
+        return self._bus.transport()
+
+    b = a
+
+    async def cut(self) -> None:
+        self._bus.power_off()
+
+    async def mend(self) -> None:
+        self._bus.power_on()
 
 
 class LineEnd(Transport, Carrier):
@@ -412,13 +431,22 @@ class Setup(msgspec.Struct, frozen=True):
         assert not lost
 
 
+def _zenoh() -> Cable:
+    from tests.transports.zenoh.cable import ZenohCable  # which needs this module
+
+    return ZenohCable()
+
+
 SETUPS = {
     "memory": Setup(MemoryCable, VirtualLoop),
+    "sim": Setup(SimCable, VirtualLoop),
     "line": Setup(LineCable, VirtualLoop),
     "tcp-asyncio": Setup(TcpCable, asyncio.new_event_loop),
     "tcp-uvloop": Setup(TcpCable, uvloop.new_event_loop),
     "serial-asyncio": Setup(SerialCable, asyncio.new_event_loop),
     "serial-uvloop": Setup(SerialCable, uvloop.new_event_loop),
+    "zenoh-asyncio": Setup(_zenoh, asyncio.new_event_loop),
+    "zenoh-uvloop": Setup(_zenoh, uvloop.new_event_loop),
 }
 
 
@@ -428,8 +456,8 @@ def conforms(test: Callable[[Cable], Coroutine[Any, Any, None]]) -> Callable[[st
 
 
 def conforms_lines(test: Callable[[Cable], Coroutine[Any, Any, None]]) -> Callable[[str], None]:
-    """The same, of every transport whose other end may stop reading."""
-    return _over([name for name in SETUPS if SETUPS[name].cable is not MemoryCable], test)
+    """The same, of every transport whose other end may stop reading; zenoh has tests of its own for that."""
+    return _over([name for name in SETUPS if SETUPS[name].cable not in (MemoryCable, SimCable, _zenoh)], test)
 
 
 def _over(names: list[str], test: Callable[[Cable], Coroutine[Any, Any, None]]) -> Callable[[str], None]:

@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator
 
 import r2p
 import r2p.msg
+from r2p.events import ModuleEvent
 from r2p.messages import Message, layout
-from r2p.module import ModuleEvent
 from r2p.runner import run_main
 
 EVERY: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]

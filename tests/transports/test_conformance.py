@@ -8,8 +8,8 @@ from typing import TypeVar
 
 import r2p
 import r2p.msg
+from r2p.events import ModuleEvent
 from r2p.messages import Message
-from r2p.module import ModuleEvent
 from r2p.msg import PWM2, Led, Speed3, Text
 from r2p.network import ModuleView
 from r2p.protocols.events import Mismatched, ModuleGone, NameConflict
@@ -349,27 +349,41 @@ async def test_a_peer_that_does_not_read(cable: Cable) -> None:
 async def test_events_and_periods_that_wait_for_a_link_are_discarded_when_it_breaks(cable: Cable) -> None:
     degraded: list[r2p.Missed] = []
     missed: list[r2p.Missed] = []
+    stale: list[r2p.Missed] = []
+    number = 0
     async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
         await acquainted(a, b)
         filler = alice.advertise("text", Text, r2p.NonRealTime(stall=0.01))
         klass = r2p.Sporadic(deadline=10.0, on_missed=missed.append, on_degraded=degraded.append)
         publisher = alice.advertise("cmd", Led, klass)
-        texts, commands = bob.subscribe("text", Text), bob.subscribe("cmd", Led)
-        await filler.wait_subscriber()
-        await publisher.wait_subscriber()
+        state = alice.advertise("state", Led, r2p.Periodic(0.005, lambda: Led(led=number), on_missed=stale.append))
+        texts, commands, states = bob.subscribe("text", Text), bob.subscribe("cmd", Led), bob.subscribe("state", Led)
+        for each in (filler, publisher, state):
+            await each.wait_subscriber()
         cable.freeze()
         while not filler.missed:
             await filler.publish(Text())
+        number = 1
         assert not publisher.publish_nowait(Led(led=1))  # waits for room
+        await until(lambda: state.missed > 1)
+        assert {each.reason for each in stale} == {"no room"}
         await cable.cut()
         await until(lambda: degraded)
         await until(lambda: not publisher.subscribers)
+        where = degraded[0].where
+        assert missed == [r2p.Missed("cmd", "link down", where)]
+        assert publisher.publish_nowait(Led(led=2)) == (not a.links)  # a server's link ends with its client
+        assert missed == [r2p.Missed("cmd", "link down", where)] * (1 + len(a.links))
+        assert "link down" in {each.reason for each in stale}
+        number = 3
         await cable.mend()
         await publisher.wait_subscriber()
-        await publisher.publish(Led(led=2))
-        assert await commands.fetch() == Led(led=2)
+        await publisher.publish(Led(led=3))
+        assert await commands.fetch() == Led(led=3)
+        while (state_now := (await states.fetch()).led) != 3:
+            assert state_now == 0
         texts.close()
-        assert not missed
+        assert publisher.missed == len(missed)
 
 
 @conforms

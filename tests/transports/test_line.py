@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import pytest
 
@@ -135,10 +135,135 @@ async def test_whoever_waits_for_a_line_that_breaks_waits_no_more() -> None:
         assert not events.publish_nowait(Led())
         held = len(script.link._samples)
         script.link.disconnected("broken")
-        assert script.link.losses["link down"] == held + 1
+        assert script.link.losses["link down"] == held + 2
         await asyncio.sleep(0)
         flood.cancel()
         assert filler.sent > stalled
+
+
+async def test_events_never_wait_behind_a_blocked_line() -> None:
+    """Their publisher keeps them, and they go first; those of NRT publishers keep their order behind them."""
+    signals: list[r2p.Missed] = []
+    async with scripted() as (script, _, node):
+        bulk = node.advertise("text", Text)
+        klass = r2p.Sporadic(0.5, on_missed=signals.append, on_late=signals.append)
+        events = [node.advertise("leds", Led, klass), node.advertise("leds", Led, klass)]
+        script.hear(manage(m.SubscribeRequest("text", 64, 1)) + manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        script.blocked = True
+        flood = asyncio.create_task(_flood(bulk))
+        await asyncio.sleep(0.5)
+        script.said.clear()
+        for number in range(6):
+            assert not events[number % 2].publish_nowait(Led(led=number))
+        await asyncio.sleep(0.4)
+        script.unblock()
+        assert script.topics("leds") == [Led(led=number).encode() for number in range(6)]
+        assert said(script)[:6] == ["leds"] * 6
+        flood.cancel()
+        assert not signals
+
+
+async def test_an_event_overtakes_what_waits_for_the_end_of_the_turn() -> None:
+    async with scripted() as (script, _, node):
+        bulk, event = node.advertise("text", Text), node.advertise("leds", Led, r2p.Sporadic(0.5))
+        script.hear(manage(m.SubscribeRequest("text", 64, 1)) + manage(SUBSCRIBE))
+        await asyncio.sleep(0.9)
+        script.said.clear()
+        for _ in range(3):
+            bulk.publish_nowait(Text())
+        event.publish_nowait(Led())
+        event.publish_nowait(Led())
+        await asyncio.sleep(0)
+        assert said(script) == ["text", "leds", "leds", "text", "text"]
+
+
+@pytest.mark.parametrize(("late", "sent"), [("drop", []), ("send", [Led(led=2).encode()])])
+async def test_an_event_that_a_line_does_not_take_in_time_is_late(
+    late: Literal["drop", "send"], sent: list[bytes]
+) -> None:
+    missed: list[r2p.Missed] = []
+    told: list[r2p.Missed] = []
+    async with scripted() as (script, _, node):
+        event = node.advertise("leds", Led, r2p.Sporadic(0.1, late=late, on_missed=missed.append, on_late=told.append))
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        script.blocked = True
+        await event.publish(Led(led=1))  # the line takes this one, slowly, and then no more
+        await asyncio.sleep(0.05)
+        script.said.clear()
+        await event.publish(Led(led=2))
+        await asyncio.sleep(1)
+        script.unblock()
+        await asyncio.sleep(1)
+        assert script.topics("leds") == sent
+        first = r2p.Missed("leds", "sent late", where="script", late=0.95)
+        second = r2p.Missed("leds", "no room by the deadline", where="script")
+        assert missed == ([second] if late == "drop" else [])
+        assert told == ([first] if late == "drop" else [second, first])
+        assert (event.missed, event.late) == (len(missed), len(told))
+
+
+async def test_an_event_that_a_line_had_begun_to_send_when_it_broke_is_missed() -> None:
+    missed: list[r2p.Missed] = []
+    async with scripted() as (script, _, node):
+        event = node.advertise("leds", Led, r2p.Sporadic(0.1, on_missed=missed.append))
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        await event.publish(Led())
+        script.blocked = True
+        await asyncio.sleep(1)
+        await event.publish(Led())
+        script.link.disconnected("broken")
+        assert missed == [r2p.Missed("leds", "link down", where="script")]
+        assert (script.link.stats.sent, script.link.losses["link down"]) == (1, 1)
+
+
+async def test_a_period_waits_for_a_line_until_the_next_one() -> None:
+    missed: list[r2p.Missed] = []
+    late: list[r2p.Missed] = []
+    values = iter([Led(led=number) for number in range(100)])
+    async with scripted() as (script, _, node):
+        klass = r2p.Periodic(1.0, values.__next__, on_missed=missed.append, on_late=late.append)
+        state = node.advertise("leds", Led, klass)
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(2.5)
+        script.blocked = True
+        script.link.carrier_full()
+        await asyncio.sleep(0.7)  # at 3.2
+        script.unblock()
+        assert (missed, late) == ([], [])
+        script.blocked = True
+        script.link.carrier_full()
+        await asyncio.sleep(2.6)  # at 5.8, when 3 has been sent
+        script.unblock()
+        assert script.topics("leds") == [Led(led=number).encode() for number in (0, 1, 2, 4)]
+        assert missed == [r2p.Missed("leds", "no room", where="script")]
+        assert late == [r2p.Missed("leds", "sent late", where="script", late=0.8)]
+        assert (state.missed, state.late) == (1, 1)
+
+
+async def test_what_a_line_that_is_down_does_not_get() -> None:
+    """Each sample of a real-time publisher is missed; the others were told that the link is down."""
+    missed: list[r2p.Missed] = []
+    degraded: list[r2p.Missed] = []
+    signals: dict[str, Any] = {"on_missed": missed.append, "on_degraded": degraded.append}
+    async with scripted() as (script, _, node):
+        event = node.advertise("event", Led, r2p.Sporadic(0.1, **signals))
+        state = node.advertise("state", Led, r2p.Periodic(1.0, Led, **signals))
+        text = node.advertise("text", Led, r2p.NonRealTime(**signals))
+        script.hear(b"".join(manage(m.SubscribeRequest(topic, 5, 1)) for topic in ("event", "state", "text")))
+        await asyncio.sleep(0.5)
+        script.link.disconnected("broken")
+        assert {each.topic for each in degraded} == {"event", "state", "text"}
+        for _ in range(3):
+            assert not event.publish_nowait(Led())
+            assert text.publish_nowait(Led())
+        await asyncio.sleep(2)
+        down = [(each.topic, each.reason, each.where) for each in missed]
+        assert down == [("event", "link down", "script")] * 3 + [("state", "link down", "script")] * 2
+        assert (event.missed, state.missed, text.missed) == (3, 2, 0)
+        assert script.link.losses["link down"] == 8
 
 
 async def test_the_outage_is_told() -> None:

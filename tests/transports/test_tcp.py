@@ -10,6 +10,7 @@ from typing import cast
 import pytest
 
 import r2p
+from r2p.backoff import Backoff
 from r2p.codecs import management as m
 from r2p.codecs.debug import Reader
 from r2p.errors import TransportError
@@ -17,7 +18,6 @@ from r2p.msg import Led
 from r2p.protocols.discovery import Discovery
 from r2p.testing.network import node_in
 from r2p.transports import tcp
-from r2p.transports.backoff import Backoff
 from r2p.transports.line import LineLink
 from r2p.transports.tcp import TcpListenTransport, TcpTransport
 from r2p.transports.url import parse
@@ -331,3 +331,12 @@ def test_where_it_listens(url: str, address: tuple[str, int]) -> None:
 def test_addresses_that_are_none(url: str) -> None:
     with pytest.raises(TransportError):
         TcpTransport(parse(url))
+
+
+@pytest.mark.parametrize("host", ["a..b", ".a", "a" * 64, "a\0b"])
+@pytest.mark.parametrize("transport", [TcpTransport, TcpListenTransport])
+def test_what_can_not_be_a_host_name_is_said_at_once(
+    transport: type[TcpTransport] | type[TcpListenTransport], host: str
+) -> None:
+    with pytest.raises(TransportError, match="is no host name"):
+        transport(parse(f"tcp:{host}:23"))

@@ -1,0 +1,158 @@
+"""Who may exchange what, among those who tell it by tokens: our side of each topic against that of every session.
+
+Both sides see the other's tokens, so both know when two types don't fit, and tell their own user.
+"""
+
+from collections import Counter
+
+import msgspec
+
+from r2p.codecs.liveliness import TopicToken
+from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.protocols.declarations import Declarations, TopicRole, counterpart
+from r2p.protocols.demand import Demand
+from r2p.protocols.directory import TopicInfo
+from r2p.protocols.events import Event, Joined, Left, Mismatched, Opened, Parted, Shape, Shut
+
+
+class _Session(msgspec.Struct):
+    """What one r2p module on the network has declared of topics, what of it flows, and what was refused."""
+
+    tokens: dict[TopicRole, dict[str, TopicToken]] = msgspec.field(default_factory=dict)
+    matched: dict[TopicRole, int] = msgspec.field(default_factory=dict)
+    refused: dict[TopicRole, Shape] = msgspec.field(default_factory=dict)
+
+
+class Matching:
+    """The topics of one network."""
+
+    def __init__(self, own: Declarations, events: list[Event]) -> None:
+        self.topics: dict[str, TopicInfo] = {}
+        self.demand = Demand()
+        """What others offer and want, whether we have anything to do with it or not."""
+        self._own = own
+        self._events = events
+        self._sessions: dict[int, _Session] = {}
+        self._takers: Counter[str] = Counter()
+        self._told: Counter[TopicRole] = Counter()
+
+    def appeared(self, now: int, key: str, token: TopicToken) -> None:
+        """A publisher or subscriber of some session is there."""
+        session = self._sessions.setdefault(token.session, _Session())
+        topic_role = token.topic, token.role
+        session.tokens.setdefault(topic_role, {})[key] = token
+        self._told[topic_role] += 1
+        self.demand.add(*topic_role, token.session)
+        self._note(now, token)
+        self._review(token.session, session, topic_role)
+
+    def disappeared(self, key: str, token: TopicToken) -> None:
+        """It is not there any more."""
+        session = self._sessions[token.session]
+        topic_role = token.topic, token.role
+        tokens = session.tokens[topic_role]
+        del tokens[key]
+        if not tokens:
+            del session.tokens[topic_role]
+            self.demand.remove(*topic_role, token.session)
+        self._review(token.session, session, topic_role)
+        if not session.tokens:
+            del self._sessions[token.session]
+        self._told[topic_role] -= 1
+        if not self._told[topic_role]:
+            del self._told[topic_role]
+            self._forget_role(*topic_role)
+
+    def changed(self, topic: str, role: int) -> None:
+        """Our own side of the topic in this role has changed."""
+        for number, session in list(self._sessions.items()):
+            session.refused.pop((topic, counterpart(role)), None)
+            self._review(number, session, (topic, counterpart(role)))
+
+    def freshen(self, now: int) -> None:
+        """What is there is as good as just heard."""
+        for topic, role in self._told:
+            self._mark(now, self.topics[topic], role)
+
+    def _review(self, number: int, session: _Session, key: TopicRole) -> None:
+        topic, role = key
+        tokens = session.tokens.get(key)
+        own = self._own.own(topic, counterpart(role))
+        if not tokens or own is None:
+            session.refused.pop(key, None)
+            self._end(number, session, key)
+        else:
+            theirs = _shape(tokens)
+            if own.shape.fits(theirs):
+                session.refused.pop(key, None)
+                self._match(number, session, key, _detail(tokens, role))
+            else:
+                self._end(number, session, key)
+                if session.refused.get(key) != theirs:
+                    session.refused[key] = theirs
+                    self._events.append(Mismatched(topic, number, role, own.shape, theirs))
+        if topic in self.topics:
+            refused = any(kept[:1] == (topic,) for each in self._sessions.values() for kept in each.refused)
+            self.topics[topic].mismatch = refused
+
+    def _match(self, number: int, session: _Session, key: TopicRole, detail: int) -> None:
+        if session.matched.get(key) == detail:
+            return
+        topic, role = key
+        if role == ROLE_SUBSCRIBES:
+            self._takers[topic] += key not in session.matched
+            self._events.append(Joined(topic, NO_PARAMS, detail, number))
+        else:
+            self._events.append(Opened(topic, number, NO_PARAMS, detail))
+        session.matched[key] = detail
+
+    def _end(self, number: int, session: _Session, key: TopicRole) -> None:
+        if session.matched.pop(key, None) is None:
+            return
+        topic, role = key
+        if role == ROLE_PUBLISHES:
+            self._events.append(Shut(topic, number))
+            return
+        self._events.append(Parted(topic, number))
+        self._takers[topic] -= 1
+        if not self._takers[topic]:
+            del self._takers[topic]
+            self._events.append(Left(topic))
+
+    def _note(self, now: int, token: TopicToken) -> None:
+        info = self.topics.setdefault(token.topic, TopicInfo(token.topic))
+        self._mark(now, info, token.role)
+        typed = token.fingerprint != ANY_TYPE
+        if typed and (token.role == ROLE_PUBLISHES or info.fingerprint is None):
+            info.fingerprint = token.fingerprint
+        if token.size and (token.role == ROLE_PUBLISHES or not info.size):
+            info.size = token.size
+
+    def _mark(self, now: int, info: TopicInfo, role: int) -> None:
+        if role == ROLE_PUBLISHES:
+            info.advertised_at = now
+        else:
+            info.requested_at = now
+
+    def _forget_role(self, topic: str, role: int) -> None:
+        """Nobody has the topic in this role any more; where nobody does in the other one it is forgotten."""
+        if (topic, counterpart(role)) not in self._told:
+            del self.topics[topic]
+        elif role == ROLE_PUBLISHES:
+            self.topics[topic].advertised_at = None
+        else:
+            self.topics[topic].requested_at = None
+
+
+def _shape(tokens: dict[str, TopicToken]) -> Shape:
+    """The type that a session tells; the first one that does."""
+    size = next((each.size for each in tokens.values() if each.size), 0)
+    fingerprint = next((each.fingerprint for each in tokens.values() if each.fingerprint != ANY_TYPE), ANY_TYPE)
+    return Shape(size, fingerprint)
+
+
+def _detail(tokens: dict[str, TopicToken], role: int) -> int:
+    """What else matters: the size of a publisher's messages, the window of a subscriber."""
+    if role == ROLE_PUBLISHES:
+        return _shape(tokens).size
+    return max(each.window for each in tokens.values())

@@ -1,0 +1,172 @@
+"""Room: what takes samples, who waits for a free place in it, and in which order they get one.
+
+Two lines before each place, both first come first served: events and periods get a free place before messages that do
+not expire. Whoever has places serves the lines as soon as one is free; so while somebody waits there is none, and
+nobody can slip in.
+"""
+
+import abc
+from collections import deque
+from typing import TYPE_CHECKING
+
+from r2p.sample import PublisherClass, Sample
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+LINK_DOWN = "link down"
+"""Why samples for a link are lost while it is down: its publishers were told when that began."""
+
+
+class Sink(abc.ABC):
+    """What takes samples: a subscriber's queue, or a link's send buffer."""
+
+    __slots__ = ("lost", "patient")
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self.patient = True
+        """Whether publishers wait for room in it; False while it is considered lossy."""
+
+    @property
+    @abc.abstractmethod
+    def owner(self) -> str:
+        """The name of its node or link."""
+
+    @property
+    def reachable(self) -> bool:
+        """Whether it can take anything at all."""
+        return True
+
+    @abc.abstractmethod
+    def offer(self, sample: Sample) -> bool:
+        """Take the sample if there is room."""
+
+    @abc.abstractmethod
+    def force(self, sample: Sample) -> None:
+        """Take the sample even without room, losing and counting one."""
+
+    @abc.abstractmethod
+    def room(self) -> "Room":
+        """Those who wait for room in it."""
+
+    @abc.abstractmethod
+    def refill(self) -> None:
+        """Give them what room there is."""
+
+    def give_up(self, refusal: str) -> None:
+        """It made no room in time: lossy until it has."""
+        self.patient = False
+        self.room().refuse(self, refusal)
+        self.room().recoveries.append(self._recover)
+
+    def _recover(self) -> None:
+        self.patient = True
+
+
+class Claim(abc.ABC):
+    """A sample that waits for room in some sinks."""
+
+    __slots__ = ("lacking", "sample")
+
+    def __init__(self, sample: Sample, sinks: list[Sink]) -> None:
+        self.sample = sample
+        self.lacking = sinks
+        """Who has not got it yet."""
+        for sink in sinks:
+            sink.room().enter(sink, self)
+
+    @abc.abstractmethod
+    def settled(self, sink: Sink, refusal: str) -> None:
+        """The sink has got it, or lost it (counted there) for the reason `refusal`."""
+
+    def settle(self, sink: Sink, refusal: str = "") -> None:
+        """The sink has got it or lost it."""
+        if sink in self.lacking:  # else somebody who was told of another one has withdrawn it
+            self.lacking.remove(sink)
+            self.settled(sink, refusal)
+
+    def withdraw(self) -> list[Sink]:
+        """Wait no more; says who has not got it."""
+        without, self.lacking = self.lacking, []
+        for sink in without:
+            sink.room().leave(sink, self)
+        return without
+
+
+_Line = deque[tuple[Sink, Claim]]
+
+
+class Room:
+    """The lines before one place; several sinks may share it."""
+
+    __slots__ = ("claims", "events", "recoveries")
+
+    def __init__(self) -> None:
+        self.events: _Line = deque()
+        self.claims: _Line = deque()
+        self.recoveries: list[Callable[[], None]] = []
+        """What to call when there is plenty of room: from those who went on without waiting."""
+
+    def __bool__(self) -> bool:
+        return bool(self.events or self.claims or self.recoveries)
+
+    def line(self, sample: Sample) -> _Line:
+        """The line in which such a sample waits."""
+        return self.claims if sample.publisher_class == PublisherClass.NON_REAL_TIME else self.events
+
+    def enter(self, sink: Sink, claim: Claim) -> None:
+        self.line(claim.sample).append((sink, claim))
+
+    def leave(self, sink: Sink, claim: Claim) -> None:
+        line = self.line(claim.sample)
+        if (sink, claim) in line:
+            line.remove((sink, claim))
+
+    def serve(self) -> None:
+        """There may be room for some."""
+        for line in (self.events, self.claims):
+            while line:
+                first = line.popleft()
+                sink, claim = first
+                if not sink.offer(claim.sample):
+                    line.appendleft(first)
+                    break
+                claim.settle(sink)
+
+    def recover(self) -> None:
+        """There is plenty of room."""
+        recoveries, self.recoveries = self.recoveries, []
+        for callback in recoveries:
+            callback()
+
+    def dismiss(self, sink: Sink) -> None:
+        """Nobody is behind this sink any more: nobody lacks what waits for it."""
+        for line in (self.events, self.claims):
+            for claim in _take(line, sink):
+                claim.settle(sink)
+
+    def refuse(self, sink: Sink, refusal: str) -> None:
+        """No room in this sink for messages that do not expire: it loses those that wait, or older ones."""
+        for claim in _take(self.claims, sink):
+            sink.force(claim.sample)
+            claim.settle(sink, refusal)
+
+    def refuse_all(self, refusal: str) -> None:
+        """No room for anything."""
+        for line in (self.events, self.claims):
+            while line:
+                sink, claim = line.popleft()
+                sink.force(claim.sample)
+                claim.settle(sink, refusal)
+
+
+def _take(line: _Line, sink: Sink) -> list[Claim]:
+    """Take out of the line what waits for this sink."""
+    taken = [claim for each, claim in line if each is sink]
+    if taken:
+        rest = [entry for entry in line if entry[0] is not sink]
+        line.clear()
+        line.extend(rest)
+    return taken

@@ -1,0 +1,150 @@
+"""A listener on a bus: every frame, the load, the slots; on the simulated bus, and as the tools use it."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator
+
+import pytest
+
+import r2p
+from r2p.bus import BusMonitor, FrameKind
+from r2p.msg import Led
+from r2p.sim.can import CanNode
+from r2p.sim.transport import SimCan, SimPort
+from r2p.tools import bus_dump, bus_load, bus_schedule
+from r2p.tools._bus.listening import listen
+from r2p.tools.session import Usage
+
+pytestmark = pytest.mark.virtual_time
+
+RATE = 100
+
+
+@contextlib.asynccontextmanager
+async def robot() -> AsyncIterator[tuple[SimCan, BusMonitor]]:
+    """A module with slots of its own, one that subscribes, and a listener."""
+    bus = SimCan()
+
+    async def motor(node: r2p.Node) -> None:
+        node.advertise("encoder", Led, r2p.Periodic(1 / RATE, lambda: Led(led=7)))
+        await node.spin()
+
+    async def watch(node: r2p.Node) -> None:
+        async for _ in node.subscribe("encoder", Led):
+            pass
+
+    async with (
+        r2p.Module("MOTOR", via=bus.transport()) as module,
+        r2p.Module("PC", via=bus.transport()) as pc,
+        BusMonitor(SimPort(bus, CanNode("listener"))) as listener,
+    ):
+        module.start(motor)
+        pc.start(watch)
+        await asyncio.sleep(6)
+        yield bus, listener
+
+
+async def test_frames_come_with_their_names_and_slots() -> None:
+    async with robot() as (_, listener):
+        seen = []
+        async for each in listener:
+            seen.append(each)
+            if len(seen) == 500:
+                break
+        hrt = [each for each in seen if each.kind is FrameKind.HRT]
+        assert {(each.topic, each.module) for each in hrt} == {("encoder", "MOTOR")}
+        assert len({each.slot for each in hrt}) == 1
+        assert listener.lost == 0
+
+
+async def test_the_load_is_that_of_the_bus() -> None:
+    async with robot() as (bus, listener):
+        bus.bus.reset_statistics()
+        load = await anext(listener.loads(5.0))
+        assert load.total == pytest.approx(bus.bus.load(), rel=0.01)
+        frames = load.tallies["encoder", "MOTOR", FrameKind.HRT].frames
+        assert frames == pytest.approx(5 * 100.4, abs=2)
+
+
+async def test_the_slots_show_their_owner_and_who_died() -> None:
+    async with robot() as (bus, listener):
+        assert await listener.cycles(20, patience=1.0)
+        owned = [slot for slot in listener.slots if "encoder" in slot.owners]
+        assert [(slot.reserved, slot.missed) for slot in owned] == [(20, 0)]
+        cells = bus_schedule.cells_of(listener)
+        assert [cell.owner for cell in cells].count("encoder") == 1
+        assert cells[0].owner == "sync"
+        assert [row["used"] for row in bus_schedule.rows(listener) if row["owner"] == "encoder"] == [20]
+        bus.power_off()
+        assert not await listener.cycles(20, patience=1.0)
+
+
+async def test_slow_iterations_lose_the_oldest_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.bus.QUEUE", 500)
+    async with robot() as (_, listener):
+        frames = aiter(listener)
+        first = await anext(frames)
+        await asyncio.sleep(5)
+        assert listener.lost > 0
+        assert (await anext(frames)).stamp > first.stamp + 1_000_000_000
+        await frames.aclose()  # type: ignore[attr-defined]
+
+
+async def test_what_the_commands_print() -> None:
+    async with robot() as (_, listener):
+        lines, records = [], []
+        async for seen in listener:
+            lines.append(bus_dump.line(seen, listener.since))
+            records.append(json.loads(json.dumps(bus_dump.record(seen, listener.since))))
+            if len(lines) == 200:
+                break
+        encoder = next(record for record in records if record["topic"] == "encoder")
+        assert encoder["kind"] == "hrt"
+        assert encoder["fragments"] == 1
+        assert encoder["data"] == "0700000000"
+        assert any("hrt" in line and "encoder" in line and "MOTOR" in line and "1/1" in line for line in lines)
+        load = await anext(listener.loads(2.0))
+        text = bus_load.text(load)
+        assert text.startswith("load ")
+        assert any("encoder" in line and "MOTOR" in line for line in text.splitlines())
+        assert bus_load.trouble(load) is None
+        assert bus_load.record(load)["load"] == pytest.approx(load.total, abs=1e-6)
+
+
+async def test_a_crowded_bus_is_told() -> None:
+    async with robot() as (bus, listener):
+
+        async def talk(node: r2p.Node) -> None:
+            flood = node.advertise("flood", Led)
+            await flood.wait_subscriber()
+            while flood.subscribers:
+                await flood.publish(Led())
+
+        async def hear(node: r2p.Node) -> None:
+            async for _ in node.subscribe("flood", Led, lossy=True):
+                pass
+
+        async with r2p.Module("LOUD", via=bus.transport()) as loud, r2p.Module("EAR", via=bus.transport()) as ear:
+            loud.start(talk)
+            ear.start(hear)
+            await asyncio.sleep(2)
+            load = await anext(listener.loads(0.2))
+        assert load.free_used > 0.95
+        assert "starve" in str(bus_load.trouble(load))
+
+
+async def test_a_bus_that_can_not_be_had_is_an_error() -> None:
+    with pytest.raises(r2p.TransportError, match="python-can"):
+        async with BusMonitor("rtcan:nonsense:0"):
+            pass
+    with pytest.raises(r2p.TransportError, match="slots"):
+        async with BusMonitor("rtcan:can0,slots=1"):
+            pass
+
+
+@pytest.mark.parametrize("via", [["memory:lab"], ["rtcan:can0", "rtcan:can1"]])
+async def test_the_commands_take_one_can_bus(via: list[str]) -> None:
+    with pytest.raises(Usage, match="give one CAN bus"):
+        async with listen(via):
+            pass
