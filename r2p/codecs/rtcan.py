@@ -156,7 +156,7 @@ def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
         bits += 8 + (step >> 3)
         crc = (crc << 8 ^ _REMAINDERS[crc >> 7 ^ byte]) & 0x7FFF
     high = _STUFFING[state << 8 | crc >> 7]
-    low = _stuff(high & 7, crc & 0x7F, 7)
+    low = _STUFFING_7[(high & 7) << 7 | crc & 0x7F]
     return bits + _CRC + (high >> 3) + (low >> 3) + TAIL
 
 
@@ -240,4 +240,5 @@ def _remainder(byte: int) -> int:
 
 
 _STUFFING = tuple(_stuff(state, byte, 8) for state in range(8) for byte in range(256))
+_STUFFING_7 = tuple(_stuff(state, bits, 7) for state in range(8) for bits in range(128))
 _REMAINDERS = tuple(_remainder(byte) for byte in range(256))

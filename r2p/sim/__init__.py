@@ -7,5 +7,6 @@ are the same.
 """
 
 from r2p.sim.loop import VirtualLoop, run
+from r2p.sim.transport import SimCan, can_bus
 
-__all__ = ["VirtualLoop", "run"]
+__all__ = ["SimCan", "VirtualLoop", "can_bus", "run"]

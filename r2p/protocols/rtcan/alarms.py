@@ -11,27 +11,22 @@ class Alarms(Timers):
 
     def __init__(self) -> None:
         super().__init__()
-        self._next_due = NEVER
-        self._stale = False
-
-    @property
-    def due(self) -> int:
+        self.due = NEVER
         """When the next key runs out; NEVER if there is none."""
-        if self._stale:
-            due = super().next()
-            self._next_due = NEVER if due is None else due
-            self._stale = False
-        return self._next_due
 
     def set(self, key: Hashable, due: int) -> None:
-        self._stale = True
         super().set(key, due)
+        self._look()
 
     def clear(self, key: Hashable) -> None:
-        self._stale = True
         super().clear(key)
+        self._look()
 
     def pop(self, now: int) -> Iterator[Hashable]:
-        self._stale = True
-        yield from super().pop(now)
-        self._stale = True
+        for key in super().pop(now):
+            self._look()
+            yield key
+
+    def _look(self) -> None:
+        due = self.next()
+        self.due = NEVER if due is None else due

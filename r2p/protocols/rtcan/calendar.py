@@ -69,7 +69,8 @@ class Refusal(msgspec.Struct, frozen=True):
                     f"0x{self.rival:04X} nor is a multiple"
                 )
             case Reason.LENGTH:
-                return f"a period of {self.period} slots: 2 to {LONGEST_PERIOD} are possible, more than the fragments"
+                needed = max(2, self.fragments + 1)
+                return f"a period of {self.period} slots: this message needs one of {needed} to {LONGEST_PERIOD}"
             case Reason.FULL:
                 return f"no {self.fragments} slots in a row are free every {self.period} slots"
             case Reason.TAKEN:

@@ -108,7 +108,7 @@ class Core:
 
     def settle(self, now: int) -> None:
         """Use the bus as the state of things allows."""
-        electing = self.election.role is Role.ELECTING
+        electing, held = self.election.role is Role.ELECTING, self.queue.only is not None
         self.queue.only = self.message_id(rtcan.MANAGEMENT) if electing else None
         if self.identity.stage is Stage.LISTENING or self.network.silenced is not None:
             mode = Mode.SILENT
@@ -117,13 +117,13 @@ class Core:
         else:
             mode = Mode.SLOTTED if self.network.verified else Mode.SILENT
         self.sender.enter(now, mode)
+        if held and not electing:
+            self.sender.kick(now)
 
     def discard(self, now: int) -> None:
         """Give up everything that waits to be sent."""
-        self.pacer.clear()
-        for message in self.post.discard():
-            if message.handle is not None:
-                self.out.append(Done(message.handle, Fate.DISCARDED, missed=True, at=now))
+        handles = self.pacer.clear() + [message.handle for message in self.post.discard()]
+        self.out += [Done(each, Fate.DISCARDED, missed=True, at=now) for each in handles if each is not None]
         for periodic in self.periodics.values():
             self.wishes.lapse(periodic, "the node may not send")
             self.timers.clear(("tick", periodic.high))
@@ -134,18 +134,19 @@ class Core:
         """Send a management message of our own."""
         self.manage(now, management.encode(message))
 
-    def manage(self, now: int, data: bytes, *, urgent: bool = False) -> None:
+    def manage(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> None:
         """Send a management message; before the others, if it is urgent."""
-        if self.profile is Profile.FIRMWARE:
-            self.pacer.put(data, urgent=urgent)
-        else:
-            self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, urgent=urgent)
+        if self.profile is not Profile.FIRMWARE:
+            self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, handle, urgent=urgent)
+            return
+        dropped = self.pacer.put(data, urgent=urgent, handle=handle)
+        self.post.report(dropped, Fate.FULL, missed=False, at=now)
 
     def pace(self, now: int) -> None:
         """Among firmware: send management if it is quiet."""
-        data = self.pacer.pop(now)
-        if data is not None:
-            self._queue_management(now, rtcan.FIRMWARE_MANAGEMENT, data, urgent=False)
+        due = self.pacer.pop(now)
+        if due is not None:
+            self._queue_management(now, rtcan.FIRMWARE_MANAGEMENT, *due, urgent=False)
 
     def listen(self, identifier: int) -> None:
         """What any frame tells while we only listen."""
@@ -265,12 +266,13 @@ class Core:
                 self.tick(now, periodic)
         self.settle(now)
 
-    def _queue_management(self, now: int, message: int, data: bytes, *, urgent: bool) -> None:
+    def _queue_management(self, now: int, message: int, data: bytes, handle: Hashable, *, urgent: bool) -> None:
         deadline = now + (_URGENT if urgent else _DEADLINE)
-        if self.queue.put(Outgoing(message, data, deadline, drop=False), urgent=urgent):
+        if self.queue.put(Outgoing(message, data, deadline, drop=False, handle=handle), urgent=urgent):
             self.sender.kick(now)
         else:
             self.counts["management dropped"] += 1
+            self.post.report(handle, Fate.FULL, missed=False, at=now)
 
     def _ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
         if self.election.role is not Role.MASTER:

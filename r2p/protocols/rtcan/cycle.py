@@ -75,6 +75,7 @@ class Cycle:
         self.mask: int | None = None
         self.missed = 0
         self.anchored = False
+        self._slot = timing.slot
         self._latency = receive_latency
         self._first = 0
         self._first_at = 0
@@ -86,11 +87,11 @@ class Cycle:
 
     def slot_at(self, now: int) -> int:
         """The slot at this instant, counted from the start of this cycle; not limited to it."""
-        return (now - self.reference) // self.timing.slot
+        return (now - self.reference) // self._slot
 
     def start_of(self, slot: int) -> int:
         """When a slot of this cycle begins; may be one of a later cycle."""
-        return self.reference + slot * self.timing.slot
+        return self.reference + slot * self._slot
 
     def number_of(self, slot: int) -> int:
         """The number of a slot of this cycle, counted from the start of cycle 0."""

@@ -106,6 +106,11 @@ class Engine:
         return self._reassembly.losses
 
     @property
+    def silenced(self) -> str | None:
+        """Why the node sends nothing: the network has other parameters."""
+        return self._core.network.silenced
+
+    @property
     def cycle(self) -> int | None:
         """The counter of the current cycle; without NETWORK only its low 8 bits mean something."""
         return self._core.cycle.counter if self._core.cycle.running else None
@@ -117,8 +122,8 @@ class Engine:
 
     @property
     def waiting(self) -> int:
-        """Messages that wait to be sent."""
-        return len(self._core.queue)
+        """Messages that wait to be sent, and management that waits for silence."""
+        return len(self._core.queue) + len(self._pacer)
 
     @property
     def full(self) -> bool:
@@ -203,10 +208,11 @@ class Engine:
         """When to call `poll`; an instant in the past means at once."""
         if not self._running:
             return None
-        due = self._sender.due
-        for other in (self._timers.due, self._reassembly.due, self._pacer.due):
-            if other < due:
-                due = other
+        due = min(self._sender.due, self._timers.due)
+        if self._reassembly.open:
+            due = min(due, self._reassembly.due)
+        if self._pacer.waiting:
+            due = min(due, self._pacer.due)
         return due if due < NEVER else None
 
     def poll(self, now: int) -> Sequence[Action]:
@@ -220,9 +226,9 @@ class Engine:
                 core.settle(now)
         if self._sender.due <= now:
             self._sender.poll(now)
-        if self._reassembly.due <= now:
+        if self._reassembly.open:
             self._reassembly.poll(now)
-        if self._pacer.due <= now:
+        if self._pacer.waiting:
             core.pace(now)
         return self._take()
 
@@ -245,10 +251,13 @@ class Engine:
             self._send(now, message)
         return self._take()
 
-    def manage(self, now: int, data: bytes, *, urgent: bool = False) -> Sequence[Action]:
-        """Send a management message of 32 bytes, within 50 ms, or 1 ms and before all others if `urgent`."""
+    def manage(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Sequence[Action]:
+        """Send a management message of 32 bytes, within 50 ms, or 1 ms and before all others if `urgent`.
+
+        `Done` tells what became of it, if there is a `handle` and the node may send.
+        """
         if self.ready:
-            self._core.manage(now, data, urgent=urgent)
+            self._core.manage(now, data, urgent=urgent, handle=handle)
         return self._take()
 
     def subscribe(self, message: int, size: int) -> None:

@@ -106,7 +106,8 @@ class Identity:
             return
         if not self.fixed:
             free = [id8 for id8 in range(1, 255) if id8 not in self._taken] or list(range(1, 255))
-            self.id8 = free[self.draw(len(free))]
+            if self.id8 not in free:  # else it is the one that we had before
+                self.id8 = free[self.draw(len(free))]
         self.stage = Stage.CLAIMING
         self._changed(now)
         self.announce(now)

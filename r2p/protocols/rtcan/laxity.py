@@ -65,16 +65,17 @@ class LaxityQueue:
         self._depth = depth
         self._lanes: dict[int, _Lane] = {}
         self._sorted: list[tuple[int, int, _Lane]] = []
-        self._size = 0
+        self.size = 0
+        """Messages that wait."""
         self._count = 0
         self._expiry = NEVER
 
     def __len__(self) -> int:
-        return self._size
+        return self.size
 
     @property
     def full(self) -> bool:
-        return self._size >= self._capacity
+        return self.size >= self._capacity
 
     def put(self, message: Outgoing, *, urgent: bool = False) -> bool:
         """Queue it; `urgent` before all others of its topic that have not started. False: there is no room.
@@ -83,21 +84,21 @@ class LaxityQueue:
         """
         message.frames = rtcan.fragment_count(len(message.payload))
         lane = self._lanes.get(message.message)
-        if self._size >= self._capacity or (lane is not None and len(lane.waiting) >= self._depth):
+        if self.size >= self._capacity or (lane is not None and len(lane.waiting) >= self._depth):
             return False
         self._count += 1
         message.order = self._count
         if lane is None:
             lane = self._lanes[message.message] = _Lane(deque((message,)))
-        else:
+            self._enter(lane)
+        elif urgent:
             self._leave(lane)
-            first = lane.waiting[0]
-            if urgent:
-                lane.waiting.insert(1 if lane.busy or first.sent else 0, message)
-            else:
-                lane.waiting.append(message)
-        self._size += 1
-        self._enter(lane)
+            lane.deadline = min(lane.deadline, message.deadline)
+            lane.waiting.insert(1 if lane.busy or lane.waiting[0].sent else 0, message)
+            self._enter(lane)
+        else:
+            self._append(lane, message)
+        self.size += 1
         return True
 
     def expire(self, now: int) -> list[Outgoing]:
@@ -117,7 +118,7 @@ class LaxityQueue:
     @property
     def next_expiry(self) -> int:
         """When to call `expire` at the latest; may be early."""
-        return self._expiry if self._size else NEVER
+        return self._expiry if self.size else NEVER
 
     def best(self, now: int, *, nrt: bool = True) -> Outgoing | None:
         """The message to try now. `nrt=False`: among those that are not non real-time."""
@@ -209,7 +210,7 @@ class LaxityQueue:
         gone = list(self.messages())
         self._lanes.clear()
         self._sorted.clear()
-        self._size = 0
+        self.size = 0
         self._expiry = NEVER
         return gone
 
@@ -217,7 +218,7 @@ class LaxityQueue:
         self._leave(lane)
         for message in gone:
             lane.waiting.remove(message)
-        self._size -= len(gone)
+        self.size -= len(gone)
         if lane.waiting:
             self._enter(lane)
         else:
@@ -226,6 +227,17 @@ class LaxityQueue:
     def _leave(self, lane: _Lane) -> None:
         del self._sorted[bisect_left(self._sorted, (lane.deadline, lane.order))]
 
+    def _append(self, lane: _Lane, message: Outgoing) -> None:
+        """Put it behind the others: the lane may become more urgent by that."""
+        lane.waiting.append(message)
+        if message.deadline < lane.deadline:
+            self._leave(lane)
+            lane.deadline = message.deadline
+            insort(self._sorted, (lane.deadline, lane.order, lane))
+        if message.expiry < lane.expiry:
+            lane.expiry = message.expiry
+            self._expiry = min(self._expiry, lane.expiry)
+
     def _enter(self, lane: _Lane) -> None:
         """Sort it in, as urgent as its most urgent message."""
         waiting = lane.waiting
@@ -233,7 +245,7 @@ class LaxityQueue:
         lane.order = first.order
         if len(waiting) == 1:
             lane.deadline, lane.expiry = first.deadline, first.expiry
-        else:
+        elif lane.deadline < NEVER:  # else all are non real-time; there may be many
             lane.deadline = min(each.deadline for each in waiting)
             lane.expiry = min(each.expiry for each in waiting)
         if lane.expiry < self._expiry:

@@ -48,7 +48,8 @@ class Post:
     @property
     def idle(self) -> bool:
         """Whether no frame of the queue is with the port."""
-        return self.boxes[1] is None and self.boxes[2] is None
+        _, srt, nrt = self.boxes
+        return srt is None and nrt is None
 
     @property
     def due(self) -> int:

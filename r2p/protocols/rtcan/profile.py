@@ -5,7 +5,7 @@ other's frames; so on their networks management waits until nobody has sent any 
 """
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Profile
 
@@ -44,19 +44,22 @@ class Pacer:
     def __init__(self, draw: Callable[[int], int], counts: Counter[str]) -> None:
         self._draw = draw
         self._counts = counts
-        self._waiting: deque[bytes] = deque()
+        self.waiting: deque[tuple[bytes, Hashable]] = deque()
+        """Messages and their handles, the next one first."""
         self._quiet_from = LONG_AGO
         self._delay = 0
 
-    def put(self, data: bytes, *, urgent: bool = False) -> None:
-        """Send it when it is quiet; the oldest is dropped when there are too many."""
-        if len(self._waiting) >= _MOST:
-            self._waiting.popleft()
+    def put(self, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Hashable:
+        """Send it when it is quiet; the oldest is dropped when there are too many: its handle comes back."""
+        dropped: Hashable = None
+        if len(self.waiting) >= _MOST:
+            _, dropped = self.waiting.popleft()
             self._counts["management dropped"] += 1
         if urgent:
-            self._waiting.appendleft(data)
+            self.waiting.appendleft((data, handle))
         else:
-            self._waiting.append(data)
+            self.waiting.append((data, handle))
+        return dropped
 
     def traffic(self, now: int) -> None:
         """Somebody, or this node, sent a management frame."""
@@ -66,14 +69,20 @@ class Pacer:
     @property
     def due(self) -> int:
         """When the next one may go."""
-        return self._quiet_from + QUIET + self._delay if self._waiting else NEVER
+        return self._quiet_from + QUIET + self._delay if self.waiting else NEVER
 
-    def pop(self, now: int) -> bytes | None:
-        """What may go now."""
+    def pop(self, now: int) -> tuple[bytes, Hashable] | None:
+        """What may go now, and its handle."""
         if self.due > now:
             return None
         self.traffic(now)
-        return self._waiting.popleft()
+        return self.waiting.popleft()
 
-    def clear(self) -> None:
-        self._waiting.clear()
+    def __len__(self) -> int:
+        return len(self.waiting)
+
+    def clear(self) -> list[Hashable]:
+        """Forget all; their handles come back."""
+        handles = [handle for _, handle in self.waiting]
+        self.waiting.clear()
+        return handles

@@ -42,18 +42,19 @@ class Reassembly:
         self.losses: dict[int, Counter[str]] = {}
         """What was lost, by id8 of the source and reason."""
         self._inlets: dict[int, Inlet] = {}
-        self._open: dict[int, Inlet] = {}
+        self.open: dict[int, Inlet] = {}
+        """Unfinished messages by id, the oldest first."""
 
     def subscribe(self, message: int, size: int) -> None:
         """Take messages with this id, of `size` bytes. Raises `MessageError` beyond 1..1024."""
         first = rtcan.fragment_count(size) - 1
         before = self._inlets.get(message)
         if before is None or before.size != size:
-            self._open.pop(message, None)
+            self.open.pop(message, None)
             self._inlets[message] = Inlet(first, size)
 
     def unsubscribe(self, message: int) -> None:
-        self._open.pop(message, None)
+        self.open.pop(message, None)
         self._inlets.pop(message, None)
 
     def subscribed(self, message: int) -> bool:
@@ -80,12 +81,12 @@ class Reassembly:
     @property
     def due(self) -> int:
         """When to call `poll`: that is when the oldest unfinished message is given up."""
-        return next(iter(self._open.values())).last + TIMEOUT if self._open else NEVER
+        return next(iter(self.open.values())).last + TIMEOUT if self.open else NEVER
 
     def poll(self, now: int) -> None:
         """Give up messages whose next frame stays away."""
-        while self._open:
-            message, inlet = next(iter(self._open.items()))
+        while self.open:
+            message, inlet = next(iter(self.open.items()))
             if now < inlet.last + TIMEOUT:
                 return
             self._reset(message, inlet, "time-out")
@@ -93,7 +94,7 @@ class Reassembly:
 
     def reset(self) -> None:
         """Forget what is unfinished."""
-        for message, inlet in list(self._open.items()):
+        for message, inlet in list(self.open.items()):
             self._reset(message, inlet, "interrupted")
             inlet.expected = _IDLE
 
@@ -138,9 +139,9 @@ class Reassembly:
             self._reset(message, inlet, "wrong length")
             return None
         inlet.parts.append(data)
-        self._open.pop(message, None)
+        self.open.pop(message, None)
         if left:
-            self._open[message] = inlet  # at the end: the oldest comes first
+            self.open[message] = inlet  # at the end: the oldest comes first
             return None
         payload = b"".join(inlet.parts)
         inlet.parts.clear()
@@ -149,7 +150,7 @@ class Reassembly:
 
     def _reset(self, message: int, inlet: Inlet, reason: str) -> None:
         self._lose(message << 7, reason)
-        self._open.pop(message, None)
+        self.open.pop(message, None)
         inlet.parts.clear()
 
     def _lose(self, identifier: int, reason: str) -> None:

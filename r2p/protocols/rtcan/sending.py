@@ -61,9 +61,12 @@ class Sender:
         self._coarse = coarse
         self._periodics: list[Periodic] = []
         self._done = 0
+        self._tried = 0  # the last slot in which nothing more can be tried
         self._last = 0
         self._all = (1 << self._timing.slots) - 1
-        self._longest = [rtcan.frame_bits_max(size) + INTERMISSION for size in range(FRAME_MAX + 1)]
+        bit = self._timing.bit
+        self._close = _CLOSE * bit
+        self._longest = [(rtcan.frame_bits_max(size) + INTERMISSION) * bit for size in range(FRAME_MAX + 1)]  # ns
 
     # What the engine tells
 
@@ -89,7 +92,7 @@ class Sender:
 
     def turned(self, now: int) -> None:
         """A cycle has begun, at `Cycle.reference`; nothing of it is done yet."""
-        self._done = 0
+        self._done = self._tried = 0
         self._agenda.turn(self._cycle.counter, self._periodics)
         self._last = self._timing.slots + (self._cycle.state is not State.LEADING)
         self._plan(now)
@@ -107,7 +110,7 @@ class Sender:
     def sync(self, now: int, frame: Frame) -> None:
         """The cycle begins with this sync frame."""
         start = self._cycle.reference
-        last = start + self._timing.slot - (self._longest[FRAME_MAX]) * self._timing.bit
+        last = start + self._timing.slot - self._longest[FRAME_MAX]
         if now + self._latency > last or self._post.boxes[Mailbox.HRT] is not None:
             self._counts["syncs not sent"] += 1
             return
@@ -149,7 +152,7 @@ class Sender:
             self._post.confirm(now, item, outcome, at, slotted=self.mode is Mode.SLOTTED)
             if self.mode is not Mode.SLOTTED:
                 self.kick(now)
-            elif len(self._queue):
+            elif self._queue.size:
                 self._plan(now)
         elif isinstance(item, Periodic):
             self._confirm_periodic(now, item, outcome, at)
@@ -166,16 +169,17 @@ class Sender:
     def _plan(self, now: int) -> None:
         """Wake up for the next slot where there is something to do, or to send something, or for the next cycle."""
         cycle, slot_length = self._cycle, self._timing.slot
-        bits = self._agenda.bits
+        bits = self._agenda.bits & -2 << self._done
         mask = cycle.mask
-        if mask is not None and self._post.idle and len(self._queue) and self.mode is Mode.SLOTTED:
+        if mask is not None and self._post.idle and self._queue.size and self.mode is Mode.SLOTTED:
             ahead = now + self._latency - cycle.reference
             # A try would come too late for the slots up to this one; a coarse port may still try in the present one.
             over = ahead // slot_length - 1 if self._coarse else (ahead - self._timing.bit) // slot_length
-            bits |= ~mask & self._all & -2 << max(over, 0)
-        bits &= -2 << self._done
-        slot = (bits & -bits).bit_length() - 1 if bits else self._last
-        self.due = cycle.reference + min(slot, self._last) * slot_length - self._latency
+            bits |= ~mask & self._all & -2 << max(over, self._tried)
+        slot = (bits & -bits).bit_length() - 1
+        if not bits or slot > self._last:
+            slot = self._last
+        self.due = cycle.reference + slot * slot_length - self._latency
 
     def _run(self, now: int, upto: int, current: int) -> None:
         """Do what is to be done in the slots up to one; it is slot `current` now."""
@@ -191,7 +195,9 @@ class Sender:
                 periodic, fragment = self._agenda.sends[slot]
                 if periodic.active:
                     self._periodic_slot(now, periodic, fragment, slot, current)
-        if len(self._queue) and current == upto and self.mode is Mode.SLOTTED:
+        if not self._coarse:
+            self._tried = upto
+        if self._queue.size and current == upto and self.mode is Mode.SLOTTED:
             self._try(now, current)
 
     def _try(self, now: int, slot: int) -> None:
@@ -202,28 +208,31 @@ class Sender:
         self._post.expire(now)
         message = self._queue.best(now)
         if message is None:
+            self._tried = slot
             return
         frame = self._queue.take(message, now)
         end = slot + 1
         while self._coarse and end < self._timing.slots and not mask >> end & 1:
             end += 1
-        last = self._latest_start(now, frame, end)
+        start = self._cycle.start_of(slot)
+        last = self._latest_start(now, frame, start + (end - slot) * self._timing.slot)
         if now + self._latency > last:
             self._counts["late_to_slot"] += 1
             self._queue.put_back(message)
+            self._tried = slot
             return
-        self._post.hand_over(message, frame, self._cycle.start_of(slot), last)
+        self._post.hand_over(message, frame, start, last)
 
     def _latest_start(self, now: int, frame: Frame, end: int) -> int:
-        """The last instant at which the frame surely ends in its slot. `end` is the slot after that one."""
-        last = self._cycle.start_of(end) - self._longest[len(frame.data)] * self._timing.bit
-        close = last - now - self._latency < _CLOSE * self._timing.bit
+        """The last instant at which the frame surely ends in its slot. `end` is when that is over."""
+        last = end - self._longest[len(frame.data)]
+        close = last - now - self._latency < self._close
         return self._exact_latest_start(frame, end) if close else last
 
     def _exact_latest_start(self, frame: Frame, end: int) -> int:
         """As above, to the stuff bit. That is not cheap, unless the same frame is seen again."""
         bits = rtcan.frame_bits(frame.id, frame.data) + INTERMISSION
-        return self._cycle.start_of(end) - bits * self._timing.bit
+        return end - bits * self._timing.bit
 
     # Periodic messages
 
@@ -252,7 +261,8 @@ class Sender:
         assert payload is not None
         at = fragment * FRAME_MAX
         frame = Frame(periodic.message << 7 | periodic.fragments - 1 - fragment, payload[at : at + FRAME_MAX])
-        last = self._exact_latest_start(frame, slot + 1) if slot == current else LONG_AGO
+        start = self._cycle.start_of(slot)
+        last = self._exact_latest_start(frame, start + self._timing.slot) if slot == current else LONG_AGO
         if mask is not None and not mask >> slot & 1:
             self._abandon(now, periodic, "not in the mask")
         elif self._post.boxes[Mailbox.HRT] is not None:
@@ -261,7 +271,7 @@ class Sender:
             self._counts["late_to_slot"] += 1
             self._abandon(now, periodic, "too late for the slot")
         else:
-            self._post.put(periodic, frame, Mailbox.HRT, self._cycle.start_of(slot), last)
+            self._post.put(periodic, frame, Mailbox.HRT, start, last)
 
     def _abandon(self, now: int, periodic: Periodic, reason: str) -> None:
         periodic.restart()

@@ -1,1 +1,41 @@
-"""RTCAN as a transport: one engine, and the ports that carry its frames."""
+"""RTCAN on a real CAN bus (PROTOCOL.md 6 to 9): `rtcan:can0` on SocketCAN, `rtcan:INTERFACE:CHANNEL` by python-can."""
+
+from collections.abc import Callable
+
+from r2p.errors import TransportError
+from r2p.transports.rtcan.options import OPTIONS, Options, checked
+from r2p.transports.rtcan.port import CanPort
+from r2p.transports.rtcan.transport import RtcanTransport
+from r2p.transports.url import Url
+
+
+def from_url(url: Url) -> RtcanTransport:
+    """`rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`; options as in `Options`, which see."""
+    make_port, options = _taken_apart(url)
+    return RtcanTransport(f"rtcan:{url.address}", make_port, options)
+
+
+def open_port(url: Url) -> tuple[CanPort, Options]:
+    """The port of such a URL, not running yet, and the options: for who only listens."""
+    make_port, options = _taken_apart(url)
+    return make_port(), options
+
+
+def _taken_apart(url: Url) -> tuple[Callable[[], CanPort], Options]:
+    options = checked(str(url), url.parsed(OPTIONS), Options())
+    interface, colon, channel = url.address.partition(":")
+    if not colon:
+        interface, channel = "socketcan", url.address
+    if not channel:
+        raise TransportError(f"{url}: give the CAN interface: rtcan:can0, or rtcan:slcan:/dev/ttyACM0")
+    return _port(interface, channel, options), options
+
+
+def _port(interface: str, channel: str, options: Options) -> Callable[[], CanPort]:
+    if interface == "socketcan":
+        from r2p.transports.rtcan.socketcan import SocketCanPort
+
+        return lambda: SocketCanPort(channel)
+    from r2p.transports.rtcan.pythoncan import PythonCanPort
+
+    return lambda: PythonCanPort(interface, channel, options.bitrate)

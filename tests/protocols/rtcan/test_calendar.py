@@ -56,7 +56,7 @@ def test_fragments_take_slots_in_a_row() -> None:
         (7, 1, Reason.PERIOD, "a period of 7 slots neither divides the 60 of a cycle nor is a multiple"),
         (90, 1, Reason.PERIOD, "a period of 90 slots neither divides the 60"),
         (20, 1, Reason.OTHER, "a period of 20 slots neither divides the 12 of message 0x0102 nor is a multiple"),
-        (0, 1, Reason.LENGTH, "2 to 65536 are possible, more than the fragments"),
+        (0, 1, Reason.LENGTH, "this message needs one of 2 to 65536"),
         (1, 1, Reason.LENGTH, "a period of 1 slots"),
         (6, 6, Reason.LENGTH, "a period of 6 slots"),
         (6, 0, Reason.LENGTH, ""),

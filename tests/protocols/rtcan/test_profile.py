@@ -50,11 +50,12 @@ def test_it_speaks_when_it_is_quiet_and_a_random_time_later() -> None:
     assert pacer.pop(due - 1) is None
     pacer.traffic(110 * MS)
     assert pacer.pop(due) is None
-    assert pacer.pop(due + 10 * MS) == b"a"
+    assert pacer.pop(due + 10 * MS) == (b"a", None)
     assert pacer.due == due + 10 * MS + QUIET + 20 * MS - 1
     pacer.put(b"urgent", urgent=True)
-    assert pacer.pop(pacer.due) == b"urgent"
-    pacer.clear()
+    assert pacer.pop(pacer.due) == (b"urgent", None)
+    pacer.put(b"c", handle="c")
+    assert pacer.clear() == [None, "c"]
     assert pacer.due == NEVER
 
 
@@ -64,4 +65,4 @@ def test_it_is_bounded() -> None:
     for n in range(70):
         pacer.put(bytes([n]))
     assert counts == {"management dropped": 6}
-    assert pacer.pop(QUIET) == bytes([6])
+    assert pacer.pop(QUIET) == (bytes([6]), None)

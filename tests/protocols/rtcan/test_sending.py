@@ -162,6 +162,32 @@ def test_coarse_ports_may_start_anywhere_in_free_slots() -> None:
     assert not slave.engine.mask >> ((transmit.not_after - reference) // SLOT) & 1
 
 
+def test_coarse_ports_send_one_frame_after_the_other_in_a_slot() -> None:
+    bus = Bus()
+    _, slave = network(bus, 1, 0, coarse=True, slots=10)
+    for number in range(20):
+        publish(slave, 6, bytes([number]) * 8, 50 * MS)
+    bus.run(20 * MS)
+    sent = starts(bus, 6)
+    assert len(sent) == 20
+    assert sent[-1] - sent[0] < 5 * MS  # 1 ms is a slot
+    assert slave.engine.waiting == 0
+
+
+def test_a_coarse_port_that_comes_too_late_waits_for_the_next_free_slot() -> None:
+    bus = Bus()
+    _, slave = network(bus, 1, 0, coarse=True, slots=10)
+    bus.run(10 * MS)
+    reference = syncs(bus)[-1][0]
+    now = reference + 10 * MS - 50_000  # no frame fits into what is left
+    slave.act(slave.engine.poll(now))
+    assert [*slave.engine.publish(now, 6, bytes(8), deadline=now + 50 * MS), *slave.engine.poll(now)] == []
+    at = slave.engine.next_deadline()
+    assert at is not None
+    assert at > now
+    assert slave.engine.counts["late_to_slot"] == 1
+
+
 def test_an_unknown_outcome_is_not_sent_again() -> None:
     engine, now = ready_engine()
     first = engine.publish(now, TOPIC, bytes(12), handle="x")

@@ -1,0 +1,249 @@
+"""Watching an RTCAN bus without a word: what each frame is, what the bus carries, and who uses which slots.
+
+Lengths are counted with the bits stuffed in, so loads are true for the bit rate that is given. The cycle is the
+master's, by its sync frames (PROTOCOL.md 6): a slot is what lies that far behind the start of one.
+"""
+
+import enum
+from collections import Counter
+
+import msgspec
+
+from r2p.codecs import management, rtcan
+from r2p.codecs.rtcan import Frame
+from r2p.protocols.rtcan.census import Census
+from r2p.protocols.rtcan.cycle import Timing
+from r2p.protocols.rtcan.reassembly import Reassembly
+
+_EARLY = 8  # a frame that starts less than this part of a slot early belongs to the slot
+
+
+class FrameKind(enum.Enum):
+    """What a frame is."""
+
+    SYNC = "sync"
+    HRT = "hrt"
+    SRT = "srt"
+    NRT = "nrt"
+    MANAGEMENT = "management"
+
+
+class SeenFrame(msgspec.Struct, frozen=True):
+    """One frame. `stamp` is its end (ns), `bits` its length with the intermission, `left` how many fragments follow.
+
+    `cycle` (mod 256) and `slot` are None while no sync has been heard. `text` tells a whole management message.
+    """
+
+    stamp: int
+    frame: Frame
+    kind: FrameKind
+    topic: str
+    module: str
+    laxity: int
+    left: int
+    bits: int
+    fragments: int | None = None
+    cycle: int | None = None
+    slot: int | None = None
+    text: str = ""
+
+
+class Tally(msgspec.Struct):
+    """Frames and bits (stuffed ones and intermission included) of one message id and kind."""
+
+    frames: int = 0
+    bits: int = 0
+
+
+class BusSlot(msgspec.Struct):
+    """One slot over all cycles watched: in how many it was reserved, held an HRT frame, held another one; by whom."""
+
+    reserved: int = 0
+    used: int = 0
+    shared: int = 0
+    owners: Counter[str] = msgspec.field(default_factory=Counter)
+
+    @property
+    def missed(self) -> int:
+        """Cycles in which it was reserved, and its owner sent nothing."""
+        return max(0, self.reserved - self.used)
+
+
+class BusLoad(msgspec.Struct, frozen=True):
+    """What the bus carried in `elapsed` ns; shares are of the time: 1.0 is all of it.
+
+    `free` is the share that nobody reserved, `free_frames` how many frames of full length fit in there. `nrt_gap` is
+    the longest time without a non real-time frame (ns); None where none was seen at all.
+    """
+
+    elapsed: int
+    bit: int
+    tallies: dict[tuple[str, str, FrameKind], Tally]
+    faults: dict[str, int]
+    reserved: float
+    free_frames: float
+    nrt_gap: int | None
+
+    def share(self, bits: int) -> float:
+        """Bits as a share of the time."""
+        return bits * self.bit / self.elapsed if self.elapsed else 0.0
+
+    @property
+    def total(self) -> float:
+        return self.share(sum(tally.bits for tally in self.tallies.values()))
+
+    @property
+    def free(self) -> float:
+        return max(0.0, 1.0 - self.reserved)
+
+    @property
+    def free_used(self) -> float:
+        """How much of what nobody reserved was taken: by time, or by frames, of which a slot holds so many."""
+        events = [tally for (_, _, kind), tally in self.tallies.items() if kind not in {FrameKind.SYNC, FrameKind.HRT}]
+        by_time = self.share(sum(tally.bits for tally in events)) / self.free if self.free else 0.0
+        by_frames = sum(tally.frames for tally in events) / self.free_frames if self.free_frames else 0.0
+        return min(1.0, max(by_time, by_frames))
+
+
+class Monitor:
+    """What a silent listener makes of the frames of a bus. Instants are ns of one clock, `bit` is the bit time."""
+
+    def __init__(self, timing: Timing) -> None:
+        self.census = Census(timing)
+        self.slots: list[BusSlot] = []
+        self.cycles = 0
+        """Whole cycles watched since the last `reset`."""
+        self._reassembly = Reassembly()
+        self._sync: int | None = None  # start of the current cycle
+        self._cycle = 0
+        self._mask = 0
+        self._filled: set[int] = set()
+        self.reset(0)
+
+    def reset(self, now: int) -> None:
+        """Count from now on."""
+        self._since = now
+        self._tallies: dict[tuple[int, FrameKind], Tally] = {}
+        self._faults: Counter[str] = Counter()
+        self._reserved = 0
+        self._nrt: int | None = None
+        self._nrt_gap: int | None = None
+        self.slots = []
+        self.cycles = 0
+        self._whole = False
+
+    def fault(self, kind: str) -> None:
+        """An error frame, or another trouble that the interface tells."""
+        self._faults[kind] += 1
+
+    def frame(self, frame: Frame, stamp: int) -> SeenFrame:
+        """A frame was on the bus until `stamp`."""
+        message = frame.id >> 7 & 0xFFFF
+        kind = self._kind(frame, message)
+        bits = rtcan.frame_bits(frame.id, frame.data)
+        start = stamp - bits * self.census.timing.bit
+        if kind is FrameKind.SYNC:
+            self._begin(start, frame)
+        slot = self._slot(start, message, kind)
+        tally = self._tallies.setdefault((message, kind), Tally())
+        tally.frames += 1
+        tally.bits += bits + rtcan.INTERMISSION
+        if kind is FrameKind.NRT:
+            self._note_nrt(stamp)
+        text = self._hear(frame, message, stamp) if kind is FrameKind.MANAGEMENT else ""
+        size = self.census.sizes.get(message)
+        return SeenFrame(
+            stamp,
+            frame,
+            kind,
+            "" if kind is FrameKind.SYNC else self.census.topic(message),
+            "" if kind is FrameKind.SYNC else self.census.module(message),
+            frame.id >> 23,
+            frame.id & 0x7F,
+            bits + rtcan.INTERMISSION,
+            rtcan.fragment_count(size) if size and size <= rtcan.PAYLOAD_MAX else None,
+            self._cycle if self._sync is not None else None,
+            slot,
+            text,
+        )
+
+    def load(self, now: int) -> BusLoad:
+        """What was carried since the last `reset`."""
+        gap = self._nrt_gap
+        if self._nrt is not None:
+            gap = max(gap or 0, now - self._nrt)
+        elapsed = now - self._since
+        tallies: dict[tuple[str, str, FrameKind], Tally] = {}
+        for (message, kind), tally in self._tallies.items():
+            names = ("", "") if kind is FrameKind.SYNC else (self.census.topic(message), self.census.module(message))
+            total = tallies.setdefault((*names, kind), Tally())
+            total.frames += tally.frames
+            total.bits += tally.bits
+        timing = self.census.timing
+        reserved = min(1.0, self._reserved * timing.slot / elapsed) if elapsed else 0.0
+        longest = (rtcan.frame_bits_max(rtcan.FRAME_MAX) + rtcan.INTERMISSION) * timing.bit
+        free = (1.0 - reserved) * elapsed / timing.slot * (timing.slot // longest) if self._reserved else 0.0
+        return BusLoad(elapsed, timing.bit, tallies, dict(self._faults), reserved, free, gap)
+
+    def _begin(self, start: int, frame: Frame) -> None:
+        sync = rtcan.decode_sync(frame)
+        timing = self.census.timing
+        if self._whole and self._sync is not None and abs(start - self._sync - timing.cycle) < timing.slot:
+            self._close()
+        self._whole = True
+        self._sync, self._cycle, self._mask = start, sync.cycle, sync.mask | 1
+        self._filled = set()
+        self._reserved += self._mask.bit_count()
+
+    def _close(self) -> None:
+        """The cycle that ends was watched from its beginning."""
+        self.cycles += 1
+        self._grow(self._mask.bit_length() - 1)
+        for index, slot in enumerate(self.slots):
+            if self._mask >> index & 1:
+                slot.reserved += 1
+                slot.used += index in self._filled
+
+    def _slot(self, start: int, message: int, kind: FrameKind) -> int | None:
+        """The slot in which a frame started; what it is, is noted there."""
+        timing = self.census.timing
+        if self._sync is None:
+            return None
+        index = (start - self._sync + timing.slot // _EARLY) // timing.slot
+        if not 0 <= index < timing.slots:
+            self._sync = self._sync if index < 0 else None  # no sync came
+            return None
+        if self._whole:
+            self._note_slot(index, message, kind)
+        return index
+
+    def _note_slot(self, index: int, message: int, kind: FrameKind) -> None:
+        self._grow(index)
+        slot = self.slots[index]
+        if kind in {FrameKind.SYNC, FrameKind.HRT}:
+            self._filled.add(index)
+            slot.owners["sync" if kind is FrameKind.SYNC else self.census.topic(message)] += 1
+        else:
+            slot.shared += 1
+
+    def _grow(self, index: int) -> None:
+        while len(self.slots) <= max(index, self.census.timing.slots - 1):
+            self.slots.append(BusSlot())
+
+    def _note_nrt(self, stamp: int) -> None:
+        since = self._since if self._nrt is None else self._nrt
+        self._nrt_gap = max(self._nrt_gap or 0, stamp - since)
+        self._nrt = stamp
+
+    def _hear(self, frame: Frame, message: int, stamp: int) -> str:
+        self._reassembly.subscribe(message, management.SIZE)
+        received = self._reassembly.receive(frame, stamp)
+        return "" if received is None else self.census.learn(received.payload, rtcan.id8_of(message))
+
+    def _kind(self, frame: Frame, message: int) -> FrameKind:
+        if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX:
+            return FrameKind.SYNC
+        if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.census.topics:
+            return FrameKind.MANAGEMENT  # firmware of 2014 may have topics there
+        laxity = frame.id >> 23
+        return FrameKind.HRT if laxity == rtcan.HRT else FrameKind.NRT if laxity == rtcan.NRT else FrameKind.SRT

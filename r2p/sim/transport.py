@@ -1,0 +1,305 @@
+"""`sim:NAME`: modules of one event loop on a simulated CAN bus, with RTCAN as on a real one.
+
+    async with r2p.Module("A", via="sim:lab"), r2p.Module("B", via="sim:lab,drift=30"):
+        lab = r2p.sim.can_bus("lab")
+        lab.bus.observers.append(print)          # every frame, at its true time
+        lab.port("B").power_off()                # B dies
+
+Under virtual time all is exact to the nanosecond, and one seed gives one course of events. On an ordinary loop the bus
+is paced to real time: what happens on it is carried out a little late, with its true instants.
+"""
+
+import asyncio
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from r2p.clock import random_of
+from r2p.codecs import rtcan
+from r2p.codecs.rtcan import Frame
+from r2p.errors import TransportError
+from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
+from r2p.sim.can import CanBus, CanController, CanNode, ErrorKind, Latency, State
+from r2p.transports.link import Hub, Transport
+from r2p.transports.rtcan.options import OPTIONS, Options, checked
+from r2p.transports.rtcan.port import CanPort, PortAlarm, PortUser
+from r2p.transports.rtcan.transport import run_link
+from r2p.transports.url import Url, duration
+
+_BILLION = 1_000_000_000
+_NO_POWER = "no power"
+_MAILBOXES = (Mailbox.HRT, *[Mailbox.SRT] * (rtcan.NRT - 1), Mailbox.NRT)  # by laxity
+DEFAULTS = Options(priority=1, utc=0.0)
+"""Of `sim:` URLs: anybody may be the master, and knows UTC."""
+
+
+class SimCan:
+    """A simulated CAN bus for modules of the running event loop; `bus` is the wire itself, with statistics and faults.
+
+    `bitrate` in bit/s; `noise` is the share of frames with a bit error; `seed` None: from the loop's random numbers.
+    """
+
+    def __init__(self, *, bitrate: int = 1_000_000, noise: float = 0.0, seed: int | None = None) -> None:
+        loop = asyncio.get_running_loop()
+        numbers = random_of(loop).getrandbits(32) if seed is None else seed
+        self.bus = CanBus(loop, bitrate=bitrate, noise=noise, seed=numbers)
+        self.powered = True
+        """Whether modules that come have power."""
+        self._ports: dict[str, SimPort] = {}
+        self._spare: dict[str, CanController] = {}
+
+    def transport(self, options: Options = DEFAULTS, **node: Any) -> "SimTransport":
+        """A place on this bus, for `Module(via=...)` of one module; `node` are fields of `CanNode`."""
+        return SimTransport("", options, node, shared=self)
+
+    def port(self, module: str) -> "SimPort":
+        """The port of a module that is open. Raises KeyError if it is not on this bus."""
+        return self._ports[module]
+
+    def power_off(self) -> None:
+        """All modules lose power, and those that come have none."""
+        self.powered = False
+        for port in list(self._ports.values()):
+            port.power_off()
+
+    def power_on(self) -> None:
+        """All modules have power again."""
+        self.powered = True
+        for port in list(self._ports.values()):
+            port.power_on()
+
+    def plug_in(self, port: "SimPort", node: CanNode) -> CanController:
+        """Connect a module. One that was here before gets the controller that it had."""
+        name = node.name
+        while name in self._ports or (name in self._spare and self._spare[name].node != node):
+            name += "'"
+            node = msgspec.structs.replace(node, name=name)
+        self._ports[name] = port
+        controller = self._spare.pop(name, None)
+        if controller is None:
+            return self.bus.attach(node)
+        controller.power_on()
+        return controller
+
+    def unplug(self, controller: CanController) -> None:
+        """Its module has closed."""
+        controller.power_off()
+        controller.filters = ()
+        del self._ports[controller.name]
+        self._spare[controller.name] = controller
+
+
+class SimPort(CanPort):
+    """A simulated controller as a port. Its clock is the node's, which may be off and drift."""
+
+    now: Callable[[], int]
+
+    def __init__(self, shared: SimCan, node: CanNode) -> None:
+        super().__init__(node.name)
+        self.one_shot = node.one_shot
+        self.transmit_latency = node.transmit.nominal
+        self.receive_latency = node.receive.nominal
+        self.controller = shared.plug_in(self, node)
+        self._shared = shared
+        self._timeline = shared.bus.timeline
+        self._clock = self.controller.clock
+        self.now = self._clock.monotonic if self._clock.virtual else self._present
+        self._user: PortUser | None = None
+        self._up = False
+
+    async def run(self, user: PortUser, opened: Callable[[], object]) -> None:
+        self._user = user
+        controller = self.controller
+        controller.on_receive = user.received
+        controller.on_sent = self._sent
+        controller.on_lost = self._lost
+        controller.on_error = self._failed
+        controller.on_late = self._late
+        controller.on_state = self._state
+        try:
+            if self._shared.powered:
+                self._goes_up()
+            else:
+                controller.power_off()
+                user.waits(_NO_POWER)
+            opened()
+            await asyncio.get_running_loop().create_future()
+        finally:
+            self._up = False
+            self._user = None
+            controller.on_receive = _deaf
+
+    def transmit(self, order: Transmit) -> None:
+        last = None if order.not_after == NEVER else order.not_after
+        frame, mailbox = order.frame, order.mailbox
+        if not self.controller.request(frame, mailbox, not_before=order.not_before, not_after=last):
+            self._confirm(mailbox, Outcome.LATE, self.now())
+
+    def withdraw(self, order: Withdraw) -> None:
+        if self.controller.abort(order.mailbox):
+            self._confirm(order.mailbox, Outcome.LATE, self.now())
+
+    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+        self.controller.filters = filters
+
+    def monotonic(self, instant: int) -> int:
+        return self._clock.true(instant)
+
+    def alarm(self, callback: Callable[[], object]) -> PortAlarm:
+        return self.controller.alarm(callback)
+
+    # Faults
+
+    def power_off(self) -> None:
+        """The node dies, in the middle of a frame if need be; its software notices that it can't send."""
+        self.controller.power_off()
+        self._goes_down(_NO_POWER)
+
+    def power_on(self) -> None:
+        """It comes back, as new."""
+        self.controller.power_on()
+
+    # From the controller
+
+    def _present(self) -> int:
+        self._timeline.catch_up()
+        return self._clock.monotonic()
+
+    def _sent(self, frame: Frame, stamp: int) -> None:
+        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.SENT, stamp - self.receive_latency)
+
+    def _lost(self, frame: Frame, stamp: int) -> None:
+        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.LOST, stamp)
+
+    def _late(self, frame: Frame, stamp: int) -> None:
+        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.LATE, stamp)
+
+    def _failed(self, frame: Frame, kind: ErrorKind, stamp: int) -> None:
+        if self._user is not None and self._up:
+            self._user.fault(kind.value)
+        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.ERROR, stamp)
+
+    def _confirm(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+        if self._user is not None and self._up:
+            self._user.confirmed(mailbox, outcome, at)
+
+    def _state(self, state: State, _stamp: int) -> None:
+        if state is State.BUS_OFF:
+            self._goes_down(state.value)
+        elif state is State.ACTIVE:
+            self._goes_up()
+        elif self._user is not None:
+            self._user.fault(state.value)
+
+    def _goes_up(self) -> None:
+        if self._user is not None and not self._up:
+            self._up = True
+            self._user.up()
+
+    def _goes_down(self, reason: str) -> None:
+        if self._user is not None and self._up:
+            self._up = False
+            self._user.down(reason)
+
+
+def _deaf(_frame: Frame, _stamp: int) -> None:
+    """Its module has closed."""
+
+
+class SimTransport(Transport):
+    """A place on a simulated bus for one module: on `shared`, or on the running loop's bus of that name."""
+
+    def __init__(
+        self,
+        name: str,
+        options: Options = DEFAULTS,
+        node: dict[str, Any] | None = None,
+        *,
+        shared: SimCan | None = None,
+        noise: float = 0.0,
+        seed: int | None = None,
+    ) -> None:
+        self._name = name
+        self._options = options
+        self._node = node or {}
+        self._shared = shared
+        self._noise = noise
+        self._seed = seed
+
+    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+        options = self._options
+        shared = self._shared or can_bus(self._name, bitrate=options.bitrate, noise=self._noise, seed=self._seed)
+        if shared.bus.bit * options.bitrate != _BILLION:
+            raise TransportError(f"sim:{self._name} has {_BILLION // shared.bus.bit} bit/s, not {options.bitrate}")
+        node = CanNode(hub.space.module, **{"one_shot": True} | self._node)
+        port = SimPort(shared, node)
+        try:
+            await run_link(f"sim:{self._name}", hub, opened, port, options)
+        finally:
+            shared.unplug(port.controller)
+
+
+_Buses = weakref.WeakValueDictionary[str, SimCan]
+_buses: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, _Buses] = weakref.WeakKeyDictionary()
+
+
+def can_bus(name: str, **options: Any) -> SimCan:
+    """The running loop's simulated bus of that name, made at first use, with options as `SimCan` takes them then.
+
+    It lives as long as a module is on it, or somebody holds it.
+    """
+    buses = _buses.setdefault(asyncio.get_running_loop(), weakref.WeakValueDictionary())
+    shared = buses.get(name)
+    if shared is None:
+        shared = buses[name] = SimCan(**options)
+    return shared
+
+
+def from_url(url: Url) -> SimTransport:
+    """`sim:NAME`; options as for `rtcan:`, and for the node `drift` (ppm), `offset` (its clock's), `latency`, `jitter`.
+
+    `latency` is that of both ways, `jitter` its spread. `loss` is the share of frames that the node loses, `one_shot=0`
+    gives it a controller that tries again by itself. Of the bus, if it is the first to open it: `noise`, `seed`.
+    """
+    if not url.address:
+        raise TransportError(f"{url}: give the bus a name: sim:lab")
+    values = url.parsed(OPTIONS | _OPTIONS)
+    known = {key: value for key, value in values.items() if key in OPTIONS}
+    latency = Latency(values.get("latency", 0), values.get("jitter", 0))
+    node = {"transmit": latency, "receive": latency}
+    node |= {field: values[key] for key, field in _FIELDS.items() if key in values}
+    options = checked(str(url), known, DEFAULTS)
+    return SimTransport(url.address, options, node, noise=values.get("noise", 0.0), seed=values.get("seed"))
+
+
+def _nanoseconds(text: str) -> int:
+    return round(duration(text) * _BILLION)
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value <= 1.0:
+        raise ValueError("a share lies between 0 and 1")
+    return value
+
+
+def _flag(text: str) -> bool:
+    if text not in ("0", "1"):
+        raise ValueError("it is 0 or 1")
+    return text == "1"
+
+
+_FIELDS = {"drift": "drift_ppm", "offset": "offset", "loss": "loss", "one_shot": "one_shot"}
+
+_OPTIONS: dict[str, Callable[[str], Any]] = {
+    "drift": float,
+    "offset": _nanoseconds,
+    "latency": _nanoseconds,
+    "jitter": _nanoseconds,
+    "loss": _share,
+    "one_shot": _flag,
+    "noise": _share,
+    "seed": int,
+}

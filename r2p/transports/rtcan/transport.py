@@ -1,0 +1,44 @@
+"""The transport on any CAN port: one link, for as long as the port is open."""
+
+import asyncio
+from collections.abc import Callable
+
+from r2p.transports.link import Hub, Transport
+from r2p.transports.rtcan.link import RtcanLink
+from r2p.transports.rtcan.options import Options
+from r2p.transports.rtcan.port import CanPort
+
+_CLOSING = 0.5  # seconds for the last words to get through
+
+
+class RtcanTransport(Transport):
+    """An RTCAN link called `name` on the port that `make_port` makes."""
+
+    def __init__(self, name: str, make_port: Callable[[], CanPort], options: Options) -> None:
+        self._name = name
+        self._make_port = make_port
+        self._options = options
+
+    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+        await run_link(self._name, hub, opened, self._make_port(), self._options)
+
+
+async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanPort, options: Options) -> None:
+    """Run a link on a port until cancelled; the port is closed after the link's last words."""
+    settings = options.settings(hub.random.getrandbits(64), port)
+    link = RtcanLink(name, hub, port, settings, options.utc_error)
+    hub.attach(link)
+    running = asyncio.create_task(port.run(link.shell, opened), name=f"{name} port")
+    try:
+        await asyncio.wait([running])
+        await running
+    finally:
+        link.close()
+        try:
+            if not running.done():
+                await link.shell.drained(_CLOSING)
+        finally:
+            running.cancel()
+            await asyncio.wait([running])
+            link.shell.close()
+            hub.detach(link)

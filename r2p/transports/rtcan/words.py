@@ -1,0 +1,85 @@
+"""What an RTCAN link says to people: what the classes mean on it now, and what happens on the bus."""
+
+from collections.abc import Callable
+from typing import Any
+
+from r2p.protocols.rtcan.engine import Engine
+from r2p.protocols.rtcan.events import IdConflict, LostSync, NewMaster, Profile, Silenced, Unsilenced
+from r2p.protocols.rtcan.settings import Settings
+from r2p.sample import PublisherClass
+from r2p.transports.rtcan.periodics import Slotted
+from r2p.transports.rtcan.port import CanPort
+
+HOLDABLE = 500_000
+"""Ns: a port that can't hit an instant exactly does not try to hold shorter slots."""
+
+_SOFT = "soft real-time with the period as deadline"
+
+
+class Words:
+    """The truth about one link, in words."""
+
+    def __init__(self, engine: Engine, port: CanPort, settings: Settings) -> None:
+        self._engine = engine
+        self._port = port
+        self._reserves = settings.reserves
+
+    @property
+    def no_slots(self) -> str:
+        """Why periodic messages never get slots here; empty: they may."""
+        if not self._reserves:
+            slot = self._engine.timing.slot // 1000
+            return f"slots of {slot} us are too short for a port that does not hit them; choose slots= and cycle="
+        if self._engine.profile is Profile.FIRMWARE:
+            return "firmware of 2014 keeps no cycle"
+        return ""
+
+    def guarantee(self, publisher_class: PublisherClass, slotted: Slotted | None) -> str:
+        """What a class means for a topic, which may have slots."""
+        engine = self._engine
+        if engine.silenced is not None:
+            return f"nothing is sent: {engine.silenced}"
+        if not engine.ready:
+            return "nothing yet: not on the bus"
+        match publisher_class:
+            case PublisherClass.PERIODIC:
+                return self._periodic(slotted)
+            case PublisherClass.SPORADIC:
+                fresh = "fresh at each try" if self._port.one_shot else "fixed when a frame is handed to the controller"
+                return f"soft real-time, least laxity first, {fresh}; late ones are signalled"
+            case _:
+                return "non real-time: what the others leave of the bus; waits for room"
+
+    def _periodic(self, slotted: Slotted | None) -> str:
+        if self.no_slots:
+            return f"best effort: {self.no_slots}; {_SOFT}"
+        if slotted is None:
+            return f"best effort: another publisher of the topic has the slots; {_SOFT}"
+        if slotted.period and slotted.driven:
+            return slotted.words(self._engine.timing)
+        if slotted.elsewhere:
+            return f"best effort: the slots of another link are its clock; {_SOFT}"
+        master = "" if self._engine.master is not None else ": there is no master yet"
+        return f"{slotted.words(self._engine.timing)}{master}; meanwhile {_SOFT}"
+
+
+def _conflict(news: IdConflict) -> tuple[str, str, bool]:
+    then = "it is the other's, this module takes another one" if news.yielded else "the other one should yield"
+    return "id conflict", f"another node uses the id {news.id8} of this one: {then}", True
+
+
+def _master(news: NewMaster) -> tuple[str, str, bool]:
+    if news.own:
+        return "master", f"this module is the RTCAN master (epoch {news.epoch:08x})", False
+    who = "firmware" if news.id8 is None else f"node {news.id8}"
+    return "master", f"{who} is the RTCAN master", False
+
+
+NOTICES: dict[type, Callable[[Any], tuple[str, str, bool]]] = {
+    IdConflict: _conflict,
+    NewMaster: _master,
+    LostSync: lambda news: ("no master", f"no RTCAN master: {news.reason}", True),
+    Silenced: lambda news: ("other parameters", f"nothing is sent: {news.reason}", True),
+    Unsilenced: lambda _news: ("own parameters", "the network's parameters are ours after all", False),
+}
+"""News of the engine -> kind, text, whether it is trouble."""

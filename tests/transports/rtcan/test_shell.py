@@ -1,0 +1,170 @@
+"""The loop around an engine, on a port that answers at once."""
+
+import asyncio
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import pytest
+
+from r2p.clock import Alarm
+from r2p.codecs import management
+from r2p.codecs.management import Alive
+from r2p.protocols.rtcan.engine import Engine
+from r2p.protocols.rtcan.events import Action, Done, Fate, Mailbox, Outcome, Ready, Transmit, Withdraw
+from r2p.protocols.rtcan.settings import Settings
+from r2p.sample import PublisherClass
+from r2p.transports.rtcan.options import Options
+from r2p.transports.rtcan.port import CanPort, PortAlarm
+from r2p.transports.rtcan.shell import Shell
+from r2p.transports.rtcan.words import Words
+
+if TYPE_CHECKING:
+    from r2p.codecs.rtcan import Frame
+
+pytestmark = pytest.mark.virtual_time
+
+
+class Port(CanPort):
+    """Sends every frame within `transmit`, unless it is `stuck`."""
+
+    def __init__(self) -> None:
+        super().__init__("port")
+        self.sent: list[Frame] = []
+        self.filters: list[tuple[int, int]] = []
+        self.stuck = False
+        self.shell: Shell
+
+    async def run(self, user: object, opened: Callable[[], object]) -> None:
+        raise NotImplementedError
+
+    def transmit(self, order: Transmit) -> None:
+        self.sent.append(order.frame)
+        if not self.stuck:
+            self.shell.confirmed(order.mailbox, Outcome.SENT, self.now())
+
+    def withdraw(self, order: Withdraw) -> None:
+        self.shell.confirmed(order.mailbox, Outcome.LATE, self.now())
+
+    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+        self.filters = filters
+
+    def alarm(self, callback: Callable[[], object]) -> PortAlarm:
+        return Alarm(asyncio.get_running_loop(), callback)
+
+
+class Owner:
+    """Writes down what it is told, and publishes once when it is ready."""
+
+    def __init__(self) -> None:
+        self.actions: list[Action] = []
+        self.changes: list[str] = []
+        self.on_ready: Callable[[], object] = lambda: None
+
+    def act(self, action: Action) -> None:
+        self.actions.append(action)
+        if isinstance(action, Ready):
+            self.on_ready()
+
+    def bus_up(self) -> None:
+        self.changes.append("up")
+
+    def bus_down(self, reason: str) -> None:
+        self.changes.append(reason)
+
+    def bus_waits(self, reason: str) -> None:
+        self.changes.append(f"waits: {reason}")
+
+    def bus_fault(self, kind: str) -> None:
+        self.changes.append(f"fault: {kind}")
+
+    def fates(self) -> list[Fate]:
+        return [each.fate for each in self.actions if isinstance(each, Done)]
+
+
+def make() -> tuple[Shell, Port, Owner]:
+    port, owner = Port(), Owner()
+    port.shell = shell = Shell(Engine(Settings(number=5, id8=9)), port, owner)
+    return shell, port, owner
+
+
+async def test_it_polls_when_the_engine_wants() -> None:
+    shell, port, owner = make()
+    shell.up()
+    assert port.filters == [(0, 0)]
+    await asyncio.sleep(2.0)
+    assert owner.changes == ["up"]
+    assert any(isinstance(each, Ready) for each in owner.actions)
+    assert len(port.sent) >= 8  # two claims of four frames
+    shell.close()
+    sent = len(port.sent)
+    await asyncio.sleep(10.0)
+    assert len(port.sent) == sent
+
+
+async def test_a_port_that_confirms_at_once_and_an_owner_that_publishes_at_once() -> None:
+    """Each waits for its turn: a message of many frames goes out whole, and in order."""
+    shell, port, owner = make()
+    payload = bytes(range(100))
+    owner.on_ready = lambda: shell.do(shell.engine.publish(port.now(), 0x42, payload, handle="bulk"))
+    shell.up()
+    await asyncio.sleep(3.0)
+    data = [frame for frame in port.sent if frame.id >> 15 & 0xFF == 0x42]
+    assert b"".join(frame.data for frame in data) == payload
+    assert [frame.id & 0x7F for frame in data] == list(range(12, -1, -1))
+    assert owner.fates() == [Fate.SENT]
+
+
+async def test_drained_when_all_is_on_the_bus_or_it_takes_too_long() -> None:
+    shell, port, _ = make()
+    shell.up()
+    await asyncio.sleep(3.0)
+    await shell.drained(1.0)
+    port.stuck = True
+    shell.do(shell.engine.manage(port.now(), management.encode(Alive("A"))))
+    before = port.now()
+    await shell.drained(0.5)
+    assert port.now() - before == 500_000_000
+    waiting = asyncio.create_task(shell.drained(0.5))
+    await asyncio.sleep(0.1)
+    port.stuck = False
+    shell.confirmed(Mailbox.SRT, Outcome.SENT, port.now())
+    await waiting
+    assert port.now() - before < 700_000_000
+
+
+async def test_what_is_discarded_is_told_after_the_bus_is_down() -> None:
+    shell, port, owner = make()
+    shell.up()
+    await asyncio.sleep(3.0)
+    port.stuck = True
+    shell.do(shell.engine.publish(port.now(), 0x42, b"x", handle="x"))
+    owner.actions.clear()
+    shell.down("cable cut")
+    assert owner.changes == ["up", "cable cut"]
+    assert owner.fates() == [Fate.DISCARDED]
+    shell.waits("no cable")
+    shell.fault("stuff error")
+    assert owner.changes[2:] == ["waits: no cable", "fault: stuff error"]
+
+
+async def test_a_port_that_is_not_exact_asks_for_slots_only_where_they_are_coarse() -> None:
+    port = Port()
+    port.coarse = True
+    for options, reserves in ((Options(), False), (Options(slots=10), True), (Options(slots=20, cycle=0.010), True)):
+        settings = options.settings(1, port)
+        assert settings.reserves == reserves
+        words = Words(Engine(settings), port, settings)
+        assert bool(words.no_slots) is not reserves
+    port.coarse = False
+    assert Options().settings(1, port).reserves
+
+
+async def test_what_a_class_means_depends_on_the_controller() -> None:
+    shell, port, _ = make()
+    words = Words(shell.engine, port, Settings(number=5))
+    assert words.guarantee(PublisherClass.SPORADIC, None) == "nothing yet: not on the bus"
+    shell.up()
+    await asyncio.sleep(3.0)
+    assert "fixed when a frame is handed to the controller" in words.guarantee(PublisherClass.SPORADIC, None)
+    port.one_shot = True
+    assert "fresh at each try" in words.guarantee(PublisherClass.SPORADIC, None)
