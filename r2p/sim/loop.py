@@ -1,10 +1,12 @@
 """Virtual time: an event loop whose clock jumps to the next timer as soon as nothing else is left to do.
 
 Time stands still while code runs, so what a program does depends on its timers alone, not on the computer. Everything
-in asyncio that goes through the loop works unchanged. What virtual time can't see is the world outside:
+in asyncio that goes through the loop works unchanged. What virtual time can't see is the world outside, nor work:
 
 - Jobs in threads (`asyncio.to_thread`, `loop.run_in_executor`) are counted: time stands still until they are done.
   Other threads are not seen, nor are subprocesses.
+- A task that never waits, such as one that publishes in a loop, would stop the world: after 100 000 turns of the loop
+  at one instant the next timer comes all the same.
 - Real file descriptors are polled, but never waited for: time goes on without them. Keep sockets and devices out.
 - `time.time`, `time.sleep`, `random` and the order of sets of strings are as real as ever: use `r2p.clock` for the
   first three.
@@ -19,12 +21,13 @@ import random
 import selectors
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, Unpack
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
 from r2p.errors import Deadlock
 
 if TYPE_CHECKING:
     import contextvars
+    from collections.abc import Sized
     from concurrent.futures import Executor
 
 T = TypeVar("T")
@@ -33,6 +36,9 @@ Ts = TypeVarTuple("Ts")
 _SECOND: Final = 1_000_000_000
 _EPOCH: Final = 1_356_998_400 * _SECOND  # 2013-01-01T00:00:00Z
 _HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two floats to each nanosecond
+_BUSY: Final = 100_000  # turns of the loop at one instant
+_END: Final = 2**22 * _SECOND  # the same in ns
+_AHEAD: Final = 1000  # events; then the loop has its turn, for signals and real file descriptors
 _RESOLUTION: Final = 0.4e-9  # seconds; tells nanoseconds apart, and is more than rounding error at the horizon
 
 
@@ -47,48 +53,53 @@ def run(main: Coroutine[Any, Any, T] | Callable[[], Coroutine[Any, Any, T]], *, 
         return runner.run(main() if callable(main) else main)
 
 
+Event: TypeAlias = tuple[int, int, Callable[..., object], tuple[Any, ...]]
+"""When (ns since the start), its place among those of one instant, what to call, with what."""
+
+
 class VirtualClock:
     """The clock of a `VirtualLoop`: an integer, moved by the loop. Satisfies `r2p.clock.Clock`."""
 
     virtual = True
 
     def __init__(self) -> None:
-        self._elapsed = 0
-        self.seconds = 0.0
+        self.elapsed = 0  # ns
 
     def now(self) -> int:
         """UTC in ns: 2013-01-01 at the start."""
-        return _EPOCH + self._elapsed
+        return _EPOCH + self.elapsed
 
     def monotonic(self) -> int:
         """Ns since the start."""
-        return self._elapsed
+        return self.elapsed
 
-    def move_to(self, seconds: float) -> None:
-        """Jump to this loop time."""
-        self._elapsed = _nanoseconds(seconds)
-        self.seconds = seconds
+    def move_to(self, instant: int) -> None:
+        """Jump to this instant (ns since the start)."""
+        self.elapsed = instant
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
     """An asyncio event loop under virtual time. `clock` and `random` are what `r2p.clock` finds here."""
 
+    _ready: Sized  # what asyncio will call next
     _scheduled: list[asyncio.TimerHandle]  # asyncio's heap of timers; when it polls, the first one is not cancelled
     _clock_resolution: float  # asyncio runs timers that are due this much later, too
 
     def __init__(self, *, seed: int = 0) -> None:
-        super().__init__(_Selector(self._idle))
+        super().__init__(_Selector(self._idle, self._turn))
         self.clock = VirtualClock()
         self.random = random.Random(seed)
         self.task_numbers = itertools.count(1)
         self._timer_numbers = itertools.count()
         self._jobs = 0
+        self._turns = 0
+        self._instant = 0
         self._clock_resolution = _RESOLUTION
         self.set_task_factory(_Task.make)
 
     def time(self) -> float:
         """Virtual seconds since the start."""
-        return self.clock.seconds
+        return self.clock.elapsed / _SECOND
 
     def call_at(
         self,
@@ -127,8 +138,40 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         finally:
             self._jobs -= 1
 
+    def run_ahead(self, events: list[Event]) -> None:
+        """Carry out events of this heap, each at its instant, for as long as nothing else is due in between.
+
+        For whoever has many events, and keeps them in order himself: a turn of the loop for each would cost more than
+        the event. What is over is now. After some events, the loop has its turn all the same.
+        """
+        ready, timers, clock = self._ready, self._scheduled, self.clock
+        first, limit = None, _END
+        for _ in range(_AHEAD):
+            if not events:
+                return
+            when, _, callback, args = events[0]
+            if when > clock.elapsed:
+                if timers and timers[0] is not first:
+                    first = timers[0]
+                    limit = _nanoseconds(min(first.when(), _HORIZON))
+                if ready or when >= limit or self._jobs:
+                    return
+                clock.elapsed = when
+            heapq.heappop(events)
+            callback(*args)
+
     def _job_done(self, _future: asyncio.Future[Any]) -> None:
         self._jobs -= 1
+
+    def _turn(self) -> None:
+        """There is more to do at this instant. Who never waits takes time, too: in the end the next timer comes."""
+        if self._instant != self.clock.elapsed:
+            self._instant, self._turns = self.clock.elapsed, 0
+        self._turns += 1
+        if self._turns >= _BUSY and self._scheduled and not self._jobs:
+            when = self._scheduled[0].when()
+            if when < _HORIZON:
+                self.clock.move_to(max(self.clock.elapsed, _nanoseconds(when)))
 
     def _idle(self) -> bool:
         """Nothing is left to do at this instant: go on to the next timer, or say True: wait for a job in a thread."""
@@ -137,7 +180,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         when = self._scheduled[0].when() if self._scheduled else _HORIZON
         if when >= _HORIZON:
             raise Deadlock(self._who_waits())
-        self.clock.move_to(when)
+        self.clock.move_to(_nanoseconds(when))
         return False
 
     def _who_waits(self) -> str:
@@ -152,13 +195,17 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 class _Selector(selectors.DefaultSelector):
     """Never waits while virtual time can go on instead."""
 
-    def __init__(self, idle: Callable[[], bool]) -> None:
+    def __init__(self, idle: Callable[[], bool], turn: Callable[[], None]) -> None:
         super().__init__()
         self._idle = idle
+        self._turn = turn
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         events = super().select(0)
-        if events or timeout == 0:  # 0 is what asyncio says when callbacks are ready
+        if events:
+            return events
+        if timeout == 0:  # what asyncio says when callbacks are ready
+            self._turn()
             return events
         return super().select(None) if self._idle() else events
 

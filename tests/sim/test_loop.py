@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from r2p.sim import VirtualLoop
+    from r2p.sim.loop import Event
 
 SECOND = 1_000_000_000
 HORIZON = 2**22 * SECOND
@@ -337,3 +338,42 @@ def test_a_closed_loop_takes_no_timers() -> None:
     assert loop.is_closed()
     with pytest.raises(RuntimeError, match="closed"):
         loop.call_later(1, print)
+
+
+def test_a_task_that_never_waits_does_not_stop_time() -> None:
+    turns = 0
+
+    async def busy() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    async def main() -> None:
+        task = asyncio.create_task(busy())
+        await asyncio.sleep(1.0)
+        task.cancel()
+
+    run(main)
+    assert 100_000 <= turns < 100_100
+
+
+# Events of others
+
+
+@pytest.mark.virtual_time
+async def test_events_run_ahead_up_to_the_next_thing_of_the_loop() -> None:
+    loop = cast("VirtualLoop", asyncio.get_running_loop())
+    seen: list[tuple[str, int]] = []
+
+    def see(name: str) -> None:
+        seen.append((name, loop.clock.monotonic() // 1_000_000))
+
+    events: list[Event] = [(at * 1_000_000, number, see, (f"{at} ms",)) for number, at in enumerate((1, 1, 4, 9))]
+    loop.call_at(0.004, see, "timer")
+    loop.run_ahead(events)
+    assert seen == [("1 ms", 1), ("1 ms", 1)]
+    await asyncio.sleep(0.004)
+    loop.run_ahead(events)
+    assert seen[2:] == [("timer", 4), ("4 ms", 5), ("9 ms", 9)]
+    assert not events

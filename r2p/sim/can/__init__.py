@@ -15,7 +15,7 @@ its frame is counted (and cached) by the codec. One seed, one course of events: 
 
 from r2p.sim.can.bus import CanBus
 from r2p.sim.can.controller import CanController
-from r2p.sim.can.node import CanNode, ErrorKind, Latency, LocalClock, Record, State
+from r2p.sim.can.node import CanNode, ErrorKind, Latency, LocalAlarm, LocalClock, Record, State
 from r2p.sim.can.statistics import Count, Statistics
 from r2p.sim.can.timeline import Timeline, Timer
 
@@ -26,6 +26,7 @@ __all__ = [
     "Count",
     "ErrorKind",
     "Latency",
+    "LocalAlarm",
     "LocalClock",
     "Record",
     "State",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from r2p.codecs.rtcan import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
 from r2p.sim.can.controller import CanController, Request
 from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
-from r2p.sim.can.node import CanNode, ErrorKind, Record, State
+from r2p.sim.can.node import NEVER, CanNode, ErrorKind, Record, State
 from r2p.sim.can.recovery import Recovery
 from r2p.sim.can.statistics import Statistics
 from r2p.sim.can.timeline import Timeline
@@ -32,13 +32,15 @@ class _Transfer:
 
     __slots__ = ("bits", "doomed", "frame", "heard_by", "names", "requests", "start")
 
-    def __init__(self, requests: list[Request], heard_by: list[CanController], start: int) -> None:
-        self.frame = requests[0].frame
+    def __init__(
+        self, requests: list[Request], names: tuple[str, ...], heard_by: Sequence[CanController], start: int
+    ) -> None:
+        self.frame = frame = requests[0].frame
         self.requests = requests
-        self.names = tuple(request.owner.name for request in requests)
+        self.names = names
         self.heard_by = heard_by
         self.start = start
-        self.bits = frame_bits(self.frame.id, self.frame.data)
+        self.bits = frame_bits(frame.id, frame.data)
         self.doomed = False
 
     @property
@@ -72,6 +74,7 @@ class CanBus:
         self._numbers = random.Random(f"{seed}")
         self._names: set[str] = set()
         self._live: list[CanController] = []
+        self._others: dict[CanController, list[CanController]] = {}
         self._noisy = False  # whether a node has noise of its own
         self._disturb: list[int] = []
         self._free = 0  # from when on a frame may start
@@ -87,7 +90,7 @@ class CanBus:
             raise ValueError(f"there is a node {node.name} on this bus already")
         self._names.add(node.name)
         controller = CanController(self, node, self._seed)
-        self._live.append(controller)
+        self.joined(controller)
         self._noisy = self._noisy or node.noise > 0
         return controller
 
@@ -109,10 +112,16 @@ class CanBus:
 
     # What controllers say (`controller.Wire`)
 
-    def contend(self, request: Request) -> None:
-        """Try this frame as soon as the bus is free."""
-        if not self._busy:
-            self._plan_start(max(request.ready, self._free, request.owner.not_before))
+    def contend(self, request: Request) -> bool:
+        """Try this frame as soon as the bus is free. False: it is not, or this frame would come too late."""
+        if self._busy:
+            return False
+        start = max(request.ready, self._free, request.owner.not_before)
+        if start > request.last:
+            return False
+        if self._start is None or start < self._start:
+            self._plan_start(start)
+        return True
 
     def trying(self, request: Request) -> bool:
         """Whether the start of this frame has begun, and who wins is still open."""
@@ -130,6 +139,7 @@ class CanBus:
         """A controller takes no part any more: no power, or bus-off."""
         if controller in self._live:
             self._live.remove(controller)
+            self._others.clear()
         if controller.state is State.DOWN:
             self._recovery.forget(controller)
         if self._transfer:
@@ -139,6 +149,7 @@ class CanBus:
     def joined(self, controller: CanController) -> None:
         """A controller takes part again."""
         self._live.append(controller)
+        self._others.clear()
 
     def recover(self, controller: CanController) -> None:
         """A controller wants to leave bus-off."""
@@ -147,36 +158,58 @@ class CanBus:
     # The start of a frame
 
     def _plan_start(self, start: int) -> None:
-        if self._start is None or start < self._start:
-            self._start = start
-            self._plan += 1
-            self.timeline.at(start + self.bit, self._arbitrate, self._plan)
+        self._start = start
+        self._plan += 1
+        self.timeline.at(start + self.bit, self._arbitrate, self._plan)
 
     def _plan_anew(self) -> None:
         self._start = None
         self._plan += 1
-        starts = [start for controller in self._live if (start := controller.first(self._free)) is not None]
-        if starts:
-            self._plan_start(min(starts))
+        free, start = self._free, NEVER
+        for controller in self._live:
+            if controller.boxes and (first := controller.first(free)) < start:
+                start = first
+        if start < NEVER:
+            self._plan_start(start)
 
     def _arbitrate(self, plan: int) -> None:
         if plan != self._plan or self._start is None:
             return
         start, self._start = self._start, None
         self._busy = True
-        self._recovery.busy(start)
-        end = start + self.bit
-        tries = [request for node in self._live if (request := node.choose(start, end))]
-        lowest = min([request.frame.id for request in tries])
-        winners = [request for request in tries if request.frame.id == lowest]
-        if len(winners) < len(tries):
-            for request in tries:
-                if request.frame.id != lowest:
-                    self._lose(request, lowest, start)
-        if len(winners) > 1 and any(request.frame != winners[0].frame for request in winners):
-            self._collide(winners, start)
+        if self._recovery.left:
+            self._recovery.busy(start)
+        tries = self._tries(start, start + self.bit)
+        if len(tries) > 1:
+            tries = self._winners(tries, start)
+        if len(tries) > 1 and any(request.frame != tries[0].frame for request in tries):
+            self._collide(tries, start)
         else:
-            self._send(winners, start)
+            self._send(tries, start)
+
+    def _tries(self, start: int, end: int) -> list[Request]:
+        """What takes part; `end` is one bit after the start of frame."""
+        tries = []
+        for node in self._live:
+            boxes = node.boxes
+            if not boxes:
+                continue
+            request = node.choose(start, end)
+            if request is None:
+                node.passed(None)
+                continue
+            tries.append(request)
+            if len(boxes) > 1:
+                node.passed(request)
+        return tries
+
+    def _winners(self, tries: list[Request], start: int) -> list[Request]:
+        """Arbitration: the lowest identifier wins; the others lose where they differ from it."""
+        lowest = min([request.frame.id for request in tries])
+        for request in tries:
+            if request.frame.id != lowest:
+                self._lose(request, lowest, start)
+        return [request for request in tries if request.frame.id == lowest]
 
     def _lose(self, request: Request, winner: int, start: int) -> None:
         self.statistics.add_lost(request.owner.name, request.frame.id)
@@ -193,27 +226,34 @@ class CanBus:
         if (self.noise or self._noisy or self._disturb) and self._hit(transfer):
             return
         if transfer.heard_by:
-            self.timeline.at(end, self._finish, transfer)
+            self.timeline.at(end, self._finish, transfer, end)
         else:
             self._destroy(transfer, wire_bits(transfer.frame)[:-_AFTER_ACK], ErrorKind.ACK, transfer.owners)
 
     def _transfer_of(self, requests: list[Request], start: int, deaf: Sequence[CanController]) -> _Transfer:
+        first = requests[0].owner
+        if len(requests) == 1 and not deaf:
+            return _Transfer(requests, (first.name,), self._others.get(first) or self._others_of(first), start)
         owners = [request.owner for request in requests]
         heard_by = [node for node in self._live if node not in owners and node not in deaf]
-        return _Transfer(requests, heard_by, start)
+        return _Transfer(requests, tuple([owner.name for owner in owners]), heard_by, start)
 
-    def _finish(self, transfer: _Transfer) -> None:
+    def _others_of(self, node: CanController) -> list[CanController]:
+        """All that hear what this one sends."""
+        self._others[node] = others = [each for each in self._live if each is not node]
+        return others
+
+    def _finish(self, transfer: _Transfer, end: int) -> None:
         if transfer.doomed:
             return
-        end = self.timeline.now()
+        frame = transfer.frame
         for request in transfer.requests:
             request.owner.sent(request, end)
         for node in transfer.heard_by:
-            node.arrived(transfer.frame, end)
-        self._over(transfer, transfer.bits, None)
+            node.arrived(frame, end)
+        self._over(transfer, transfer.bits, None, end)
 
-    def _over(self, transfer: _Transfer, bits: int, error: ErrorKind | None) -> None:
-        end = self.timeline.now()
+    def _over(self, transfer: _Transfer, bits: int, error: ErrorKind | None, end: int) -> None:
         record = Record(transfer.start, end, transfer.frame, transfer.names, bits, error)
         self.statistics.add(record)
         self._transfer = None
@@ -222,7 +262,8 @@ class CanBus:
         for request in transfer.requests:
             if request.owner.state is State.PASSIVE:
                 request.owner.not_before = self._free + _SUSPEND * self.bit
-        self._recovery.free(self._free)
+        if self._recovery.left:
+            self._recovery.free(self._free)
         self._plan_anew()
         for observer in self.observers:
             observer(record)
@@ -243,7 +284,7 @@ class CanBus:
                     bit = node.numbers.randrange(1, transfer.bits + 1)
                     self._destroy(transfer, wire_bits(transfer.frame)[:bit], ErrorKind.BIT, [node])
                     return True
-                transfer.heard_by.remove(node)
+                transfer.heard_by = [each for each in transfer.heard_by if each is not node]
         return False
 
     def _collide(self, requests: list[Request], start: int, deaf: Sequence[CanController] = ()) -> None:
@@ -271,13 +312,13 @@ class CanBus:
         transfer.doomed = True
         detected = transfer.start + len(bus) * self.bit
         active = any(node.state is State.ACTIVE for node in by)
-        others = any(n.state is State.ACTIVE for n in transfer.owners + transfer.heard_by if n not in by)
+        others = any(n.state is State.ACTIVE for n in (*transfer.owners, *transfer.heard_by) if n not in by)
         bits = len(bus) + error_frame_bits(bus, wire_bits(transfer.frame), active=active, others=others)
         end = transfer.start + bits * self.bit
         for request in transfer.requests:
             request.held = end
         self.timeline.at(detected, self._failed, transfer, kind)
-        self.timeline.at(end, self._over, transfer, bits, kind)
+        self.timeline.at(end, self._over, transfer, bits, kind, end)
 
     def _failed(self, transfer: _Transfer, kind: ErrorKind) -> None:
         now = self.timeline.now()

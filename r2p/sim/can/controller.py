@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from r2p.codecs.rtcan import FRAME_MAX
 from r2p.errors import MessageError
-from r2p.sim.can.node import ErrorKind, LocalClock, State
+from r2p.sim.can.node import NEVER, ErrorKind, LocalAlarm, LocalClock, State
 from r2p.sim.can.recovery import RECESSIVE
 
 if TYPE_CHECKING:
@@ -20,21 +20,27 @@ if TYPE_CHECKING:
 _PASSIVE: Final = 127
 _OFF: Final = 255
 _RECEIVED_WELL: Final = 119  # what the receive error counter goes back to from above 127
-_NEVER: Final = 1 << 63
+_REMEMBERED: Final = 4096  # identifiers of which it is known whether the filters let them through
 _BABBLE: Final = -1  # the mailbox of a node that has gone mad
 
 
 class Request:
-    """A frame in a mailbox. `ready`: from when on the controller tries it; `held`: until when it is on the wire."""
+    """A frame in a mailbox.
 
-    __slots__ = ("frame", "held", "mailbox", "owner", "ready")
+    `ready`: from when on the controller tries it; `last`: until when it may start; `held`: until when it is on the
+    wire. `guarded`: it will be aborted at `last`, unless it is on the wire.
+    """
 
-    def __init__(self, owner: CanController, frame: Frame, mailbox: int, ready: int) -> None:
+    __slots__ = ("frame", "guarded", "held", "last", "mailbox", "owner", "ready")
+
+    def __init__(self, owner: CanController, frame: Frame, mailbox: int, ready: int, last: int) -> None:
         self.owner = owner
         self.frame = frame
         self.mailbox = mailbox
         self.ready = ready
+        self.last = last
         self.held = 0
+        self.guarded = False
 
 
 class Wire(Protocol):
@@ -43,8 +49,9 @@ class Wire(Protocol):
     timeline: Timeline
     bit: int
 
-    def contend(self, request: Request) -> None:
-        """Try this frame as soon as the bus is free."""
+    def contend(self, request: Request) -> bool:
+        """Try this frame as soon as the bus is free. False: it is not, or this frame would come too late."""
+        ...
 
     def trying(self, request: Request) -> bool:
         """Whether the start of this frame has begun, and who wins is still open."""
@@ -74,8 +81,6 @@ class CanController:
         self.transmit_errors = 0  # the controller's two counters
         self.receive_errors = 0
         self.missed = 0  # frames that the software lost (`CanNode.loss`, `lose_next`)
-        self.filters: Sequence[tuple[int, int]] = ()
-        """(identifier, mask): only frames with `id & mask == identifier` of one are received; none: all are."""
         self.on_receive: Callable[[Frame, int], object] = _ignore
         """A frame of another node has arrived."""
         self.on_sent: Callable[[Frame, int], object] = _ignore
@@ -84,15 +89,22 @@ class CanController:
         """One-shot: a frame has lost arbitration, and leaves its mailbox now."""
         self.on_error: Callable[[Frame, ErrorKind, int], object] = _ignore
         """A frame has left its mailbox because of an error: one-shot, or bus-off."""
+        self.on_late: Callable[[Frame, int], object] = _ignore
+        """A frame has not started by its `not_after`, and left its mailbox: nobody has seen it."""
         self.on_state: Callable[[State, int], object] = _ignore
         """`state` has changed."""
         self.numbers = random.Random(f"{seed}/{node.name}")
-        self.not_before = 0  # for the bus: no start of frame here earlier than this
+        self.boxes: dict[int, Request] = {}  # for the bus, as is the next one
+        self.not_before = 0  # no start of frame here earlier than this
+        self._ahead = node.transmit.nominal
+        self._mailboxes = node.mailboxes
         self._transmit_delay = node.transmit.drawer(self.numbers)
         self._receive_delay = node.receive.drawer(self.numbers)
         self._bus = bus
         self._timeline = bus.timeline
-        self._boxes: dict[int, Request] = {}
+        self._filters: Sequence[tuple[int, int]] = ()
+        self._wanted: dict[int, bool] = {}
+        self._loss = node.loss
         self._lose_next = 0
         self._mad: Frame | None = None
         self._life = 0  # counts deaths: what it was about to hear is not heard any more
@@ -100,35 +112,61 @@ class CanController:
 
     # What software does
 
-    def request(self, frame: Frame, mailbox: int = 0) -> bool:
+    def request(
+        self, frame: Frame, mailbox: int = 0, *, not_before: int | None = None, not_after: int | None = None
+    ) -> bool:
         """Send this frame. False: this mailbox still holds one, or the controller is down or in bus-off.
+
+        The two instants are those of this node's clock, in ns. `not_before`: software hands the frame over ahead of
+        it, by the nominal latency; so the start of frame is as exact as the latency. `not_after`: a frame that has not
+        started by then is aborted, and `on_late` is told.
 
         Raises IndexError for a mailbox that the controller does not have, and `MessageError` for what is no frame.
         """
-        if not 0 <= mailbox < self.node.mailboxes:
-            raise IndexError(f"{self.name} has {self.node.mailboxes} mailboxes: there is no mailbox {mailbox}")
-        if mailbox in self._boxes or not self.live:
+        if not 0 <= mailbox < self._mailboxes:
+            raise IndexError(f"{self.name} has {self._mailboxes} mailboxes: there is no mailbox {mailbox}")
+        if mailbox in self.boxes or self.state is State.BUS_OFF or self.state is State.DOWN:
             return False
-        self._put(frame, mailbox, self._transmit_delay())
+        given = self._timeline.now()
+        if not_before is not None:
+            ahead = self.clock.true(not_before) - self._ahead
+            if ahead > given:
+                given = ahead
+        last = NEVER if not_after is None else self.clock.true(not_after + 1) - 1
+        self._put(frame, mailbox, given + self._transmit_delay(), last)
         return True
 
     def abort(self, mailbox: int = 0) -> bool:
         """Withdraw the frame of this mailbox. False: its start of frame has begun, or there is none."""
-        request = self._boxes.get(mailbox)
+        request = self.boxes.get(mailbox)
         if request is None or self._timeline.now() < request.held or self._bus.trying(request):
             return False
-        del self._boxes[mailbox]
+        del self.boxes[mailbox]
         self._bus.withdrawn()
         return True
 
     def pending(self, mailbox: int = 0) -> Frame | None:
         """The frame in this mailbox."""
-        request = self._boxes.get(mailbox)
+        request = self.boxes.get(mailbox)
         return request.frame if request else None
+
+    @property
+    def filters(self) -> Sequence[tuple[int, int]]:
+        """(identifier, mask): only frames with `id & mask == identifier` of one are received; none: all are."""
+        return self._filters
+
+    @filters.setter
+    def filters(self, filters: Sequence[tuple[int, int]]) -> None:
+        self._filters = filters
+        self._wanted.clear()
 
     def call_at(self, local: int, callback: Callable[..., object], *args: Any) -> Timer:
         """Call it when this node's clock shows `local` ns: a timer interrupt, without latency."""
         return self._timeline.timer(self.clock.true(local), callback, *args)
+
+    def alarm(self, callback: Callable[[], object]) -> LocalAlarm:
+        """A timer of this node that can be moved, by its clock."""
+        return LocalAlarm(self._timeline, self.clock, callback)
 
     def restart(self) -> None:
         """Leave bus-off, after 128 times 11 recessive bits: for `CanNode(recovery=False)`."""
@@ -140,7 +178,7 @@ class CanController:
     def babble(self, frame: Frame | None) -> None:
         """Go mad: send this frame over and over, whatever happens. None: be well again."""
         self._mad = frame
-        self._boxes.pop(_BABBLE, None)
+        self.boxes.pop(_BABBLE, None)
         self._bus.withdrawn()
         self._babble()
 
@@ -155,7 +193,7 @@ class CanController:
         self.state = State.DOWN
         self._mad = None
         self._life += 1
-        self._boxes.clear()
+        self.boxes.clear()
         self._bus.left(self)
 
     def power_on(self) -> None:
@@ -178,33 +216,48 @@ class CanController:
         """
         chosen = None
         not_before = max(start, self.not_before)
-        rank = (end, 0)
-        for request in self._boxes.values():
+        for request in self.boxes.values():
             begins = request.ready
             if begins < not_before:
                 begins = not_before
-            if (begins, request.frame.id) < rank:
-                rank = begins, request.frame.id
-                chosen = request
+            if begins > request.last:
+                continue
+            if begins < end or (begins == end and chosen is not None and request.frame.id < chosen.frame.id):
+                chosen, end = request, begins
         return chosen
 
-    def first(self, free: int) -> int | None:
-        """When this controller wants to start a frame, given when the bus is free. None: not at all."""
-        if not self._boxes:
-            return None
-        ready = min([request.ready for request in self._boxes.values()])
-        return None if ready == _NEVER else max(ready, free, self.not_before)
+    def first(self, free: int) -> int:
+        """When this controller wants to start a frame, given when the bus is free. NEVER: not at all."""
+        earliest = NEVER
+        not_before = max(free, self.not_before)
+        for request in self.boxes.values():
+            begins = request.ready
+            if begins < not_before:
+                begins = not_before
+            if begins > request.last:
+                self._guard(request)
+            elif begins < earliest:
+                earliest = begins
+        return earliest
+
+    def passed(self, chosen: Request | None) -> None:
+        """A frame has started, and of this controller at most this one takes part: watch the others' last instants."""
+        for request in self.boxes.values():
+            if request.last < NEVER and request is not chosen:
+                self._guard(request)
 
     def arrived(self, frame: Frame, end: int) -> None:
         """A good frame of another node ended."""
         if self.receive_errors:
             self._count(receive=-1 if self.receive_errors <= _PASSIVE else _RECEIVED_WELL - self.receive_errors)
-        if self.filters and not any(frame.id & mask == wanted for wanted, mask in self.filters):
-            return
+        if self._filters:
+            wanted = self._wanted.get(frame.id)
+            if wanted is False or (wanted is None and not self._passes(frame.id)):
+                return
         if self._lose_next:
             self._lose_next -= 1
             self.missed += 1
-        elif self.node.loss and self.numbers.random() < self.node.loss:
+        elif self._loss and self.numbers.random() < self._loss:
             self.missed += 1
         else:
             self._tell(end, self.on_receive, frame)
@@ -220,8 +273,10 @@ class CanController:
         """This request's frame loses arbitration, at this instant."""
         request.held = at
         if self.node.one_shot and request.mailbox != _BABBLE:
-            request.ready = _NEVER
+            request.ready = NEVER
             self._tell(at, self._lost, request)
+        elif request.last < NEVER:
+            self._guard(request)
 
     def failed(self, request: Request, kind: ErrorKind, at: int) -> None:
         """This request's frame was destroyed: an error frame begins."""
@@ -244,17 +299,32 @@ class CanController:
 
     # Inside
 
-    def _put(self, frame: Frame, mailbox: int, delay: int) -> None:
+    def _put(self, frame: Frame, mailbox: int, ready: int, last: int = NEVER) -> None:
         if frame.id >> 29 or len(frame.data) > FRAME_MAX:
             raise MessageError(f"identifier {frame.id:#x} with {len(frame.data)} bytes: no frame has room")
-        self._boxes[mailbox] = request = Request(self, frame, mailbox, self._timeline.now() + delay)
-        self._bus.contend(request)
+        self.boxes[mailbox] = request = Request(self, frame, mailbox, ready, last)
+        if not self._bus.contend(request) and last < NEVER:
+            self._guard(request)
+
+    def _passes(self, identifier: int) -> bool:
+        """Whether the filters let it through."""
+        if len(self._wanted) >= _REMEMBERED:
+            self._wanted.clear()
+        self._wanted[identifier] = wanted = any(identifier & mask == value for value, mask in self._filters)
+        return wanted
+
+    def _guard(self, request: Request) -> None:
+        """Abort it at its last instant, if it still waits by then: its software is told, and only then looks."""
+        if not request.guarded and request.ready < NEVER:
+            request.guarded = True
+            heard = max(request.last, request.held, self._timeline.now()) + self._receive_delay()
+            self._timeline.at(heard, self._hear, heard, self._life, self._late, (request,))
 
     def _free(self, request: Request) -> bool:
         """Empty its mailbox. False if it is no longer there; a babbling node never ends."""
-        if request.mailbox == _BABBLE or self._boxes.get(request.mailbox) is not request:
+        if request.mailbox == _BABBLE or self.boxes.get(request.mailbox) is not request:
             return False
-        del self._boxes[request.mailbox]
+        del self.boxes[request.mailbox]
         return True
 
     def _count(self, transmit: int = 0, receive: int = 0) -> None:
@@ -269,8 +339,8 @@ class CanController:
 
     def _off(self) -> None:
         now = self._timeline.now()
-        given_up = [request.frame for request in self._boxes.values() if request.mailbox != _BABBLE]
-        self._boxes.clear()
+        given_up = [request.frame for request in self.boxes.values() if request.mailbox != _BABBLE]
+        self.boxes.clear()
         self._enter(State.BUS_OFF)
         for frame in given_up:
             self._tell(now, self.on_error, frame, ErrorKind.BUS_OFF)
@@ -287,9 +357,16 @@ class CanController:
         if self._free(request):  # only now: one event less for each loss, and software can't know before
             self.on_lost(request.frame, stamp)
 
+    def _late(self, request: Request, stamp: int) -> None:
+        request.guarded = False  # if it has started, and is not sent, this comes again
+        if self._timeline.now() < request.held or self._bus.trying(request) or not self._free(request):
+            return
+        self._bus.withdrawn()
+        self.on_late(request.frame, stamp)
+
     def _babble(self) -> None:
         if self._mad and self.live:
-            self._put(self._mad, _BABBLE, 0)
+            self._put(self._mad, _BABBLE, self._timeline.now())
 
     def _tell(self, when: int, callback: Callable[..., object], *args: Any) -> None:
         if callback is _ignore:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from r2p.sim.can.timeline import Timeline
 
+NEVER: Final = 1 << 63
 _BILLION: Final = 1_000_000_000
 
 
@@ -105,7 +106,8 @@ class LocalClock:
 
     def monotonic(self) -> int:
         """What this clock shows now, in ns."""
-        return self.local(self._timeline.now())
+        true = self._timeline.now()
+        return true + self._offset + true * self._drift // _BILLION
 
     def now(self) -> int:
         """UTC in ns, as this node has it."""
@@ -115,15 +117,51 @@ class LocalClock:
 
     def local(self, true: int) -> int:
         """What this clock shows at that true instant."""
-        if not self._drift:
-            return true + self._offset
         return true + self._offset + true * self._drift // _BILLION
 
     def true(self, local: int) -> int:
         """The first true instant at which this clock shows `local`, or more."""
-        true = (local - self._offset) * _BILLION // (_BILLION + self._drift)
-        while self.local(true) < local:
-            true += 1
-        while self.local(true - 1) >= local:
-            true -= 1
-        return true
+        return -((self._offset - local) * _BILLION // (_BILLION + self._drift))
+
+
+class LocalAlarm:
+    """One timer that can be moved, on a node's clock: calls `callback()` when that shows the deadline, or more.
+
+    Putting it off costs nothing: when it goes off too early, it looks again.
+    """
+
+    def __init__(self, timeline: Timeline, clock: LocalClock, callback: Callable[[], object]) -> None:
+        self._timeline = timeline
+        self._clock = clock
+        self._callback = callback
+        self._deadline: int | None = None
+        self._due = 0  # the true instant of the deadline
+        self._armed = NEVER  # when it looks; may be earlier
+
+    def set(self, deadline: int | None) -> None:
+        """Move to this local instant, in ns; what is over is now. None: off."""
+        if deadline == self._deadline:
+            return
+        self._deadline = deadline
+        if deadline is not None:
+            self._due = due = self._clock.true(deadline)
+            if due < self._armed:
+                self._armed = due
+                self._timeline.at(due, self._look, due)
+
+    def close(self) -> None:
+        """Switch it off."""
+        self._deadline = None
+
+    def _look(self, armed: int) -> None:
+        if armed != self._armed:
+            return  # it was armed for an earlier instant since
+        self._armed = NEVER
+        if self._deadline is None:
+            return
+        if self._due > armed:
+            self._armed = self._due
+            self._timeline.at(self._due, self._look, self._due)
+            return
+        self._deadline = None
+        self._callback()

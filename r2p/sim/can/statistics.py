@@ -28,15 +28,6 @@ class Count:
         """Bit times that nobody else could use: everything, with the intermission that follows."""
         return self.bits + self.error_bits + INTERMISSION * (self.frames + self.errors)
 
-    def add(self, bits: int, failed: bool) -> None:
-        """Count one attempt."""
-        if failed:
-            self.errors += 1
-            self.error_bits += bits
-        else:
-            self.frames += 1
-            self.bits += bits
-
 
 class Statistics:
     """Counts in all, by message id and by node. A frame that several nodes sent as one counts for each of them."""
@@ -51,11 +42,14 @@ class Statistics:
 
     def add(self, record: Record) -> None:
         """Count one attempt."""
-        failed = record.error is not None
-        self.total.add(record.bits, failed)
-        self.by_message[record.frame.id >> 7 & 0xFFFF].add(record.bits, failed)
-        for name in record.senders:
-            self.by_node[name].add(record.bits, failed)
+        bits, message = record.bits, record.frame.id >> 7 & 0xFFFF
+        for count in (self.total, self.by_message[message], *[self.by_node[name] for name in record.senders]):
+            if record.error is None:
+                count.frames += 1
+                count.bits += bits
+            else:
+                count.errors += 1
+                count.error_bits += bits
 
     def add_lost(self, name: str, identifier: int) -> None:
         """Count an arbitration that this node lost with this identifier."""
