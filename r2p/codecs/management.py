@@ -15,6 +15,13 @@ modules that are directly on it. After the version, without gaps (`slot` and `ut
 | 0x45 | RELEASE | `u16 message` |
 | 0x46 | RENEW | `u8 serial; u8 highs[24]` (of the messages, 0: none) |
 | 0x47 | RENEWED | `u8 id8; u8 serial; u16 lease_ms; u8 highs[24]` |
+
+Gateways agree on their tree (`r2p.protocols.bridging`) with two more, which stay on their network as well:
+
+| type | name | body |
+| --- | --- | --- |
+| 0x60 | BRIDGE | `u32 gateway; u8 port; u16 count; u32 agreement; 3 x {u32 gateway; u16 count} acks` (gateway 0: none) |
+| 0x61 | MESH | `u32 gateway; u16 serial; u8 part; 3 x {u8 port; u32 gateway; u8 its_port} heard` (0: none) |
 """
 
 import msgspec
@@ -47,6 +54,8 @@ CLASS_HRT = 3  # periodic
 CLASS_LATCHES = 128  # added to the others: new subscribers get its last message
 
 NO_PARAMS = bytes(10)
+UNANSWERED = bytes(9) + b"\1"
+"""Params of a SUBSCRIBE_REQUEST between r2p modules: no SUBSCRIBE_RESPONSE has been heard yet."""
 ANY_TYPE = bytes(8)
 
 # Claim.flags
@@ -168,6 +177,32 @@ class Conflict(msgspec.Struct, frozen=True, gc=False):
     instance_b: int
 
 
+class Bridge(msgspec.Struct, frozen=True, gc=False):
+    """A gateway is there: `count` numbers what it sends, `agreement` is the hash of what it takes the network for.
+
+    `acks` are 3 times the gateway (u32) and `count` (u16) of the last BRIDGE that it got on this network.
+    """
+
+    gateway: int
+    port: int
+    count: int
+    agreement: int
+    acks: bytes
+
+
+class Mesh(msgspec.Struct, frozen=True, gc=False):
+    """Whom a gateway hears at its ports, once more with a new `serial` when that changes.
+
+    `part`: the high four bits number this part, the low four the last one. `heard` is 3 times the own port (u8), the
+    other gateway (u32) and its port (u8).
+    """
+
+    gateway: int
+    serial: int
+    part: int
+    heard: bytes
+
+
 class Network(msgspec.Struct, frozen=True, gc=False):
     """The RTCAN master tells what all must agree on, and anchors the cycle counter. `slot` is the length of one (ns).
 
@@ -277,6 +312,8 @@ Management = (
     | Unsubscribe
     | Endpoint
     | Conflict
+    | Bridge
+    | Mesh
 )
 
 RTCAN_TYPES = range(0x40, 0x50)
@@ -306,6 +343,8 @@ _CODEC = Codec[Management](
     Record(Unsubscribe, 0x52, "16s I", version=_VERSION),
     Record(Endpoint, 0x53, "B I 8s 16s B", version=_VERSION, may_be_empty=("node",)),
     Record(Conflict, 0x54, "7s I I", version=_VERSION),
+    Record(Bridge, 0x60, "I B H I 18s", version=_VERSION),
+    Record(Mesh, 0x61, "I H B 18s", version=_VERSION),
 )
 
 

@@ -268,7 +268,8 @@ class Core:
 
     def _queue_management(self, now: int, message: int, data: bytes, handle: Hashable, *, urgent: bool) -> None:
         deadline = now + (_URGENT if urgent else _DEADLINE)
-        if self.queue.put(Outgoing(message, data, deadline, drop=False, handle=handle), urgent=urgent):
+        outgoing = Outgoing(message, data, deadline, drop=False, handle=handle)
+        if self.queue.put(outgoing, urgent=urgent, management=True):
             self.sender.kick(now)
         else:
             self.counts["management dropped"] += 1

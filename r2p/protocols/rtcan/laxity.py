@@ -18,6 +18,7 @@ from r2p.codecs.rtcan import FRAME_MAX, NRT, SRT_MAX, Frame
 from r2p.protocols.rtcan.events import LONG_AGO, NEVER
 
 _MILLISECOND = 1_000_000
+_FIRST = 1 << 62  # more than any count
 
 
 class Outgoing(msgspec.Struct, eq=False):
@@ -77,17 +78,19 @@ class LaxityQueue:
     def full(self) -> bool:
         return self.size >= self._capacity
 
-    def put(self, message: Outgoing, *, urgent: bool = False) -> bool:
+    def put(self, message: Outgoing, *, urgent: bool = False, management: bool = False) -> bool:
         """Queue it; `urgent` before all others of its topic that have not started. False: there is no room.
 
-        Raises `MessageError` for what RTCAN can't carry.
+        `management` has room of its own, and goes before others of the same laxity, as it does on the bus: else events
+        that are overdue but not dropped would stop leases and discovery. Raises `MessageError` for what RTCAN can't
+        carry.
         """
         message.frames = rtcan.fragment_count(len(message.payload))
         lane = self._lanes.get(message.message)
-        if self.size >= self._capacity or (lane is not None and len(lane.waiting) >= self._depth):
+        if (self.size >= self._capacity and not management) or (lane is not None and len(lane.waiting) >= self._depth):
             return False
         self._count += 1
-        message.order = self._count
+        message.order = self._count - (_FIRST if management else 0)
         if lane is None:
             lane = self._lanes[message.message] = _Lane(deque((message,)))
             self._enter(lane)

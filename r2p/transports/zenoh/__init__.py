@@ -1,1 +1,18 @@
-"""zenoh as a transport: between PCs, over any network that zenoh reaches."""
+"""zenoh as a transport: between PCs, over any network that zenoh reaches.
+
+    options   what the URL says               config    ... as zenoh wants it
+    session   one zenoh session: everything that comes from zenoh's threads enters the event loop here
+    link      discovery and topics over it    outlet    what goes out    streams   what comes in
+    trouble   why there is no connection, in words
+
+zenoh itself is imported when a session is opened, not before.
+"""
+
+from r2p.transports.url import Url
+from r2p.transports.zenoh.options import options_of
+from r2p.transports.zenoh.transport import ZenohTransport
+
+
+def from_url(url: Url) -> ZenohTransport:
+    """`zenoh:[ENDPOINT]`; options `mode`, `listen`, `network`, `config`, `scouting`. Raises TransportError."""
+    return ZenohTransport(options_of(url))

@@ -117,6 +117,7 @@ async def test_waiting_frames(channel: str, peer: can.BusABC) -> None:
     port = port_on(channel)
     async with using(port) as user:
         port.transmit(order(last=-1))
+        await user.until(lambda: user.outcomes)
         port.transmit(order(wait=3600_000 * MS))
         port.withdraw(Withdraw(Mailbox.SRT))
         assert user.outcomes == [(Mailbox.SRT, Outcome.LATE)] * 2

@@ -1,0 +1,212 @@
+"""The header of a message on zenoh: what the payload, which is the packed message and nothing else, does not say.
+
+It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by what stays the same from message to
+message of one publisher, the origin; so a reader looks that up in a table, and decodes it once.
+
+| bytes | what |
+| --- | --- |
+| 0 | version, 1 |
+| 1 | flags: bit 0 the stamp is not the publisher's, bit 1 there is a clock part |
+| 2 | hops: gateways that it has crossed |
+| 3 | reserved, 0 |
+| 4..7 | serial: counts what the sender has sent on this topic in this class; a gap is what was lost on the way |
+| 8..15 | sequence: counts what the publisher has published, from 1; 0: not known |
+| 16..23 | stamp, UTC in ns |
+| 24..31 | deadline, UTC in ns; 0: none |
+| 16 more, if flagged | clock: `u32 epoch; i64 offset; u32 error` |
+| the rest | origin: `u8 class; u32 sender; u32 instance; u8 fingerprint[8]`, then `module/node` in ASCII |
+"""
+
+import re
+import struct
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import msgspec
+
+from r2p.codecs import UnknownType
+from r2p.errors import DecodeError
+
+T = TypeVar("T")
+
+VERSION = 1
+
+FLAG_RESTAMPED = 1
+FLAG_CLOCK = 2
+
+SERIAL_WRAP = 0xFFFFFFFF
+
+_FIXED = struct.Struct("<BBBxIQqq")
+_CLOCK = struct.Struct("<IqI")
+_ORIGIN = struct.Struct("<BII8s")
+_CREDIT = struct.Struct("<BBII")
+_unpack = _FIXED.unpack_from
+
+PLAIN = bytes((VERSION, 0))
+"""What almost all headers begin with: this version, and no flags. Then their origin begins at `ORIGIN_AT`, and
+`unpack_plain` gives hops, serial, sequence, stamp and deadline: for who has looked up the origin himself."""
+
+ORIGIN_AT = _FIXED.size
+unpack_plain = struct.Struct("<xxBxIQqq").unpack_from
+
+_TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
+_NAMES = re.compile(rb"([A-Za-z0-9_]{0,7})/([A-Za-z0-9_]{0,8})")
+_CLASSES = (1, 2, 3)
+_REMEMBERED = 4096  # origins
+
+
+class Clock(msgspec.Struct, frozen=True, gc=False):
+    """How a stamp was translated to UTC from another clock, that of the RTCAN network `epoch`.
+
+    UTC = that clock + `offset` (ns), known to +-`error` (ns).
+    """
+
+    epoch: int
+    offset: int
+    error: int
+
+
+class Origin(msgspec.Struct, frozen=True):
+    """Who published a message, and who put it on this network.
+
+    `sender` is the r2p module that sent it: the publisher's, or a gateway; `instance` the number of the module that
+    published it, 0 for firmware. Names are empty where they are not known. `fingerprint` all zero: type not known.
+    """
+
+    publisher_class: int
+    sender: int
+    instance: int
+    fingerprint: bytes
+    module: str = ""
+    node: str = ""
+
+
+class Header(msgspec.Struct, frozen=True, gc=False):
+    """The header of one message."""
+
+    origin: Origin
+    serial: int
+    sequence: int
+    stamp: int
+    deadline: int = 0
+    hops: int = 0
+    stamped: bool = True
+    clock: Clock | None = None
+
+
+def encoder(origin: Origin) -> Callable[[int, int, int, int], bytes]:
+    """Headers of an own publisher's messages: takes serial (wraps), sequence, stamp and deadline."""
+    tail = _encode_origin(origin)
+    pack = _FIXED.pack
+
+    def encode_fast(serial: int, sequence: int, stamp: int, deadline: int) -> bytes:
+        return pack(VERSION, 0, 0, serial & SERIAL_WRAP, sequence, stamp, deadline) + tail
+
+    return encode_fast
+
+
+def encode(header: Header) -> bytes:
+    """The bytes of a header; serial and error are cut to their 32 bits, hops to 255."""
+    flags = (0 if header.stamped else FLAG_RESTAMPED) | (0 if header.clock is None else FLAG_CLOCK)
+    serial = header.serial & SERIAL_WRAP
+    fixed = _FIXED.pack(VERSION, flags, min(header.hops, 255), serial, header.sequence, header.stamp, header.deadline)
+    return fixed + _encode_clock(header.clock) + _encode_origin(header.origin)
+
+
+class Reader(Generic[T]):
+    """Decodes headers; `remember` makes of each new origin what is kept of it, and handed out with its headers."""
+
+    def __init__(self, remember: Callable[[Origin], T]) -> None:
+        self._make = remember
+        self.known: dict[bytes, T] = {}
+        """By the bytes of the origin."""
+
+    def read(self, data: bytes) -> tuple[T, int, int, int, int, int, int, Clock | None]:
+        """What is known of the origin; serial, sequence, stamp, deadline, hops, flags and clock.
+
+        Raises `UnknownType` for a version to ignore, else `DecodeError`.
+        """
+        try:
+            version, flags, hops, serial, sequence, stamp, deadline = _unpack(data)
+        except struct.error:
+            version = data[0] if data else VERSION
+        if version != VERSION:
+            raise UnknownType(f"version {version} of the header")
+        if len(data) < _FIXED.size:
+            raise DecodeError(f"a header of {len(data)} bytes")
+        if flags & FLAG_CLOCK:
+            clock, tail = _decode_clock(data), data[_FIXED.size + _CLOCK.size :]
+        else:
+            clock, tail = None, data[_FIXED.size :]
+        try:
+            known = self.known[tail]
+        except KeyError:
+            known = self._remember(tail)
+        return known, serial, sequence, stamp, deadline, hops, flags, clock
+
+    def _remember(self, tail: bytes) -> T:
+        origin = _decode_origin(tail)
+        if len(self.known) >= _REMEMBERED:
+            self.known.clear()
+        known = self.known[tail] = self._make(origin)
+        return known
+
+
+def decode(data: bytes) -> Header:
+    """The header in these bytes. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    origin, serial, sequence, stamp, deadline, hops, flags, clock = Reader(_itself).read(data)
+    return Header(origin, serial, sequence, stamp, deadline, hops, not flags & FLAG_RESTAMPED, clock)
+
+
+class Credit(msgspec.Struct, frozen=True, gc=False):
+    """A subscriber's session tells a publisher's how far it has come: serial `serial` of this topic and class."""
+
+    session: int
+    publisher_class: int
+    serial: int
+    topic: str
+
+
+def encode_credit(credit: Credit) -> bytes:
+    """`u8 version; u8 class; u32 session; u32 serial`, then the topic in ASCII."""
+    fixed = _CREDIT.pack(VERSION, credit.publisher_class, credit.session, credit.serial & SERIAL_WRAP)
+    return fixed + credit.topic.encode()
+
+
+def decode_credit(data: bytes) -> Credit:
+    """Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    if data[:1] != bytes((VERSION,)):
+        raise UnknownType(f"version {data[:1]!r} of a credit")
+    if _TOPIC.fullmatch(data, _CREDIT.size) is None:
+        raise DecodeError("a credit for no topic")
+    _, publisher_class, session, serial = _CREDIT.unpack_from(data)
+    return Credit(session, publisher_class, serial, data[_CREDIT.size :].decode())
+
+
+def _itself(origin: Origin) -> Origin:
+    return origin
+
+
+def _decode_clock(data: bytes) -> Clock:
+    if len(data) < _FIXED.size + _CLOCK.size:
+        raise DecodeError("the header ends in its clock part")
+    return Clock(*_CLOCK.unpack_from(data, _FIXED.size))
+
+
+def _encode_clock(clock: Clock | None) -> bytes:
+    return b"" if clock is None else _CLOCK.pack(clock.epoch, clock.offset, min(clock.error, 0xFFFFFFFF))
+
+
+def _encode_origin(origin: Origin) -> bytes:
+    fixed = _ORIGIN.pack(origin.publisher_class, origin.sender, origin.instance, origin.fingerprint)
+    return fixed + f"{origin.module}/{origin.node}".encode()
+
+
+def _decode_origin(data: bytes) -> Origin:
+    names = _NAMES.fullmatch(data, _ORIGIN.size)
+    if names is None:
+        raise DecodeError("the header ends in no `module/node`")
+    publisher_class, sender, instance, fingerprint = _ORIGIN.unpack_from(data)
+    if publisher_class not in _CLASSES:
+        raise DecodeError(f"no class has the number {publisher_class}")
+    return Origin(publisher_class, sender, instance, fingerprint, names[1].decode(), names[2].decode())

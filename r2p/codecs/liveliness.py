@@ -1,0 +1,110 @@
+"""Liveliness tokens: what each r2p module on zenoh has, as keys that zenoh keeps while it lives (PROTOCOL.md 10).
+
+    1/SESSION/module/NAME/INSTANCE/FLAGS/HOPS
+    1/SESSION/pub|sub/TOPIC/INSTANCE/NODE/CLASS/SIZE/FINGERPRINT/WINDOW/HOPS
+
+The first part is the version. `SESSION` is the instance of the r2p module that declares the token, in hex; `INSTANCE`
+is that of the module concerned, another one where `HOPS` (gateways in between) is not 0, and `-` for firmware. `-`
+stands also for a node or a fingerprint that is not known; `%` for the slash of a topic in a namespace. Tokens of
+another version mean nothing to us.
+"""
+
+import re
+
+import msgspec
+
+from r2p.codecs import UnknownType
+from r2p.codecs.management import ANY_TYPE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.errors import DecodeError
+
+VERSION = "1"
+
+_NONE = "-"
+_HEX32 = r"[0-9a-f]{1,8}"
+_MODULE = re.compile(rf"({_HEX32})/module/([A-Za-z0-9_]{{1,7}})/({_HEX32}|-)/([0-9a-f]{{1,2}})/([0-9]{{1,2}})")
+_TOPIC = re.compile(
+    rf"({_HEX32})/(pub|sub)/([A-Za-z0-9_]{{1,16}}(?:%[A-Za-z0-9_]{{1,16}})?)/({_HEX32}|-)/([A-Za-z0-9_]{{1,8}}|-)"
+    r"/([0-9]{1,3})/([0-9]{1,6})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
+)
+_OBSERVER = 0x80
+_ROLES = {"pub": ROLE_PUBLISHES, "sub": ROLE_SUBSCRIBES}
+_ROLE_NAMES = {role: name for name, role in _ROLES.items()}
+
+
+class ModuleToken(msgspec.Struct, frozen=True):
+    """A module lives. `flags` are FLAG_... of ALIVE, `instance` is None for firmware behind a gateway."""
+
+    session: int
+    name: str
+    instance: int | None
+    flags: int = 0
+    observer: bool = False
+    hops: int = 0
+
+
+class TopicToken(msgspec.Struct, frozen=True):
+    """A publisher or subscriber (`role` is ROLE_...) of a topic.
+
+    `publisher_class` is CLASS_..., a sum; `size` in bytes, 0: not known. A subscriber with a `window` wants its
+    publishers to wait for it: so many messages may be on their way. 0: it would rather lose some.
+    """
+
+    session: int
+    role: int
+    topic: str
+    instance: int | None
+    node: str = ""
+    publisher_class: int = 0
+    size: int = 0
+    fingerprint: bytes = ANY_TYPE
+    window: int = 0
+    hops: int = 0
+
+
+Token = ModuleToken | TopicToken
+
+
+def encode(token: Token) -> str:
+    """The key of a token."""
+    instance = _NONE if token.instance is None else f"{token.instance:x}"
+    if isinstance(token, ModuleToken):
+        flags = token.flags | (_OBSERVER if token.observer else 0)
+        return f"{VERSION}/{token.session:x}/module/{token.name}/{instance}/{flags:x}/{token.hops}"
+    fingerprint = _NONE if token.fingerprint == ANY_TYPE else token.fingerprint.hex()
+    topic = token.topic.replace("/", "%")
+    return (
+        f"{VERSION}/{token.session:x}/{_ROLE_NAMES[token.role]}/{topic}/{instance}/{token.node or _NONE}"
+        f"/{token.publisher_class}/{token.size}/{fingerprint}/{token.window}/{token.hops}"
+    )
+
+
+def decode(key: str) -> Token:
+    """The token of a key. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    version, _, rest = key.partition("/")
+    if version != VERSION:
+        raise UnknownType(f"version {version[:8]} of a token")
+    if found := _MODULE.fullmatch(rest):
+        session, name, instance, flags, hops = found.groups()
+        bits = int(flags, 16)
+        return ModuleToken(
+            int(session, 16), name, _instance(instance), bits & ~_OBSERVER, bool(bits & _OBSERVER), int(hops)
+        )
+    if found := _TOPIC.fullmatch(rest):
+        session, role, topic, instance, node, publisher_class, size, fingerprint, window, hops = found.groups()
+        return TopicToken(
+            int(session, 16),
+            _ROLES[role],
+            topic.replace("%", "/"),
+            _instance(instance),
+            "" if node == _NONE else node,
+            int(publisher_class) & 0xFF,
+            int(size),
+            ANY_TYPE if fingerprint == _NONE else bytes.fromhex(fingerprint),
+            int(window),
+            int(hops),
+        )
+    raise DecodeError(f"{key[:80]!r} is no token")
+
+
+def _instance(text: str) -> int | None:
+    return None if text == _NONE else int(text, 16)

@@ -1,0 +1,410 @@
+"""One gateway's part in the forwarding tree: who may forward where, and until when.
+
+`Tree` hears BRIDGE and MESH at each port and says its own; `Port.until` is the instant before which data may pass.
+A gateway that was stopped for a while finds it in the past before it does anything else.
+
+    LISTENING --LISTEN s--> ALONE                       nobody else is on this network: forwards
+        |                     |
+        +--another is heard---+--> CONVERGING --all agree--> BLOCKED          not in the tree
+                                       |                        |
+                                       +--all agree, SETTLE s--> FORWARDING   in the tree, by leases
+
+The timings fit together: a gateway counts as dead (`DEAD`) only after what it was granted has run out (`LEASE`); a new
+one listens (`LISTEN`) for longer than an old one can be stuck and still forward.
+"""
+
+import enum
+import struct
+from collections import deque
+
+import msgspec
+
+from r2p.codecs.management import Bridge, Mesh
+from r2p.protocols.bridging.mesh import Assembly, Edge, Hearing, Place, digest, edges_from, parts, tree
+
+_MS = 1_000_000
+
+TICK = 80 * _MS
+"""Ns between two BRIDGE where there are other gateways."""
+TICK_ALONE = 200 * _MS
+TICK_LISTENING = 50 * _MS
+LEASE = 600 * _MS
+"""How long an acknowledgement holds, from when what it acknowledges was sent."""
+DEAD = 650 * _MS
+"""A gateway that was silent for so long is gone."""
+LISTEN = 800 * _MS
+"""A new port is silent for so long, but for hellos."""
+SETTLE = 300 * _MS
+"""Between agreement and forwarding; no message may take longer from its publisher to the last gateway."""
+PROBE = 2_000 * _MS
+"""Between two probes for loops through gateways that know nothing of this."""
+PROBE_MEMORY = 7_000 * _MS
+PROBE_PROVEN = 300 * _MS
+"""A gateway of which only a probe was heard for so long is not on this network itself."""
+
+MOST_PORTS = 250
+
+_APART = 10 * _MS  # hellos out of turn
+_FOR_EVER = 1 << 62
+_ACK = struct.Struct("<IH")
+_ACKS = 3
+_RECORDS_KEPT = 5_000 * _MS
+_RECORDS_A_TICK = 16
+
+
+class State(enum.Enum):
+    """What a port does."""
+
+    LISTENING = "listening"
+    ALONE = "alone"
+    CONVERGING = "converging"
+    FORWARDING = "forwarding"
+    BLOCKED = "blocked"
+    LOOP = "loop"
+
+
+class Say(msgspec.Struct, frozen=True):
+    """Send this at the port."""
+
+    port: int
+    message: Bridge | Mesh
+
+
+class Probe(msgspec.Struct, frozen=True):
+    """Send a probe at the port: something that any gateway passes on."""
+
+    port: int
+
+
+class Changed(msgspec.Struct, frozen=True):
+    """A port is in another state, or has another place in the tree."""
+
+    port: int
+
+
+Action = Say | Probe | Changed
+
+
+class Neighbour(msgspec.Struct):
+    """Another port on the same network; instants in monotonic ns."""
+
+    heard_at: int
+    count: int
+    agreement: int
+    acked_at: int
+
+
+class Port(msgspec.Struct, eq=False):
+    """A port of this gateway.
+
+    `until`: data may pass before this instant (monotonic ns). `in_tree`: whether it does, has done, or will soon do so;
+    what others want is known by that. `gateways` are those heard on its network. `echoes`: it gives back what we say.
+    """
+
+    number: int
+    opened_at: int
+    until: int = 0
+    state: State = State.LISTENING
+    in_tree: bool = False
+    neighbours: dict[Place, Neighbour] = {}
+    probes: dict[Place, tuple[int, int]] = {}
+    view: object = None
+    agreement: int = 0
+    agreed_since: int | None = None
+    said_at: int = -_FOR_EVER
+    say_at: int = 0
+    probe_at: int = 0
+    echoes: bool = False
+
+    @property
+    def gateways(self) -> set[int]:
+        return {gateway for gateway, _ in self.neighbours}
+
+
+class _Record(msgspec.Struct):
+    """Whom another gateway hears."""
+
+    serial: int
+    heard: frozenset[Hearing]
+    at: int
+
+
+class Tree:
+    """The tree as one gateway knows it. Every method takes `now` (monotonic ns); `take` gives what to do about it.
+
+    `gateway` is its number, that of this start of it; 0 can't be one.
+    """
+
+    def __init__(self, gateway: int) -> None:
+        self.gateway = gateway or 1
+        self.ports: dict[int, Port] = {}
+        self.edges: frozenset[Edge] = frozenset()
+        """The mesh of gateways that this one is part of."""
+        self._chosen: frozenset[Place] = frozenset()
+        self._mesh_hash = digest(self.edges)
+        self._members: set[int] = set()
+        self._records: dict[int, _Record] = {}
+        self._assembly = Assembly()
+        self._heard: frozenset[Hearing] = frozenset()
+        self._serial = 0
+        self._count = 0
+        self._sent: deque[tuple[int, int]] = deque()  # count, instant
+        self._looked_at = 0
+        self._actions: list[Action] = []
+
+    # Ports
+
+    def open(self, now: int, number: int) -> None:
+        """A link is up."""
+        self.ports[number] = Port(number, now, say_at=now, probe_at=now)
+        self._look(now)
+
+    def shut(self, now: int, number: int) -> None:
+        """It is down."""
+        port = self.ports.pop(number, None)
+        if port is not None:
+            port.until = 0
+        self._look(now)
+
+    def take(self) -> list[Action]:
+        actions, self._actions = self._actions, []
+        return actions
+
+    def next_deadline(self) -> int | None:
+        """When to call `poll`."""
+        return min((self._due(port) for port in self.ports.values()), default=None)
+
+    def poll(self, now: int) -> None:
+        """Say what is due, and see who has fallen silent."""
+        self._look(now)
+        for port in self.ports.values():
+            if port.say_at <= now:
+                self._say(now, port)
+            if port.probe_at <= now:
+                self._probe(now, port)
+
+    def _begin_anew(self, now: int) -> None:
+        """We were stopped for so long that others may think we are gone."""
+        for port in self.ports.values():
+            port.opened_at = port.say_at = now
+            port.neighbours = {}
+            port.agreed_since = None
+
+    def _due(self, port: Port) -> int:
+        due = min(port.say_at, port.probe_at)
+        if port.state is State.LISTENING:
+            due = min(due, port.opened_at + LISTEN)
+        if port.agreed_since is not None and port.state is State.CONVERGING:
+            due = min(due, port.agreed_since + SETTLE)
+        return due
+
+    # What comes in
+
+    def bridge(self, now: int, number: int, message: Bridge) -> None:
+        """A BRIDGE was heard."""
+        port = self.ports.get(number)
+        place = (message.gateway, message.port)
+        if port is None or not message.gateway:
+            return
+        if place == (self.gateway, number):
+            port.echoes = True
+            return
+        neighbour = port.neighbours.get(place)
+        if neighbour is None:
+            neighbour = Neighbour(now, message.count, message.agreement, 0)
+            port.probes = {each: at for each, at in port.probes.items() if each[0] != message.gateway}
+            port.neighbours = port.neighbours | {place: neighbour}
+        elif (message.count - neighbour.count) & 0xFFFF >= 0x8000:
+            return  # late
+        if neighbour.agreement != message.agreement:
+            neighbour.acked_at = 0
+            port.say_at = min(port.say_at, max(now, port.said_at + _APART))
+        neighbour.heard_at, neighbour.count, neighbour.agreement = now, message.count, message.agreement
+        neighbour.acked_at = max(neighbour.acked_at, self._acknowledged(message))
+        self._look(now, port)
+
+    def mesh(self, now: int, number: int, message: Mesh) -> None:
+        """A MESH was heard: new things are passed on at once."""
+        if message.gateway in (0, self.gateway) or number not in self.ports:
+            return
+        known = self._records.get(message.gateway)
+        if known is not None and not 0 < (message.serial - known.serial) & 0xFFFF < 0x8000:
+            known.at = now
+            return
+        heard = self._assembly.add(message)
+        if heard is None:
+            return
+        self._records[message.gateway] = _Record(message.serial, heard, now)
+        self._map()
+        for port in self.ports.values():
+            if port.neighbours and port.number != number:
+                self._say_record(port, message.gateway)
+        self._look(now)
+
+    def probed(self, now: int, number: int, gateway: int, its_port: int) -> None:
+        """A probe was heard, that this gateway or another one sent at that port (its number modulo 13)."""
+        port = self.ports.get(number)
+        place = gateway, its_port
+        if port is not None and place != (self.gateway, number % 13) and gateway not in port.gateways:
+            port.probes = port.probes | {place: (port.probes.get(place, (now, now))[0], now)}
+            self._look(now)
+
+    def _acknowledged(self, message: Bridge) -> int:
+        """When we sent what it acknowledges; 0: nothing of ours that still counts."""
+        for gateway, count in _ACK.iter_unpack(message.acks):
+            if gateway == self.gateway:
+                return next((at for each, at in reversed(self._sent) if each == count), 0)
+        return 0
+
+    # What follows from it
+
+    def _look(self, now: int, changed: Port | None = None) -> None:
+        """Work out everything that follows from what was heard, and from the time; at one port only if the mesh is
+        as it was.
+        """
+        if now - self._looked_at > LEASE:
+            self._begin_anew(now)
+        self._looked_at = now
+        mesh_hash = self._mesh_hash
+        if changed is None:
+            self._bury(now)
+        heard = frozenset((port.number, *place) for port in self.ports.values() for place in port.neighbours)
+        if heard != self._heard:
+            self._heard = heard
+            self._serial = (self._serial + 1) & 0xFFFF
+            self._map()
+            for port in self.ports.values():
+                if port.neighbours:
+                    self._say_record(port, self.gateway)
+        everywhere = changed is None or mesh_hash != self._mesh_hash
+        for port in list(self.ports.values()) if everywhere or changed is None else [changed]:
+            self._judge(now, port)
+
+    def _bury(self, now: int) -> None:
+        for port in self.ports.values():
+            if any(now - each.heard_at >= DEAD for each in port.neighbours.values()):
+                port.neighbours = {place: each for place, each in port.neighbours.items() if now - each.heard_at < DEAD}
+            if any(now - last >= PROBE_MEMORY for _, last in port.probes.values()):
+                port.probes = {place: at for place, at in port.probes.items() if now - at[1] < PROBE_MEMORY}
+        for gateway in [gateway for gateway, record in self._records.items() if now - record.at >= _RECORDS_KEPT]:
+            if gateway not in self._members:
+                del self._records[gateway]
+
+    def _map(self) -> None:
+        heard = {gateway: record.heard for gateway, record in self._records.items()}
+        edges = edges_from(self.gateway, heard | {self.gateway: self._heard})
+        if edges != self.edges:
+            self.edges = edges
+            self._chosen = tree(edges)
+            self._members = {place[0] for edge in edges for place in edge}
+            self._mesh_hash = digest(sorted(edges))
+
+    def _judge(self, now: int, port: Port) -> None:
+        view = (self._mesh_hash, frozenset(port.neighbours))
+        if view != port.view:
+            port.view = view
+            agreement = digest(self._mesh_hash, sorted([(self.gateway, port.number), *port.neighbours]))
+            port.agreement = agreement
+            port.agreed_since = None
+            port.say_at = min(port.say_at, max(now, port.said_at + _APART))
+        if not self._agreed(now, port):
+            port.agreed_since = None
+        elif port.agreed_since is None:
+            port.agreed_since = now
+        state = self._state(now, port)
+        in_tree = self._in_tree(port, state)
+        port.until = self._until(port, state)
+        if (state, in_tree) != (port.state, port.in_tree):
+            port.state, port.in_tree = state, in_tree
+            self._actions.append(Changed(port.number))
+
+    def _agreed(self, now: int, port: Port) -> bool:
+        return all(
+            each.agreement == port.agreement and now < each.acked_at + LEASE
+            for (gateway, _), each in port.neighbours.items()
+            if gateway != self.gateway
+        )
+
+    def _state(self, now: int, port: Port) -> State:
+        if self._loops(now, port):
+            return State.LOOP
+        if now < port.opened_at + LISTEN:
+            return State.LISTENING
+        if not port.neighbours:
+            return State.ALONE
+        if port.agreed_since is None:
+            return State.CONVERGING
+        if not self._is_chosen(port):
+            return State.BLOCKED
+        return State.FORWARDING if now >= port.agreed_since + SETTLE else State.CONVERGING
+
+    def _in_tree(self, port: Port, state: State) -> bool:
+        """Other than the state, the place stays while the gateways converge, and is known before data may pass."""
+        if state in (State.ALONE, State.FORWARDING):
+            return True
+        if state in (State.BLOCKED, State.LOOP):
+            return False
+        if port.neighbours and port.agreed_since is not None:
+            return self._is_chosen(port)
+        return port.in_tree
+
+    def _until(self, port: Port, state: State) -> int:
+        if state is State.ALONE:
+            return port.said_at + LEASE
+        if state is not State.FORWARDING:
+            return 0
+        acked = [each.acked_at for (gateway, _), each in port.neighbours.items() if gateway != self.gateway]
+        return min([port.said_at, *acked]) + LEASE
+
+    def _is_chosen(self, port: Port) -> bool:
+        return (self.gateway, port.number) in self._chosen
+
+    def _loops(self, now: int, port: Port) -> bool:
+        """Whether a gateway that says no BRIDGE joins this network to another one of ours, and we are to keep off."""
+        for (gateway, its_port), (first, _) in port.probes.items():
+            if now - first < PROBE_PROVEN or gateway in port.gateways:
+                continue
+            if gateway == self.gateway and its_port < port.number % 13:
+                return True
+            if gateway in self._members and gateway < self.gateway:
+                return True
+        return False
+
+    # What goes out
+
+    def _say(self, now: int, port: Port) -> None:
+        self._count = (self._count + 1) & 0xFFFF
+        self._sent.append((self._count, now))
+        latest = sorted(port.neighbours.items(), key=lambda item: item[1].heard_at)
+        acks = list({gateway: each.count for (gateway, _), each in latest}.items())
+        for at in range(0, max(len(acks), 1), _ACKS):
+            packed = b"".join(_ACK.pack(*each) for each in acks[at : at + _ACKS]).ljust(18, b"\0")
+            bridge = Bridge(self.gateway, port.number, self._count, port.agreement, packed)
+            self._actions.append(Say(port.number, bridge))
+        while now - self._sent[0][1] > LEASE:
+            self._sent.popleft()
+        if port.neighbours and not self._agreed(now, port):
+            for gateway in [self.gateway, *list(self._records)[:_RECORDS_A_TICK]]:
+                self._say_record(port, gateway)
+        port.said_at = now
+        port.say_at = now + self._tick(port)
+        port.until = self._until(port, port.state)
+
+    def _tick(self, port: Port) -> int:
+        if port.state is State.LISTENING:
+            return TICK_LISTENING
+        return TICK if port.neighbours else TICK_ALONE
+
+    def _say_record(self, port: Port, gateway: int) -> None:
+        if gateway == self.gateway:
+            messages = parts(gateway, self._serial, self._heard)
+        else:
+            record = self._records[gateway]
+            messages = parts(gateway, record.serial, record.heard)
+        self._actions.extend(Say(port.number, each) for each in messages)
+
+    def _probe(self, now: int, port: Port) -> None:
+        listening = port.state is State.LISTENING
+        port.probe_at = now + (LISTEN // 2 if listening else PROBE)
+        if listening or port.in_tree:
+            self._actions.append(Probe(port.number))

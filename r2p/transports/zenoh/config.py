@@ -1,0 +1,93 @@
+"""zenoh's configuration for a link: what r2p needs, then the user's file, then what the URL says."""
+
+import json
+
+import zenoh
+
+from r2p.errors import TransportError
+from r2p.transports.zenoh.options import Options
+from r2p.transports.zenoh.trouble import Tls, Way
+
+LEASE_MS = 1000
+"""A peer that says nothing for so long is gone: one that hangs is noticed within two seconds."""
+
+_OURS: dict[str, object] = {
+    "scouting/delay": 0,  # else opening takes half a second
+    "transport/link/tx/lease": LEASE_MS,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    "connect/exit_on_failure": {"router": False, "peer": False, "client": True},
+    "transport/unicast/open_timeout": 3000,
+    "transport/link/tx/queue/size/data": 16,  # batches of 64 kB: what r2p.protocols.flow allows to be on the way fits
+    "adminspace/enabled": True,  # this session's own: it tells where it listens
+}
+
+_AT_THE_USUAL_PORT: dict[str, object] = {  # the first one on this computer; so clients find it without a router
+    "listen/endpoints": ["tcp/[::]:7447", "tcp/[::]:0"],
+    "listen/exit_on_failure": False,
+}
+
+
+def config_of(options: Options) -> zenoh.Config:
+    """Raises TransportError for a file that zenoh can't read, and for what it does not take."""
+    config = _from_file(options)
+    try:
+        for key, value in _stated(options).items():
+            config.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        raise TransportError(f"{options.name}: zenoh does not take this: {error}") from error
+    return config
+
+
+def way_of(config: zenoh.Config) -> Way:
+    """What it connects to, and with what."""
+    tls = json.loads(config.get_json("transport/link/tls"))
+    user = json.loads(config.get_json("transport/auth/usrpwd"))
+    names = Tls(
+        tls["root_ca_certificate"],
+        tls["connect_certificate"],
+        tls["connect_private_key"],
+        tls["verify_name_on_connect"] is not False,
+    )
+    return Way(_texts(json.loads(config.get_json("connect/endpoints"))), names, user["user"])
+
+
+def _from_file(options: Options) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in _OURS.items():
+        config.insert_json5(key, json.dumps(value))
+    if options.config is None:
+        return config
+    try:
+        theirs = zenoh.Config.from_file(options.config)
+    except (zenoh.ZError, OSError) as error:
+        reason = "there is no such file" if not options.config.exists() else str(error)
+        raise TransportError(f"{options.name}: can't read {options.config}: {reason}") from error
+    blank = zenoh.Config()
+    for key, value in _OURS.items():
+        if theirs.get_json(key) == blank.get_json(key):  # what the file says counts
+            theirs.insert_json5(key, json.dumps(value))
+    return theirs
+
+
+def _stated(options: Options) -> dict[str, object]:
+    stated: dict[str, object] = {}
+    if options.mode is not None:
+        stated["mode"] = options.mode
+    if options.connect is not None:
+        stated["connect/endpoints"] = [options.connect]
+    if options.listen is not None:
+        stated["listen/endpoints"] = [options.listen]
+    elif options.mode == "peer" and options.config is None:
+        stated |= _AT_THE_USUAL_PORT
+    if options.scouting is not None:
+        stated["scouting/multicast/enabled"] = options.scouting
+    return stated
+
+
+def _texts(value: object) -> list[str]:
+    """The endpoints in a list, or in a list for each mode."""
+    if isinstance(value, dict):
+        return [text for each in value.values() for text in _texts(each)]
+    if not isinstance(value, list):
+        return []
+    return [each if isinstance(each, str) else str(each.get("endpoint", "")) for each in value]

@@ -1,0 +1,289 @@
+"""One zenoh session. Everything that comes from zenoh's threads enters the event loop here, in batches.
+
+zenoh calls back in a thread of its own for each subscriber. There nothing is done but to put what came into a deque,
+and to wake the loop once for a batch: no code of the user, and none of the protocols, runs outside of the loop. What
+blocks (opening, closing) runs in a thread, so the loop never waits for a network.
+"""
+
+import asyncio
+import contextlib
+import functools
+import json
+import re
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import zenoh
+from zenoh.handlers import Callback, Handler, RingChannel
+
+from r2p.errors import TransportError
+
+T = TypeVar("T")
+
+ErrorOfZenoh = zenoh.ZError
+
+_PRIORITIES = {
+    1: zenoh.Priority.DATA,
+    2: zenoh.Priority.INTERACTIVE_HIGH,
+    3: zenoh.Priority.REAL_TIME,
+}
+
+
+class Unreachable(Exception):
+    """Nobody to connect to, for now."""
+
+
+class Funnel:
+    """The way from zenoh's threads into the loop: what they put in comes out of `take`, in order."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, take: Callable[[Any], None], *, most: int) -> None:
+        self._loop = loop
+        self._take = take
+        self._most = most
+        self._waiting: deque[Any] = deque()
+        self._woken = False
+        self.overflown = 0
+        """What did not fit any more."""
+
+    def put(self, item: Any) -> None:
+        """In any thread."""
+        if len(self._waiting) >= self._most:
+            self.overflown += 1
+            return
+        self._waiting.append(item)
+        if not self._woken:
+            self._woken = True
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                self._loop.call_soon_threadsafe(self._empty)
+
+    def _empty(self) -> None:
+        self._woken = False
+        waiting = self._waiting
+        while waiting:
+            self._take(waiting.popleft())
+
+
+class Tap:
+    """A subscription, emptied by the loop itself, without a thread for each message.
+
+    A thread waits for the first sample, and hands it to the loop. That takes out all the others, and then says
+    `wait()`: only then does the thread look again.
+    """
+
+    def __init__(
+        self,
+        subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]",
+        loop: asyncio.AbstractEventLoop,
+        arrived: Callable[[zenoh.Sample], None],
+    ) -> None:
+        self.take = subscriber.handler.try_recv
+        """The next sample that waits, or None."""
+        self._subscriber = subscriber
+        self._loop = loop
+        self._arrived = arrived
+        self._emptied = threading.Lock()
+        self._emptied.acquire()
+        self.wait = self._emptied.release
+        """Nothing waits any more. Once for each sample that the thread has handed over."""
+        threading.Thread(target=self._watch, name="r2p zenoh", daemon=True).start()
+
+    def close(self) -> None:
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]  # as its stubs have it
+        with contextlib.suppress(RuntimeError):  # the thread waits for a sample, not for us
+            self._emptied.release()
+
+    def _watch(self) -> None:
+        receive = self._subscriber.handler.recv
+        with contextlib.suppress(zenoh.ZError, RuntimeError):  # it is undeclared; the loop is closed
+            while True:
+                self._loop.call_soon_threadsafe(self._arrived, receive())
+                self._emptied.acquire()
+
+
+async def open_session(config: zenoh.Config) -> "Session":
+    """Open it in a thread. Raises Unreachable where it may work later, TransportError where it can't."""
+    try:
+        return Session(await _in_thread(lambda: zenoh.open(config), _close))
+    except zenoh.ZError as error:
+        text = _plain(error)
+        if text.startswith("Unable to connect"):
+            raise Unreachable(text) from error
+        raise TransportError(text) from error
+
+
+class Session:
+    """An open session, as the loop sees it. Declarations last until they are undeclared, or the session is closed."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._kept: list[Any] = []
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._listener: Any = None
+
+    def watch(self, funnel: Funnel) -> None:
+        """Tell of each transport, those that are there included: (id, whether it opened)."""
+
+        def changed(event: zenoh.TransportEvent) -> None:
+            funnel.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
+
+        self._kept.append(self._session.info.declare_transport_events_listener(Callback(changed), history=True))
+
+    def watch_tokens(self, prefix: str, funnel: Funnel) -> None:
+        """Tell of each token under a prefix, also those that are there: (rest of its key, whether it is there)."""
+        start = len(prefix) + 1
+
+        def changed(sample: zenoh.Sample) -> None:
+            funnel.put((str(sample.key_expr)[start:], sample.kind == zenoh.SampleKind.PUT))
+
+        live = self._session.liveliness()
+        self._kept.append(live.declare_subscriber(f"{prefix}/**", Callback(changed), history=True))
+
+    def listen(self, key: str, funnel: Funnel) -> None:
+        """Tell of each message: (its key, payload)."""
+
+        def arrived(sample: zenoh.Sample) -> None:
+            if len(sample.payload) <= _MESSAGE_MAX:
+                funnel.put((str(sample.key_expr), sample.payload.to_bytes()))
+
+        self._kept.append(
+            self._session.declare_subscriber(key, Callback(arrived), allowed_origin=zenoh.Locality.REMOTE)
+        )
+
+    def serve(self, key: str, answer: Callable[[str], bytes | None]) -> None:
+        """Answer queries: `answer` gives, in the loop, the payload for a key."""
+        loop = asyncio.get_running_loop()
+
+        def reply(query: zenoh.Query) -> None:
+            name = str(query.key_expr)
+            payload = answer(name)
+            with contextlib.suppress(zenoh.ZError):  # the session is closed
+                if payload is not None:
+                    query.reply(key.replace("*", name.rpartition("/")[2]), payload)
+                query.drop()  # type: ignore[no-untyped-call]  # as its stubs have it
+
+        funnel = Funnel(loop, reply, most=_QUERIES)
+        self._kept.append(self._session.declare_queryable(key, Callback(funnel.put)))
+
+    def subscribe(self, key: str, most: int, arrived: Callable[[zenoh.Sample], None]) -> "Tap":
+        """Tell in the loop of the first sample that comes; the ones behind it are there to be taken out of the tap.
+
+        Of more than `most` that wait, the oldest are lost.
+        """
+        loop = asyncio.get_running_loop()
+        handler: RingChannel[zenoh.Sample] = RingChannel(most)
+        return Tap(self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE), loop, arrived)
+
+    def publisher(self, key: str, publisher_class: int) -> zenoh.Publisher:
+        """What sends on a key as the class deserves. Never BLOCK: that would stop the loop, not the publisher."""
+        periodic = publisher_class == 3
+        return self._session.declare_publisher(
+            key,
+            priority=_PRIORITIES[publisher_class],
+            congestion_control=zenoh.CongestionControl.DROP,
+            reliability=zenoh.Reliability.BEST_EFFORT if periodic else zenoh.Reliability.RELIABLE,
+            express=publisher_class != 1,
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+
+    def ends(self, publisher: zenoh.Publisher) -> None:
+        """Send no more with it."""
+        publisher.undeclare()  # type: ignore[no-untyped-call]  # as its stubs have it
+
+    def put(self, key: str, data: bytes, *, urgent: bool = False) -> None:
+        """Send something of the protocol's own."""
+        self._session.put(
+            key,
+            data,
+            priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+
+    def declare(self, key: str) -> None:
+        """Keep a liveliness token."""
+        self._tokens[key] = self._session.liveliness().declare_token(key)
+
+    def undeclare(self, key: str) -> None:
+        token = self._tokens.pop(key, None)
+        if token is not None:
+            token.undeclare()  # type: ignore[no-untyped-call]  # as its stubs have it
+
+    async def ask(self, key: str, timeout: float) -> list[bytes]:
+        """All answers to a query, within `timeout` seconds."""
+
+        def ask() -> list[bytes]:
+            replies = self._session.get(key, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE)
+            return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+        return await _in_thread(ask)
+
+    async def networks(self) -> set[str]:
+        """The names of the r2p networks on which there are modules."""
+
+        def ask() -> set[str]:
+            found = self._session.liveliness().get("r2p/*/live/*/*/module/**", timeout=1.0)
+            return {str(reply.ok.key_expr).split("/")[1] for reply in found if reply.ok is not None}
+
+        return await _in_thread(ask)
+
+    async def listening(self) -> list[str]:
+        """The endpoints where it takes connections."""
+
+        def ask() -> list[str]:
+            answers = self._session.get(f"@/{self._session.zid()}/*", timeout=1.0)
+            found = [json.loads(each.ok.payload.to_bytes()) for each in answers if each.ok is not None]
+            return [str(locator) for each in found for locator in each.get("locators", [])]
+
+        return await _in_thread(ask)
+
+    async def close(self) -> None:
+        """Close it; what was put before is sent."""
+        await _in_thread(functools.partial(_close, self._session))
+
+
+_MESSAGE_MAX = 4096
+_QUERIES = 1024
+
+
+async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] | None = None) -> T:
+    """What `function` returns or raises, in a thread that nobody waits for when this is cancelled.
+
+    What it returns then goes to `abandoned`.
+    """
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[T] = loop.create_future()
+
+    def finish(result: T | None, error: BaseException | None) -> None:
+        if future.cancelled():
+            if abandoned is not None and error is None:
+                threading.Thread(target=abandoned, args=(result,), daemon=True).start()
+        elif error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(result)  # type: ignore[arg-type]  # None only where T is None
+
+    def work() -> None:
+        try:
+            outcome: tuple[T | None, Exception | None] = function(), None
+        except Exception as error:  # noqa: BLE001 - raised again where it is awaited
+            outcome = None, error
+        try:
+            loop.call_soon_threadsafe(finish, *outcome)
+        except RuntimeError:  # the loop is closed
+            if abandoned is not None and outcome[1] is None:
+                abandoned(outcome[0])  # type: ignore[arg-type]  # None only where T is None
+
+    threading.Thread(target=work, name="r2p zenoh", daemon=True).start()
+    return await future
+
+
+def _close(session: zenoh.Session) -> None:
+    session.close()  # type: ignore[no-untyped-call]  # as its stubs have it
+
+
+def _plain(error: Exception) -> str:
+    """zenoh's text without the places in its source."""
+    return re.sub(r" at /\S+?\.rs:\d+\.?", "", str(error)).strip()

@@ -1,0 +1,144 @@
+"""The header of messages on zenoh."""
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r2p.codecs import UnknownType, attachment
+from r2p.codecs.attachment import Clock, Credit, Header, Origin, Reader
+from r2p.errors import DecodeError
+
+ORIGIN = Origin(1, 0xA0B1C2D3, 0x01020304, bytes(range(8)), "PC1", "blink")
+HEADER = Header(ORIGIN, serial=7, sequence=9, stamp=1_700_000_000_000_000_000, deadline=1_700_000_000_020_000_000)
+
+U32 = st.integers(0, 0xFFFFFFFF)
+I64 = st.integers(-(2**63), 2**63 - 1)
+NAME = "ABCxyz019_"
+TOPICS = st.from_regex(r"([A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}", fullmatch=True)
+HEADERS = st.builds(
+    Header,
+    origin=st.builds(
+        Origin,
+        publisher_class=st.sampled_from([1, 2, 3]),
+        sender=U32,
+        instance=U32,
+        fingerprint=st.binary(min_size=8, max_size=8),
+        module=st.text(NAME, max_size=7),
+        node=st.text(NAME, max_size=8),
+    ),
+    serial=U32,
+    sequence=st.integers(0, 2**64 - 1),
+    stamp=I64,
+    deadline=I64,
+    hops=st.integers(0, 255),
+    stamped=st.booleans(),
+    clock=st.none() | st.builds(Clock, epoch=U32, offset=I64, error=U32),
+)
+
+
+@given(HEADERS)
+def test_what_is_encoded_is_decoded(header: Header) -> None:
+    assert attachment.decode(attachment.encode(header)) == header
+
+
+def test_the_bytes_of_a_header() -> None:
+    """As docs/PROTOCOL.md has it."""
+    data = attachment.encode(HEADER)
+    assert data[:16] == bytes.fromhex("01000000 07000000 0900000000000000")
+    assert data[16:32] == HEADER.stamp.to_bytes(8, "little") + HEADER.deadline.to_bytes(8, "little")
+    assert data[32:] == bytes.fromhex("01 d3c2b1a0 04030201 0001020304050607") + b"PC1/blink"
+
+
+def test_a_fast_encoder_says_the_same() -> None:
+    fast = attachment.encoder(ORIGIN)
+    assert fast(7, 9, HEADER.stamp, HEADER.deadline) == attachment.encode(HEADER)
+    assert fast(7 + 2**32, 9, HEADER.stamp, HEADER.deadline) == attachment.encode(HEADER)
+
+
+def test_what_is_too_large_is_cut() -> None:
+    header = msgspec.structs.replace(HEADER, hops=300, serial=2**32 + 1, clock=Clock(1, -5, 2**40))
+    read = attachment.decode(attachment.encode(header))
+    assert (read.hops, read.serial, read.clock) == (255, 1, Clock(1, -5, 0xFFFFFFFF))
+
+
+def test_an_origin_is_remembered_once() -> None:
+    made: list[Origin] = []
+
+    def remember(origin: Origin) -> int:
+        made.append(origin)
+        return len(made)
+
+    reader = Reader(remember)
+    data = attachment.encode(HEADER)
+    other = attachment.encode(msgspec.structs.replace(HEADER, origin=msgspec.structs.replace(ORIGIN, node="other")))
+    assert [reader.read(each)[0] for each in (data, other, data, other)] == [1, 2, 1, 2]
+
+
+def test_a_liar_does_not_fill_the_memory() -> None:
+    made: list[Origin] = []
+    reader = Reader(made.append)
+    for sender in range(5000):
+        reader.read(
+            attachment.encode(msgspec.structs.replace(HEADER, origin=msgspec.structs.replace(ORIGIN, sender=sender)))
+        )
+    assert len(made) == 5000
+    assert len(reader.known) < 4097
+
+
+@given(st.binary(max_size=120))
+def test_any_bytes_are_a_header_or_counted(data: bytes) -> None:
+    try:
+        header = attachment.decode(data)
+    except DecodeError:
+        return
+    assert attachment.decode(attachment.encode(header)) == header
+
+
+@pytest.mark.parametrize("cut", range(len(attachment.encode(HEADER)) - len("PC1/blink") + 1))
+def test_a_header_that_was_cut(cut: int) -> None:
+    with pytest.raises(DecodeError):
+        attachment.decode(attachment.encode(HEADER)[:cut])
+
+
+def test_another_version_is_left_alone() -> None:
+    for data in (b"\2", b"\2" + attachment.encode(HEADER)[1:]):
+        with pytest.raises(UnknownType, match="version 2"):
+            attachment.decode(data)
+
+
+@pytest.mark.parametrize("tail", [b"PC1", b"TOOLONG8/node", b"PC1/nodeof9ch", b"PC 1/a", b"a/b/c"])
+def test_names_that_are_none(tail: bytes) -> None:
+    with pytest.raises(DecodeError, match="module/node"):
+        attachment.decode(attachment.encode(HEADER)[: -len("PC1/blink")] + tail)
+
+
+def test_a_class_that_does_not_exist() -> None:
+    header = msgspec.structs.replace(HEADER, origin=msgspec.structs.replace(ORIGIN, publisher_class=4))
+    with pytest.raises(DecodeError, match="class"):
+        attachment.decode(attachment.encode(header))
+
+
+@given(st.builds(Credit, session=U32, publisher_class=st.integers(0, 255), serial=U32, topic=TOPICS))
+def test_credits(credit: Credit) -> None:
+    assert attachment.decode_credit(attachment.encode_credit(credit)) == credit
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_are_a_credit_or_counted(data: bytes) -> None:
+    try:
+        credit = attachment.decode_credit(data)
+    except DecodeError:
+        return
+    assert attachment.encode_credit(credit) == data
+
+
+def test_the_short_way_through_a_plain_header() -> None:
+    data = attachment.encode(HEADER)
+    assert data.startswith(attachment.PLAIN)
+    reader = Reader(lambda origin: origin)
+    reader.read(data)
+    assert reader.known[data[attachment.ORIGIN_AT :]] == ORIGIN
+    assert attachment.unpack_plain(data) == (0, 7, 9, HEADER.stamp, HEADER.deadline)
+    for odd in (msgspec.structs.replace(HEADER, stamped=False), msgspec.structs.replace(HEADER, clock=Clock(1, 2, 3))):
+        assert not attachment.encode(odd).startswith(attachment.PLAIN)

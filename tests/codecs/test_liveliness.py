@@ -1,0 +1,88 @@
+"""Liveliness tokens as keys."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from r2p.codecs import UnknownType, liveliness
+from r2p.codecs.liveliness import ModuleToken, TopicToken
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.errors import DecodeError
+
+U32 = st.integers(0, 0xFFFFFFFF)
+TOKENS = st.one_of(
+    st.builds(
+        ModuleToken,
+        session=U32,
+        name=st.from_regex(r"[A-Za-z0-9_]{1,7}", fullmatch=True),
+        instance=st.none() | U32,
+        flags=st.integers(0, 0x7F),
+        observer=st.booleans(),
+        hops=st.integers(0, 99),
+    ),
+    st.builds(
+        TopicToken,
+        session=U32,
+        role=st.sampled_from([ROLE_PUBLISHES, ROLE_SUBSCRIBES]),
+        topic=st.from_regex(r"([A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}", fullmatch=True),
+        instance=st.none() | U32,
+        node=st.from_regex(r"[A-Za-z0-9_]{0,8}", fullmatch=True),
+        publisher_class=st.integers(0, 255),
+        size=st.integers(0, 1024),
+        fingerprint=st.binary(min_size=8, max_size=8),
+        window=st.integers(0, 999_999),
+        hops=st.integers(0, 99),
+    ),
+)
+
+
+@given(TOKENS)
+def test_what_is_encoded_is_decoded(token: liveliness.Token) -> None:
+    key = liveliness.encode(token)
+    assert liveliness.decode(key) == token
+    assert not set(key) & set("*$#?")  # what zenoh keeps for itself
+
+
+def test_keys_as_people_see_them() -> None:
+    assert liveliness.encode(ModuleToken(0xAB, "PC1", 0xAB, 1)) == "1/ab/module/PC1/ab/1/0"
+    assert liveliness.encode(ModuleToken(0xAB, "IMU", None, 0, hops=1)) == "1/ab/module/IMU/-/0/1"
+    token = TopicToken(0xAB, ROLE_PUBLISHES, "leds", 0xAB, "blink", 1, 5, bytes.fromhex("9ef58fbde4f40142"))
+    assert liveliness.encode(token) == "1/ab/pub/leds/ab/blink/1/5/9ef58fbde4f40142/0/0"
+    assert liveliness.encode(TopicToken(1, ROLE_SUBSCRIBES, "a/leds", None)) == "1/1/sub/a%leds/-/-/0/0/-/0/0"
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "1",
+        "1/ab",
+        "1/ab/module",
+        "1/ab/module/TOOLONG8/ab/0/0",
+        "1/ab/module/PC1/ab/0/0/more",
+        "1/123456789/module/PC1/ab/0/0",
+        "1/AB/module/PC1/ab/0/0",
+        "1/ab/pub/leds/ab/blink/1/5/9ef58fbde4f4014/0/0",
+        "1/ab/pub/le ds/ab/blink/1/5/-/0/0",
+        "1/ab/both/leds/ab/blink/1/5/-/0/0",
+        "1/ab/pub/leds/ab/blink/1/-5/-/0/0",
+        "1/ab/module/PC\n/ab/0/0",
+    ],
+)
+def test_keys_of_somebody_else(key: str) -> None:
+    with pytest.raises(DecodeError):
+        liveliness.decode(key)
+
+
+@given(st.text())
+def test_any_text_is_a_token_or_counted(key: str) -> None:
+    try:
+        liveliness.decode(key)
+    except DecodeError:
+        pass
+    else:
+        raise AssertionError("found a token by chance")
+
+
+def test_another_version_is_left_alone() -> None:
+    with pytest.raises(UnknownType, match="version 2"):
+        liveliness.decode("2/ab/module/PC1/ab/0/0")

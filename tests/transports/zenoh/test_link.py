@@ -1,0 +1,360 @@
+"""Topics over zenoh: flow from end to end, losses, latches, other people's keys. On loopback, in one process."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Any
+
+import pytest
+import zenoh
+
+import r2p
+from r2p.clock import SystemClock
+from r2p.codecs import attachment
+from r2p.codecs.attachment import Header, Origin
+from r2p.messages import layout
+from r2p.msg import Led, Text
+from r2p.testing.network import node_in
+from r2p.transports.zenoh.link import ZenohLink
+from r2p.transports.zenoh.outlet import ZenohOutlet
+from r2p.transports.zenoh.streams import WINDOW
+from tests.transports.test_conformance import first, other, until
+from tests.transports.zenoh.cable import Net, guarded, module, plain_session
+
+pytestmark = pytest.mark.anyio
+
+HEADER = Header(Origin(1, 7, 7, layout(Led).fingerprint, "ALIEN", "node"), 1, 1, 1_700_000_000_000_000_000)
+
+
+@asynccontextmanager
+async def nodes(net: Net, *names: str) -> AsyncIterator[list[r2p.Node]]:
+    """One node in each module; the first module is the router."""
+    async with AsyncExitStack() as stack:
+        modules = [
+            await stack.enter_async_context(module(name, net.join if number else net.listen))
+            for number, name in enumerate(names)
+        ]
+        yield [await stack.enter_async_context(node_in(each)) for each in modules]
+
+
+@asynccontextmanager
+async def alien_on(net: Net) -> AsyncIterator[zenoh.Session]:
+    with plain_session(net) as session:
+        yield session
+
+
+def link_of(node: r2p.Node) -> ZenohLink:
+    link = node._space.links[0]
+    assert isinstance(link, ZenohLink)
+    return link
+
+
+def network_of(node: r2p.Node) -> r2p.NetworkView:
+    hub = link_of(node)._hub
+    assert isinstance(hub, r2p.Module)
+    return hub.network
+
+
+def knows(publisher: r2p.Publisher[Any], node: r2p.Node) -> bool:
+    """Whether a publisher sends to a module."""
+    return any(
+        isinstance(outlet, ZenohOutlet) and outlet.knows(link_of(node).instance) for outlet in publisher._topic.outlets
+    )
+
+
+@guarded
+async def test_a_slow_subscriber_slows_its_publisher_and_loses_nothing() -> None:
+    total = 4 * WINDOW
+    async with nodes(Net(), "A", "B") as (alice, bob):
+        publisher = alice.advertise("numbers", r2p.msg.Float32, r2p.NonRealTime(stall=30.0))
+        subscriber = bob.subscribe("numbers", r2p.msg.Float32)
+        await publisher.wait_subscriber()
+
+        async def send() -> None:
+            for number in range(total):
+                await publisher.publish(r2p.msg.Float32(float(number)))
+
+        sending = asyncio.create_task(send())
+        await until(lambda: publisher.sent > WINDOW // 2)
+        stuck = -1
+        while stuck != publisher.sent:  # until it waits for its subscriber, who does not read
+            stuck = publisher.sent
+            await asyncio.sleep(0.05)
+        assert stuck <= WINDOW + 1 + subscriber.limit
+        for number in range(total):
+            assert (await subscriber.fetch()).data == number
+        await sending
+        assert (publisher.missed, subscriber.lost) == (0, 0)
+        assert not link_of(alice).losses + link_of(bob).losses
+
+
+@guarded
+async def test_who_hangs_is_left_behind_and_the_others_lose_nothing() -> None:
+    total = 3 * WINDOW
+    missed: list[r2p.Missed] = []
+    async with nodes(Net(), "A", "HUNG", "WELL") as (alice, hung, well):
+        publisher = alice.advertise("text", Text, r2p.NonRealTime(stall=0.2, on_missed=missed.append))
+        stuck, fine = hung.subscribe("text", Text, queue=4), well.subscribe("text", Text)
+        await publisher.wait_subscriber()
+        await until(lambda: knows(publisher, hung) and knows(publisher, well))
+
+        async def read() -> None:
+            for number in range(total):
+                assert (await fine.fetch()).text == f"{number}"
+
+        reading = asyncio.create_task(read())
+        for number in range(total):
+            await publisher.publish(Text(f"{number}"))
+        await reading
+        assert (fine.lost, publisher.missed) == (0, 1)
+        assert missed[0].reason == "no room for 0.2 s"
+        while stuck.queue:  # it wakes: the latest come through, and it is waited for again
+            await stuck.fetch()
+            await asyncio.sleep(0.001)
+        await publisher.publish(Text("latest"))
+        while (await stuck.fetch()).text != "latest":
+            pass
+
+
+@guarded
+async def test_a_tool_that_watches_never_makes_a_publisher_wait() -> None:
+    async with nodes(Net(), "A", "TOOL") as (alice, tool):
+        publisher = alice.advertise("leds", Led, r2p.NonRealTime(stall=30.0))
+        tool.subscribe("leds", Led, lossy=True)
+        await publisher.wait_subscriber()
+        for number in range(3 * WINDOW):  # would take 30 s if it waited once
+            await publisher.publish(Led(number))
+        assert publisher.missed == 0
+
+
+@guarded
+async def test_many_topics_at_once_lose_nothing() -> None:
+    async with nodes(Net(), "A", "B") as (alice, bob):
+        pairs = [
+            (alice.advertise(f"t{n}", Led, r2p.NonRealTime(stall=20.0)), bob.subscribe(f"t{n}", Led)) for n in range(20)
+        ]
+
+        async def send(publisher: r2p.Publisher[Led]) -> None:
+            await publisher.wait_subscriber()
+            for number in range(500):
+                await publisher.publish(Led(number))
+
+        async def read(subscriber: r2p.Subscriber[Led]) -> None:
+            for number in range(500):
+                assert (await subscriber.fetch()).led == number
+
+        async with asyncio.TaskGroup() as tasks:
+            for publisher, subscriber in pairs:
+                tasks.create_task(send(publisher))
+                tasks.create_task(read(subscriber))
+        assert not link_of(bob).losses
+
+
+@guarded
+async def test_all_three_classes_with_stamp_deadline_and_sequence() -> None:
+    async with nodes(Net(), "A", "B") as (alice, bob):
+        before = alice.now()
+        alice.advertise("beat", Led, r2p.Periodic(0.005, lambda: Led(3)))
+        event = alice.advertise("event", Led, r2p.Sporadic(deadline=2.0))
+        beats, events = bob.subscribe("beat", Led).samples(), bob.subscribe("event", Led).samples()
+        await event.wait_subscriber()
+        await event.publish(Led(2))
+        sample = await anext(events)
+        assert sample.publisher_class == r2p.PublisherClass.SPORADIC
+        assert sample.deadline - sample.stamp == 2_000_000_000
+        assert before <= sample.stamp <= bob.now()
+        assert (sample.stamped, sample.sequence, sample.hops, sample.source.module) == (True, 1, 0, "A")
+        one, two = await anext(beats), await anext(beats)
+        assert one.publisher_class == r2p.PublisherClass.PERIODIC
+        assert two.sequence - one.sequence == 1
+
+
+@guarded
+async def test_a_latched_value_comes_once_to_each() -> None:
+    async with nodes(Net(), "A", "B", "C") as (alice, bob, carol):
+        publisher = alice.advertise("leds", Led, latch=True)
+        await publisher.publish(Led(7))
+        bobs = bob.subscribe("leds", Led)
+        assert await bobs.fetch() == Led(7)
+        carols = carol.subscribe("leds", Led)
+        assert await carols.fetch() == Led(7)
+        await publisher.publish(Led(8))
+        assert (await bobs.fetch(), await carols.fetch()) == (Led(8), Led(8))
+        assert not bobs.queue
+        again = carol.subscribe("leds", Led)
+        assert await again.fetch() == Led(8)
+
+
+@guarded
+async def test_networks_of_different_names_stay_apart() -> None:
+    ours = Net("ours")
+    theirs = Net("theirs")
+    theirs.port = ours.port
+    async with (
+        module("A", ours.listen) as a,
+        module("B", theirs.join) as b,
+        module("C", ours.join) as c,
+        node_in(a) as alice,
+        node_in(b) as bob,
+        node_in(c) as carol,
+    ):
+        publisher = alice.advertise("leds", Led)
+        foreign, friend = bob.subscribe("leds", Led), carol.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        await publisher.publish(Led(1))
+        assert await friend.fetch() == Led(1)
+        assert not foreign.queue
+        assert not other(b, "A")
+        assert not other(a, "B")
+
+
+@guarded
+async def test_the_last_words_of_a_module_arrive() -> None:
+    net = Net()
+    async with module("A", net.listen) as a, node_in(a) as alice:
+        subscriber = alice.subscribe("leds", Led, queue=200)
+        async with module("B", net.join) as b, node_in(b) as bob:
+            publisher = bob.advertise("leds", Led)
+            await publisher.wait_subscriber()
+            for number in range(100):
+                await publisher.publish(Led(number))
+        assert [(await subscriber.fetch()).led for _ in range(100)] == list(range(100))
+
+
+@guarded
+async def test_garbage_and_foreign_keys_are_counted_and_harm_nobody() -> None:
+    net = Net()
+    async with nodes(net, "A", "B") as (alice, bob), alien_on(net) as alien:
+        publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        live = alien.liveliness()
+        tokens = [
+            live.declare_token(f"r2p/lab/live/{key}") for key in ("x", "1/zz/module/A/1/0/0", "9/1/module/A/1/0/0")
+        ]
+        good = attachment.encode(HEADER)
+        for key, payload, header in (
+            ("topic/leds", b"\xff" * 1_000_000, None),
+            ("topic/leds", b"\xff" * 1_000_000, good),
+            ("topic/leds", b"four", good),
+            ("topic/leds", b"", good),
+            ("topic/leds", bytes(5), b"\x09" + good),
+            ("topic/leds", bytes(5), good[:-3] + b"///"),
+            ("topic/unknown", bytes(5), good),
+            ("control/zz", bytes(32), None),
+            ("control/7", bytes(33), None),
+            ("control/7", b"\xff" * 1_000_000, None),
+            (f"credit/{link_of(alice).instance:x}", b"\1\1junk", None),
+            ("whatever/else", b"x" * 1000, None),
+        ):
+            alien.put(f"r2p/lab/{key}", payload, attachment=header, congestion_control=zenoh.CongestionControl.BLOCK)
+        alien.put("r2p/lab/topic/leds", layout(Led).encode(Led(9)), attachment=good)
+        assert await subscriber.fetch() == Led(9)  # it could be an r2p module, as far as anybody can tell
+        await publisher.publish(Led(1))
+        assert await subscriber.fetch() == Led(1)
+        told = {"wrong size": 3, "unknown type": 3, "foreign": 1, "undecodable": 4}
+        await until(lambda: link_of(bob).losses == told)
+        await until(lambda: link_of(alice).losses["undecodable"] >= 3)
+        assert not subscriber.queue
+        del tokens
+
+
+@guarded
+async def test_what_is_lost_on_the_way_is_counted_by_source() -> None:
+    net = Net()
+    async with nodes(net, "A") as (alice,), alien_on(net) as alien:
+        subscriber = alice.subscribe("leds", Led)
+        for serial in (1, 2, 5, 6, 16):
+            header = Header(HEADER.origin, serial, serial, HEADER.stamp)
+            alien.put("r2p/lab/topic/leds", Led(serial).encode(), attachment=attachment.encode(header))
+        for serial in (1, 2, 5, 6, 16):
+            assert (await subscriber.fetch()).led == serial
+        link = link_of(alice)
+        assert link.losses["on the way"] == 11
+        assert link._streams.gaps == {("leds", r2p.Source("ALIEN", "node", link.name)): 11}
+
+
+@guarded
+async def test_a_type_whose_code_is_elsewhere_is_asked_for() -> None:
+    class Wheel(r2p.Message):
+        """Nobody else has it."""
+
+        speed: r2p.f32 = 0.0
+        currents: tuple[r2p.f32, r2p.f32] = (0.0, 0.0)
+
+    async with nodes(Net(), "A", "B") as (alice, bob):
+        alice.advertise("wheel", Wheel)
+        network = network_of(bob)
+        await until(lambda: "wheel" in network.topics())
+        fingerprint = network.topics()["wheel"].fingerprint
+        assert fingerprint is not None
+        found: Any = await network.message_type(fingerprint)
+        assert found.__name__ == "Wheel"
+        assert layout(found).schema == layout(Wheel).schema
+        assert found.decode(Wheel(2.0, (1.0, 0.5)).encode()).currents == (1.0, 0.5)
+        assert await network.message_type(b"nobody__") is None
+
+
+@guarded
+async def test_a_schema_that_lies_is_refused() -> None:
+    net = Net()
+    async with nodes(net, "A") as (alice,), alien_on(net) as alien:
+        fingerprint = layout(Led).fingerprint
+        lies = [b"Led\nled:u32 value:u16", b"\xff" * 1000, b"class\n" + layout(Led).schema.encode()]
+
+        def answer(query: zenoh.Query) -> None:
+            for number, lie in enumerate(lies):
+                query.reply(f"r2p/lab/schema/{number}/{fingerprint.hex()}", lie)
+
+        queryable = alien.declare_queryable("r2p/lab/schema/*/*", answer)
+        network = network_of(alice)
+        while not link_of(alice).losses["wrong schema"]:  # until the query reaches it
+            assert await network.message_type(fingerprint) is None
+        assert link_of(alice).losses["wrong schema"] == len(lies)
+        del queryable
+
+
+@guarded
+async def test_a_clock_that_jumps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stamps never go back, and nothing waits for a clock."""
+    async with nodes(Net(), "A", "B") as (alice, bob):
+        publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        stamps = []
+        for jump in (0, -3600, 0, 7200, -10):
+            clock = alice._space.clock
+            assert isinstance(clock, SystemClock)
+            utc = clock._utc
+            monkeypatch.setattr(clock, "_utc", lambda utc=utc, jump=jump: utc() + jump * 1_000_000_000)
+            await publisher.publish(Led(1))
+            async for sample in subscriber.samples():
+                stamps.append(sample.stamp)
+                break
+        assert stamps == sorted(stamps)
+
+
+@guarded
+async def test_it_says_where_it_listens() -> None:
+    a = r2p.Module("A", via="zenoh:?mode=peer&listen=tcp/127.0.0.1:0&scouting=off&network=lab", watchdog=False)
+    events = a.events()
+    async with a:
+        address = (await first(events, r2p.Listening)).address
+        assert address.startswith("tcp/127.0.0.1:")
+        async with module("B", f"zenoh:{address}?scouting=off&network=lab") as b:
+            await until(lambda: other(a, "B") and other(b, "A"))
+
+
+@guarded
+async def test_an_address_that_is_taken_is_an_error() -> None:
+    net = Net()
+    async with module("A", net.listen):
+        with pytest.raises(r2p.TransportError, match="Address already in use"):
+            async with module("B", net.listen):
+                pass
+
+
+@guarded
+async def test_a_tool_finds_the_only_network() -> None:
+    net = Net("robot1")
+    tool = r2p.Module("_tool", via=f"zenoh:tcp/127.0.0.1:{net.port}?scouting=off", observer=True, watchdog=False)
+    async with module("A", net.listen), tool:
+        await until(lambda: other(tool, "A"))

@@ -1,0 +1,97 @@
+"""What a `zenoh:` URL may say."""
+
+from pathlib import Path
+
+import pytest
+
+import r2p
+from r2p.transports.url import open_transport, parse
+from r2p.transports.zenoh.options import Options, chosen, default_network, options_of
+
+
+def options(text: str) -> Options:
+    return options_of(parse(text))
+
+
+def test_alone_it_is_a_peer_of_the_hosts_network() -> None:
+    found = options("zenoh:")
+    assert (found.mode, found.connect, found.listen, found.scouting) == ("peer", None, None, None)
+    assert found.network is None
+
+
+def test_with_an_endpoint_it_is_a_client() -> None:
+    found = options("zenoh:tcp/[::1]:7447,network=lab")
+    assert (found.mode, found.connect, found.network) == ("client", "tcp/[::1]:7447", "lab")
+    assert options("zenoh:tls/robot.local:7447?mode=peer").mode == "peer"
+
+
+def test_a_router() -> None:
+    found = options("zenoh:?mode=router&listen=tcp/0.0.0.0:7447&scouting=off")
+    assert (found.mode, found.listen, found.scouting) == ("router", "tcp/0.0.0.0:7447", False)
+
+
+def test_a_file_decides_what_the_url_does_not() -> None:
+    found = options("zenoh:?config=/etc/r2p/zenoh.json5")
+    assert (found.mode, found.config) == (None, Path("/etc/r2p/zenoh.json5"))
+
+
+@pytest.mark.parametrize(
+    ("url", "says"),
+    [
+        ("zenoh:7447", "no zenoh endpoint"),
+        ("zenoh:?mode=server", "peer, client, router"),
+        ("zenoh:?listen=7447", "tcp/ADDRESS:PORT"),
+        ("zenoh:?network=a/b", "letters"),
+        ("zenoh:?network=", "letters"),
+        ("zenoh:tcp/localhost:7447?listen=tcp/0.0.0.0:7447", "listens nowhere"),
+        ("zenoh:?speed=9600", "config, listen, mode, network, scouting"),
+    ],
+)
+def test_what_it_does_not_take(url: str, says: str) -> None:
+    with pytest.raises(r2p.TransportError, match=says):
+        open_transport(url)
+
+
+def test_the_network_of_a_tool_that_was_told_none() -> None:
+    own = default_network()
+    assert chosen(set(), "zenoh:") == own
+    assert chosen({"robot1", own}, "zenoh:") == own
+    assert chosen({"robot1"}, "zenoh:") == "robot1"
+    with pytest.raises(r2p.TransportError, match="networks robot1, robot2: say which"):
+        chosen({"robot2", "robot1"}, "zenoh:")
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (None, "there is no such file"),
+        ("{mode: 'client'", "can't read"),
+        ("{mode: 'nonsense'}", "can't read"),
+    ],
+)
+async def test_files_that_are_none(tmp_path: Path, text: str | None, says: str) -> None:
+    file = tmp_path / "zenoh.json5"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(r2p.TransportError, match=says):
+        async with r2p.Module("A", via=f"zenoh:?config={file}", watchdog=False):
+            pass
+
+
+@pytest.mark.anyio
+async def test_what_the_file_says_counts(tmp_path: Path) -> None:
+    from r2p.transports.zenoh.config import config_of, way_of
+
+    file = tmp_path / "zenoh.json5"
+    file.write_text(
+        "{mode: 'client', connect: {endpoints: ['tls/robot:7447'], retry: {period_init_ms: 7}},"
+        " transport: {link: {tx: {lease: 4000}, tls: {root_ca_certificate: 'ca.pem'}}}}"
+    )
+    config = config_of(options(f"zenoh:?config={file}"))
+    assert config.get_json("mode") == '"client"'
+    assert config.get_json("transport/link/tx/lease") == "4000"
+    assert way_of(config).endpoints == ["tls/robot:7447"]
+    assert way_of(config).tls.root == "ca.pem"
+    ours = config_of(options("zenoh:"))
+    assert ours.get_json("transport/link/tx/lease") == "1000"

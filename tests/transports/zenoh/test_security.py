@@ -1,0 +1,241 @@
+"""TLS, passwords and access control: they work, and who is refused is told why, and what to check."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import r2p
+from r2p.events import LinkNotice
+from r2p.msg import Led
+from r2p.testing.network import node_in
+from tests.transports.test_conformance import first, other, until
+from tests.transports.zenoh.authority import Authority
+from tests.transports.zenoh.cable import free_port, guarded, module
+
+pytestmark = pytest.mark.anyio
+
+
+class Secured:
+    """A network whose router and clients have configuration files."""
+
+    def __init__(self, folder: Path, protocol: str = "tcp", host: str = "localhost") -> None:
+        self._folder = folder
+        self._endpoint = f"{protocol}/{host}:{free_port()}"
+        self._files = 0
+
+    def router(self, **config: Any) -> str:
+        return self._url({"mode": "router", "listen": {"endpoints": [self._endpoint]}} | config)
+
+    def client(self, **config: Any) -> str:
+        return self._url({"mode": "client", "connect": {"endpoints": [self._endpoint]}} | config)
+
+    def _url(self, config: dict[str, Any]) -> str:
+        self._files += 1
+        file = self._folder / f"zenoh{self._files}.json5"
+        file.write_text(json.dumps(config))
+        return f"zenoh:?config={file}&network=lab&scouting=off"
+
+
+def tls(**names: str | bool) -> dict[str, Any]:
+    return {"link": {"tls": names}}
+
+
+async def refused(url: str) -> str:
+    """What a module is told that can't join."""
+    refused = module("B", url)
+    events = refused.events()
+    async with refused:
+        reason = (await first(events, r2p.LinkWaits)).reason
+        assert not refused.links[0].up
+        return reason
+
+
+async def exchange(a: str, b: str) -> None:
+    """Two modules send each other a message."""
+    async with module("A", a) as one, module("B", b) as two, node_in(one) as alice, node_in(two) as bob:
+        publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        await publisher.publish(Led(1))
+        assert await subscriber.fetch() == Led(1)
+
+
+@guarded
+async def test_tls(tmp_path: Path) -> None:
+    ours, theirs = Authority(tmp_path / "ours"), Authority(tmp_path / "theirs")
+    certificate, key = ours.sign("router")
+    net = Secured(tmp_path, "tls")
+    router = net.router(transport=tls(listen_certificate=certificate, listen_private_key=key))
+    await exchange(router, net.client(transport=tls(root_ca_certificate=ours.root)))
+    async with module("A", router):
+        text = await refused(net.client(transport=tls(root_ca_certificate=theirs.root)))
+        assert "its certificate is not accepted here" in text
+        assert theirs.root in text
+
+
+@guarded
+async def test_a_certificate_for_another_name(tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "ca")
+    certificate, key = authority.sign("router", host="robot.example")
+    net = Secured(tmp_path, "tls")
+    async with module("A", net.router(transport=tls(listen_certificate=certificate, listen_private_key=key))):
+        text = await refused(net.client(transport=tls(root_ca_certificate=authority.root)))
+        assert "Hostname mismatch" in text
+
+
+@guarded
+async def test_mutual_tls(tmp_path: Path) -> None:
+    ours, theirs = Authority(tmp_path / "ours"), Authority(tmp_path / "theirs")
+    certificate, key = ours.sign("router")
+    net = Secured(tmp_path, "tls")
+    router = net.router(
+        transport=tls(
+            listen_certificate=certificate, listen_private_key=key, root_ca_certificate=ours.root, enable_mtls=True
+        )
+    )
+
+    def client(signed: tuple[str, str] | None) -> str:
+        files = {} if signed is None else {"connect_certificate": signed[0], "connect_private_key": signed[1]}
+        return net.client(transport=tls(root_ca_certificate=ours.root, enable_mtls=True, **files))
+
+    await exchange(router, client(ours.sign("laptop")))
+    async with module("A", router):
+        for wrong in (None, theirs.sign("stranger")):
+            text = await refused(client(wrong))
+            assert "connect_certificate" in text
+
+
+@guarded
+async def test_tls_where_there_is_none(tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "ca")
+    plain = Secured(tmp_path)
+    async with module("A", plain.router()):
+        plain._endpoint = plain._endpoint.replace("tcp/", "tls/")
+        text = await refused(plain.client(transport=tls(root_ca_certificate=authority.root)))
+        assert "does not speak TLS" in text
+
+
+@guarded
+async def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    net = Secured(tmp_path)
+    async with module("A", net.router()):
+        net._endpoint = net._endpoint.replace("tcp/", "tls/")
+        text = await refused(net.client(transport=tls(root_ca_certificate="/nowhere/ca.pem")))
+        assert "there is no file /nowhere/ca.pem" in text
+
+
+@guarded
+async def test_passwords(tmp_path: Path) -> None:
+    users = tmp_path / "users.txt"
+    users.write_text("alice:secret\n")
+    net = Secured(tmp_path)
+
+    def auth(**values: str) -> dict[str, Any]:
+        return {"auth": {"usrpwd": values}}
+
+    router = net.router(transport=auth(dictionary_file=str(users), user="alice", password="secret"))
+    await exchange(router, net.client(transport=auth(user="alice", password="secret")))
+    async with module("A", router):
+        text = await refused(net.client(transport=auth(user="alice", password="wrong")))
+        assert "check the password of user alice" in text
+        text = await refused(net.client())
+        assert "it may ask for a user and a password" in text
+
+
+def denial(*messages: str) -> dict[str, Any]:
+    return {
+        "enabled": True,
+        "default_permission": "allow",
+        "rules": [
+            {
+                "id": "secret",
+                "permission": "deny",
+                "flows": ["egress", "ingress"],
+                "messages": list(messages),
+                "key_exprs": ["r2p/lab/topic/secret"],
+            }
+        ],
+        "subjects": [{"id": "all"}],
+        "policies": [{"rules": ["secret"], "subjects": ["all"]}],
+    }
+
+
+@guarded
+@pytest.mark.parametrize("message", ["put", "declare_subscriber"])
+async def test_a_topic_that_access_control_denies(tmp_path: Path, message: str) -> None:
+    net = Secured(tmp_path)
+    async with (
+        module("ROUTER", net.router(access_control=denial(message))),
+        module("A", net.client()) as a,
+        module("B", net.client()) as b,
+        node_in(a) as alice,
+        node_in(b) as bob,
+    ):
+        told = a.events()
+        secret, plain = alice.advertise("secret", Led, latch=True), alice.advertise("plain", Led)
+        await secret.publish(Led(1))
+        secrets, plains = bob.subscribe("secret", Led), bob.subscribe("plain", Led)
+        await plain.wait_subscriber()
+        await plain.publish(Led(1))
+        assert await plains.fetch() == Led(1)
+        notice = await first(told, LinkNotice)
+        assert notice.kind == "unheard"
+        assert "topic secret does not reach module B" in notice.text
+        assert "access control" in notice.text
+        assert not secrets.queue
+
+
+@guarded
+async def test_access_control_by_certificate(tmp_path: Path) -> None:
+    """Only the one whose certificate says `pilot` may publish."""
+    authority = Authority(tmp_path / "ca")
+    certificate, key = authority.sign("router")
+    net = Secured(tmp_path, "tls")
+    rule = {"flows": ["ingress"], "messages": ["put"], "key_exprs": ["r2p/lab/topic/**"]}
+    control = {
+        "enabled": True,
+        "default_permission": "allow",
+        "rules": [{"id": "no", "permission": "deny", **rule}],
+        "subjects": [{"id": "guest", "cert_common_names": ["guest"]}],
+        "policies": [{"rules": ["no"], "subjects": ["guest"]}],
+    }
+    router = net.router(
+        transport=tls(
+            listen_certificate=certificate,
+            listen_private_key=key,
+            root_ca_certificate=authority.root,
+            enable_mtls=True,
+        ),
+        access_control=control,
+    )
+
+    def client(name: str) -> str:
+        mine, secret = authority.sign(name)
+        return net.client(
+            transport=tls(
+                root_ca_certificate=authority.root,
+                enable_mtls=True,
+                connect_certificate=mine,
+                connect_private_key=secret,
+            )
+        )
+
+    async with (
+        module("ROUTER", router) as hub,
+        module("PILOT", client("pilot")) as pilot,
+        module("GUEST", client("guest")) as guest,
+        node_in(hub) as listener,
+        node_in(pilot) as good,
+        node_in(guest) as bad,
+    ):
+        subscriber = listener.subscribe("cmd", Led)
+        await until(lambda: other(hub, "PILOT") and other(hub, "GUEST"))
+        fine, denied = good.advertise("cmd", Led), bad.advertise("cmd", Led)
+        await fine.wait_subscriber()
+        await denied.wait_subscriber()
+        told = guest.events()
+        await denied.publish(Led(2))
+        assert (await first(told, LinkNotice)).kind == "unheard"
+        await fine.publish(Led(1))
+        assert await subscriber.fetch() == Led(1)
