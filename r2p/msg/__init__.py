@@ -26,6 +26,7 @@ from r2p.msg.firmware import (
     Tilt,
     Velocity3,
 )
+from r2p.msg.gateway import GatewayStatus
 from r2p.msg.robot import (
     GPS,
     IMU,
@@ -53,6 +54,7 @@ __all__ = [
     "Encoder",
     "Encoder2",
     "Float32",
+    "GatewayStatus",
     "IMURaw9",
     "Led",
     "Log",

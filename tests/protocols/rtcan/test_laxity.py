@@ -56,6 +56,16 @@ def test_laxity_is_in_whole_ms_and_never_that_of_another_class(remaining: float,
     assert drain(filled(srt(1, remaining, drop=False))) == [(1, laxity, 0)]
 
 
+def test_management_goes_first_among_equals_and_has_room_of_its_own() -> None:
+    queue = LaxityQueue(capacity=2)
+    assert queue.put(srt(5, -3, drop=False))
+    assert queue.put(srt(6, 1.5, drop=False))
+    assert not queue.put(srt(7, 1))
+    for number in range(2):
+        assert queue.put(srt(1, 1.9 + number, 16, drop=False), management=True)
+    assert drain(queue) == [(1, 1, 1), (1, 1, 0), (1, 2, 1), (1, 2, 0), (5, 1, 0), (6, 1, 0)]
+
+
 def test_first_come_first_served_among_equals() -> None:
     """Equal is what has the same laxity now, not the same deadline."""
     assert [m for m, _, _ in drain(filled(srt(1, 20.9), srt(2, 20.1), srt(3, 19.99)))] == [3, 1, 2]

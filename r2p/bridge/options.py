@@ -1,0 +1,125 @@
+"""What a gateway lets through, and as what."""
+
+from fnmatch import fnmatchcase
+from typing import TypeVar
+
+import msgspec
+
+from r2p.errors import Error
+from r2p.names import LOADER_PREFIX
+from r2p.sample import PublisherClass
+
+T = TypeVar("T")
+
+IP = frozenset({"tcp", "tcp-listen", "zenoh"})
+"""Schemes of links that anybody in an IP network may reach."""
+
+
+class ClassOf(msgspec.Struct, frozen=True):
+    """A publisher class, and its period or deadline in seconds."""
+
+    publisher_class: PublisherClass
+    time: float = 0.0
+
+
+class Rule(msgspec.Struct, frozen=True):
+    """Topics and the way that they take; all three are patterns as in a shell."""
+
+    topic: str
+    source: str = "*"
+    target: str = "*"
+
+    def matches(self, topic: str, source: str, target: str) -> bool:
+        return fnmatchcase(topic, self.topic) and is_link(source, self.source) and is_link(target, self.target)
+
+
+class BridgeOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of a gateway; the default joins everything.
+
+    `allow`, `deny`: rules `TOPIC[@FROM[>TO]]`, patterns for a topic, the link that it comes from and the one that it
+    goes to (a link is named as in the log, or by its scheme: `zenoh`); without `allow` everything is allowed, `deny`
+    wins. `rate_limit`: messages a second, by topic pattern. `read_only`: links onto which nothing is forwarded.
+    `prefix`: what topics are called elsewhere, behind this on the links `prefix_on`. `allow_control`: REBOOT, BOOTLOAD
+    and loader topics may come in from IP links. `classes`: the class of what a debug line brings, which can't say it.
+    `reserve`: topics that are sent in slots of their own on RTCAN.
+    """
+
+    allow: tuple[str, ...] = ()
+    deny: tuple[str, ...] = ()
+    rate_limit: dict[str, float] = {}
+    read_only: tuple[str, ...] = ()
+    prefix: str = ""
+    prefix_on: tuple[str, ...] = ("zenoh",)
+    allow_control: bool = False
+    classes: dict[str, ClassOf] = {}
+    reserve: tuple[str, ...] = ()
+
+
+def rule(text: str) -> Rule:
+    """A rule from `TOPIC[@FROM[>TO]]`. Raises Error for an empty part."""
+    topic, at, way = text.partition("@")
+    source, arrow, target = way.partition(">")
+    if not topic or (at and not source) or (arrow and not target):
+        raise Error(f"{text!r}: write TOPIC, TOPIC@FROM or TOPIC@FROM>TO; * stands for anything")
+    return Rule(topic, source or "*", target or "*")
+
+
+def is_link(name: str, pattern: str) -> bool:
+    """Whether a pattern means the link: its name, its scheme, or with stars and question marks."""
+    return pattern in (name, name.partition(":")[0]) or fnmatchcase(name, pattern)
+
+
+class Policy:
+    """The options, ready to be asked."""
+
+    def __init__(self, options: BridgeOptions) -> None:
+        self._options = options
+        self._allow = [rule(each) for each in options.allow]
+        self._deny = [rule(each) for each in options.deny]
+
+    def allows(self, topic: str, source: str, target: str) -> bool:
+        """Whether a topic may go from one link to another; links by name, the topic as it is called on the robot."""
+        if any(is_link(target, each) for each in self._options.read_only):
+            return False
+        if topic.startswith(LOADER_PREFIX) and not self._may_control(source):
+            return False
+        if any(each.matches(topic, source, target) for each in self._deny):
+            return False
+        return not self._allow or any(each.matches(topic, source, target) for each in self._allow)
+
+    def allows_order(self, source: str, target: str, *, harmless: bool) -> bool:
+        """Whether an order for a module may go this way; STOP is harmless."""
+        if any(is_link(target, each) for each in self._options.read_only):
+            return False
+        return harmless or self._may_control(source)
+
+    def rate_limit(self, topic: str) -> float | None:
+        """Messages a second; None: as many as come."""
+        return _first(self._options.rate_limit, topic)
+
+    def class_of(self, topic: str, source: str) -> ClassOf | None:
+        """The class of what a debug line brings; None as it is."""
+        is_line = source.partition(":")[0] in {"tcp", "serial"}
+        return _first(self._options.classes, topic) if is_line else None
+
+    def reserves(self, topic: str) -> bool:
+        return any(fnmatchcase(topic, each) for each in self._options.reserve)
+
+    def called(self, topic: str, link: str) -> str:
+        """What a topic of the robot is called on this link."""
+        return self._prefix(link) + topic
+
+    def meant(self, name: str, link: str) -> str | None:
+        """The topic of the robot that has this name on the link; None: it is not the robot's."""
+        prefix = self._prefix(link)
+        return name.removeprefix(prefix) if name.startswith(prefix) else None
+
+    def _prefix(self, link: str) -> str:
+        return self._options.prefix if any(is_link(link, each) for each in self._options.prefix_on) else ""
+
+    def _may_control(self, source: str) -> bool:
+        return self._options.allow_control or source.partition(":")[0] not in IP
+
+
+def _first(table: dict[str, T], topic: str) -> T | None:
+    return next((value for pattern, value in table.items() if fnmatchcase(topic, pattern)), None)

@@ -1,0 +1,222 @@
+"""Which topics a gateway relays, and what it tells each link of them: looked at anew whenever demand changes.
+
+On a link we publish what is offered, and subscribe what is wanted, on another one to or from which it may go. All of
+that only on links that are in the tree; so demand travels along the tree, and can't feed itself.
+"""
+
+import logging
+import re
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from r2p.bridge.options import Policy
+from r2p.bridge.port import BridgePort
+from r2p.bridge.relay import BridgedTopic, Relay, Way
+from r2p.bridge.reserving import RelayedPeriodic
+from r2p.bridge.shaping import Shaper
+from r2p.codecs.management import ANY_TYPE
+from r2p.protocols.events import Shape
+from r2p.topic import Topic, TopicSpace
+from r2p.transports.announce import NOTHING, Told
+
+if TYPE_CHECKING:
+    from r2p.bridge.bridge import Bridge
+
+logger = logging.getLogger("r2p.bridge")
+
+QUEUE = 16
+"""Messages that a gateway asks firmware to keep for it."""
+
+_NAME = re.compile(r"[A-Za-z0-9_/]+")
+_BUSES = frozenset({"rtcan", "sim"})
+
+
+class Relays:
+    """The relayed topics by their name on the robot."""
+
+    def __init__(self, bridge: "Bridge", space: TopicSpace, policy: Policy) -> None:
+        self.by_name: dict[str, Relay] = {}
+        self._bridge = bridge
+        self._space = space
+        self._policy = policy
+        self._dirty: dict[str, None] = {}
+        self._reviewing = False
+        self._shapes: dict[tuple[str, str], Shape] = {}
+        self._too_long: set[str] = set()
+
+    # What has changed
+
+    def changed(self, names: Iterable[str], port: BridgePort) -> None:
+        """The demand for these topics has changed on a link."""
+        self._mark(topic for name in names if (topic := self._meant(name, port)) is not None)
+
+    def all_changed(self) -> None:
+        """The tree, or the links, have changed."""
+        ports = self._bridge.ports.values()
+        heard = {topic for port in ports for name in port.demand.topics() if (topic := self._meant(name, port))}
+        self._mark(heard | self.by_name.keys())
+
+    def retyped(self) -> None:
+        """See whether other types, or sizes, are told than before."""
+        for (topic, link), shape in list(self._shapes.items()):
+            port = self._bridge.ports.get(link)
+            if port is not None and self._shape(topic, port) != shape:
+                self._mark((topic,))
+
+    def _mark(self, topics: Iterable[str]) -> None:
+        """Look at these anew, at once: what comes in next may need a new way."""
+        self._dirty.update(dict.fromkeys(sorted(topics)))
+        if self._reviewing:
+            return
+        self._reviewing = True
+        try:
+            while self._dirty:
+                topic = next(iter(self._dirty))
+                del self._dirty[topic]
+                self._review(topic)
+        finally:
+            self._reviewing = False
+
+    def _review(self, topic: str) -> None:
+        ports = [port for port in self._bridge.ports.values() if port.in_tree and self._carries(topic, port)]
+        if any(self._uses(topic, source, target) for source, target in _pairs(ports)):
+            self._relay(topic, ports)
+        else:
+            self._end(topic)
+
+    def _uses(self, topic: str, source: BridgePort, target: BridgePort) -> bool:
+        """Whether messages flow this way, or would if there were any."""
+        asked = self._offers(topic, source) or self._wants(topic, target)
+        return asked and self._policy.allows(topic, source.name, target.name)
+
+    # Relays
+
+    def _relay(self, topic: str, ports: list[BridgePort]) -> None:
+        relay = self.by_name.get(topic)
+        if relay is None:
+            relay = self.by_name[topic] = Relay()
+        for port in ports:
+            here = self._topic(topic, port)
+            here.relay = relay
+            relay.topics[here.name] = here
+        pairs = {
+            (source.name, target.name): target
+            for source, target in _pairs(ports)
+            if self._policy.allows(topic, source.name, target.name)
+        }
+        for key in relay.ways.keys() - pairs.keys():
+            del relay.ways[key]
+        for (source_name, _), target in pairs.items():
+            key = source_name, target.name
+            if key not in relay.ways:
+                relay.ways[key] = Way(target, self._topic(topic, target), self._shaper(topic, source_name, target))
+        relay.route()
+        self._tell(topic)
+
+    def _end(self, topic: str) -> None:
+        relay = self.by_name.pop(topic, None)
+        if relay is None:
+            return
+        for here in relay.topics.values():
+            here.relay = here.reserved = None
+            here.open = {}
+        self._tell(topic, relay.topics)
+        for here in relay.topics.values():
+            if here.idle and not here.in_use:
+                self._space.topics.pop(here.name, None)
+
+    def _tell(self, topic: str, topics: dict[str, BridgedTopic] | None = None) -> None:
+        for port in list(self._bridge.ports.values()):
+            name = self._policy.called(topic, port.name)
+            here = (topics or self._space.topics).get(name)
+            if here is not None:
+                self._shapes[topic, port.name] = self._shape(topic, port)
+                port.link.topic_changed(here)
+            if topics is not None:
+                self._shapes.pop((topic, port.name), None)
+
+    def wish(self, port: BridgePort, topic: Topic, own: Told) -> Told:
+        """What a link is to be told of a topic that this module itself has as `own`."""
+        if not port.in_tree:
+            return NOTHING
+        name = self._policy.meant(topic.name, port.name)
+        if name is None or name not in self.by_name:
+            return own
+        others = [each for each in self._bridge.ports.values() if each is not port and each.in_tree]
+        allows = self._policy.allows
+        publishes = any(self._offers(name, each) and allows(name, each.name, port.name) for each in others)
+        subscribes = any(self._wants(name, each) and allows(name, port.name, each.name) for each in others)
+        if not publishes and not subscribes:
+            return own
+        shape = Shape(own.size, own.fingerprint) if topic.layout is not None else self._shape(name, port)
+        return msgspec.structs.replace(
+            own,
+            publishes=own.publishes or publishes,
+            subscribes=own.subscribes or subscribes,
+            size=shape.size,
+            fingerprint=shape.fingerprint,
+            queue=max(own.queue, QUEUE),
+        )
+
+    def _shape(self, topic: str, port: BridgePort) -> Shape:
+        """The topic's type as it is known on other links; publishers know best."""
+        others = [each for each in self._bridge.ports.values() if each is not port and each.in_tree]
+        others.sort(key=lambda each: not self._offers(topic, each))
+        infos = [
+            info for each in others if (info := each.link.discovery.topics.get(self._policy.called(topic, each.name)))
+        ]
+        size = next((info.size for info in infos if info.size), 0)
+        return Shape(size, next((info.fingerprint for info in infos if info.fingerprint), ANY_TYPE))
+
+    # One topic on one link
+
+    def _offers(self, topic: str, port: BridgePort) -> bool:
+        return port.demand.offers(self._policy.called(topic, port.name))
+
+    def _wants(self, topic: str, port: BridgePort) -> bool:
+        return port.demand.wants(self._policy.called(topic, port.name))
+
+    def _topic(self, topic: str, port: BridgePort) -> BridgedTopic:
+        here = self._space.open(self._policy.called(topic, port.name), None)
+        assert isinstance(here, BridgedTopic)  # this module makes no others
+        return here
+
+    def _meant(self, name: str, port: BridgePort) -> str | None:
+        """The topic of the robot; None for what is not its own, and for what only a hostile wire can say."""
+        topic = self._policy.meant(name, port.name)
+        return topic if topic and _NAME.fullmatch(topic) else None
+
+    def _carries(self, topic: str, port: BridgePort) -> bool:
+        """Whether the topic's name fits there."""
+        name = self._policy.called(topic, port.name)
+        if len(name) <= port.link.longest_name:
+            return True
+        if name not in self._too_long:
+            self._too_long.add(name)
+            logger.warning("link %s carries no name as long as %s: the topic is not relayed there", port.name, name)
+        return False
+
+    def _shaper(self, topic: str, source: str, target: BridgePort) -> Shaper | None:
+        policy = self._policy
+        is_bus = target.name.partition(":")[0] in _BUSES
+        shaper = Shaper.of(
+            rate=policy.rate_limit(topic),
+            klass=policy.class_of(topic, source),
+            soften=is_bus,
+            learnt=(lambda size, period: reserve(size, period)) if is_bus and policy.reserves(topic) else None,
+        )
+
+        def reserve(size: int, period: float) -> None:
+            here = self._topic(topic, target)
+            here.reserved = here.reserved or RelayedPeriodic(here.name, size, period)
+            if shaper is not None:
+                shaper.reserved = here.reserved
+            target.link.topic_changed(here)
+
+        return shaper
+
+
+def _pairs(ports: list[BridgePort]) -> Iterator[tuple[BridgePort, BridgePort]]:
+    return ((source, target) for source in ports for target in ports if source is not target)

@@ -1,0 +1,381 @@
+"""What a gateway does between two memory networks."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
+
+import msgspec
+import pytest
+
+import r2p
+from r2p.bridge import BridgeOptions
+from r2p.codecs import management
+from r2p.msg import Float32, Led, Text
+from r2p.testing.network import node_in
+from r2p.transports.memory import Frame, Port, network
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+pytestmark = pytest.mark.virtual_time
+
+CONVERGED = 1.0
+"""Seconds after which a lone gateway forwards."""
+
+
+@asynccontextmanager
+async def gateway(
+    options: BridgeOptions | bool = True, name: str = "GW", networks: str = "ab"
+) -> AsyncIterator[r2p.Module]:
+    async with r2p.Module(name, via=[f"memory:{each}" for each in networks], bridge=options) as module:
+        await asyncio.sleep(CONVERGED)
+        yield module
+
+
+@asynccontextmanager
+async def node(name: str, where: str) -> AsyncIterator[r2p.Node]:
+    async with r2p.Module(name, via=f"memory:{where}") as module, node_in(module) as node:
+        yield node
+
+
+def drain(subscriber: r2p.Subscriber[Led]) -> list[int]:
+    values = [Led.decode(sample.data).led for sample in subscriber.queue]
+    subscriber.queue.clear()
+    return values
+
+
+def ways(module: r2p.Module, topic: str = "leds") -> dict[tuple[str, str], tuple[int, dict[str, int]]]:
+    return {
+        (each.source, each.target): (each.forwarded, each.dropped)
+        for each in module.gateway_statistics().ways
+        if each.topic == topic
+    }
+
+
+async def test_both_ways() -> None:
+    async with gateway() as gw, node("A", "a") as a, node("B", "b") as b:
+        there, back = a.advertise("leds", Led), b.advertise("back", Led)
+        leds, backs = b.subscribe("leds", Led), a.subscribe("back", Led)
+        await there.wait_subscriber()
+        await back.wait_subscriber()
+        for number in range(10):
+            await there.publish(Led(led=number))
+            await back.publish(Led(led=100 + number))
+        await asyncio.sleep(0.1)
+        assert drain(leds) == list(range(10))
+        assert drain(backs) == list(range(100, 110))
+        assert ways(gw)["memory:a", "memory:b"] == (10, {})
+
+
+async def test_nothing_is_asked_for_that_nobody_wants() -> None:
+    async with gateway() as gw, node("A", "a") as a, node("B", "b") as b:
+        leds = a.advertise("leds", Led)
+        await asyncio.sleep(1)
+        assert not leds.subscribers
+        subscriber = b.subscribe("leds", Led)
+        await leds.wait_subscriber()
+        subscriber.close()
+        await asyncio.sleep(0.1)
+        assert not leds.subscribers
+        assert ways(gw)["memory:a", "memory:b"] == (0, {})
+
+
+async def test_subscribers_on_the_same_side_get_it_once() -> None:
+    async with gateway(), node("A", "a") as a, node("B", "a") as b, node("C", "b") as c:
+        leds = a.advertise("leds", Led)
+        near, far = b.subscribe("leds", Led), c.subscribe("leds", Led)
+        await asyncio.sleep(1)
+        await leds.publish(Led(led=1))
+        await asyncio.sleep(0.1)
+        assert (drain(near), drain(far)) == ([1], [1])
+
+
+async def test_a_chain() -> None:
+    """Subscriptions travel through all of it, and samples keep who published them, when, and as which."""
+    async with (
+        gateway(name="G1"),
+        gateway(name="G2", networks="bc"),
+        gateway(name="G3", networks="cd"),
+        node("A", "a") as a,
+        node("D", "d") as d,
+    ):
+        leds, far = a.advertise("leds", Led), d.subscribe("leds", Led)
+        await leds.wait_subscriber()
+        await asyncio.sleep(0.1)
+        await leds.publish(Led(led=7))
+        await asyncio.sleep(0.1)
+        (sample,) = far.queue
+        assert str(sample.source) == "A/test"
+        assert (sample.sequence, sample.hops, sample.stamped) == (1, 3, True)
+
+
+async def test_the_other_side_can_be_seen() -> None:
+    async with gateway(), r2p.Module("B", via="memory:b") as b:
+        async with r2p.Module("A", via="memory:a") as a, node_in(a) as one:
+            leds = one.advertise("leds", Led)
+            await asyncio.sleep(0.5)
+            view = b.network.topics()["leds"]
+            assert [(each.module, each.node) for each in view.publishers] == [("A", "test")]
+            assert {view.name: view.state for view in b.network.modules()}["A"] == "running"
+            await a.stop()
+            await asyncio.sleep(0.5)
+            assert {view.name: view.state for view in b.network.modules()}["A"] == "stopped"
+            leds.close()
+            await asyncio.sleep(0.5)
+            assert not b.network.topics()["leds"].publishers
+        await asyncio.sleep(0.5)
+        assert "A" not in {view.name for view in b.network.modules()}
+
+
+@pytest.mark.parametrize(
+    ("options", "passes"),
+    [
+        (BridgeOptions(allow=("leds",)), True),
+        (BridgeOptions(allow=("cmd*",)), False),
+        (BridgeOptions(deny=("l*",)), False),
+        (BridgeOptions(allow=("leds@memory:a",)), True),
+        (BridgeOptions(allow=("leds@memory:b",)), False),
+        (BridgeOptions(deny=("leds@memory:a>memory:b",)), False),
+        (BridgeOptions(deny=("leds@memory:b>memory:a",)), True),
+        (BridgeOptions(read_only=("memory:a",)), True),
+        (BridgeOptions(read_only=("memory:b",)), False),
+        (BridgeOptions(read_only=("memory",)), False),
+    ],
+)
+async def test_what_may_pass(options: BridgeOptions, passes: bool) -> None:
+    async with gateway(options), node("A", "a") as a, node("B", "b") as b:
+        leds, far = a.advertise("leds", Led), b.subscribe("leds", Led)
+        await asyncio.sleep(1)
+        assert bool(leds.subscribers) is passes
+        await leds.publish(Led(led=1))
+        await asyncio.sleep(0.1)
+        assert drain(far) == ([1] if passes else [])
+
+
+async def test_rate_limit() -> None:
+    async with gateway(BridgeOptions(rate_limit={"leds": 10.0})) as gw, node("A", "a") as a, node("B", "b") as b:
+        leds, far = a.advertise("leds", Led), b.subscribe("leds", Led, queue=1000)
+        await leds.wait_subscriber()
+        await asyncio.sleep(0.1)
+        for number in range(200):
+            await leds.publish(Led(led=number))
+            await asyncio.sleep(0.01)
+        assert len(drain(far)) in range(19, 23)  # in 2 s
+        forwarded, dropped = ways(gw)["memory:a", "memory:b"]
+        assert dropped == {"rate limit": 200 - forwarded}
+
+
+async def test_a_prefix() -> None:
+    """On the network the robot's topics are called robot1/..., and others are not the robot's."""
+    options = BridgeOptions(prefix="robot1/", prefix_on=("memory:b",))
+    async with gateway(options), node("A", "a") as a, node("B", "b") as b:
+        leds, far = a.advertise("leds", Led), b.subscribe("robot1/leds", Led)
+        plain, cmd = b.subscribe("leds", Led), a.subscribe("cmd", Led)
+        stranger, ours = b.advertise("cmd", Led), b.advertise("robot1/cmd", Led)
+        await asyncio.sleep(1)
+        await leds.publish(Led(led=1))
+        await ours.publish(Led(led=2))
+        await stranger.publish(Led(led=3))
+        await asyncio.sleep(0.1)
+        assert (drain(far), drain(plain), drain(cmd)) == ([1], [], [2])
+
+
+async def test_a_latched_value_reaches_who_joins_later() -> None:
+    async with gateway(), node("A", "a") as a:
+        config = a.advertise("leds", Led, latch=True)
+        await config.publish(Led(led=5))
+        await asyncio.sleep(0.5)
+        for name in ("B", "C"):
+            async with node(name, "b") as b:
+                assert (await b.subscribe("leds", Led).fetch(timeout=1)).led == 5
+
+
+async def test_a_late_message_is_dropped_if_its_publisher_said_when() -> None:
+    async with gateway() as gw, node("A", "a") as a, node("B", "b") as b:
+        leds = a.advertise("leds", Led, r2p.Sporadic(deadline=0.02))
+        far = b.subscribe("leds", Led)
+        await leds.wait_subscriber()
+        await asyncio.sleep(0.1)
+        network("a").delay = 0.05
+        await leds.publish(Led(led=1))
+        await asyncio.sleep(0.2)
+        assert drain(far) == []
+        assert ways(gw)["memory:a", "memory:b"] == (0, {"late": 1})
+
+
+async def test_two_types_are_refused_across_the_gateway() -> None:
+    async with gateway(), node("A", "a") as a, node("B", "b") as b:
+        leds = a.advertise("leds", Led)
+        far = b.subscribe("leds", Float32)
+        await asyncio.sleep(2)
+        await leds.publish(Led(led=1))
+        await asyncio.sleep(0.1)
+        assert not far.queue
+
+
+async def test_own_nodes_of_a_gateway() -> None:
+    async with gateway() as gw, node_in(gw, name="own") as own, node("A", "a") as a, node("B", "b") as b:
+        text = own.advertise("text", Text)
+        near, far = a.subscribe("text", Text), b.subscribe("text", Text)
+        heard = own.subscribe("leds", Led)
+        leds = a.advertise("leds", Led)
+        await asyncio.sleep(1)
+        await text.publish(Text(text="hello"))
+        await leds.publish(Led(led=3))
+        await asyncio.sleep(0.1)
+        assert (len(near.queue), len(far.queue), drain(heard)) == (1, 1, [3])
+
+
+# Orders
+
+
+class Tap:
+    """Hears management messages on a network, as firmware would, and speaks there."""
+
+    def __init__(self, where: str) -> None:
+        self.heard: list[management.Management] = []
+        self._network = network(where)
+        self._address = self._network.new_address()
+        self._network.plug_in(self._address, Port(self._network, self._hear, lambda: None))
+
+    def _hear(self, frame: Frame) -> None:
+        if frame.topic == b"R2P":
+            self.heard.append(management.decode(frame.data))
+
+    def say(self, message: management.Management) -> None:
+        self._network.send(Frame(self._address, b"R2P", management.encode(message)))
+
+    def orders(self) -> list[management.Management]:
+        kinds = (management.Stop, management.Reboot, management.Bootload)
+        return [each for each in self.heard if isinstance(each, kinds)]
+
+
+async def test_orders_pass() -> None:
+    async with gateway():
+        a, b = Tap("a"), Tap("b")
+        orders: list[management.Management] = [
+            management.Stop("IMU1"),
+            management.Reboot("IMU1"),
+            management.Bootload("IMU1"),
+        ]
+        for order in orders:
+            a.say(order)
+        await asyncio.sleep(0.1)
+        assert b.orders() == orders
+        assert a.orders() == []
+
+
+async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
+    for allowed in (False, True):
+        async with gateway(BridgeOptions(allow_control=allowed)) as gw:
+            a, b = Tap("a"), Tap("b")
+            a.say(management.Stop("IMU1"))
+            a.say(management.Reboot("IMU1"))
+            a.say(management.SubscribeRequest("BOOT_IMU1", 31, 1))
+            b.say(management.Advertise("BOOT_IMU1", 31))
+            b.say(management.SubscribeRequest("BOOT_IMU1", 31, 1))
+            a.say(management.Advertise("BOOT_IMU1", 31))
+            await asyncio.sleep(0.1)
+            kinds = [type(order) for order in b.orders()]
+            assert kinds == ([management.Stop, management.Reboot] if allowed else [management.Stop])
+            assert bool(ways(gw, "BOOT_IMU1")) is allowed
+
+
+async def test_firmware_is_seen_with_its_age() -> None:
+    async with gateway(), r2p.Module("B", via="memory:b") as module:
+        firmware = Tap("a")
+        firmware.say(management.Alive("IMU1"))
+        await asyncio.sleep(10)
+        (imu,) = [view for view in module.network.modules() if view.name == "IMU1"]
+        assert imu.instance is None
+        assert imu.age > 7
+        firmware.say(management.Alive("IMU1"))
+        await asyncio.sleep(2)
+        (imu,) = [view for view in module.network.modules() if view.name == "IMU1"]
+        assert imu.age < 2
+
+
+class FirmwareGateway:
+    """Joins two networks as firmware does: passes on what firmware knows, and what it knows not of it drops."""
+
+    def __init__(self, one: str, other: str) -> None:
+        self._networks = network(one), network(other)
+        self._ports = [each.new_address() for each in self._networks]
+        for here, there in ((0, 1), (1, 0)):
+            self._plug_in(here, there)
+
+    def _plug_in(self, here: int, there: int) -> None:
+        def hear(frame: Frame) -> None:
+            if frame.topic != b"R2P" or frame.data[-1] < 0x40:
+                frame = msgspec.structs.replace(frame, port=self._ports[there])
+                self._networks[there].send(frame)
+
+        self._networks[here].plug_in(self._ports[here], Port(self._networks[here], hear, lambda: None))
+
+    def cut(self) -> None:
+        for each, port in zip(self._networks, self._ports, strict=True):
+            each.unplug(port)
+
+
+async def test_a_loop_through_firmware_is_blocked_and_told() -> None:
+    joined = FirmwareGateway("a", "b")
+    async with gateway() as gw, node("A", "a") as a, node("B", "b") as b:
+        leds, far = a.advertise("leds", Led), b.subscribe("leds", Led)
+        await asyncio.sleep(2)
+        states = {each.link: each.state for each in gw.gateway_statistics().ports}
+        assert states == {"memory:a": "alone", "memory:b": "loop"}
+        await leds.publish(Led(led=1))
+        await asyncio.sleep(0.5)
+        assert drain(far) == [1]
+        joined.cut()
+        await asyncio.sleep(10)
+        states = {each.link: each.state for each in gw.gateway_statistics().ports}
+        assert states == {"memory:a": "alone", "memory:b": "alone"}
+
+
+async def test_two_gateways_whose_networks_firmware_joins() -> None:
+    """Each hears the other only on the network that both are on; the loop goes through firmware."""
+    joined = FirmwareGateway("a", "b")
+    async with (
+        gateway(name="G1", networks="ac") as one,
+        gateway(name="G2", networks="bc") as two,
+        node("A", "a") as a,
+        node("C", "c") as c,
+    ):
+        leds, far = a.advertise("leds", Led), c.subscribe("leds", Led)
+        await asyncio.sleep(2)
+        states = [port.state for each in (one, two) for port in each.gateway_statistics().ports]
+        assert sorted(states) == ["alone", "forwarding", "forwarding", "loop"]
+        for number in range(5):
+            await leds.publish(Led(led=number))
+            await asyncio.sleep(0.1)
+        assert drain(far) == [0, 1, 2, 3, 4]
+        joined.cut()
+
+
+# A bus
+
+
+@pytest.mark.parametrize("reserve", [False, True])
+async def test_periodic_messages_towards_a_bus(reserve: bool) -> None:
+    """They are due within their period; in slots of their own only if that is asked for."""
+    options = BridgeOptions(reserve=("leds",) if reserve else ())
+    async with (
+        r2p.Module("GW", via=["memory:a", "sim:bus"], bridge=options) as gw,
+        node("A", "a") as a,
+        r2p.Module("IMU1", via="sim:bus") as imu,
+        node_in(imu) as there,
+    ):
+        values = iter(range(10**6))
+        far = there.subscribe("leds", Led, queue=10**4)
+        a.advertise("leds", Led, r2p.Periodic(0.01, lambda: Led(led=next(values))))
+        await asyncio.sleep(8)
+        classes = {sample.publisher_class for sample in list(far.queue)[-100:]}
+        assert classes == {r2p.PublisherClass.PERIODIC if reserve else r2p.PublisherClass.SPORADIC}
+        got = drain(far)
+        assert got == sorted(set(got))
+        assert len(got) > 300
+        assert ways(gw)["memory:a", "sim:bus"][1] == {}

@@ -1,0 +1,198 @@
+"""Robots of several networks, joined by gateways that come and go, and messages that the test can tell apart."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections import Counter, defaultdict
+from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, Self
+
+import msgspec
+
+import r2p
+from r2p.names import MANAGEMENT
+from r2p.testing.network import node_in
+from r2p.transports.memory import Frame, MemoryLink, MemoryNetwork
+
+if TYPE_CHECKING:
+    import random
+    from collections.abc import Iterable
+
+_MANAGEMENT = MANAGEMENT.encode()
+
+
+class Numbered(r2p.Message):
+    """A message that is unlike any other."""
+
+    number: r2p.u32
+
+
+def number_of(data: bytes) -> int:
+    return int(struct.unpack("<I", data)[0])
+
+
+class TestNetwork(MemoryNetwork):
+    """Doubles only what gateways and modules say of themselves, and remembers which messages it lost.
+
+    `anonymous`: messages have no number and no source, as on CAN and the debug line.
+    """
+
+    __test__ = False
+
+    def __init__(self, *, anonymous: bool = False) -> None:
+        super().__init__()
+        self.anonymous = anonymous
+        self.hurt: set[int] = set()
+
+    @property
+    def full(self) -> bool:
+        """Never: a message that is refused for want of room would be lost on the way."""
+        return False
+
+    def send(self, frame: Frame) -> None:
+        if self.anonymous and frame.topic != _MANAGEMENT:
+            frame = msgspec.structs.replace(frame, sequence=0, module="", node="", hops=0)
+        super().send(frame)
+
+    def _send_to(self, address: int, frame: Frame) -> None:
+        if frame.topic == _MANAGEMENT:
+            super()._send_to(address, frame)
+            return
+        duplicate, self.duplicate, lost = self.duplicate, 0.0, self.counts["lost"]
+        super()._send_to(address, frame)
+        self.duplicate = duplicate
+        if self.counts["lost"] != lost:
+            self.hurt.add(number_of(frame.data))
+
+
+class Gateway:
+    """A gateway that can crash."""
+
+    def __init__(self, name: str, networks: str) -> None:
+        self.name = name
+        self.networks = networks
+        self.module: r2p.Module | None = None
+
+
+class Speaker:
+    """A module with one node that publishes one topic and subscribes another."""
+
+    def __init__(self, network: str, publishes: str, subscribes: str) -> None:
+        self.network = network
+        self.publishes = publishes
+        self.subscribes = subscribes
+        self.publisher: r2p.Publisher[Numbered] | None = None
+        self.got: Counter[int] = Counter()
+
+
+class World:
+    """Everything; open it under virtual time."""
+
+    def __init__(self, chance: random.Random, *, anonymous: bool = False) -> None:
+        self.chance = chance
+        self.networks: dict[str, TestNetwork] = defaultdict(lambda: TestNetwork(anonymous=anonymous))
+        self.gateways: list[Gateway] = []
+        self.speakers: list[Speaker] = []
+        self.said: dict[int, Speaker] = {}
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        await self._stack.__aenter__()
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        await self._stack.aclose()
+
+    def faults(self, **faults: float) -> None:
+        for network in self.networks.values():
+            for name, value in faults.items():
+                setattr(network, name, value)
+
+    async def join(self, networks: str) -> Gateway:
+        """A gateway starts."""
+        gateway = Gateway(f"GW{len(self.gateways)}", networks)
+        self.gateways.append(gateway)
+        await self.start(gateway)
+        return gateway
+
+    async def start(self, gateway: Gateway) -> None:
+        via = [self.networks[name].transport(f"{name}{index}") for index, name in enumerate(gateway.networks)]
+        gateway.module = r2p.Module(gateway.name, via=via, bridge=True, watchdog=False)
+        await self._stack.enter_async_context(gateway.module)
+
+    async def crash(self, gateway: Gateway) -> None:
+        """It is gone without a word: what it still says nobody hears."""
+        assert gateway.module is not None
+        for link in gateway.module.links:
+            assert isinstance(link, MemoryLink)
+            link.network.unplug(link._address)
+            link.network = link._port.network = MemoryNetwork()
+        module, gateway.module = gateway.module, None
+        await module.__aexit__(None, None, None)
+
+    async def speak(self, network: str, publishes: str, subscribes: str) -> Speaker:
+        """A module starts."""
+        speaker = Speaker(network, publishes, subscribes)
+        name = f"M{len(self.speakers)}"
+        self.speakers.append(speaker)
+        via = self.networks[network].transport(network)
+        module = await self._stack.enter_async_context(r2p.Module(name, via=via, watchdog=False))
+        node = await self._stack.enter_async_context(node_in(module))
+        speaker.publisher = node.advertise(publishes, Numbered)
+        subscriber = node.subscribe(subscribes, Numbered, queue=4096)
+
+        async def listen(_: r2p.Node) -> None:
+            async for sample in subscriber.samples():
+                speaker.got[number_of(sample.data)] += 1
+
+        module.start(listen)
+        return speaker
+
+    def say(self) -> int:
+        """Somebody publishes something."""
+        speaker = self.chance.choice(self.speakers)
+        number = len(self.said) + 1
+        self.said[number] = speaker
+        assert speaker.publisher is not None
+        speaker.publisher.publish_nowait(Numbered(number=number))
+        return number
+
+    async def talk(self, seconds: float, pause: float = 0.03) -> list[int]:
+        """Messages at random instants for a while."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + seconds
+        said = []
+        while loop.time() < end:
+            said.append(self.say())
+            await asyncio.sleep(self.chance.uniform(0, 2 * pause))
+        return said
+
+    # What should be
+
+    def twice(self) -> dict[int, int]:
+        """Messages that somebody got more than once."""
+        return {number: count for each in self.speakers for number, count in each.got.items() if count > 1}
+
+    def missing(self, numbers: Iterable[int]) -> list[tuple[int, str, str]]:
+        """Messages that did not reach everybody, though no network lost them: number, from, to."""
+        hurt = set().union(*(network.hurt for network in self.networks.values()))
+        return [
+            (number, self.said[number].network, listener.network)
+            for number in numbers
+            if number not in hurt
+            for listener in self.speakers
+            if listener.subscribes == self.said[number].publishes
+            and listener.network in self.connected(self.said[number].network)
+            and not listener.got[number]
+        ]
+
+    def connected(self, network: str) -> set[str]:
+        """The networks that can be reached from this one."""
+        reached = {network}
+        while True:
+            joined = [set(each.networks) for each in self.gateways if each.module is not None]
+            more = reached.union(*(networks for networks in joined if networks & reached))
+            if more == reached:
+                return reached
+            reached = more

@@ -1,0 +1,168 @@
+"""`r2p gateway` without processes: what it shows, publishes and takes as options."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+import typer
+
+import r2p
+from r2p.bridge import BridgeOptions, GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge.options import ClassOf, Policy, is_link, rule
+from r2p.bridge.shaping import Shaper
+from r2p.msg import GatewayStatus, Led
+from r2p.sample import PublisherClass, Sample, Source
+from r2p.testing.network import node_in
+from r2p.tools import gateway
+from r2p.tools.gateway import Rates, Screen, serve, table
+from r2p.tools.output import Output
+from r2p.tools.session import Usage
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+SECOND = 1_000_000_000
+PORTS = [
+    PortStatistics("rtcan:can0", "forwarding", 1, {}),
+    PortStatistics("zenoh:", "alone", 0, {"converging": 3}),
+]
+
+
+def ways(forwarded: int) -> list[WayStatistics]:
+    return [
+        WayStatistics("encoder", "rtcan:can0", "zenoh:", forwarded, {"late": 2}),
+        WayStatistics("encoder", "zenoh:", "rtcan:can0", 0, {}),
+    ]
+
+
+def test_the_table() -> None:
+    rates = Rates()
+    rates.rows(GatewayStatistics(PORTS, ways(100)), 1 * SECOND)
+    rows = rates.rows(GatewayStatistics(PORTS, ways(300)), 3 * SECOND)
+    assert table(rows).splitlines() == [
+        "LINK        STATE                     DROPPED",
+        "rtcan:can0  forwarding (1 more here)",
+        "zenoh:      alone                     3 converging",
+        "",
+        "TOPIC    FROM        TO      RATE     FORWARDED  DROPPED",
+        "encoder  rtcan:can0  zenoh:  100.0/s  300        2 late",
+    ]
+
+
+@pytest.mark.virtual_time
+async def test_the_table_stays_in_its_place_until_something_is_logged() -> None:
+    stream = io.StringIO()
+    output = Output("yaml", stream)
+    output.format = "text"
+    screen = Screen(output)
+    rows = Rates().rows(GatewayStatistics(PORTS, []), SECOND)
+    await screen.draw(rows)
+    await screen.draw(rows)
+    assert stream.getvalue().count("\x1b[4F\x1b[J") == 1
+    gateway.logger.warning("something happened")
+    await screen.draw(rows)
+    assert stream.getvalue().count("\x1b[") == 2
+    screen.close()
+
+
+@pytest.mark.virtual_time
+async def test_the_counters_are_on_a_topic_and_in_a_pipe() -> None:
+    stream = io.StringIO()
+    serving = asyncio.create_task(serve("GW", ["memory:a", "memory:b"], BridgeOptions(), Output("json", stream)))
+    async with (
+        r2p.Module("A", via="memory:a") as one,
+        node_in(one) as a,
+        r2p.Module("B", via="memory:b") as other,
+        node_in(other) as b,
+    ):
+        leds, status = a.advertise("leds", Led), b.subscribe("gateway", GatewayStatus, queue=100)
+        b.subscribe("leds", Led)
+        await leds.wait_subscriber()
+        for number in range(10):
+            await leds.publish(Led(led=number))
+        await asyncio.sleep(2)
+        heard = {(each.source, each.target, each.topic): each async for each in drained(status)}
+        assert heard["memory:a", "memory:b", "leds"].forwarded == 10
+        assert heard["memory:a", "", ""].state == "alone"
+    serving.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await serving
+    printed = [json.loads(line) for line in stream.getvalue().splitlines()]
+    last = [each for each in printed if each["topic"] == "leds"][-1]
+    assert last["forwarded"] == 10
+
+
+async def drained(status: r2p.Subscriber[GatewayStatus]) -> AsyncIterator[GatewayStatus]:
+    for _ in range(len(status.queue)):
+        yield await status.fetch()
+
+
+@pytest.mark.parametrize("text", ["", "@", "leds@", "leds@a>", "@a"])
+def test_rules_without_sense(text: str) -> None:
+    with pytest.raises(r2p.Error, match="write TOPIC, TOPIC@FROM"):
+        rule(text)
+
+
+def test_links_are_meant_by_name_kind_or_pattern() -> None:
+    assert all(is_link("tcp:10.0.0.5:23", each) for each in ("tcp", "tcp:10.0.0.5:23", "tcp:10.*", "*"))
+    assert not any(is_link("tcp:10.0.0.5:23", each) for each in ("tcp-listen", "tcp:", "zenoh", ""))
+
+
+def test_loader_topics_come_in_from_ip_links_only_with_permission() -> None:
+    strict, open_ = Policy(BridgeOptions()), Policy(BridgeOptions(allow_control=True))
+    for link in ("tcp:10.0.0.5:23", "zenoh:"):
+        assert not strict.allows("BOOT_IMU1", link, "rtcan:can0")
+        assert strict.allows("BOOT_IMU1", "rtcan:can0", link)
+        assert open_.allows("BOOT_IMU1", link, "rtcan:can0")
+        assert strict.allows_order(link, "rtcan:can0", harmless=True)
+        assert not strict.allows_order(link, "rtcan:can0", harmless=False)
+    assert strict.allows("BOOT_IMU1", "serial:/dev/ttyUSB0", "rtcan:can0")
+
+
+def test_mistakes_are_told() -> None:
+    with pytest.raises(Usage, match="--deny 'leds@': write TOPIC"):
+        gateway._rules(["leds@"], "--deny")
+    with pytest.raises(Usage, match="--rate-limit leds: write it as TOPIC=HZ"):
+        list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
+    with pytest.raises(typer.BadParameter, match="periodic:10ms"):
+        gateway._class("often")
+
+
+# Classes on the way
+
+
+def sample(stamp: int = SECOND, publisher_class: PublisherClass = PublisherClass.NON_REAL_TIME) -> Sample:
+    return Sample(b"12345", Source("A", "n", "tcp:x"), stamp, publisher_class=publisher_class)
+
+
+def test_what_a_debug_line_brings_gets_the_class_that_it_can_not_say() -> None:
+    klass = ClassOf(PublisherClass.SPORADIC, 0.02)
+    policy = Policy(BridgeOptions(classes={"enc*": klass}))
+    assert policy.class_of("encoder", "tcp:10.0.0.5:23") == klass
+    assert policy.class_of("leds", "tcp:10.0.0.5:23") is None
+    assert policy.class_of("encoder", "zenoh:") is None
+    shaper = Shaper.of(rate=None, klass=klass, soften=False)
+    assert shaper is not None
+    shaped = shaper.shape(sample(), 0)
+    assert shaped is not None
+    assert (shaped.publisher_class, shaped.deadline) == (PublisherClass.SPORADIC, SECOND + SECOND // 50)
+    assert not shaped.drop_late  # nobody who published it has said so
+
+
+def test_periodic_messages_are_due_within_their_period() -> None:
+    shaper = Shaper.of(rate=None, klass=None, soften=True)
+    assert shaper is not None
+    periodic = [sample(n * SECOND // 100, PublisherClass.PERIODIC) for n in range(1, 5)]
+    last = [shaper.shape(each, 0) for each in periodic][-1]
+    assert last is not None
+    assert (last.publisher_class, last.deadline - last.stamp) == (PublisherClass.SPORADIC, SECOND // 100)
+    plain = sample()
+    assert shaper.shape(plain, 0) is plain
+
+
+def test_nothing_to_change() -> None:
+    assert Shaper.of(rate=None, klass=None, soften=False) is None
