@@ -24,12 +24,12 @@ from r2p.clock import Ticker
 from r2p.names import module_name_from
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Quiet, Usage, Verbose, execute, settings
+from r2p.transports.rtcan.interface import ARPHRD_CAN, Interface, interfaces, socketcan
 
-EXTRAS = {"serial": "pyserial"}
+EXTRAS = {"can": "python-can", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
 """The extras of r2p, and the package that each brings."""
 
 _ROOT = Path("/")
-_ARPHRD_CAN = "280"  # linux/if_arp.h
 _UP = 1  # IFF_UP
 _PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttyS*", "rfcomm*", "cu.usb*")
 _TICK = 1_000_000  # ns
@@ -38,7 +38,7 @@ _LATE = 1_000_000  # ns; a 99th percentile above it spoils periods of some milli
 
 
 class Check(msgspec.Struct, frozen=True):
-    """One thing that was looked at: what was found, and what to do if it is not `ok`."""
+    """One thing that was looked at: what was found, and what to do if it is not `ok`, or could be better."""
 
     what: str
     ok: bool
@@ -155,27 +155,55 @@ def network(root: Path = _ROOT) -> Check:
     return Check("interfaces", False, "no network interface is up", "ip link")
 
 
-def can(root: Path = _ROOT) -> Iterator[Check]:
-    """CAN interfaces, and how to bring up those that are down."""
-    interfaces = [each for each in _interfaces(root) if _is_can(each)]
-    for interface in interfaces:
-        name = interface.name
-        if _is_up(interface):
-            yield Check("CAN", True, f"{name} is up")
-        elif "virtual" in interface.resolve().parts:
-            yield Check("CAN", False, f"{name} is down", f"sudo ip link set {name} up")
-        else:
-            yield Check("CAN", False, f"{name} is down", f"sudo ip link set {name} up type can bitrate 1000000")
-    if not interfaces:
-        yield Check("CAN", False, f"no interface{_can_sockets()}: only RTCAN needs one")
+def can(root: Path = _ROOT, told: dict[str, Interface] | None = None) -> Iterator[Check]:
+    """CAN interfaces, what the kernel has told about them, and how to bring up those that are down."""
+    told = _told() if told is None else told
+    names = [each for each in _interfaces(root) if _is_can(each)]
+    for each in names:
+        yield _can_interface(told.get(each.name) or _seen(each))
+    if not names:
+        sockets = socketcan()
+        nor = "" if sockets else ", nor CAN sockets in the kernel"
+        first = "" if sockets else "sudo modprobe can_raw\n"
+        do = f"{first}plug an adapter in; ip link\nor a virtual one: sudo ip link add dev vcan0 up type vcan"
+        yield Check("CAN", False, f"no interface{nor}: only RTCAN needs one", do)
 
 
-def _can_sockets() -> str:
+def _told() -> dict[str, Interface]:
     try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (AttributeError, OSError):
-        return ", nor CAN sockets in the kernel"
-    return ""
+        return {each.name: each for each in interfaces()}
+    except (OSError, AttributeError):  # AttributeError: not Linux
+        return {}
+
+
+def _seen(folder: Path) -> Interface:
+    """What the files tell of an interface."""
+    return Interface(folder.name, "vcan" if "virtual" in folder.resolve().parts else "can", up=_is_up(folder))
+
+
+def _can_interface(there: Interface) -> Check:
+    if there.trouble:
+        found, _, do = there.trouble.partition(": ")
+        return Check("CAN", False, found, do)
+    found = ", ".join([f"{there.name} is up", *_can_details(there)])
+    if there.kind != "can" or there.one_shot:
+        return Check("CAN", True, f"{found}: --via rtcan:{there.name}")
+    again = f"sudo ip link set {there.name} down\n{there.command()}"
+    return Check("CAN", True, f"{found}; in one-shot mode, if its driver has it, laxity is fresh at each try", again)
+
+
+def _can_details(there: Interface) -> Iterator[str]:
+    if there.bitrate:
+        yield f"{there.bitrate / 1000:g} kbit/s"
+    if there.state:
+        yield there.state
+    yield from sorted(there.modes)
+    if there.restart_ms:
+        yield f"restarts {there.restart_ms} ms after bus-off"
+    elif there.restart_ms == 0:
+        yield "stays in bus-off"
+    if there.errors and any(there.errors):
+        yield f"error counters {there.errors[0]} (transmit), {there.errors[1]} (receive)"
 
 
 def _interfaces(root: Path) -> list[Path]:
@@ -184,7 +212,7 @@ def _interfaces(root: Path) -> list[Path]:
 
 
 def _is_can(interface: Path) -> bool:
-    return _read(interface / "type") == _ARPHRD_CAN
+    return _read(interface / "type") == str(ARPHRD_CAN)
 
 
 def _is_up(interface: Path) -> bool:

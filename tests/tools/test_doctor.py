@@ -12,10 +12,13 @@ import pytest
 
 from r2p.tools import doctor
 from r2p.tools.doctor import Check
+from r2p.transports.rtcan.interface import Interface
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+RETRIES = "in one-shot mode, if its driver has it, laxity is fresh at each try"
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="looks into Linux's files")
 
@@ -46,18 +49,47 @@ def test_can_interfaces_that_are_down_get_their_command(tmp_path: Path) -> None:
     interface(tmp_path, "vcan0", up=False, virtual=True)
     interface(tmp_path, "eth0", kind=1, up=True)
     interface(tmp_path, "wlan0", kind=1, up=False)
-    assert findings(doctor.can(tmp_path)) == [
-        (True, "can0 is up", ""),
-        (False, "can1 is down", "sudo ip link set can1 up type can bitrate 1000000"),
+    told = {"can0": Interface("can0", "can", up=True, bitrate=500_000, modes=frozenset({"one-shot"}), restart_ms=100)}
+    assert findings(doctor.can(tmp_path, told)) == [
+        (True, "can0 is up, 500 kbit/s, one-shot, restarts 100 ms after bus-off: --via rtcan:can0", ""),
+        (False, "can1 is down", "sudo ip link set can1 up type can bitrate 1000000 one-shot on restart-ms 100"),
         (False, "vcan0 is down", "sudo ip link set vcan0 up"),
     ]
     assert doctor.network(tmp_path) == Check("interfaces", True, "eth0")
+
+
+@pytest.mark.parametrize(
+    ("there", "ok", "found", "do"),
+    [
+        (Interface("vcan0", "vcan", up=True), True, "vcan0 is up: --via rtcan:vcan0", ""),
+        (
+            Interface("can0", "can", up=True, bitrate=125_000, state="error-passive", restart_ms=0, errors=(128, 3)),
+            True,
+            "can0 is up, 125 kbit/s, error-passive, stays in bus-off, error counters 128 (transmit), 3 (receive); "
+            + RETRIES,
+            "sudo ip link set can0 down\nsudo ip link set can0 up type can bitrate 125000 one-shot on restart-ms 100",
+        ),
+        (
+            Interface("can0", "can", up=True, state="bus-off", restart_ms=0),
+            False,
+            "can0 is in bus-off",
+            "sudo ip link set can0 type can restart",
+        ),
+    ],
+    ids=["virtual", "not one-shot", "bus-off"],
+)
+def test_what_the_kernel_tells_of_a_can_interface(
+    tmp_path: Path, there: Interface, ok: bool, found: str, do: str
+) -> None:
+    interface(tmp_path, there.name, up=there.up)
+    assert findings(doctor.can(tmp_path, {there.name: there})) == [(ok, found, do)]
 
 
 def test_no_interfaces_at_all(tmp_path: Path) -> None:
     (check,) = doctor.can(tmp_path)
     assert not check.ok
     assert check.found.startswith("no interface")
+    assert "sudo ip link add dev vcan0 up type vcan" in check.do
     assert not doctor.network(tmp_path).ok
 
 

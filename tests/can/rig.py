@@ -1,0 +1,186 @@
+"""Virtual CAN interfaces, programs beside r2p, and a user of a port that remembers what it was told."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+from r2p.clock import clock_of
+from r2p.transports.rtcan.socketcan import SocketCanPort
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from r2p.codecs.rtcan import Frame
+    from r2p.protocols.rtcan.events import Mailbox, Outcome
+    from r2p.transports.rtcan.port import CanPort
+
+GUARD = 30.0
+"""Seconds after which something that should have happened will not."""
+
+_LISTENERS = Path("/proc/net/can")
+_numbers = itertools.count()
+
+
+def ip(*arguments: str) -> None:
+    """`ip link` with these arguments."""
+    subprocess.run(("ip", "link", *arguments), check=True)
+
+
+def add(name: str) -> None:
+    ip("add", "dev", name, "up", "type", "vcan")
+
+
+def new_name() -> str:
+    return f"vcan{next(_numbers)}"
+
+
+def cansend(name: str, frame: str) -> None:
+    """A frame as candump prints it in logs, such as "1FFFFFFF#0102"."""
+    subprocess.run(("cansend", name, frame), check=True)
+
+
+def cangen(name: str, count: int) -> None:
+    """Frames as fast as can be, while the loop stands still: numbered, and 8 bytes of which the first counts."""
+    subprocess.run(("cangen", name, "-e", "-g", "0", "-I", "i", "-L", "8", "-D", "i", "-n", str(count)), check=True)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """The kernel tells nobody who begins to listen: look until it is so."""
+    async with asyncio.timeout(GUARD):
+        while not condition():  # noqa: ASYNC110 - what is awaited is not in this process
+            await asyncio.sleep(0.002)
+
+
+def listeners(name: str) -> int:
+    """How many filters programs have set on an interface."""
+    files = [file for file in _LISTENERS.glob("rcvlist_*") if file.name != "rcvlist_err"]
+    lines = itertools.chain.from_iterable(file.read_text(encoding="ascii").splitlines() for file in files)
+    return sum(line.split()[0] == name for line in lines if line.strip() and "device" not in line)
+
+
+class Candump:
+    """candump, as an async context manager inside which it listens."""
+
+    def __init__(self, name: str, *options: str) -> None:
+        self._command = ("candump", *options, name)
+        self._name = name
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def __aenter__(self) -> Self:
+        before = listeners(self._name)
+        self._process = await asyncio.create_subprocess_exec(*self._command, stdout=subprocess.PIPE)
+        await until(lambda: listeners(self._name) > before)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert self._process is not None
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+        await self._process.communicate()
+
+    async def line(self) -> str:
+        """What it prints next, with single spaces."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        async with asyncio.timeout(GUARD):
+            return " ".join((await self._process.stdout.readline()).decode().split())
+
+
+async def run_program(*command: str) -> str:
+    """What a program prints, once it has ended well."""
+    process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
+    async with asyncio.timeout(GUARD):
+        output, _ = await process.communicate()
+    assert process.returncode == 0, output
+    return output.decode()
+
+
+class User:
+    """Keeps what a port tells; `news` has one line for each change."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+        self.stamps: list[int] = []
+        self.outcomes: list[tuple[Mailbox, Outcome]] = []
+        self.instants: list[int] = []
+        self.faults: list[str] = []
+        self.news: list[str] = []
+        self.on_confirm: Callable[[], object] = lambda: None
+        self._changed = asyncio.Event()
+
+    def received(self, frame: Frame, stamp: int) -> None:
+        self.frames.append(frame)
+        self.stamps.append(stamp)
+        self._changed.set()
+
+    def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+        self.outcomes.append((mailbox, outcome))
+        self.instants.append(at)
+        self.on_confirm()
+        self._changed.set()
+
+    def up(self) -> None:
+        self._tell("up")
+
+    def down(self, reason: str) -> None:
+        self._tell(f"down: {reason}")
+
+    def waits(self, reason: str) -> None:
+        self._tell(f"waits: {reason}")
+
+    def fault(self, kind: str) -> None:
+        self.faults.append(kind)
+        self._changed.set()
+
+    def has(self, count: int) -> bool:
+        """Whether that many frames came in."""
+        return len(self.frames) >= count
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        """Until something it was told makes this true."""
+        async with asyncio.timeout(GUARD):
+            while not condition():
+                self._changed.clear()
+                await self._changed.wait()
+
+    def wake(self) -> None:
+        """Let `until` look again."""
+        self._changed.set()
+
+    def _tell(self, line: str) -> None:
+        if self.news[-1:] != [line]:
+            self.news.append(line)
+        self._changed.set()
+
+
+@contextlib.asynccontextmanager
+async def using(port: CanPort) -> AsyncIterator[User]:
+    """A user of a port that runs, and is up."""
+    user = User()
+    running = asyncio.create_task(port.run(user, lambda: None), name="port")
+    running.add_done_callback(lambda _: user.wake())
+    try:
+        await user.until(lambda: running.done() or user.news)
+        yield user
+    finally:
+        running.cancel()
+        await asyncio.wait([running])
+    if not running.cancelled():
+        running.result()
+
+
+@contextlib.asynccontextmanager
+async def port_on(name: str) -> AsyncIterator[tuple[SocketCanPort, User]]:
+    """A port on an interface, and its user."""
+    port = SocketCanPort(name)
+    async with using(port) as user:
+        yield port, user
+
+
+def now() -> int:
+    return clock_of().monotonic()

@@ -1,0 +1,65 @@
+"""Simulated CAN controllers whose every word is written down."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from r2p.clock import clock_of
+from r2p.codecs.rtcan import Frame, encode_identifier, frame_bits
+from r2p.sim.can import CanBus, CanController, CanNode, Record
+
+BIT = 1000  # ns at 1 Mbit/s
+GAP = 3 * BIT
+
+LOW = Frame(encode_identifier(1, 0x0205), b"urgent")
+MIDDLE = Frame(encode_identifier(20, 0x0206), b"soon")
+HIGH = Frame(encode_identifier(63, 0x0207), b"whenever")
+
+
+def bits(frame: Frame) -> int:
+    return frame_bits(frame.id, frame.data)
+
+
+def length(frame: Frame) -> int:
+    return bits(frame) * BIT
+
+
+class Watch:
+    """Writes down what its controllers hear, and what the bus did."""
+
+    def __init__(self, bus: CanBus) -> None:
+        self.records: list[Record] = []
+        self.heard: list[tuple[Any, ...]] = []
+        bus.observers.append(self.records.append)
+
+    def add(self, controller: CanController) -> CanController:
+        name = controller.name
+
+        def write(what: str) -> Any:
+            return lambda *args: self.heard.append((what, name, *args))
+
+        controller.on_receive = write("received")
+        controller.on_sent = write("sent")
+        controller.on_lost = write("lost")
+        controller.on_error = write("error")
+        controller.on_late = write("late")
+        controller.on_state = write("state")
+        return controller
+
+    def of(self, what: str) -> list[tuple[Any, ...]]:
+        return [entry[1:] for entry in self.heard if entry[0] == what]
+
+    @property
+    def spans(self) -> list[tuple[int, int, Frame]]:
+        return [(record.start, record.end, record.frame) for record in self.records]
+
+
+def make(*names: str, seed: int = 0, **settings: Any) -> tuple[CanBus, Watch, list[CanController]]:
+    bus = CanBus(asyncio.get_running_loop(), seed=seed)
+    watch = Watch(bus)
+    return bus, watch, [watch.add(bus.attach(CanNode(name, **settings))) for name in names]
+
+
+async def at(instant: int) -> None:
+    await asyncio.sleep((instant - clock_of().monotonic()) / 1e9)
