@@ -7,7 +7,7 @@ import sys
 
 from benchmarks.table import show
 
-ALL = ("delivery", "priority", "codecs", "network", "timers", "start")
+ALL = ("delivery", "priority", "codecs", "network", "zenoh", "gateway", "rtcan", "timers", "start", "socketcan")
 
 
 def main() -> None:
