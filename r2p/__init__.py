@@ -10,6 +10,8 @@ Nodes are coroutine functions that exchange typed messages on topics; modules ru
     r2p.run(blink, via="tcp:192.168.0.10:23")
 """
 
+from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics, PortStatistics, WayStatistics
+from r2p.classes import Missed, NonRealTime, Periodic, Sporadic
 from r2p.errors import (
     Broken,
     Closed,
@@ -23,6 +25,7 @@ from r2p.errors import (
     TransportError,
     TypeMismatch,
 )
+from r2p.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
 from r2p.messages import (
     Layout,
     Len,
@@ -40,37 +43,34 @@ from r2p.messages import (
     u32,
     u64,
 )
-from r2p.module import LinkDown, LinkUp, LinkWaits, Listening, Module, ModuleEvent
-from r2p.network import Endpoint, ModuleView, Network, TopicView
+from r2p.module import Module
+from r2p.network import Endpoint, ModuleView, NetworkView, TopicView
 from r2p.node import Node, Tick
 from r2p.protocols.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
-from r2p.publisher import (
-    Missed,
-    NonRealTime,
-    Periodic,
-    PeriodicPublisher,
-    Publisher,
-    Sporadic,
-    SporadicPublisher,
-)
+from r2p.publisher import PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runner import run, run_main
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.subscriber import Subscriber
+from r2p.supervisor import NodeFunction, name_of
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "BridgeOptions",
     "Broken",
+    "ClassOf",
     "Closed",
     "Command",
     "Deadlock",
     "DecodeError",
     "Endpoint",
     "Error",
+    "GatewayStatistics",
     "InvalidName",
     "Layout",
     "Len",
     "LinkDown",
+    "LinkNotice",
     "LinkUp",
     "LinkWaits",
     "Listening",
@@ -86,12 +86,14 @@ __all__ = [
     "ModuleView",
     "NameConflict",
     "NameTooLong",
-    "Network",
+    "NetworkView",
     "Node",
     "NodeCrashed",
+    "NodeFunction",
     "NonRealTime",
     "Periodic",
     "PeriodicPublisher",
+    "PortStatistics",
     "Publisher",
     "PublisherClass",
     "Sample",
@@ -104,6 +106,7 @@ __all__ = [
     "TopicView",
     "TransportError",
     "TypeMismatch",
+    "WayStatistics",
     "f32",
     "f64",
     "i8",
@@ -111,6 +114,7 @@ __all__ = [
     "i32",
     "i64",
     "layout",
+    "name_of",
     "run",
     "run_main",
     "u8",

@@ -1,7 +1,8 @@
-"""`r2p demo`: r2p at work on one computer, with modules that are emulated and links that are real.
+"""`r2p demo`: r2p at work on one computer, with hardware that is emulated and links that are real.
 
-`r2p demo line` starts two emulated modules with the firmware of 2014, IMU1 on a TCP connection and MOTOR1 on a pseudo
-terminal, as on a serial cable, and a module PC1 that talks to both over the debug line.
+`r2p demo` shows a whole robot, Triskar2: seven modules on a simulated RTCAN bus, and a PC that drives it along a square
+through the robot's gateway. `r2p demo line` starts two modules with the firmware of 2014, IMU1 on a TCP connection and
+MOTOR1 on a pseudo terminal, as on a serial cable, and a module PC1 that talks to both over the debug line.
 """
 
 from typing import Annotated, Literal
@@ -10,30 +11,48 @@ import typer
 
 from r2p.tools.session import Quiet, Verbose, execute, seconds
 
-_DURATION = 10.0  # seconds
+_ROBOT, _LINE = 20.0, 10.0  # seconds
 
 
 def command(
     what: Annotated[
-        Literal["line"], typer.Argument(help="line: the debug line, on TCP and on a serial port.")
-    ] = "line",
+        Literal["robot", "line"],
+        typer.Argument(help="robot: on a simulated CAN bus; line: the debug line, on TCP and on a serial port."),
+    ] = "robot",
     duration: Annotated[
-        float | None, typer.Option("--duration", parser=seconds, metavar="TIME", help="How long; default: 10 (s).")
+        float | None,
+        typer.Option("--duration", parser=seconds, metavar="TIME", help="How long; default: robot 20, line 10 (s)."),
     ] = None,
     verbose: Verbose = 0,
     quiet: Quiet = 0,
 ) -> None:
-    """Show r2p at work, without hardware: live for ten seconds, then a summary."""
+    """Show r2p at work, without hardware: live for some seconds, then a summary."""
 
-    async def main() -> None:
+    async def line() -> None:
         from r2p.tools._demo.robot import Robot
         from r2p.tools._demo.screen import Screen
 
         screen = Screen()
         async with Robot() as robot:
             screen.introduce(robot)
-            await screen.watch(robot, duration or _DURATION)
+            await screen.watch(robot, duration or _LINE)
             await robot.finish()
         screen.conclude(robot)
 
-    execute(main, verbose=verbose, quiet=quiet + 1)
+    async def robot() -> None:
+        from r2p.tools._sim.play import Play, play
+        from r2p.tools.sim import outside
+
+        await play(Play(duration=duration or _ROBOT, outside=tuple(outside()), laps=1))
+        typer.echo(_NEXT)
+
+    execute(robot if what == "robot" else line, verbose=verbose, quiet=quiet + 2)
+
+
+_NEXT = """
+Try next, in two terminals:
+  r2p sim triskar2             the same robot, until Ctrl-C; it says how to reach it
+  r2p topic list --via tcp:127.0.0.1:PORT
+  r2p run examples/teleop.py:keys --via tcp:127.0.0.1:PORT
+Or: r2p demo line
+With a robot: r2p doctor, then r2p topic list --via serial:/dev/ttyUSB0"""

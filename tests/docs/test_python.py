@@ -1,8 +1,8 @@
 """Python in the pages: every block is a program that runs, and that the type checker accepts.
 
 Programs run under virtual time, so that one that blinks for ever ends after LIMIT seconds of its own time, which take
-no time. `r2p.run` and `asyncio.run` are what is replaced; other transports than `memory:` are checked, and then left
-out.
+no time. `r2p.run` and `asyncio.run` are what is replaced; other transports than `memory:` and `sim:` are checked, and
+then left out.
 """
 
 import asyncio
@@ -52,7 +52,7 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
     def open_here(url: str) -> Transport:
         transport = open_transport(url)
-        return transport if url.startswith("memory:") else open_transport("memory:elsewhere")
+        return transport if url.startswith(("memory:", "sim:")) else open_transport("memory:elsewhere")
 
     def run_coroutine(main: Coroutine[Any, Any, T]) -> T | None:
         return run_bounded(lambda: main)

@@ -297,7 +297,7 @@ def test_local_time_and_back(true: int, offset: int, drift_ppm: float) -> None:
     async def main() -> None:
         clock = CanBus(asyncio.get_running_loop()).attach(CanNode("A", offset=offset, drift_ppm=drift_ppm)).clock
         local = clock.local(true)
-        assert abs(local - offset - true * (1 + drift_ppm / 1e6)) <= 1
+        assert abs(local - offset - true * (1 + drift_ppm / 1e6)) < 1.5  # 1, and what floats lose
         assert clock.local(clock.true(local)) >= local
         assert clock.local(clock.true(local) - 1) < local
 

@@ -84,7 +84,7 @@ def rows(text: str) -> dict[str, list[str]]:
 
 @pytest.mark.processes
 def test_in_a_pipe_it_prints_plain_text() -> None:
-    with process("demo", "--duration", "1") as child:
+    with process("demo", "line", "--duration", "1") as child:
         out, err = child.communicate()
     assert (child.returncode, err) == (0, "")
     assert out.isprintable() or set(re.findall(r"[^ -~]", out)) == {"\n"}
@@ -121,7 +121,7 @@ def _read(terminal: int) -> bytes:
 
 @pytest.mark.processes
 def test_a_signal_ends_it_well() -> None:
-    with process("demo", "--duration", "60") as child:
+    with process("demo", "line", "--duration", "60") as child:
         assert child.stdout is not None
         child.stdout.readline()
         child.send_signal(signal.SIGINT)
@@ -131,10 +131,21 @@ def test_a_signal_ends_it_well() -> None:
 
 @pytest.mark.processes
 def test_a_closed_pipe_ends_it_quietly() -> None:
-    with process("demo", "--duration", "60") as child:
+    with process("demo", "line", "--duration", "60") as child:
         assert child.stdout is not None
         child.stdout.readline()
         child.stdout.close()
         child.wait()
         assert child.stderr is not None
         assert (child.returncode, child.stderr.read()) == (0, "")
+
+
+@pytest.mark.processes
+def test_the_robot_drives_and_is_summed_up() -> None:
+    with process("demo", "--duration", "3") as child:
+        out, err = child.communicate()
+    assert (child.returncode, err) == (0, "")
+    assert re.search(r"r2p topic echo odometry --via tcp:127\.0\.0\.1:\d+", out)
+    assert re.search(r"^3\.\d s, [\d.]+ m driven", out, re.MULTILINE)
+    assert max(len(line) for line in out.splitlines()) <= 80
+    assert "Try next" in out

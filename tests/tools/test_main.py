@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -40,6 +41,18 @@ def test_mistakes_are_usage_errors(arguments: list[str], hint: str) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert hint in result.stderr
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+@pytest.mark.parametrize("arguments", [("--help",), ("topic", "--help"), ("doctor",)])
+def test_output_that_can_not_be_written_is_an_error_of_one_line(arguments: tuple[str, ...]) -> None:
+    program = f"import sys; sys.argv = ['r2p', *{list(arguments)}]; from r2p.tools.main import main; main()"
+    command = [sys.executable, "-c", program]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr == "r2p: can't write the output: No space left on device\n"
 
 
 def test_version() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from typing import TYPE_CHECKING
 
 import pytest
@@ -61,8 +62,10 @@ async def test_tools_are_listed_on_demand(capsys: pytest.CaptureFixture[str]) ->
 async def test_firmware_is_given_time_to_say_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     async with board(age=1.03) as (_, session):  # it has just said it
         await list_(session)
-    (row,) = printed(capsys)
+    captured = capsys.readouterr()
+    row = json.loads(captured.out)
     assert (row["module"], row["state"], row["kind"], row["age"]) == ("IMU1", "running", "firmware", 0.0)
+    assert "there may be more modules, listen longer with --wait 5" in captured.err
 
 
 async def test_nobody_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @pytest.fixture(autouse=True)
 def _as_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """No R2P_VIA, no r2p.toml, and the loggers as they were."""
+    """No R2P_VIA, no r2p.toml; and whatever a command did, the loggers are as they were."""
     monkeypatch.delenv("R2P_VIA", raising=False)
     monkeypatch.chdir(tmp_path)
     logger = logging.getLogger("r2p")
     before = logger.handlers[:], logger.propagate, logger.level
     yield
-    logger.handlers[:], logger.propagate, logger.level = before
+    assert (logger.handlers, logger.propagate, logger.level) == before
 
 
 # Settings
@@ -78,6 +78,12 @@ def test_what_the_file_holds(tmp_path: Path) -> None:
 def test_a_bad_file_is_told_with_its_name(text: str, tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text(text)
     with pytest.raises(Usage, match=re.escape(str(tmp_path / "r2p.toml"))):
+        settings()
+
+
+def test_a_key_that_is_unknown_is_told_with_those_that_are_known(tmp_path: Path) -> None:
+    (tmp_path / "r2p.toml").write_text('vai = "tcp:there"')
+    with pytest.raises(Usage, match="unknown field `vai`; it knows via, module, types, remap"):
         settings()
 
 

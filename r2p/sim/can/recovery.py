@@ -23,15 +23,15 @@ class Recovery:
         self._sequence = RECESSIVE * bit  # ns
         self.left: dict[CanController, int] = {}  # how many times more; without any, `busy` and `free` need no call
         self._since: dict[CanController, int] = {}  # from when on the bus was idle
-        self._idle = 0  # counts changes: a timer set before one does nothing
+        self._idle = 0  # counts the times that the bus became free or busy: a timer of another time does nothing
 
     def begin(self, controller: CanController, since: int) -> None:
         """This one counts from now, or from `since`, when the bus becomes idle."""
+        if not self.left:
+            self._idle += 1  # `busy` and `free` were not called: timers from before mean nothing
         self.left[controller] = _TIMES
         self._since[controller] = since
-        self._idle += 1
-        for each in self.left:
-            self._wait(each)
+        self._wait(controller)
 
     def forget(self, controller: CanController) -> None:
         """This one has died."""

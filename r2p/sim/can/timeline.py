@@ -1,8 +1,8 @@
 """The order of events on a bus, and of the timers of its nodes: a heap of instants under one timer of the loop.
 
-Turning asyncio's loop for each event would cost more than the event. So under virtual time the timeline moves the clock
-on by itself, for as long as nothing else in the loop is due: the same events at the same instants, only faster. On an
-ordinary loop it carries out what has become due; an event that the loop made late still has its own instant, `now()`.
+Turning asyncio's loop for each event would cost more than the event. So under virtual time the loop runs ahead through
+this heap, for as long as nothing else is due: the same events at the same instants, only faster. On an ordinary loop
+what has become due is carried out; an event that the loop made late still has its own instant, `now()`.
 """
 
 from __future__ import annotations

@@ -56,11 +56,12 @@ class Mailboxes:
         return [mailbox for mailbox, waiting in self._boxes.items() if waiting.handed]
 
     def put(self, now: int, order: Transmit) -> None:
-        """A frame for an empty mailbox."""
+        """A frame for an empty mailbox. That it is too late is told by `poll`: who heard it now would try again now."""
         due = order.not_before - self._latency
         latest = order.not_after - self._latency if order.not_after < NEVER else NEVER
-        self._boxes[order.mailbox] = _Waiting(order, due, latest)
-        self.poll(now)
+        waiting = self._boxes[order.mailbox] = _Waiting(order, due, latest)
+        if now <= latest:
+            self._offer(now, order.mailbox, waiting)
 
     def withdraw(self, now: int, mailbox: Mailbox) -> None:
         """Nobody wants it any more."""
@@ -107,10 +108,12 @@ class Mailboxes:
                     self._end(mailbox, Outcome.UNKNOWN, now)
             elif waiting.latest < now:
                 self._end(mailbox, Outcome.LATE, now)
-            elif waiting.due <= now and not (self._singly and self.handed):
-                self._hand_over(now, mailbox, waiting)
+            else:
+                self._offer(now, mailbox, waiting)
 
-    def _hand_over(self, now: int, mailbox: Mailbox, waiting: _Waiting) -> None:
+    def _offer(self, now: int, mailbox: Mailbox, waiting: _Waiting) -> None:
+        if waiting.due > now or (self._singly and self.handed):
+            return
         if self._send(waiting.order.frame, mailbox):
             waiting.handed = True
             waiting.due = now + self._patience

@@ -142,6 +142,8 @@ class _Batch:
             message.header.vectors, message.header.vector_count = ctypes.pointer(vector), 1
             message.header.control = ctypes.addressof(self._controls) + index * _CONTROL.size
             message.header.control_length = _CONTROL.size
+        self._frame_bytes = memoryview(self._frames)
+        self._control_bytes = memoryview(self._controls)
         self._fresh = bytes(self._messages)  # the kernel overwrites the lengths
         words = memoryview(self._messages).cast("B").cast("I")
         self._flags = words[_Header.flags.offset // 4 :: ctypes.sizeof(_Message) // 4]
@@ -157,12 +159,13 @@ class _Batch:
         now = time.monotonic_ns()
         offset = time.time_ns() - now
         arrived: list[Arrived] = []
-        frames = _FRAME.iter_unpack(self._frames.raw[: count * _FRAME.size])
-        controls = _CONTROL.iter_unpack(self._controls.raw[: count * _CONTROL.size])
+        frames = _FRAME.iter_unpack(self._frame_bytes[: count * _FRAME.size])
+        controls = _CONTROL.iter_unpack(self._control_bytes[: count * _CONTROL.size])
         flags = self._flags[:count].tolist()
+        oldest = now - _OLDEST
         for (identifier, length, data), flag, control in zip(frames, flags, controls, strict=True):
             stamp = control[3] * _SECOND + control[4] - offset
-            if not now - _OLDEST < stamp < now:
+            if not oldest < stamp < now:
                 stamp = now
             arrived.append((identifier, data if length == 8 else data[:length], flag, stamp))
         if self._messages[count - 1].header.control_length > _STAMP_ONLY:

@@ -33,6 +33,7 @@ PATIENCE = 1_000_000_000
 PATIENCE_ONE_SHOT = 20_000_000
 """The same for a controller that tries once: nothing but the way to it and back takes time."""
 
+_MASK = socket.CAN_EFF_MASK
 _BATCHES = 16  # more than the socket's queue holds
 _LONGEST_WAIT = 2.0  # seconds between looks at an interface that is not there; changes are noticed before
 
@@ -209,16 +210,21 @@ class _Bus:
         return len(arrived)
 
     def _hand_out(self, arrived: list[rawsocket.Arrived]) -> None:
-        received = self._user.received
+        received, flags_of, plain, mask, own = (
+            self._user.received,
+            rawsocket.FLAGS,
+            rawsocket.DATA,
+            _MASK,
+            rawsocket.OWN,
+        )
         for identifier, data, flags, stamp in arrived:
-            kind = identifier & rawsocket.FLAGS
-            if kind == rawsocket.DATA:
-                if flags & rawsocket.OWN:
-                    self._own(identifier & socket.CAN_EFF_MASK, data, stamp)
-                else:
-                    received(Frame(identifier & socket.CAN_EFF_MASK, data), stamp)
+            kind = identifier & flags_of
+            if kind == plain and not flags & own:
+                received(Frame(identifier & mask, data), stamp)
+            elif kind == plain:
+                self._own(identifier & mask, data, stamp)
             elif kind & rawsocket.ERROR:
-                self._error(identifier & socket.CAN_EFF_MASK, data)
+                self._error(identifier & mask, data)
         while self._dropped < self._socket.dropped:
             self._dropped += 1
             self._user.fault("receive queue full")

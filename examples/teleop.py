@@ -1,0 +1,60 @@
+"""Drive a robot from the keyboard: w, a, s, d move it, q and e turn it, any other key stops it.
+
+r2p sim triskar2                                         in one terminal; it tells where its gateway is
+r2p run teleop.py:keys --via tcp:127.0.0.1:PORT          in another one
+
+When this program ends, or the cable is pulled, commands stop coming and the robot stops by itself.
+"""
+
+import contextlib
+import os
+import select
+import sys
+from collections.abc import Iterator
+
+import r2p
+from r2p.msg import Odometry, Velocity3
+
+SPEED, TURN = 0.3, 0.8  # m/s, rad/s
+MOVES = {
+    "w": Velocity3(x=SPEED),
+    "s": Velocity3(x=-SPEED),
+    "a": Velocity3(y=SPEED),
+    "d": Velocity3(y=-SPEED),
+    "q": Velocity3(w=TURN),
+    "e": Velocity3(w=-TURN),
+}
+
+
+@contextlib.contextmanager
+def single_keys() -> Iterator[None]:
+    """At a terminal: each key at once, without Return."""
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin) if sys.stdin.isatty() else None
+    try:
+        if before is not None:
+            tty.setcbreak(sys.stdin)
+        yield
+    finally:
+        if before is not None:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def typed() -> str:
+    """What was typed since the last time."""
+    ready, _, _ = select.select([sys.stdin], [], [], 0)
+    return os.read(sys.stdin.fileno(), 100).decode(errors="ignore") if ready else ""
+
+
+async def keys(node: r2p.Node) -> None:
+    commands = node.advertise("velocity_cmd", Velocity3, r2p.Sporadic(deadline=0.05))
+    odometry = node.subscribe("odometry", Odometry, lambda told: print(f"\r{told.pose}", end="   "), lossy=True)
+    command = Velocity3()
+    with single_keys():
+        async for _ in node.every(0.05):
+            for key in typed():
+                command = MOVES.get(key, Velocity3())
+            await commands.publish(command)
+            await odometry.serve()

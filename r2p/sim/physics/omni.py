@@ -1,0 +1,95 @@
+"""A body on three omni wheels, 120 degrees apart: its kinematics (thesis 8.1.1) and its dynamics.
+
+`wheel_speeds` is equation 8.2. Equation 8.1 of the thesis is its transpose, not its inverse: its rows for x and y need
+a factor 2/3, the one for the rotation 1/3; `body_velocity` has them. As in listing 8.1, x is forward and y to the left.
+"""
+
+import math
+import random
+from collections.abc import Sequence
+
+import msgspec
+
+from r2p.sim.physics.motor import Motor
+
+Triple = tuple[float, float, float]
+
+_COS30, _COS60 = math.cos(math.pi / 6), 0.5
+
+
+class OmniSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """What the body is made of. Default: Triskar2, about 20 kg and 2 m/s (thesis 8.1.1)."""
+
+    wheel_radius: float = 0.05
+    """m."""
+    arm: float = 0.20
+    """From the centre to each wheel, m."""
+    radius: float = 0.22
+    """Of the outline, m."""
+    mass: float = 20.0
+    """kg."""
+    inertia: float = 0.4
+    """About the vertical axis, kg m^2."""
+    wear: float = 0.2
+    """How much the radii of the wheels differ, one sigma, %."""
+
+    def wheel_speeds(self, x: float, y: float, w: float) -> Triple:
+        """Equation 8.2: speeds of the wheels (rad/s) for a velocity of the body (m/s, m/s, rad/s)."""
+        turn = self.arm * w
+        ahead, aside = _COS60 * x, _COS30 * y
+        radius = self.wheel_radius
+        return (ahead - aside - turn) / radius, (ahead + aside - turn) / radius, (-x - turn) / radius
+
+    def body_velocity(self, one: float, two: float, three: float) -> Triple:
+        """Equation 8.1 with the factors it lacks: velocity of the body for these speeds of the wheels."""
+        radius = self.wheel_radius
+        return (
+            2 / 3 * radius * (_COS60 * (one + two) - three),
+            2 / 3 * radius * _COS30 * (two - one),
+            -1 / 3 * radius / self.arm * (one + two + three),
+        )
+
+
+class OmniBody:
+    """The body, driven by the torques of three motors: what one wheel does, the other two feel.
+
+    In speeds of the wheels, the mass matrix of such a body is `own` on the diagonal plus `shared` everywhere, which has
+    a closed inverse. Wheels do not slip, but their radii differ a little: that is why odometry drifts.
+    """
+
+    def __init__(self, spec: OmniSpec, motors: Sequence[Motor], noise: random.Random) -> None:
+        self.spec = spec
+        self.motors = tuple(motors)
+        self.x = self.y = self.w = 0.0
+        """True pose: m, m, rad (not wrapped)."""
+        self.velocity: Triple = (0.0, 0.0, 0.0)
+        """True, in its own frame."""
+        self.path = 0.0
+        """Length of the way so far, m."""
+        self._wear = [noise.gauss(1.0, spec.wear / 100) for _ in range(3)]
+        square = spec.wheel_radius**2
+        self.own = self.motors[0].spec.inertia + 2 / 3 * spec.mass * square
+        """Inertia at each wheel, kg m^2."""
+        self.shared = spec.inertia * square / (9 * spec.arm**2) - 2 / 9 * spec.mass * square
+        """Between each two of them, kg m^2."""
+
+    def step(self, dt: float) -> None:
+        """Move on by `dt` seconds."""
+        torques = [motor.torque() for motor in self.motors]
+        common = self.shared / (self.own + 3 * self.shared) * sum(torques)
+        before = [motor.speed for motor in self.motors]
+        for motor, torque in zip(self.motors, torques, strict=True):
+            motor.turn(motor.speed + (torque - common) / self.own * dt, dt)
+        rolled = [
+            (old + motor.speed) / 2 * wear for old, motor, wear in zip(before, self.motors, self._wear, strict=True)
+        ]
+        self._move(self.spec.body_velocity(*rolled), dt)
+
+    def _move(self, velocity: Triple, dt: float) -> None:
+        x, y, w = self.velocity = velocity
+        heading = self.w + w * dt / 2
+        cos, sin = math.cos(heading), math.sin(heading)
+        self.x += (x * cos - y * sin) * dt
+        self.y += (x * sin + y * cos) * dt
+        self.w += w * dt
+        self.path += math.hypot(x, y) * dt

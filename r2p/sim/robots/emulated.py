@@ -1,0 +1,223 @@
+"""Triskar2 in one piece: its hardware modules on one network, and the body that their motors drive.
+
+    async with Triskar2("memory:robot", seed=1) as robot:
+        ...
+        print(robot.pose)
+
+The robot has the modules that the thesis lists (8.1.2): three motor modules, two proximity modules, power supply and
+gateway. Programs talk to it as to a real one, by its network or through its gateway; what only an emulated robot has,
+the true pose and a power switch for each module, is here.
+"""
+
+import asyncio
+import math
+import random
+from collections.abc import Iterable
+from types import TracebackType
+from typing import Self
+
+from r2p.msg import Speed3
+from r2p.publisher import AnyPublisher
+from r2p.sim.modules.board import Board
+from r2p.sim.modules.gateway import GatewayModule
+from r2p.sim.modules.motor import MotorConfig, MotorModule, Setpoints
+from r2p.sim.modules.plant import Plant
+from r2p.sim.modules.power_supply import PowerModule
+from r2p.sim.modules.proximity import ProximityModule
+from r2p.sim.physics.battery import Battery
+from r2p.sim.physics.drive import Drive
+from r2p.sim.physics.motor import Motor
+from r2p.sim.physics.omni import OmniBody, OmniSpec, Triple
+from r2p.sim.physics.pid import Gains, speed_gains
+from r2p.sim.physics.rangefinder import RangeSpec
+from r2p.sim.physics.world import World
+from r2p.sim.robots import triskar2
+from r2p.sim.robots.latest import Traffic
+from r2p.transports.link import Transport
+
+STEP = 0.002
+"""Seconds of the physics, and of the control of the motors."""
+FREQUENCY, DAMPING = 20.0, 0.8
+"""Natural frequency (rad/s) and damping of the wheels' speed control, as far as a wheel does not feel the others."""
+
+MOTORS = ("MOTOR1", "MOTOR2", "MOTOR3")
+PROXIMITY = {"PROX1": "prox_front", "PROX2": "prox_rear"}
+"""The proximity modules and their topics."""
+MODULES = (*MOTORS, *PROXIMITY, "PS", "GW")
+
+_SENSORS_AT = 0.12  # m from the centre: what touches the robot is at the sensors' shortest range
+_SENSOR_WIDTH = (-8.0, 0.0, 8.0)  # degrees
+_LOOK, _SETTLED = 0.02, 0.5  # seconds
+_ELECTRONICS = 0.25  # A that the modules take from the battery
+
+
+class Supply:
+    """What motors and modules take from the battery."""
+
+    def __init__(self, battery: Battery, motors: Iterable[Motor]) -> None:
+        self._battery = battery
+        self._motors = list(motors)
+
+    def step(self, dt: float) -> None:
+        """Move on by `dt` seconds."""
+        power = sum(motor.voltage * motor.current for motor in self._motors)
+        self._battery.current = _ELECTRONICS + power / self._battery.voltage
+        self._battery.step(dt)
+
+
+class Hardware:
+    """The body, its motors and its battery in the world: all that is not a module."""
+
+    def __init__(self, seed: object = 0, world: World | None = None, *, spec: OmniSpec = triskar2.BODY) -> None:
+        """Two of the same `seed` are the same."""
+        self.seed = seed
+        self.world = world or World()
+        self.motors = [Motor(triskar2.MOTOR) for _ in MOTORS]
+        self.body = OmniBody(spec, self.motors, self.noise("body"))
+        self.gains: Gains = speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING)
+        self.drives = [Drive(motor, self.gains) for motor in self.motors]
+        self.battery = Battery(triskar2.BATTERY)
+        self.plant = Plant([*self.drives, self.body, Supply(self.battery, self.motors)], dt=STEP)
+
+    @property
+    def pose(self) -> Triple:
+        """The true one: x and y in m, heading in rad, since the start."""
+        return self.body.x, self.body.y, self.body.w
+
+    def noise(self, part: str) -> random.Random:
+        """The random numbers of a part."""
+        return random.Random(f"{self.seed}/{part}")
+
+    def look(self, angle: float) -> float:
+        """What a range finder that points there (degrees from ahead) sees: the nearest in its beam, mm."""
+        at = self.body.w + math.radians(angle)
+        x = self.body.x + _SENSORS_AT * math.cos(at)
+        y = self.body.y + _SENSORS_AT * math.sin(at)
+        return 1000 * min(self.world.distance(x, y, at + math.radians(beam)) for beam in _SENSOR_WIDTH)
+
+
+class Triskar2:
+    """The robot, on the network `via`, for the time of an `async with` block.
+
+    `traffic` is the class of all hops of the command chain; None: those that the nodes choose. `modules`: those that
+    are here, where the others are somewhere else. `outside`: where the gateway lets computers in.
+    Raises TransportError for a `via` that can't work.
+    """
+
+    def __init__(
+        self,
+        via: str | Transport,
+        *,
+        seed: object = 0,
+        world: World | None = None,
+        traffic: Traffic | None = None,
+        modules: Iterable[str] | None = None,
+        outside: Iterable[str | Transport] = (),
+    ) -> None:
+        self.via = via
+        self.outside = list(outside)
+        self.hardware = Hardware(seed, world)
+        self.modules: dict[str, Board] = {}
+        """Those that are switched on, by name."""
+        self._traffic = traffic
+        self._names = list(modules or MODULES)
+
+    @property
+    def pose(self) -> Triple:
+        """The true one: x and y in m, heading in rad, since the start."""
+        return self.hardware.pose
+
+    async def __aenter__(self) -> Self:
+        await self.hardware.plant.__aenter__()
+        try:
+            for name in self._names:
+                await self.switch_on(name)
+        except BaseException:
+            await self._close()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._close()
+
+    async def ready(self, timeout: float | None = None) -> None:
+        """Wait until its network has admitted all that its modules publish, and has settled (who is RTCAN's master?).
+
+        Raises TimeoutError after `timeout` seconds.
+        """
+        time = asyncio.get_running_loop().time
+        async with asyncio.timeout(timeout):
+            since = time()
+            while time() < since + _SETTLED:
+                await asyncio.sleep(_LOOK)
+                before = time()
+                for publisher in self.publishers():
+                    await publisher.ready()
+                if time() > before or not all(link.up for board in self.modules.values() for link in board.links):
+                    since = time()
+
+    def publishers(self) -> list[AnyPublisher]:
+        """Of all nodes of its modules."""
+        nodes = [each.node for board in self.modules.values() for each in board.nodes.values()]
+        return [publisher for node in nodes for publisher in node.publishers]
+
+    async def switch_on(self, name: str) -> Board:
+        """Give a module its power."""
+        board = await self._make(name).__aenter__()
+        self.modules[name] = board
+        self._start_nodes(board)
+        return board
+
+    async def switch_off(self, name: str) -> None:
+        """Take it away. What its nodes do at their end is done; the others hear that it leaves."""
+        await self.modules.pop(name).__aexit__(None, None, None)
+
+    async def _close(self) -> None:
+        for name in reversed(list(self.modules)):
+            await self.switch_off(name)
+        await self.hardware.plant.__aexit__(None, None, None)
+
+    def _make(self, name: str) -> Board:
+        if name in MOTORS:
+            return self._motor(name, MOTORS.index(name))
+        if name in PROXIMITY:
+            return self._proximity(name, PROXIMITY[name])
+        if name == "GW":
+            return GatewayModule(name, via=self.via, outside=self.outside)
+        return PowerModule(name, battery=self.hardware.battery, topic="power", via=self.via)
+
+    def _motor(self, name: str, wheel: int) -> MotorModule:
+        ticks = triskar2.MOTOR.ticks_per_radian
+        config = MotorConfig(
+            setpoints=Setpoints("speed", Speed3, lambda speeds: speeds.value[wheel] * ticks),
+            timeout=triskar2.TIMEOUT,
+            encoder=f"encoder{wheel + 1}",
+            period=triskar2.PERIOD,
+            current=f"current{wheel + 1}",
+        )
+        return MotorModule(name, drive=self.hardware.drives[wheel], config=config, via=self.via)
+
+    def _proximity(self, name: str, topic: str) -> ProximityModule:
+        ahead = triskar2.SIDES[topic]
+
+        def look(number: int) -> float:
+            return self.hardware.look(ahead + triskar2.BEARINGS[number])
+
+        return ProximityModule(
+            name, look=look, noise=self.hardware.noise(name), spec=RangeSpec(), topic=topic, via=self.via
+        )
+
+    def _start_nodes(self, board: Board) -> None:
+        """The robot's own nodes, on the modules where the thesis has them (figure 8.3)."""
+        traffic = () if self._traffic is None else (self._traffic,)
+        match board.name:
+            case "MOTOR1":
+                board.start(triskar2.inverse_kinematics, *traffic, name="invkin")
+            case "MOTOR2":
+                board.start(triskar2.forward_kinematics, name="fwdkin")
+            case "PROX1":
+                board.start(triskar2.obstacle_avoidance, *traffic, name="obstacle")
+            case "PS":
+                board.start(triskar2.battery_monitor, name="battery")

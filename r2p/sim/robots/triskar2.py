@@ -1,0 +1,147 @@
+"""Triskar2, the omnidirectional robot of thesis 8.1: its nodes.
+
+    velocity_cmd -> obstacle -> velocity -> invkin -> speed -> three motor modules
+                        ^                     ^                       |
+                    proximity              encoders  <----------------+--> fwdkin -> odometry
+
+They use the public API and nothing else, so each of them runs anywhere, on this robot or on another one:
+
+    r2p run r2p.sim.robots.triskar2:inverse_kinematics=invkin --via rtcan:can0
+
+`r2p.sim.robots.emulated` puts the whole robot together, with its modules and its body.
+"""
+
+import functools
+import math
+
+import r2p
+from r2p.msg import Battery, Encoder, Odometry, Pose3, Proximity, Speed3, Velocity3
+from r2p.sim.physics.battery import BatterySpec
+from r2p.sim.physics.motor import MotorSpec
+from r2p.sim.physics.omni import OmniSpec
+from r2p.sim.robots.latest import Latest, Traffic, sender
+
+BODY = OmniSpec()
+MOTOR = MotorSpec()
+BATTERY = BatterySpec()
+
+PERIOD = 0.02
+"""Of speeds and encoders, s; of the whole command chain where all of it is hard real-time."""
+COMMANDS = 0.05
+"""Of velocity commands, s."""
+FRESH = 0.15
+"""Seconds for which a message of the chain counts."""
+TIMEOUT = 0.2
+"""Seconds without a setpoint after which a motor stops."""
+
+WHEELS = 3
+SIDES = {"prox_front": 0.0, "prox_rear": 180.0}
+"""Topics of the two proximity modules, and where they look, degrees from ahead."""
+BEARINGS = (67.5, 22.5, -22.5, -67.5)
+"""Of the four sensors of each, degrees from there."""
+
+_STOP = 0.15  # m: closer than this a sensor's reading always stops the robot
+_BRAKING = 0.4  # s: and so much further away for each m/s
+_AHEAD = math.cos(math.radians(60))
+_ROUNDS = 5  # encoder readings for one message of odometry: 10 Hz, thesis table 4.1
+_LOW = 20  # percent
+
+
+async def obstacle_avoidance(node: r2p.Node, traffic: Traffic = "srt") -> None:
+    """Pass `velocity_cmd` on as `velocity`; where something is in the way, only its rotation.
+
+    Where a proximity module is silent, the robot does not go.
+    """
+    sides = {angle: Latest(node, topic, Proximity, fresh=2 * FRESH) for topic, angle in SIDES.items()}
+
+    def blocked(command: Velocity3) -> bool:
+        speed = math.hypot(command.x, command.y)
+        for angle, latest in sides.items():
+            ranges = latest.message.ranges if latest.message else (0, 0, 0, 0)
+            for bearing, reading in zip(BEARINGS, ranges, strict=True):
+                at = math.radians(angle + bearing)
+                towards = command.x * math.cos(at) + command.y * math.sin(at)
+                if towards > _AHEAD * speed and reading / 1000 < _STOP + _BRAKING * towards:
+                    return True
+        return False
+
+    def velocity() -> Velocity3 | None:
+        command = commands.message
+        if command is None or not blocked(command):
+            return command
+        return Velocity3(w=command.w)
+
+    send = sender(node, "velocity", Velocity3, velocity, traffic=traffic, period=PERIOD)
+    commands = Latest(node, "velocity_cmd", Velocity3, fresh=FRESH, changed=send)
+    while True:
+        await node.spin()
+
+
+async def inverse_kinematics(node: r2p.Node, traffic: Traffic = "hrt") -> None:
+    """Make speeds of the wheels (`speed`, rad/s) of `velocity`; all stand still while one of them is silent."""
+    wheels = [Latest(node, f"encoder{wheel + 1}", Encoder, fresh=FRESH) for wheel in range(WHEELS)]
+
+    def speeds() -> Speed3 | None:
+        velocity = velocities.message
+        if velocity is None:
+            return None
+        if any(wheel.message is None for wheel in wheels):
+            return Speed3()
+        return Speed3(value=BODY.wheel_speeds(velocity.x, velocity.y, velocity.w))
+
+    send = sender(node, "speed", Speed3, speeds, traffic=traffic, period=PERIOD)
+    velocities = Latest(node, "velocity", Velocity3, fresh=FRESH, changed=send)
+    while True:
+        await node.spin()
+
+
+async def forward_kinematics(node: r2p.Node) -> None:
+    """Make `odometry` of the three encoders: where the robot is since the node started, and how fast it goes."""
+    odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=0.1))
+    pose = Pose3()
+    x = y = w = 0.0  # moved since the last message, in the frame of the robot
+    moved: dict[int, float] = {}
+    rounds = 0
+
+    def finish_round() -> None:
+        """All wheels have told how far they turned."""
+        nonlocal pose, x, y, w, rounds
+        dx, dy, dw = BODY.body_velocity(*(moved.get(wheel, 0.0) for wheel in range(WHEELS)))
+        moved.clear()
+        heading = pose.w + dw / 2
+        cos, sin = math.cos(heading), math.sin(heading)
+        pose = Pose3(pose.x + dx * cos - dy * sin, pose.y + dx * sin + dy * cos, pose.w + dw)
+        x, y, w, rounds = x + dx, y + dy, w + dw, rounds + 1
+        if rounds == _ROUNDS:
+            span = rounds * PERIOD
+            odometry.publish_nowait(Odometry(pose, Velocity3(x / span, y / span, w / span)))
+            x = y = w = 0.0
+            rounds = 0
+
+    def take(wheel: int, encoder: Encoder) -> None:
+        if wheel in moved:  # a new round: who has not told by now has lost a message
+            finish_round()
+        moved[wheel] = encoder.delta / MOTOR.ticks_per_radian
+
+    for wheel in range(WHEELS):
+        node.subscribe(f"encoder{wheel + 1}", Encoder, functools.partial(take, wheel))
+    while True:
+        await node.spin()
+
+
+async def battery_monitor(node: r2p.Node) -> None:
+    """Estimate from voltage and current (`power`) what is left in the battery (`battery`); warn once it is low."""
+    battery = node.advertise("battery", Battery, latch=True)
+    current: float | None = None  # A, the mean of the last ten seconds or so
+    warned = False
+    async for reading in node.subscribe("power", Battery, lossy=True):
+        rest = reading.voltage + reading.current * BATTERY.resistance / 1000  # mV without a load
+        share = (rest / 1000 - BATTERY.empty) / (BATTERY.full - BATTERY.empty)
+        charge = max(0, min(100, round(share * 100)))
+        now = reading.current / 1000
+        current = now if current is None else current + (now - current) / 20
+        hours = BATTERY.capacity * charge / 100 / current if current > 0 else math.inf
+        await battery.publish(Battery(reading.voltage, reading.current, charge, round(min(65535, hours * 60))))
+        if charge < _LOW and not warned:
+            node.log.warning("battery is down to %d %%: %.1f V", charge, reading.voltage / 1000)
+        warned = charge < _LOW

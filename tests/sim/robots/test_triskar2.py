@@ -1,0 +1,246 @@
+"""The robot as a whole, under virtual time: it drives as it is told, and stops when it has to."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import math
+from typing import TYPE_CHECKING
+
+import pytest
+
+import r2p
+from r2p import sim
+from r2p.msg import Battery, Odometry, Velocity3
+from r2p.sim.physics.world import World
+from r2p.sim.robots import triskar2
+from r2p.sim.robots.emulated import MOTORS, Triskar2
+from r2p.sim.robots.square import square
+from r2p.transports.memory import network
+from tests.sim.robots.rig import WAIT, lap_time, odometry_of, until_at_rest, until_driving
+
+if TYPE_CHECKING:
+    from r2p.transports.memory import Frame
+
+pytestmark = pytest.mark.virtual_time
+
+VIA = "memory:robot"
+
+
+async def forward(node: r2p.Node, speed: float = 0.5) -> None:
+    """Drive ahead, for ever."""
+    commands = node.advertise("velocity_cmd", Velocity3, r2p.Sporadic(deadline=0.05))
+    async for _ in node.every(triskar2.COMMANDS):
+        await commands.publish(Velocity3(x=speed))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+async def test_the_square_closes(seed: int) -> None:
+    """A minute: after three laps odometry is within 2 % of the way, the robot within 3 % of where it was told to be."""
+    side, speed, laps = 1.5, 0.4, 3
+    async with Triskar2(VIA, seed=seed) as robot, r2p.Module("PC1", via=VIA) as pc, odometry_of(pc) as odometry:
+        pc.start(functools.partial(square, side=side, speed=speed, laps=laps, wait=WAIT), name="square")
+        corners = []
+        for leg in range(4 * laps):
+            await asyncio.sleep((WAIT if leg == 0 else 0) + side / speed + 0.5)
+            corners.append(robot.pose)
+        await asyncio.sleep(1)
+        told = (await odometry.fetch(1)).pose
+        x, y, w = robot.pose
+        path = robot.hardware.body.path
+        assert path == pytest.approx(laps * 4 * side, rel=0.03)
+        assert math.hypot(told.x - x, told.y - y) < 0.02 * path
+        assert math.hypot(x, y) < 0.03 * path
+        assert abs(w) < 0.1
+        for corner, (cx, cy) in zip(corners, [(side, 0.0), (side, side), (0.0, side), (0.0, 0.0)] * laps, strict=True):
+            assert math.hypot(corner[0] - cx, corner[1] - cy) < 0.03 * path
+        assert path / laps == pytest.approx(lap_time(side, speed) * speed - 4 * 0.5 * speed, rel=0.03)
+
+
+async def test_odometry_tells_the_velocity_too() -> None:
+    async with Triskar2(VIA) as robot, r2p.Module("PC1", via=VIA) as pc, odometry_of(pc) as odometry:
+        commands = pc.start(turn, name="turn")
+        assert commands.name == "turn"
+        await until_driving(robot, speed=0.25)
+        await asyncio.sleep(1)
+        velocity = (await odometry.fetch(1)).velocity
+        assert (velocity.x, velocity.y, velocity.w) == pytest.approx((0.2, -0.2, 0.5), abs=0.01)
+
+
+async def turn(node: r2p.Node) -> None:
+    commands = node.advertise("velocity_cmd", Velocity3, r2p.Sporadic(deadline=0.05))
+    async for _ in node.every(triskar2.COMMANDS):
+        await commands.publish(Velocity3(x=0.2, y=-0.2, w=0.5))
+
+
+async def recorded(seed: int, monkeypatch: pytest.MonkeyPatch) -> list[Frame]:
+    """All that is on the network in five seconds of a drive."""
+    frames: list[Frame] = []
+    send = network("robot").send
+
+    def record(frame: Frame) -> None:
+        frames.append(frame)
+        send(frame)
+
+    monkeypatch.setattr(network("robot"), "send", record)
+    world = World([((0.6, -5.0), (0.6, 5.0)), ((-0.6, -5.0), (-0.6, 5.0))])  # something to see
+    async with Triskar2(VIA, seed=seed, world=world), r2p.Module("PC1", via=VIA) as pc:
+        pc.start(square)
+        await asyncio.sleep(5)
+    return frames
+
+
+def test_the_same_seed_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, same, other = (sim.run(functools.partial(recorded, seed, monkeypatch), seed=7) for seed in (1, 1, 2))
+    assert len(one) > 500
+    assert one == same
+    assert one != other
+
+
+async def test_a_box_in_the_way_stops_it_and_it_can_back_off() -> None:
+    world = World()
+    world.add_box(2.0, 0.0, 0.4, 1.0)
+    async with Triskar2(VIA, world=world) as robot, r2p.Module("PC1", via=VIA) as pc:
+        driving = pc.start(forward)
+        await until_driving(robot)
+        await until_at_rest(robot)
+        await asyncio.sleep(2)
+        gap = world.clearance(*robot.pose[:2]) - triskar2.BODY.radius
+        assert 0.02 < gap < 0.3
+        assert robot.pose[0] == pytest.approx(1.8 - triskar2.BODY.radius - gap)
+        await pc.nodes[driving.name].stop()
+        pc.start(functools.partial(forward, speed=-0.3), name="back")
+        await asyncio.sleep(2)
+        assert robot.pose[0] < 1.2
+
+
+async def test_beside_a_wall_it_passes() -> None:
+    """Only what is ahead counts."""
+    world = World([((-5.0, 0.45), (5.0, 0.45))])
+    async with Triskar2(VIA, world=world) as robot, r2p.Module("PC1", via=VIA) as pc:
+        pc.start(forward)
+        await until_driving(robot)
+        await asyncio.sleep(2)
+        assert robot.pose[0] > 0.9
+
+
+async def test_a_blocked_robot_still_turns() -> None:
+    world = World()
+    world.add_box(0.6, 0.0, 0.4, 2.0)
+    async with Triskar2(VIA, world=world) as robot, r2p.Module("PC1", via=VIA) as pc:
+
+        async def ahead(node: r2p.Node) -> None:
+            commands = node.advertise("velocity_cmd", Velocity3)
+            async for _ in node.every(0.02):
+                await commands.publish(Velocity3(x=0.5, w=0.3))
+
+        pc.start(ahead)
+        await asyncio.sleep(2)
+        assert 0.3 < robot.pose[2] < 0.7
+        assert robot.pose[:2] == pytest.approx((0, 0), abs=0.01)
+
+
+@pytest.mark.parametrize("name", MOTORS)
+async def test_when_a_motor_module_dies_the_others_stop_and_drive_again_with_it(name: str) -> None:
+    async with Triskar2(VIA) as robot, r2p.Module("PC1", via=VIA) as pc:
+        pc.start(forward)
+        await until_driving(robot)
+        await robot.switch_off(name)
+        await asyncio.sleep(triskar2.TIMEOUT + 0.02)
+        others = [drive for motor, drive in zip(MOTORS, robot.hardware.drives, strict=True) if motor != name]
+        assert all(drive.setpoint in (None, 0.0) for drive in others)
+        assert await until_at_rest(robot) < 1.0
+        await asyncio.sleep(2)
+        assert await until_at_rest(robot) == 0.0
+        await robot.switch_on(name)
+        await until_driving(robot)
+
+
+async def test_when_the_pc_is_silent_for_3_s_the_motors_stop_and_then_go_on() -> None:
+    async with Triskar2(VIA) as robot:
+        pc = r2p.Module("PC1", via=VIA)
+        async with pc:
+            pc.start(forward)
+            await until_driving(robot)
+        await asyncio.sleep(triskar2.FRESH + triskar2.TIMEOUT + 0.1)
+        assert all(drive.setpoint is None for drive in robot.hardware.drives)
+        assert await until_at_rest(robot) < 1.0
+        before = robot.pose
+        await asyncio.sleep(2)
+        assert robot.pose == pytest.approx(before, abs=1e-3)
+        async with r2p.Module("PC1", via=VIA) as again:
+            again.start(forward)
+            await until_driving(robot)
+
+
+async def test_a_pc_drives_it_through_the_gateway_which_may_die_and_come_back() -> None:
+    outside = "memory:lan"
+    async with (
+        Triskar2(VIA, outside=[outside]) as robot,
+        r2p.Module("PC1", via=outside) as pc,
+        odometry_of(pc) as odometry,
+    ):
+        pc.start(forward)
+        await until_driving(robot)
+        await asyncio.sleep(1)
+        assert (await odometry.fetch(1)).pose.x > 0.2
+        await robot.switch_off("GW")
+        await asyncio.sleep(triskar2.FRESH + triskar2.TIMEOUT + 0.1)
+        assert all(drive.setpoint is None for drive in robot.hardware.drives)
+        assert await until_at_rest(robot) < 1.0
+        await asyncio.sleep(2)
+        before = robot.pose[0]
+        await robot.switch_on("GW")
+        await until_driving(robot)
+        await asyncio.sleep(2)
+        assert robot.pose[0] > before + 0.5
+        assert (await odometry.fetch(1)).pose.x == pytest.approx(robot.pose[0], abs=0.1)
+
+
+async def test_without_eyes_it_does_not_go_where_they_looked() -> None:
+    async with Triskar2(VIA) as robot, r2p.Module("PC1", via=VIA) as pc:
+        pc.start(functools.partial(forward, speed=-0.5), name="back")
+        await until_driving(robot)
+        await robot.switch_off("PROX2")
+        await asyncio.sleep(2 * triskar2.FRESH + 0.1)
+        await until_at_rest(robot)
+        await pc.nodes["back"].stop()
+        pc.start(forward)
+        await until_driving(robot)
+
+
+async def test_the_battery_is_watched() -> None:
+    async with Triskar2(VIA) as robot, r2p.Module("PC1", via=VIA) as pc:
+        cells = robot.hardware.battery
+        node = pc.start(forward)
+        states = node.subscribe("battery", Battery, queue=1)
+        await asyncio.sleep(WAIT)
+        full = await states.fetch(2)
+        assert full.charge == pytest.approx(100, abs=3)
+        assert 60 < full.remaining < 30 * 60
+        cells.charge = 0.1
+        await asyncio.sleep(2)
+        low = await states.fetch(2)
+        assert low.charge == pytest.approx(10, abs=4)
+        assert low.voltage < full.voltage
+        assert low.remaining < full.remaining
+
+
+async def test_odometry_survives_a_lost_encoder_message() -> None:
+    """Who lost one round is behind by it, not by all that follow."""
+    heard: list[Odometry] = []
+
+    async def watch(node: r2p.Node) -> None:
+        node.subscribe("odometry", Odometry, heard.append)
+        while True:
+            await node.spin()
+
+    async with Triskar2(VIA) as robot, r2p.Module("PC1", via=VIA) as pc:
+        pc.start(watch)
+        pc.start(forward)
+        await until_driving(robot)
+        network("robot").loss = 0.02
+        await asyncio.sleep(5)
+        network("robot").loss = 0.0
+        await asyncio.sleep(1)
+        assert heard[-1].pose.x == pytest.approx(robot.pose[0], rel=0.1)

@@ -1,0 +1,151 @@
+"""`r2p sim`: what it measures, how it shows it, and the command itself."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+
+import r2p
+from r2p import sim
+from r2p.msg import Odometry, Pose3
+from r2p.sim import can_bus
+from r2p.sim.physics.world import World, box
+from r2p.sim.robots.emulated import Triskar2
+from r2p.sim.robots.figures import BusFigures, Figures, Gauge, WheelFigures
+from r2p.sim.robots.square import square
+from r2p.tools._sim import screen
+from r2p.tools._sim.chart import Chart
+from r2p.tools._sim.play import Play, play
+from tests.tools.rig import process
+
+VIA = "sim:gauge"
+
+
+@pytest.mark.virtual_time
+async def test_figures_of_a_drive() -> None:
+    bus = can_bus("gauge")
+    async with Triskar2(VIA, seed=1) as robot, r2p.Module("PC1", via=VIA) as pc:
+        await robot.ready(10)
+        gauge = Gauge(robot, bus, [pc])
+        pc.start(square, 1.0, 0.4, name="square")
+        await asyncio.sleep(2)
+        gauge.read(2.0)
+        await asyncio.sleep(1)
+        figures = gauge.read(3.0)
+        assert figures.path == robot.hardware.body.path
+    topics = {topic.topic: topic for topic in figures.topics}
+    assert topics["velocity_cmd"].rate == pytest.approx(20, abs=1)
+    assert topics["encoder1"].rate == pytest.approx(50, abs=2)
+    assert topics["encoder1"].how == "in slots"
+    assert topics["odometry"].how == "by deadline"
+    assert not {"log", "power", "current1"} & set(topics)
+    assert figures.missed == 0
+    assert figures.bus is not None
+    assert 0.05 < figures.bus.load < 0.5
+    assert figures.bus.of == 60
+    assert 2.0 < figures.bus.slots < 4.0  # five messages each 20 ms, in cycles of 10 ms
+    assert [wheel.setpoint for wheel in figures.wheels] == pytest.approx([4, 4, -8], abs=0.01)
+    assert [wheel.speed for wheel in figures.wheels] == pytest.approx([4, 4, -8], abs=0.3)
+
+
+@pytest.mark.virtual_time
+async def test_what_was_missed_before_does_not_count_and_what_is_off_says_so() -> None:
+    async with Triskar2(VIA) as robot:
+        await asyncio.sleep(1)
+        publisher = next(iter(robot.modules["PS"].nodes["battery"].node.publishers))
+        publisher.missed += 5
+        gauge = Gauge(robot, None)
+        publisher.missed += 2
+        await robot.switch_off("MOTOR2")
+        figures = gauge.read(1.0)
+    assert figures.missed == 2
+    assert [wheel.on for wheel in figures.wheels] == [True, False, True]
+    assert figures.odometry is None
+    assert figures.bus is None
+    text = "\n".join(screen.state(figures))
+    assert "MOTOR2    switched off" in text
+    assert "2 deadlines missed" in text
+    assert "a network in memory" in text
+
+
+def test_the_map_shows_walls_way_and_robot() -> None:
+    chart = Chart(World(box(0, 0, 4, 4)), 20, 10)
+    chart.draw((-1.0, 0.0, 0.0))
+    lines = chart.draw((1.0, 0.0, 1.6)).splitlines()
+    assert len(lines) == 10
+    assert {len(line) for line in lines} == {20}
+    assert set("".join(lines)) == set(" #.^")
+    row = next(line for line in lines if "^" in line)
+    assert row.index(".") < row.index("^")
+    assert row.strip().startswith("#")
+
+
+def test_the_map_grows_with_the_way() -> None:
+    chart = Chart(World(), 20, 10)
+    for step in range(100):
+        picture = chart.draw((step / 2, 0.0, 0.0))
+    assert picture.count(">") == 1
+    assert picture.count(".") == pytest.approx(18, abs=2)
+
+
+def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureFixture[str]) -> None:
+    sim.run(play(Play(duration=20.0, seed=3, laps=1, fast=True, bus=True)), seed=3)
+    fast = capsys.readouterr().out
+    lines = fast.splitlines()
+    assert max(len(line) for line in lines) <= 80
+    assert [line.split()[0] for line in lines if " at " in line and "wheels" in line] == ["10.0", "20.0"]
+    found = re.search(r"^20.0 s, ([\d.]+) m driven; the robot is at x (-?[\d.]+), y (-?[\d.]+) m$", fast, re.MULTILINE)
+    assert found
+    driven, x, y = map(float, found.groups())
+    assert driven == pytest.approx(8.0, rel=0.03)
+    assert abs(x) + abs(y) < 0.1
+    assert re.search(r"messages published, \d+ missed a deadline$", fast, re.MULTILINE)
+    assert not re.search(r"most of them of (encoder|speed)", fast)  # which have slots of their own
+    assert re.search(r"^MOTOR1 +\d+ +\d+% +0 +\d+$", fast, re.MULTILINE)
+
+
+def test_the_state_fits_beside_the_map() -> None:
+    wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
+    bus = BusFigures(1.0, 7654.3, 999_999, 99, 10.5, 60)
+    odometry = Odometry(Pose3(-10.5, -10.5, -3.0))
+    figures = Figures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, 0.123, wheels, (25.6, 10.0, 1.0), [], bus)
+    lines = screen.state(figures)
+    assert len(lines) <= 10
+    assert max(len(line) for line in lines) <= 48
+
+
+@pytest.mark.processes
+def test_others_reach_it_through_its_gateway() -> None:
+    """The debug line, in real time, from another process."""
+    with process("sim", "triskar2", "--square", "--via", "tcp-listen:0") as robot:
+        assert robot.stdout is not None
+        address = next(found[1] for line in robot.stdout if (found := re.search(r"--via (tcp:\S+)", line)))
+        with process("topic", "echo", "odometry", "--via", address, "--type", "Odometry", "--once") as echo:
+            out, err = echo.communicate()
+        assert echo.returncode == 0, err
+        assert '"velocity"' in out
+        robot.send_signal(signal.SIGINT)
+        out, err = robot.communicate()
+    assert (robot.returncode, err) == (0, "")
+    assert "m driven" in out
+
+
+@pytest.mark.processes
+def test_fast_and_a_link_to_the_outside_do_not_go_together() -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from r2p.tools.main import main; main()",
+        "sim",
+        "--fast",
+        "--via",
+        "tcp-listen:0",
+    ]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "--fast runs in virtual time" in ended.stderr
