@@ -39,6 +39,7 @@ class Bridge:
     def __init__(
         self, space: TopicSpace, instance: int, options: BridgeOptions, told: Callable[[Link, str, str, bool], None]
     ) -> None:
+        self.name = space.module
         self.instance = instance
         self.ports: dict[str, BridgePort] = {}
         """By the name of the link."""
@@ -125,7 +126,7 @@ class Bridge:
             return False
         if isinstance(message, management.Hello):
             return message.instance == self.instance and message.hops == 0
-        return isinstance(message, management.Alive) and message.module == self._space.module
+        return isinstance(message, management.Alive) and message.module == self.name
 
     def _heard_gateway(self, port: BridgePort, data: bytes) -> None:
         try:

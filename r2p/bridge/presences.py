@@ -109,8 +109,8 @@ class Presences:
     def _add_module(self, news: dict[_Key, _Told], info: ModuleInfo, port: BridgePort) -> None:
         known = port.link.discovery.modules.get(info.name)
         hops = info.hops + 1
-        if hops > MOST_HOPS or info.instance == self._bridge.instance:
-            return
+        if hops > MOST_HOPS or info.name == self._bridge.name:
+            return  # of our name: our last start, of which others still tell
         if known is not None and known.instance == info.instance:
             return  # it is on both links
         alive = ("alive", info.name)

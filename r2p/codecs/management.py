@@ -20,7 +20,7 @@ Gateways agree on their tree (`r2p.protocols.bridging`) with two more, which sta
 
 | type | name | body |
 | --- | --- | --- |
-| 0x60 | BRIDGE | `u32 gateway; u8 port; u16 count; u32 agreement; 3 x {u32 gateway; u16 count} acks` (gateway 0: none) |
+| 0x60 | BRIDGE | `u32 gateway; u8 port; u16 count; u32 agreement; 3 x {u32 gateway; u16 count} acks` (0: none) |
 | 0x61 | MESH | `u32 gateway; u16 serial; u8 part; 3 x {u8 port; u32 gateway; u8 its_port} heard` (0: none) |
 """
 

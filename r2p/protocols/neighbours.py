@@ -69,16 +69,18 @@ class Neighbours:
             if not message.hops:  # else a gateway does not know yet that we are on both sides of it
                 self._heard_ourselves(now)
         elif self._is_nearer(message):
-            pass  # a gateway does not know yet that the module is on both sides of it
+            pass  # a gateway may not know yet that the module is on both sides of it
         elif message.flags & management.HELLO_LEAVING:
             self._leaving(now, message, source)
         else:
             self._present(now, message, source)
 
     def _is_nearer(self, message: management.Hello) -> bool:
-        """Whether the module is known to be nearer than a gateway says."""
+        """Whether a module of this name is known to be nearer than a gateway says: the latter may be its last start,
+        of which others have not heard that it is over.
+        """
         info = self._directory.modules.get(message.module)
-        return info is not None and info.instance == message.instance and info.hops < message.hops
+        return info is not None and info.r2p and info.hops < message.hops
 
     def endpoint(self, now: int, message: management.Endpoint, source: Source) -> None:
         """A publisher or subscriber of a remote node."""

@@ -51,7 +51,7 @@ def command(
 
 _NEXT = """
 Try next, in two terminals:
-  r2p sim triskar2             the same robot, until Ctrl-C; it says how to reach it
+  r2p sim triskar2             the same robot, to be driven by you
   r2p topic list --via tcp:127.0.0.1:PORT
   r2p run examples/teleop.py:keys --via tcp:127.0.0.1:PORT
 Or: r2p demo line

@@ -8,6 +8,7 @@ import pytest
 
 import r2p
 from r2p.msg import Odometry
+from r2p.sim.robots import emulated, triskar2
 from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.robots.square import square
 from r2p.testing.network import node_in
@@ -15,10 +16,19 @@ from r2p.testing.network import node_in
 pytestmark = [pytest.mark.can, pytest.mark.anyio]
 
 DRIVEN = 0.2  # m
-LONGEST = 120.0
-"""Seconds; eight modules share one slow CPU."""
+LONGEST = 120.0  # seconds
+SLOWER = 5
+"""Eight modules share one slow CPU: everything takes so many times as long as on the real robot."""
 
 
+@pytest.fixture
+def _slow_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("PERIOD", "COMMANDS", "FRESH", "TIMEOUT"):
+        monkeypatch.setattr(triskar2, name, SLOWER * getattr(triskar2, name))
+    monkeypatch.setattr(emulated, "STEP", SLOWER * emulated.STEP)
+
+
+@pytest.mark.usefixtures("_slow_robot")
 @pytest.mark.parametrize("anyio_backend", [("asyncio", {"use_uvloop": True})], ids=["uvloop"])
 async def test_it_drives_along(vcan: str) -> None:
     """Without a master, so without slots, which such a computer could not keep: as soft real-time."""

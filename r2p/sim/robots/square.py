@@ -2,8 +2,8 @@
 
 import r2p
 from r2p.msg import Velocity3
+from r2p.sim.robots import triskar2
 from r2p.sim.robots.latest import Traffic, sender
-from r2p.sim.robots.triskar2 import COMMANDS, PERIOD
 
 REST = 0.5
 """Seconds that the robot rests at each corner."""
@@ -35,6 +35,6 @@ async def square(
         elapsed = (node.now() - start) / 1e9 - wait
         return velocity_at(elapsed, side=side, speed=speed) if elapsed < laps * lap else Velocity3()
 
-    send = sender(node, "velocity_cmd", Velocity3, command, traffic=traffic, period=PERIOD)
-    async for _ in node.every(COMMANDS):
+    send = sender(node, "velocity_cmd", Velocity3, command, traffic=traffic, period=triskar2.PERIOD)
+    async for _ in node.every(triskar2.COMMANDS):
         send()

@@ -89,7 +89,7 @@ def line(figures: Figures) -> str:
     x, y, w = figures.pose
     speeds = " ".join(f"{wheel.speed:6.2f}" for wheel in figures.wheels)
     bus = "" if figures.bus is None else f"  bus {figures.bus.load:4.0%}"
-    return f"{figures.time:6.1f} s  at {x:5.2f} {y:5.2f} m {math.degrees(w):4.0f} deg  wheels {speeds} rad/s{bus}"
+    return f"{figures.time:6.1f} s  at {x:5.2f} {y:5.2f} m {math.degrees(w):4.0f} deg  wheels {speeds}{bus}"
 
 
 def _wheel(wheel: WheelFigures) -> str:

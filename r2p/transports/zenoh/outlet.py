@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from r2p.codecs.attachment import Header, Origin, encode, encoder
 from r2p.codecs.management import ANY_TYPE
-from r2p.room import Room
+from r2p.room import LINK_DOWN, Room
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.topic import Topic
 from r2p.transports.outlet import LinkOutlet
@@ -22,14 +22,12 @@ _NRT = PublisherClass.NON_REAL_TIME
 class _Lane:
     """The way of one class: what zenoh sends with, and the headers of the publisher that sent last."""
 
-    __slots__ = ("encode", "flow", "origin", "put", "source")
+    __slots__ = ("encode", "flow", "put", "source")
 
     def __init__(self, flow: "Outflow") -> None:
         self.flow = flow
         self.put: Callable[..., None] = _nowhere
         self.source: Source | None = None
-        self.origin: Origin | None = None
-        """Of what comes from another link; None for what is published here."""
         self.encode: Callable[[int, int, int, int], bytes] = _nothing
 
 
@@ -55,19 +53,44 @@ class ZenohOutlet(LinkOutlet):
     def offer(self, sample: Sample) -> bool:
         lane = self._lanes[sample.publisher_class]
         flow = lane.flow
+        serial = flow.serial + 1
+        if serial > flow.limit or sample.source is not lane.source or not self._link.up:
+            return self._offer_odd(lane, sample)
+        flow.serial = serial
+        stats, data = self._stats, sample.data
+        try:  # zenoh sends it, or drops it where the network is too slow
+            lane.put(data, attachment=lane.encode(serial, sample.sequence, sample.stamp, sample.deadline))
+        except self._error:
+            stats.lost[LINK_DOWN] += 1
+            return True
+        stats.sent += 1
+        stats.bytes_sent += len(data)
+        return True
+
+    def _offer_odd(self, lane: _Lane, sample: Sample) -> bool:
+        """No room, no link, another publisher than before, or something that comes from another link."""
+        flow = lane.flow
         if not self._link.up:
             if sample.publisher_class != _NRT:
                 return False
-            self._lose("link down")
+            self._lose(LINK_DOWN)
             return True
         if flow.serial >= flow.limit and not self.welcoming:
             return False
-        self._send(lane, sample)
+        origin = self._prepare(lane, sample)
+        flow.serial += 1
+        try:
+            lane.put(sample.data, attachment=_header(origin, flow.serial, sample))
+        except self._error:
+            self._stats.lost[LINK_DOWN] += 1
+            return True
+        self._stats.sent += 1
+        self._stats.bytes_sent += len(sample.data)
         return True
 
     def force(self, sample: Sample) -> None:
         if not self._link.up:
-            self._lose("link down")
+            self._lose(LINK_DOWN)
         elif not self.offer(sample):
             self._lose("no credit")
 
@@ -120,42 +143,23 @@ class ZenohOutlet(LinkOutlet):
         heard = {number for lane in self._lanes.values() for number, taker in lane.flow.takers.items() if taker.heard}
         return {number for lane in self._lanes.values() for number in lane.flow.unheard()} - heard
 
-    def _send(self, lane: _Lane, sample: Sample) -> None:
-        """Give it to zenoh, which sends it, or drops it where the network is too slow."""
-        if sample.source is not lane.source:
-            self._prepare(lane, sample)
-        flow, stats, data = lane.flow, self._stats, sample.data
-        flow.serial = serial = flow.serial + 1
-        try:
-            if lane.origin is None:
-                lane.put(data, attachment=lane.encode(serial, sample.sequence, sample.stamp, sample.deadline))
-            else:
-                lane.put(data, attachment=_encode_forwarded(lane.origin, serial, sample))
-        except self._error:
-            stats.lost["link down"] += 1
-            return
-        stats.sent += 1
-        stats.bytes_sent += len(data)
-
-    def _prepare(self, lane: _Lane, sample: Sample) -> None:
-        """For another publisher than the one before."""
+    def _prepare(self, lane: _Lane, sample: Sample) -> Origin:
+        """The origin of a sample; the next ones of the same publisher, if it is one of our own, go the short way."""
         publisher = self._zenoh.publisher(self.topic.name, sample.publisher_class)
         lane.put = _nowhere if publisher is None else publisher.put
-        layout = self.topic.layout
-        fingerprint = ANY_TYPE if layout is None else layout.fingerprint
-        instance, source = self._zenoh.instance, sample.source
-        forwarded = bool(source.link)
+        layout, instance, source = self.topic.layout, self._zenoh.instance, sample.source
         origin = Origin(
             sample.publisher_class,
             instance,
-            self._zenoh.instance_of(source.module) if forwarded else instance,
-            fingerprint,
+            self._zenoh.instance_of(source.module) if source.link else instance,
+            ANY_TYPE if layout is None else layout.fingerprint,
             source.module,
             source.node,
         )
-        lane.encode = encoder(origin)
-        lane.origin = origin if forwarded else None
-        lane.source = source
+        if not source.link:
+            lane.encode = encoder(origin)
+            lane.source = source
+        return origin
 
 
 def _nowhere(data: bytes, *, attachment: bytes) -> None:
@@ -167,17 +171,9 @@ def _nothing(serial: int, sequence: int, stamp: int, deadline: int) -> bytes:
     return b""
 
 
-def _encode_forwarded(origin: Origin, serial: int, sample: Sample) -> bytes:
-    """The header of what a gateway passes on."""
+def _header(origin: Origin, serial: int, sample: Sample) -> bytes:
+    """The header of anything; what comes from another link has crossed a gateway more."""
+    hops = sample.hops + bool(sample.source.link)
     return encode(
-        Header(
-            origin,
-            serial,
-            sample.sequence,
-            sample.stamp,
-            sample.deadline,
-            sample.hops + 1,
-            sample.stamped,
-            sample.clock,
-        )
+        Header(origin, serial, sample.sequence, sample.stamp, sample.deadline, hops, sample.stamped, sample.clock)
     )

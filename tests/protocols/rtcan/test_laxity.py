@@ -61,9 +61,9 @@ def test_management_goes_first_among_equals_and_has_room_of_its_own() -> None:
     assert queue.put(srt(5, -3, drop=False))
     assert queue.put(srt(6, 1.5, drop=False))
     assert not queue.put(srt(7, 1))
-    for number in range(2):
-        assert queue.put(srt(1, 1.9 + number, 16, drop=False), management=True)
-    assert drain(queue) == [(1, 1, 1), (1, 1, 0), (1, 2, 1), (1, 2, 0), (5, 1, 0), (6, 1, 0)]
+    for remaining in (1.9, 1.9, 30):
+        assert queue.put(srt(1, remaining, 16, drop=False), management=True)
+    assert drain(queue) == [(1, 1, 1), (1, 1, 0), (1, 1, 1), (1, 1, 0), (5, 1, 0), (6, 1, 0), (1, 30, 1), (1, 30, 0)]
 
 
 def test_first_come_first_served_among_equals() -> None:

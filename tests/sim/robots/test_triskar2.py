@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import inspect
 import math
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.emulated import MOTORS, Triskar2
 from r2p.sim.robots.square import square
+from r2p.tools.run import load
 from r2p.transports.memory import network
 from tests.sim.robots.rig import WAIT, lap_time, odometry_of, until_at_rest, until_driving
 
@@ -25,6 +27,9 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.virtual_time
 
 VIA = "memory:robot"
+
+
+NODES = ("obstacle_avoidance", "inverse_kinematics", "forward_kinematics", "battery_monitor")
 
 
 async def forward(node: r2p.Node, speed: float = 0.5) -> None:
@@ -244,3 +249,14 @@ async def test_odometry_survives_a_lost_encoder_message() -> None:
         network("robot").loss = 0.0
         await asyncio.sleep(1)
         assert heard[-1].pose.x == pytest.approx(robot.pose[0], rel=0.1)
+
+
+@pytest.mark.parametrize("name", NODES)
+async def test_each_node_is_short_and_runs_anywhere(name: str) -> None:
+    (program,) = load([f"r2p.sim.robots.triskar2:{name}=node"])
+    assert len(inspect.getsource(program.function).splitlines()) < 60
+    async with r2p.Module("PC1") as module:
+        node = module.start(program.function, name=program.name)
+        await asyncio.sleep(1)
+        assert node.publishers
+        assert node.subscribers
