@@ -79,6 +79,8 @@ class Neighbours:
         """Whether a module of this name is known to be nearer than a gateway says: the latter may be its last start,
         of which others have not heard that it is over.
         """
+        if message.module == self._module:
+            return message.hops > 0
         info = self._directory.modules.get(message.module)
         return info is not None and info.r2p and info.hops < message.hops
 

@@ -205,3 +205,14 @@ def test_endpoints_that_are_forgotten_leave_no_timer() -> None:
         discovery.receive(number, m.encode(endpoint))
     assert len(discovery.endpoints) == MOST
     assert len(discovery._timers._due) <= MOST + 8
+
+
+def test_what_gateways_still_tell_of_a_last_start_is_no_namesake() -> None:
+    """Neither of ours, nor of a module that is nearer."""
+    discovery = started()
+    hear(discovery, S, PC2)
+    assert joined(discovery, S)
+    last_starts = [m.Hello(name, 77, flags, 1) for name in ("PC1", "PC2") for flags in (0, m.HELLO_LEAVING)]
+    assert news(hear(discovery, 2 * S, *last_starts)) == []
+    assert discovery.modules["PC2"].instance == PEER
+    assert not joined(discovery, 3 * S)

@@ -98,7 +98,7 @@ class Replay:
         text: Any = self._problem
         if self._outcome == "skipped":
             text = ("tests/can", 1, f"Skipped: {self._problem}")  # one place: pytest shows one line
-        keywords = dict.fromkeys(item.keywords, 1)
+        keywords: dict[str, Any] = dict.fromkeys(item.keywords, 1)
         return pytest.TestReport(item.nodeid, item.location, keywords, self._outcome, text, "setup")
 
 
