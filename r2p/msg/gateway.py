@@ -7,7 +7,7 @@ from r2p.messages import Len, Message, f32, u64
 
 class GatewayStatus(Message):
     """Once a second, for each link (`topic` and `target` are empty) and for each topic and way (`state` is empty) of a
-    gateway; topic `gateway`. 14 CAN fragments.
+    gateway; topic `gateway`. 12 CAN fragments.
     """
 
     topic: Annotated[str, Len(16)] = ""

@@ -63,6 +63,7 @@ SIZES = {
     "StampedOdometry": 32,
     "Text": 64,
     "Log": 145,
+    "GatewayStatus": 96,
     "Timestamp": 8,
 }
 
@@ -82,7 +83,7 @@ def test_all_are_listed() -> None:
     assert set(r2p.msg.__all__) == {*FIRMWARE, *SIZES}
     defined = {
         name
-        for module in (firmware, robot, text)
+        for module in (firmware, gateway, robot, text)
         for name, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Message) and value.__module__ == module.__name__
     }
