@@ -15,6 +15,7 @@ from r2p.msg import (
     Tilt,
     Velocity3,
     firmware,
+    gateway,
     robot,
     text,
 )
