@@ -8,7 +8,6 @@ last, how often) and each byte which state is next and how many bits were stuffe
 """
 
 from functools import lru_cache
-from typing import Any
 
 import msgspec
 
@@ -150,13 +149,15 @@ def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
     `extended=False` is for frames with 11-bit identifiers, which only others send. Raises `MessageError` when the
     identifier or the data are too long.
     """
-    row, crc, bits = _header(identifier, len(data), extended)
-    for byte, remainders in zip(data, _REMAINDERS_BEFORE[len(data)], strict=True):
-        row, stuffed = row[byte]
-        bits += stuffed
-        crc ^= remainders[byte]
-    row, stuffed = row[crc >> 7]
-    return bits + stuffed + row[_SEVEN | crc & 0x7F][1]
+    state, crc, bits = _header(identifier, len(data), extended)
+    for byte in data:
+        step = _STUFFING[state << 8 | byte]
+        state = step & 7
+        bits += 8 + (step >> 3)
+        crc = (crc << 8 ^ _REMAINDERS[crc >> 7 ^ byte]) & 0x7FFF
+    high = _STUFFING[state << 8 | crc >> 7]
+    low = _STUFFING_7[(high & 7) << 7 | crc & 0x7F]
+    return bits + _CRC + (high >> 3) + (low >> 3) + TAIL
 
 
 @lru_cache(maxsize=4096)
@@ -197,17 +198,14 @@ def _arbitration(identifier: int) -> int:
 
 
 @lru_cache(maxsize=4096)
-def _header(identifier: int, size: int, extended: bool) -> tuple[Any, int, int]:
-    """What the bits before the data leave: state of the stuffing as a row of `_STUFFING`, what the CRC would be if
-    only zeros followed, bits of the whole frame but for those stuffed in from here on.
-    """
+def _header(identifier: int, size: int, extended: bool) -> tuple[int, int, int]:
+    """What the bits before the data leave: state of the stuffing, CRC, bits so far."""
     if identifier >> (29 if extended else 11) or size > FRAME_MAX:
         raise MessageError(f"identifier {identifier:#x} with {size} bytes: no frame has room")
     bits = _arbitration(identifier) << 7 | size if extended else identifier << 7 | size
     count = _HEADER if extended else _HEADER - 20
     step = _stuff(_START, bits, count)
-    crc = _crc(bits.to_bytes(5, "big") + bytes(size))
-    return _STUFFING[step & 7], crc, count + (step >> 3) + 8 * size + _CRC + TAIL
+    return step & 7, _crc(bits.to_bytes(5, "big")), count + (step >> 3)
 
 
 def _crc(data: bytes) -> int:
@@ -241,22 +239,6 @@ def _remainder(byte: int) -> int:
     return crc & 0x7FFF
 
 
-def _rows() -> list[list[Any]]:
-    """For each state of the stuffing: which row is next after each byte, or 7 bits, and how many bits were stuffed in."""
-    rows: list[list[Any]] = [[] for _ in range(8)]
-    for state, row in enumerate(rows):
-        steps = [_stuff(state, byte, 8) for byte in range(256)] + [_stuff(state, bits, 7) for bits in range(128)]
-        row += [(rows[step & 7], step >> 3) for step in steps]
-    return rows
-
-
-def _remainders_before(size: int) -> list[tuple[int, ...]]:
-    """For each of `size` bytes, by its value, what it makes of the CRC with those that follow it: CRCs can be added."""
-    return [tuple(_crc(bytes((byte, *bytes(after)))) for byte in range(256)) for after in range(size - 1, -1, -1)]
-
-
-_SEVEN = 256  # in a row of the stuffing, 7 bits come after the bytes
-_STUFFING = _rows()
+_STUFFING = tuple(_stuff(state, byte, 8) for state in range(8) for byte in range(256))
+_STUFFING_7 = tuple(_stuff(state, bits, 7) for state in range(8) for bits in range(128))
 _REMAINDERS = tuple(_remainder(byte) for byte in range(256))
-_LONGEST = _remainders_before(FRAME_MAX)
-_REMAINDERS_BEFORE = [_LONGEST[FRAME_MAX - size :] for size in range(FRAME_MAX + 1)]
