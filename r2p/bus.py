@@ -89,7 +89,7 @@ class BusMonitor:
         try:
             await asyncio.wait([waiting, self._running], return_when=asyncio.FIRST_COMPLETED)
             self._check()
-        except BaseException:
+        except BaseException:  # cancelled, too: who does not come to the block does not leave it either
             await self._close()
             raise
         finally:

@@ -128,7 +128,7 @@ class Module:
         try:
             for via in self._via:
                 await self._open_transport(self._tasks, via)
-        except BaseException:
+        except BaseException:  # cancelled, too: who does not come to the block does not leave it either
             await self._close(self._tasks)
             raise
         return self

@@ -97,7 +97,7 @@ class SerialTransport(Transport):
         try:
             os.set_blocking(device.fileno(), False)
             _tell_end_from_silence(device.fileno())
-        except BaseException:
+        except BaseException:  # nobody has it yet who could close it
             device.close()
             raise
         return device

@@ -148,7 +148,7 @@ class TcpTransport(Transport):
             try:
                 async with asyncio.timeout(_CONNECT_TIMEOUT):
                     await loop.create_connection(lambda: connection, self._host, self._port)
-            except BaseException:
+            except BaseException:  # cancelled, too: the connection may be there by now
                 connection.forget()
                 raise
             began = loop.time()

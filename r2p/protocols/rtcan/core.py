@@ -88,16 +88,7 @@ class Core:
             self.say,
             settings.priority,
         )
-        self._handlers: dict[type, Callable[[int, Any, int], None]] = {
-            management.Network: self._told,
-            management.Claim: self._claimed,
-            management.Reserve: self._wanted,
-            management.Grant: self._granted,
-            management.Refuse: self._refused,
-            management.Release: self._released,
-            management.Renew: self._renew,
-            management.Renewed: self._renewed,
-        }
+        self._handlers = self._table()
 
     @property
     def profile(self) -> Profile:
@@ -237,6 +228,19 @@ class Core:
             self.out.append(Due(periodic.high, at, False))
 
     # What the parts need of each other
+
+    def _table(self) -> dict[type, Callable[[int, Any, int], None]]:
+        """Who handles which message of the bus."""
+        return {
+            management.Network: self._told,
+            management.Claim: self._claimed,
+            management.Reserve: self._wanted,
+            management.Grant: self._granted,
+            management.Refuse: self._refused,
+            management.Release: self._released,
+            management.Renew: self._renew,
+            management.Renewed: self._renewed,
+        }
 
     def _turn(self, now: int) -> None:
         self.network.turn(now)

@@ -132,7 +132,7 @@ class Triskar2:
         try:
             for name in self._names:
                 await self.switch_on(name)
-        except BaseException:
+        except BaseException:  # cancelled, too: who does not come to the block does not leave it either
             await self._close()
             raise
         return self

@@ -81,7 +81,7 @@ class RawSocket:
         try:
             self._configure()
             self._socket.bind((name,))
-        except BaseException:
+        except BaseException:  # nobody has it yet who could close it
             self._socket.close()
             raise
         self._batch = _Batch(self._socket.fileno())

@@ -90,7 +90,7 @@ class Tap:
         threading.Thread(target=self._watch, name="r2p zenoh", daemon=True).start()
 
     def close(self) -> None:
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]  # as its stubs have it
+        self._subscriber.undeclare()
         with contextlib.suppress(RuntimeError):  # the thread waits for a sample, not for us
             self._emptied.release()
 
@@ -161,7 +161,7 @@ class Session:
             with contextlib.suppress(zenoh.ZError):  # the session is closed
                 if payload is not None:
                     query.reply(key.replace("*", name.rpartition("/")[2]), payload)
-                query.drop()  # type: ignore[no-untyped-call]  # as its stubs have it
+                query.drop()
 
         funnel = Funnel(loop, reply, most=_QUERIES)
         self._kept.append(self._session.declare_queryable(key, Callback(funnel.put)))
@@ -189,7 +189,7 @@ class Session:
 
     def ends(self, publisher: zenoh.Publisher) -> None:
         """Send no more with it."""
-        publisher.undeclare()  # type: ignore[no-untyped-call]  # as its stubs have it
+        publisher.undeclare()
 
     def put(self, key: str, data: bytes, *, urgent: bool = False) -> None:
         """Send something of the protocol's own."""
@@ -209,7 +209,7 @@ class Session:
     def undeclare(self, key: str) -> None:
         token = self._tokens.pop(key, None)
         if token is not None:
-            token.undeclare()  # type: ignore[no-untyped-call]  # as its stubs have it
+            token.undeclare()
 
     async def ask(self, key: str, timeout: float) -> list[bytes]:
         """All answers to a query, within `timeout` seconds."""
@@ -256,32 +256,35 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
 
-    def finish(result: T | None, error: BaseException | None) -> None:
-        if future.cancelled():
-            if abandoned is not None and error is None:
-                threading.Thread(target=abandoned, args=(result,), daemon=True).start()
-        elif error is not None:
+    def succeed(result: T) -> None:
+        if not future.cancelled():
+            future.set_result(result)
+        elif abandoned is not None:
+            threading.Thread(target=abandoned, args=(result,), daemon=True).start()
+
+    def fail(error: Exception) -> None:
+        if not future.cancelled():
             future.set_exception(error)
-        else:
-            future.set_result(result)  # type: ignore[arg-type]  # None only where T is None
 
     def work() -> None:
         try:
-            outcome: tuple[T | None, Exception | None] = function(), None
+            result = function()
         except Exception as error:  # noqa: BLE001 - raised again where it is awaited
-            outcome = None, error
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(fail, error)
+            return
         try:
-            loop.call_soon_threadsafe(finish, *outcome)
+            loop.call_soon_threadsafe(succeed, result)
         except RuntimeError:  # the loop is closed
-            if abandoned is not None and outcome[1] is None:
-                abandoned(outcome[0])  # type: ignore[arg-type]  # None only where T is None
+            if abandoned is not None:
+                abandoned(result)
 
     threading.Thread(target=work, name="r2p zenoh", daemon=True).start()
     return await future
 
 
 def _close(session: zenoh.Session) -> None:
-    session.close()  # type: ignore[no-untyped-call]  # as its stubs have it
+    session.close()
 
 
 def _plain(error: Exception) -> str:
