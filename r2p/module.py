@@ -12,36 +12,24 @@ from collections.abc import AsyncIterator, Iterable
 from types import TracebackType
 from typing import Self
 
-from r2p.bridge import Bridge, BridgeOptions, GatewayStatistics
+from r2p.bridge import BridgeOptions, GatewayStatistics
 from r2p.clock import clock_of, random_of
 from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import Closed, Error, NodeCrashed
-from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
+from r2p.events import EventHub, ModuleEvent
+from r2p.hub import ModuleHub
 from r2p.logs import LogTopic
 from r2p.names import module_name, module_name_from, node_name, topic_name
-from r2p.network import NetworkView, describe_mismatch
+from r2p.network import NetworkView
 from r2p.node import Node
-from r2p.protocols.events import (
-    Command,
-    Echoes,
-    Event,
-    Mismatched,
-    ModuleChanged,
-    ModuleGone,
-    ModuleInfo,
-    NameConflict,
-    Obey,
-)
+from r2p.protocols.events import Command
 from r2p.supervisor import NodeFunction, Supervisor, check_function, name_of
-from r2p.topic import Topic, TopicSpace
+from r2p.topic import TopicSpace
 from r2p.transports.link import Link, Transport
 from r2p.transports.url import open_transport
 from r2p.watchdog import Watchdog
 
 logger = logging.getLogger("r2p.module")
-
-_CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
-_PROMPT = 1.0  # seconds in which a tool's link comes up without a word
 
 PATIENCE = 1.0
 """Seconds after which the log names the nodes whose clean-up is being waited for."""
@@ -88,17 +76,14 @@ class Module:
         self._remap = _checked_remap(remap)
         self._with_watchdog = watchdog
         self._bridging = BridgeOptions() if bridge is True else bridge or None
-        self._bridge: Bridge | None = None
         self._supervisors: dict[str, Supervisor] = {}
         self._crashes: dict[str, Exception] = {}
         self._events = EventHub()
-        self._space: TopicSpace | None = None
+        self._hub: ModuleHub | None = None
         self._transports: list[asyncio.Task[None]] = []
         self._tasks: asyncio.TaskGroup | None = None
         self._order: Command | None = None
         self._obeying: asyncio.Task[None] | None = None
-        self._suspected: set[str] = set()
-        self._flags = 0
         self._open = False
 
     # Life
@@ -109,13 +94,16 @@ class Module:
             raise Error(f"module {self.name} was opened before: make a new one")
         loop = asyncio.get_running_loop()
         clock = clock_of(loop)
-        self.random = random_of(loop)
-        self.instance = self.random.getrandbits(32)
-        self._space = TopicSpace(self.name, loop, clock)
-        self._space.changed = self._topic_changed
-        if self._bridging is not None:
-            self._bridge = Bridge(self._space, self.instance, self._bridging, self._port_changed)
-            self._space.make_topic = self._bridge.make_topic
+        self._hub = ModuleHub(
+            TopicSpace(self.name, loop, clock),
+            self.links,
+            random_of(loop),
+            self._events,
+            self._obey,
+            observer=self.observer,
+            bridging=self._bridging,
+        )
+        self.instance = self._hub.instance
         self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
@@ -152,16 +140,26 @@ class Module:
         Raises Closed before it is open, and Error if it is no gateway (`bridge`).
         """
         self._running()
-        if self._bridge is None:
+        bridge = self._opened.bridge
+        if bridge is None:
             raise Error(f"module {self.name} is no gateway: make it with bridge=True")
-        return self._bridge.statistics()
+        return bridge.statistics()
 
     @property
     def space(self) -> TopicSpace:
         """Its topics. Raises Closed before it is opened."""
-        if self._space is None:
+        return self._opened.space
+
+    @property
+    def addresses(self) -> list[tuple[str, str]]:
+        """Where it takes connections: each URL that was opened, and its address. Raises Closed before it is opened."""
+        return list(self._opened.addresses)
+
+    @property
+    def _opened(self) -> ModuleHub:
+        if self._hub is None:
             raise self._not_open()
-        return self._space
+        return self._hub
 
     def _running(self) -> asyncio.TaskGroup:
         """The owner of its tasks. Raises Closed unless it is open."""
@@ -181,7 +179,7 @@ class Module:
             if not opened.done():
                 opened.set_result(None)
 
-        running = tasks.create_task(transport.run(self, works), name=f"{self.name} {via}")
+        running = tasks.create_task(transport.run(self._opened, works), name=f"{self.name} {via}")
         self._transports.append(running)
         await asyncio.wait([opened, running], return_when=asyncio.FIRST_COMPLETED)
 
@@ -201,8 +199,8 @@ class Module:
             except BaseExceptionGroup as group:  # of transports: what a node raises, its supervisor keeps
                 raise group.exceptions[0] if len(group.exceptions) == 1 else group from None
             finally:
-                if self._bridge is not None:
-                    self._bridge.close()
+                if self._opened.bridge is not None:
+                    self._opened.bridge.close()
                 if self._watchdog is not None:
                     self._watchdog.close()
                 self._changed.set()
@@ -269,7 +267,7 @@ class Module:
         """End all nodes; links and management go on (ALIVE says so)."""
         async with self._switching:
             self.stopped = True
-            self._set_flags(self._flags | FLAG_STOPPED)
+            self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
             await self._end_nodes()
 
     async def reboot(self) -> None:
@@ -280,7 +278,8 @@ class Module:
     async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
         """In a task of its own: a node that asks for it is ended by it."""
         async with self._switching:
-            self._set_flags(self._flags | FLAG_STOPPED)  # so that others notice each reboot, not only the first one
+            # Others notice each reboot by it, not only the first one.
+            self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
             await self._end_nodes()
             if not self._open:
                 return
@@ -289,7 +288,7 @@ class Module:
             for supervisor in self._supervisors.values():
                 if not supervisor.running:  # one was started meanwhile
                     supervisor.start(tasks, self._node_ended)
-            self._set_flags(FLAG_REBOOTED)
+            self._opened.set_flags(FLAG_REBOOTED)
 
     @property
     def _held(self) -> bool:
@@ -325,77 +324,6 @@ class Module:
         """
         return self._events.listen()
 
-    # For transports (the Hub)
-
-    def attach(self, link: Link) -> None:
-        """A transport has a link, up or not yet."""
-        self.links.append(link)
-        self.space.links.append(link)
-        if self._bridge is not None:
-            self._bridge.attach(link)
-        for topic in list(self.space.topics.values()):
-            link.topic_changed(topic)
-        link.set_flags(self._flags)
-
-    def detach(self, link: Link) -> None:
-        """It does not have it any more."""
-        self.links.remove(link)
-        self.space.links.remove(link)
-        if self._bridge is not None:
-            self._bridge.detach(link)
-
-    def link_waits(self, link: Link, reason: str) -> None:
-        """The link can't be had yet."""
-        logger.warning("link %s: %s; trying again", link.name, reason)
-        self._events.tell(LinkWaits(link.name, reason))
-
-    def link_notice(self, link: Link, kind: str, text: str, *, trouble: bool) -> None:
-        """Something on the link is worth telling."""
-        logger.log(logging.WARNING if trouble else logging.INFO, "link %s: %s", link.name, text)
-        self._events.tell(LinkNotice(link.name, kind, text))
-
-    def _port_changed(self, link: Link, kind: str, text: str, trouble: bool) -> None:
-        self.link_notice(link, f"gateway: {kind}", text, trouble=trouble)
-
-    def listening(self, url: str, address: str) -> None:
-        """A transport takes connections."""
-        logger.info("%s takes connections at %s", url, address)
-        self._events.tell(Listening(url, address))
-
-    def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
-        """The link went up or down."""
-        if link.up:
-            first = link.stats.ups == 1
-            meanwhile = "" if first else f", after {outage:.1f} s; {lost} messages lost meanwhile"
-            expected = self.observer and first and outage < _PROMPT
-            logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.name, meanwhile)
-            self._events.tell(LinkUp(link.name, outage, lost))
-        else:
-            abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
-            logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.name, reason)
-            self._events.tell(LinkDown(link.name, reason))
-        if self._bridge is not None:
-            self._bridge.link_changed(link)
-
-    def discovered(self, link: Link, event: Event) -> None:
-        """The discovery of a link found something that concerns the module."""
-        match event:
-            case Obey():
-                self._obey(event.command)
-            case Mismatched():
-                logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
-                self._events.tell(event)
-            case NameConflict():
-                logger.error("link %s: two modules carry the name %s: rename one (--module)", link.name, event.module)
-                self._events.tell(event)
-            case Echoes():
-                logger.error("link %s gives back what we send: switch off local echo at the other end", link.name)
-            case ModuleChanged():
-                self._suspect_namesakes(link, event.info)
-                self._events.tell(event)
-            case ModuleGone():
-                self._events.tell(event)
-
     def _obey(self, command: Command) -> None:
         logger.warning("module %s: %s from the network", self.name, command.name)
         if self._tasks is None or not self._open:
@@ -413,38 +341,6 @@ class Module:
         while self._order is not None and self._open:
             order, self._order = self._order, None
             await (self.stop() if order is Command.STOP else self._reboot(tasks))
-
-    def _suspect_namesakes(self, link: Link, info: ModuleInfo) -> None:
-        """Two who can't hear each other may have one name, or one came back before its old link was seen to be down."""
-        others = (other.discovery.modules.get(info.name) for other in self.links if other is not link)
-        if info.name in self._suspected:
-            return
-        if any(other is not None and other.instance != info.instance for other in others):
-            self._suspected.add(info.name)
-            self.space.loop.call_later(_CONFIRMED, self._tell_namesakes, info.name, self.space.clock.monotonic())
-
-    def _tell_namesakes(self, name: str, suspected: int) -> None:
-        """Whoever has heard both since then (monotonic ns) tells them."""
-        self._suspected.discard(name)
-        found = [(link, info) for link in self.links if (info := link.discovery.modules.get(name)) is not None]
-        heard = {
-            info.instance: link for link, info in found if info.instance is not None and info.last_heard > suspected
-        }
-        if len(heard) < 2 or not self._open:
-            return
-        (one, link), (other, _), *_ = heard.items()
-        for each in heard.values():
-            each.tell_conflict(name, one, other)
-        self.discovered(link, NameConflict(name, one, other))
-
-    def _topic_changed(self, topic: Topic) -> None:
-        for link in self.links:
-            link.topic_changed(topic)
-
-    def _set_flags(self, flags: int) -> None:
-        self._flags = flags
-        for link in self.links:
-            link.set_flags(flags)
 
 
 def _urls(via: str | Transport | Iterable[str | Transport] | None) -> list[str | Transport]:

@@ -92,7 +92,7 @@ async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatc
     async with robot(hold) as bot, tool() as session:
         await bot.reboot()
         await asyncio.sleep(1)
-        monkeypatch.setattr(bot, "_obey", lambda _command: None)
+        monkeypatch.setattr(bot._hub, "_obey", lambda _command: None)
         with pytest.raises(
             TimedOut, match=r"BOT did not confirm REBOOT in 4 s: it is running, heard .* rebooted before"
         ):

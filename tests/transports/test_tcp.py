@@ -4,6 +4,7 @@ import asyncio
 import gc
 import os
 import socket
+from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
@@ -19,6 +20,7 @@ from r2p.protocols.discovery import Discovery
 from r2p.testing.network import node_in
 from r2p.transports import tcp
 from r2p.transports.line import LineLink
+from r2p.transports.link import Hub, Transport
 from r2p.transports.tcp import TcpListenTransport, TcpTransport
 from r2p.transports.url import parse
 from tests.transports.cables import GUARD
@@ -248,38 +250,28 @@ async def test_a_server_that_is_cancelled_twice_lets_go_of_its_clients() -> None
     transport = listen()
     links_left: list[int] = []
 
-    class Hub:
-        """A module's, with an eye on its links."""
+    class Apart(Transport):
+        """Runs it in a task of its own."""
 
-        def __init__(self, module: r2p.Module) -> None:
-            self._module = module
+        async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+            self.running = asyncio.create_task(transport.run(hub, opened))
+            await asyncio.wait([self.running])
+            links_left.append(len(hub.space.links))
 
-        def __getattr__(self, name: str) -> object:
-            return getattr(self._module, name)
-
-    async with asyncio.timeout(GUARD), r2p.Module("A", watchdog=False) as module, node_in(module) as node:
+    apart = Apart()
+    async with asyncio.timeout(GUARD), r2p.Module("A", via=[apart], watchdog=False) as module, node_in(module) as node:
         publisher = node.advertise("leds", Led, r2p.NonRealTime(stall=0.01))
-        opened = asyncio.Event()
-
-        async def run() -> None:
-            try:
-                await transport.run(Hub(module), opened.set)  # type: ignore[arg-type]
-            finally:
-                links_left.append(len(module.links))
-
-        running = asyncio.create_task(run())
-        await opened.wait()
         _, writer = await dial(transport)
         writer.write(SUBSCRIBE)
         await publisher.wait_subscriber()
         while not publisher.missed:
             await publisher.publish(Led())
         (link,) = module.links
-        running.cancel()
+        apart.running.cancel()
         await until(lambda: link._closed)
-        running.cancel()
-        await asyncio.wait([running])
-        assert running.cancelled()
+        apart.running.cancel()
+        await until(lambda: bool(links_left))
+        assert apart.running.cancelled()
         assert links_left == [0]
         writer.close()
 

@@ -29,8 +29,6 @@ class Board(r2p.Module):
     ) -> None:
         super().__init__(name, via=via, remap=remap, watchdog=False, bridge=bridge)
         self._programs = dict(nodes or {})
-        self.addresses: list[tuple[str, str]] = []
-        """Where it takes connections: the URL that was opened, and the address."""
 
     async def __aenter__(self) -> Self:
         """Power on. Raises as `r2p.Module` does."""
@@ -38,8 +36,3 @@ class Board(r2p.Module):
         for name, function in self._programs.items():
             self.start(function, name=name)
         return self
-
-    def listening(self, url: str, address: str) -> None:
-        """A transport takes connections."""
-        self.addresses.append((url, address))
-        super().listening(url, address)

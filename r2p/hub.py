@@ -1,0 +1,172 @@
+"""What the transports of a module see of it: they bring it links, and the links bring news.
+
+It keeps the links of one module, tells all of them what changes here, and tells the module's listeners and the log what
+they find out. With a bridge it tells that, too.
+"""
+
+import logging
+import random
+from collections.abc import Callable
+
+from r2p.bridge import Bridge, BridgeOptions
+from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
+from r2p.network import describe_mismatch
+from r2p.protocols.events import (
+    Command,
+    Echoes,
+    Event,
+    Mismatched,
+    ModuleChanged,
+    ModuleGone,
+    ModuleInfo,
+    NameConflict,
+    Obey,
+)
+from r2p.topic import Topic, TopicSpace
+from r2p.transports.link import Link
+
+logger = logging.getLogger("r2p.module")
+
+_CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
+_PROMPT = 1.0  # seconds in which a tool's link comes up without a word
+
+
+class ModuleHub:
+    """The `Hub` of one module, from its opening on; `links` is the module's own list, `obey` gets others' orders."""
+
+    def __init__(
+        self,
+        space: TopicSpace,
+        links: list[Link],
+        numbers: random.Random,
+        events: EventHub,
+        obey: Callable[[Command], object],
+        *,
+        observer: bool,
+        bridging: BridgeOptions | None,
+    ) -> None:
+        self.space = space
+        self.links = links
+        self.random = numbers
+        self.observer = observer
+        self.instance = numbers.getrandbits(32)
+        """Random number of this run of the module."""
+        self.flags = 0
+        """Those of ALIVE."""
+        self.bridge: Bridge | None = None
+        self.addresses: list[tuple[str, str]] = []
+        """Where it takes connections: the URL that was opened, and the address."""
+        self._events = events
+        self._obey = obey
+        self._suspected: set[str] = set()
+        space.changed = self._topic_changed
+        if bridging is not None:
+            self.bridge = Bridge(space, self.instance, bridging, self._port_changed)
+            space.make_topic = self.bridge.make_topic
+
+    def set_flags(self, flags: int) -> None:
+        """The module's state changed: tell the others."""
+        self.flags = flags
+        for link in self.links:
+            link.set_flags(flags)
+
+    def _topic_changed(self, topic: Topic) -> None:
+        for link in self.links:
+            link.topic_changed(topic)
+
+    # For transports
+
+    def attach(self, link: Link) -> None:
+        """A transport has a link, up or not yet."""
+        self.links.append(link)
+        self.space.links.append(link)
+        if self.bridge is not None:
+            self.bridge.attach(link)
+        for topic in list(self.space.topics.values()):
+            link.topic_changed(topic)
+        link.set_flags(self.flags)
+
+    def detach(self, link: Link) -> None:
+        """It does not have it any more."""
+        self.links.remove(link)
+        self.space.links.remove(link)
+        if self.bridge is not None:
+            self.bridge.detach(link)
+
+    def link_waits(self, link: Link, reason: str) -> None:
+        """The link can't be had yet."""
+        logger.warning("link %s: %s; trying again", link.name, reason)
+        self._events.tell(LinkWaits(link.name, reason))
+
+    def link_notice(self, link: Link, kind: str, text: str, *, trouble: bool) -> None:
+        """Something on the link is worth telling."""
+        logger.log(logging.WARNING if trouble else logging.INFO, "link %s: %s", link.name, text)
+        self._events.tell(LinkNotice(link.name, kind, text))
+
+    def _port_changed(self, link: Link, kind: str, text: str, trouble: bool) -> None:
+        self.link_notice(link, f"gateway: {kind}", text, trouble=trouble)
+
+    def listening(self, url: str, address: str) -> None:
+        """A transport takes connections."""
+        logger.info("%s takes connections at %s", url, address)
+        self.addresses.append((url, address))
+        self._events.tell(Listening(url, address))
+
+    def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
+        """The link went up or down."""
+        if link.up:
+            first = link.stats.ups == 1
+            meanwhile = "" if first else f", after {outage:.1f} s; {lost} messages lost meanwhile"
+            expected = self.observer and first and outage < _PROMPT
+            logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.name, meanwhile)
+            self._events.tell(LinkUp(link.name, outage, lost))
+        else:
+            abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
+            logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.name, reason)
+            self._events.tell(LinkDown(link.name, reason))
+        if self.bridge is not None:
+            self.bridge.link_changed(link)
+
+    def discovered(self, link: Link, event: Event) -> None:
+        """The discovery of a link found something that concerns the module."""
+        match event:
+            case Obey():
+                self._obey(event.command)
+            case Mismatched():
+                logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
+                self._events.tell(event)
+            case NameConflict():
+                logger.error("link %s: two modules carry the name %s: rename one (--module)", link.name, event.module)
+                self._events.tell(event)
+            case Echoes():
+                logger.error("link %s gives back what we send: switch off local echo at the other end", link.name)
+            case ModuleChanged():
+                self._suspect_namesakes(link, event.info)
+                self._events.tell(event)
+            case ModuleGone():
+                self._events.tell(event)
+
+    # Names
+
+    def _suspect_namesakes(self, link: Link, info: ModuleInfo) -> None:
+        """Two who can't hear each other may have one name, or one came back before its old link was seen to be down."""
+        others = (other.discovery.modules.get(info.name) for other in self.links if other is not link)
+        if info.name in self._suspected:
+            return
+        if any(other is not None and other.instance != info.instance for other in others):
+            self._suspected.add(info.name)
+            self.space.loop.call_later(_CONFIRMED, self._tell_namesakes, info.name, self.space.clock.monotonic())
+
+    def _tell_namesakes(self, name: str, suspected: int) -> None:
+        """Whoever has heard both since then (monotonic ns) tells them."""
+        self._suspected.discard(name)
+        found = [(link, info) for link in self.links if (info := link.discovery.modules.get(name)) is not None]
+        heard = {
+            info.instance: link for link, info in found if info.instance is not None and info.last_heard > suspected
+        }
+        if len(heard) < 2:
+            return
+        (one, link), (other, _), *_ = heard.items()
+        for each in heard.values():
+            each.tell_conflict(name, one, other)
+        self.discovered(link, NameConflict(name, one, other))
