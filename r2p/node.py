@@ -223,8 +223,7 @@ class Node:
             on_timeout=on_timeout,
         )
         self.subscribers[subscriber] = None
-        where.join(subscriber)
-        self._space.changed(where)
+        subscriber.open()
         return subscriber
 
     async def spin(self, timeout: float | None = None) -> bool:
@@ -358,8 +357,7 @@ class Node:
             await waiter
         finally:
             for subscriber in listening:
-                if subscriber.waiter is waiter:
-                    subscriber.waiter = None
+                subscriber.wait_no_more(waiter)
 
     def _listening(self) -> list[Subscriber[Any]]:
         return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]

@@ -55,7 +55,7 @@ class _GuardedQueue(deque[Sample]):
         self._note(sample)
 
 
-class Subscriber(QueueSink, Generic[T]):
+class Subscriber(Generic[T]):
     """One subscription of a node. Made by `Node.subscribe`.
 
     Iterate it (`async for message in sub`), `fetch()` single messages, or give a callback that `node.spin()` serves.
@@ -77,7 +77,6 @@ class Subscriber(QueueSink, Generic[T]):
         timeout: float | None,
         on_timeout: Callable[[], object] | None,
     ) -> None:
-        super().__init__(space.waker, node, queue, node.priority, lossy=lossy, keep_oldest=keep == "oldest")
         self.topic = topic.name
         self.callback = callback
         self.undecodable = 0
@@ -86,6 +85,8 @@ class Subscriber(QueueSink, Generic[T]):
         """Messages older than `max_age` when their turn came; skipped."""
         self.timeouts = 0
         """Times that nothing (fresh) came for `timeout` seconds."""
+        self._sink = QueueSink(space.waker, node, queue, node.priority, lossy=lossy, keep_oldest=keep == "oldest")
+        self._node = node
         self._space = space
         self._topic = topic
         self._layout = layout
@@ -93,15 +94,21 @@ class Subscriber(QueueSink, Generic[T]):
         self._max_age = None if max_age is None else round(max_age * _SECOND)
         self._on_timeout = on_timeout
         self._closed = False
-        self._matches: list[asyncio.Future[None]] = []
         self._silent = False
         self._credit = 0
         self._timeout = 0 if timeout is None else round(timeout * _SECOND)
         self._heard = space.clock.monotonic()
         self._alarm = Alarm(space.loop, self._check_silence)
         if timeout is not None:
-            self.queue = _GuardedQueue(self._note)
+            self._sink.queue = _GuardedQueue(self._note)
             self._alarm.set(self._heard + self._timeout)
+        self.queue = self._sink.queue
+        """What waits to be read, oldest first."""
+
+    @property
+    def lost(self) -> int:
+        """Messages that found the queue full, or were pushed out of it."""
+        return self._sink.lost
 
     @property
     def publishers(self) -> int:
@@ -112,16 +119,11 @@ class Subscriber(QueueSink, Generic[T]):
         """Wait until somebody publishes the topic. Raises Closed if the subscription is closed before."""
         if not self.publishers:
             waiter = self._space.loop.create_future()
-            self._matches.append(waiter)
+            self._sink.matches.append(waiter)
             try:
                 await waiter
             finally:
-                self._matches.remove(waiter)
-
-    def publisher_joined(self) -> None:
-        for waiter in self._matches:
-            if not waiter.done():
-                waiter.set_result(None)
+                self._sink.matches.remove(waiter)
 
     def __aiter__(self) -> AsyncIterator[T]:
         return self._iterate(whole=False)
@@ -132,23 +134,23 @@ class Subscriber(QueueSink, Generic[T]):
 
     async def _iterate(self, *, whole: bool) -> AsyncIterator[Any]:  # noqa: C901 - see below
         # One long function, because this is where every message passes: calls would take as long as the work.
-        queue, kind, create_future = self.queue, self._type, self._space.loop.create_future
-        fussy = self._max_age is not None
+        sink, kind, create_future = self._sink, self._type, self._space.loop.create_future
+        queue, waker, fussy = sink.queue, self._space.waker, self._max_age is not None
         while not self._closed:
             if not queue:
-                if self.waiter is not None:
+                if sink.waiter is not None:
                     raise self._two_readers()
-                waiter = self.waiter = create_future()
+                waiter = sink.waiter = create_future()
                 try:
                     await waiter
                 finally:
-                    if self.waiter is waiter:
-                        self.waiter = None
-            credit = BURST if self.priority >= self._waker.top else 1
+                    if sink.waiter is waiter:
+                        sink.waiter = None
+            credit = BURST if sink.priority >= waker.top else 1
             while queue:
                 sample = queue.popleft()
-                if self._room is not None:
-                    self.refill()
+                if sink.lines is not None:
+                    sink.refill()
                 message = sample.message
                 if fussy or message.__class__ is not kind:
                     message = self._examine(sample)
@@ -186,14 +188,14 @@ class Subscriber(QueueSink, Generic[T]):
         if not self._closed:
             self._closed = True
             self._alarm.close()
-            self._topic.leave(self)
+            self._topic.leave(self._sink)
             self._space.release(self._topic)
-            self.node.forget(self)
+            self._node.forget(self)
             self.queue.clear()
-            self.refill()
-            if self.waiter is not None and not self.waiter.done():
-                self.waiter.set_result(None)
-            for waiter in self._matches:
+            self._sink.refill()
+            if (reader := self._sink.waiter) is not None and not reader.done():
+                reader.set_result(None)
+            for waiter in self._sink.matches:
                 if not waiter.done():
                     waiter.set_exception(self._is_closed())
 
@@ -205,7 +207,12 @@ class Subscriber(QueueSink, Generic[T]):
     ) -> None:
         self.close()
 
-    # For the node, and below
+    # For the node
+
+    def open(self) -> None:
+        """Join the topic; a latched value is there at once."""
+        self._topic.join(self._sink)
+        self._space.changed(self._topic)
 
     async def serve(self) -> bool:
         """Hand what waits now to the callback; says whether there was anything. For `Node.spin`."""
@@ -222,17 +229,22 @@ class Subscriber(QueueSink, Generic[T]):
 
     def wait_by(self, waiter: asyncio.Future[None]) -> None:
         """Wake this future at the next message."""
-        if self.waiter is not None:
+        if self._sink.waiter is not None:
             raise self._two_readers()
-        self.waiter = waiter
+        self._sink.waiter = waiter
+
+    def wait_no_more(self, waiter: asyncio.Future[None]) -> None:
+        """Take it back, if it has not been woken."""
+        if self._sink.waiter is waiter:
+            self._sink.waiter = None
 
     def _next(self) -> T | None:
         """The next good message that waits, or None."""
-        queue = self.queue
+        sink, queue = self._sink, self.queue
         while queue:
             sample = queue.popleft()
-            if self._room is not None:
-                self.refill()
+            if sink.lines is not None:
+                sink.refill()
             message: T | None = self._examine(sample)
             if message is not None:
                 return message
@@ -265,8 +277,7 @@ class Subscriber(QueueSink, Generic[T]):
         try:
             await waiter
         finally:
-            if self.waiter is waiter:
-                self.waiter = None
+            self.wait_no_more(waiter)
 
     def _two_readers(self) -> RuntimeError:
         return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each")
@@ -277,16 +288,17 @@ class Subscriber(QueueSink, Generic[T]):
     async def _use_credit(self) -> None:
         """Let others run after BURST messages in a row; a node of low priority after each."""
         self._credit += 1
-        if self._credit >= BURST or self.priority < self._waker.top:
+        if self._credit >= BURST or self._sink.priority < self._space.waker.top:
             self._credit = 0
             await self._give_way()
 
     async def _give_way(self) -> None:
-        if self.priority >= self._waker.top:
+        waker, priority = self._space.waker, self._sink.priority
+        if priority >= waker.top:
             await pause()
         else:
             turn = self._space.loop.create_future()
-            self._waker.queue(self.priority, turn)
+            waker.queue(priority, turn)
             await turn
 
     def _note(self, sample: Sample) -> None:
@@ -307,9 +319,9 @@ class Subscriber(QueueSink, Generic[T]):
             try:
                 self._on_timeout()
             except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
-                self.node.crash(error)
+                self._node.crash(error)
             return
         self._heard = now
         self._alarm.set(now + self._timeout)
-        if self.waiter is not None and not self.waiter.done():
-            self.waiter.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / _SECOND} s"))
+        if (reader := self._sink.waiter) is not None and not reader.done():
+            reader.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / _SECOND} s"))

@@ -12,8 +12,11 @@ import itertools
 import logging
 import types
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Hashable, Sequence
 from typing import Any, Protocol
+from weakref import WeakValueDictionary
+
+import msgspec
 
 from r2p.clock import Clock
 from r2p.errors import MessageError, TypeMismatch
@@ -101,7 +104,7 @@ class Waker:
 class QueueSink(Sink):
     """The bounded queue of one subscriber; the topic fills it, the subscriber empties it."""
 
-    __slots__ = ("_room", "_waker", "keep_oldest", "limit", "lossy", "node", "priority", "queue", "waiter")
+    __slots__ = ("_waker", "keep_oldest", "limit", "lines", "lossy", "matches", "node", "priority", "queue", "waiter")
 
     def __init__(self, waker: Waker, node: Owner, limit: int, priority: int, *, lossy: bool, keep_oldest: bool) -> None:
         super().__init__()
@@ -114,7 +117,11 @@ class QueueSink(Sink):
         self.patient = not lossy
         self.queue: deque[Sample] = deque()
         self.waiter: asyncio.Future[None] | None = None
-        self._room: Room | None = None  # only while somebody waits: whoever takes a message out looks for it
+        """Its reader, while that waits for a message."""
+        self.matches: list[asyncio.Future[None]] = []
+        """Those who wait for a publisher."""
+        self.lines: Room | None = None
+        """Only while somebody waits for room: whoever takes a message out then calls `refill`."""
 
     def offer(self, sample: Sample) -> bool:
         if len(self.queue) >= self.limit:
@@ -131,18 +138,17 @@ class QueueSink(Sink):
             self._put(sample)
 
     def room(self) -> Room:
-        if self._room is None:
-            self._room = Room()
-        return self._room
+        if self.lines is None:
+            self.lines = Room()
+        return self.lines
 
     def refill(self) -> None:
-        room = self._room
-        if room is not None:
+        if (room := self.lines) is not None:
             room.serve()
             if len(self.queue) <= self.limit // 2:
                 room.recover()
             if not room:
-                self._room = None
+                self.lines = None
 
     @property
     def owner(self) -> str:
@@ -151,6 +157,9 @@ class QueueSink(Sink):
 
     def publisher_joined(self) -> None:
         """The topic has one more publisher."""
+        for waiter in self.matches:
+            if not waiter.done():
+                waiter.set_result(None)
 
     def _put(self, sample: Sample) -> None:
         self.queue.append(sample)
@@ -203,6 +212,13 @@ class Memory(Protocol):
         """Send the last message to a new subscriber, if the publisher latches it."""
 
 
+class Heard(msgspec.Struct, eq=False, weakref=True):
+    """The last message of a remote publisher, by whatever way it came: sequence number and stamp."""
+
+    sequence: int = 0
+    stamp: int = 0
+
+
 class Topic:
     """One topic in one module."""
 
@@ -216,6 +232,17 @@ class Topic:
         """Remote publishers."""
         self.memories: list[Memory] = []
         self._waker = waker
+        self._heard: WeakValueDictionary[Hashable, Heard] = WeakValueDictionary()
+
+    def heard(self, publisher: Hashable) -> Heard:
+        """What all ways share by which messages of a remote publisher come in, so that doubles are recognised.
+
+        It lasts as long as somebody keeps it.
+        """
+        heard = self._heard.get(publisher)
+        if heard is None:
+            heard = self._heard[publisher] = Heard()
+        return heard
 
     def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
         """Queue the sample wherever there is room; the sinks that are worth waiting for come back.

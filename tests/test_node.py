@@ -103,7 +103,7 @@ async def test_the_time_out_of_a_subscription_ends_a_spin() -> None:
         leds = node.subscribe("a", Led, lambda message: None, timeout=0.5)
         assert not await node.spin()
         assert leds.timeouts == 1
-        assert leds.waiter is None
+        assert leds._sink.waiter is None
 
 
 @pytest.mark.virtual_time
@@ -121,7 +121,7 @@ async def test_a_cancelled_spin_loses_no_message() -> None:
                 await asyncio.sleep(0)
             spinning.cancel()
             await asyncio.wait([spinning])
-            assert leds.waiter is None
+            assert leds._sink.waiter is None
         await node.spin()
         assert numbers(got) == list(range(6))
 

@@ -243,7 +243,7 @@ async def test_a_cancelled_reader_loses_no_message(how: str) -> None:
             reading.cancel()
             await asyncio.wait([reading])
             assert numbers(got) + drain(leds) == [0, 1, 2]
-            assert leds.waiter is None
+            assert leds._sink.waiter is None
 
 
 # Fetch
