@@ -47,7 +47,7 @@ from r2p.module import Module
 from r2p.network import Endpoint, ModuleView, NetworkView, TopicView
 from r2p.node import Node, Tick
 from r2p.protocols.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
-from r2p.publisher import PeriodicPublisher, Publisher, SporadicPublisher
+from r2p.publishers import PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runner import run, run_main
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.subscriber import Subscriber

@@ -17,7 +17,7 @@ from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.events import EventHub, ModuleEvent
 from r2p.messages import Message, layout
 from r2p.names import MANAGEMENT, topic_name
-from r2p.publisher import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
+from r2p.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.subscriber import Callback, Keep, Subscriber, check_options
 from r2p.topic import TopicSpace, pause
 

@@ -6,7 +6,7 @@ period, and keeps the bus's beat instead of that of the network it came by.
 
 from typing import Any
 
-from r2p.publisher import PeriodicPublisher
+from r2p.publishers import PeriodicPublisher
 from r2p.sample import PublisherClass, Sample
 
 

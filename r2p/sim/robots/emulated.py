@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from r2p.msg import Speed3
-from r2p.publisher import AnyPublisher
+from r2p.publishers import AnyPublisher
 from r2p.sim.modules.board import Board
 from r2p.sim.modules.gateway import GatewayModule
 from r2p.sim.modules.motor import MotorConfig, MotorModule, Setpoints

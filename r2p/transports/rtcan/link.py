@@ -43,7 +43,7 @@ from r2p.protocols.rtcan.events import (
 )
 from r2p.protocols.rtcan.settings import Settings
 from r2p.protocols.rtcan.topics import HighBytes
-from r2p.publisher import PeriodicPublisher
+from r2p.publishers import PeriodicPublisher
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Advertised, Topic
 from r2p.transports.link import Hub, Link

@@ -15,7 +15,7 @@ from r2p.codecs import rtcan
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Degraded, Done, Due, Fate, Granted, Refused
-from r2p.publisher import PeriodicPublisher
+from r2p.publishers import PeriodicPublisher
 from r2p.topic import Topic
 from r2p.transports.intake import LinkStats
 
