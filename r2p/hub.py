@@ -29,6 +29,7 @@ logger = logging.getLogger("r2p.module")
 
 _CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
+_APART = 1_000_000_000  # ns between two lines about one topic whose types differ
 
 
 class ModuleHub:
@@ -59,6 +60,7 @@ class ModuleHub:
         self._events = events
         self._obey = obey
         self._suspected: set[str] = set()
+        self._mismatches: dict[tuple[str, str], int] = {}
         space.changed = self._topic_changed
         if bridging is not None:
             self.bridge = Bridge(space, self.instance, bridging, self._port_changed)
@@ -133,7 +135,7 @@ class ModuleHub:
             case Obey():
                 self._obey(event.command)
             case Mismatched():
-                logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
+                self._log_mismatch(link, event)
                 self._events.tell(event)
             case NameConflict():
                 logger.error("link %s: two modules carry the name %s: rename one (--module)", link.name, event.module)
@@ -145,6 +147,13 @@ class ModuleHub:
                 self._events.tell(event)
             case ModuleGone():
                 self._events.tell(event)
+
+    def _log_mismatch(self, link: Link, event: Mismatched) -> None:
+        """At most once a second: another type in each message would fill the log."""
+        now = self.space.clock.monotonic()
+        if now - self._mismatches.get((link.name, event.topic), -_APART) >= _APART:
+            self._mismatches[link.name, event.topic] = now
+            logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
 
     # Names
 

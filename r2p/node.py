@@ -206,7 +206,15 @@ class Node:
         Raises InvalidName or NameTooLong, MessageError (a type without a layout, an option without sense),
         TypeMismatch, and Closed once the node has ended.
         """
-        check_options(topic, queue=queue, keep=keep, callback=callback, max_age=max_age, timeout=timeout)
+        check_options(
+            topic,
+            queue=queue,
+            keep=keep,
+            callback=callback,
+            max_age=max_age,
+            timeout=timeout,
+            on_timeout=on_timeout,
+        )
         shape = None if type is None else layout(type)
         where = self._space.open(self._resolve(topic), shape)
         subscriber: Subscriber[Any] = Subscriber(

@@ -30,7 +30,7 @@ _SHORTEST = 1e-6  # s
 
 
 def check_options(
-    topic: str, *, queue: object, keep: object, callback: object, max_age: object, timeout: object
+    topic: str, *, queue: object, keep: object, callback: object, max_age: object, timeout: object, on_timeout: object
 ) -> None:
     """Raise MessageError for options of `Node.subscribe` without sense."""
     number(topic, "queue", queue)
@@ -38,6 +38,8 @@ def check_options(
         raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {keep!r}")
     if callback is not None and not callable(callback):
         raise MessageError(f"topic {topic}: a callback is a function, not {callback!r}: options are given by name")
+    if on_timeout is not None and (timeout is None or not callable(on_timeout)):
+        raise MessageError(f"topic {topic}: on_timeout is a function, called after a timeout= without messages")
     for option, value in (("max_age", max_age), ("timeout", timeout)):
         if value is not None:
             seconds(topic, option, value, least=_SHORTEST)

@@ -14,7 +14,7 @@ import pytest
 import r2p
 from r2p.events import EVENTS
 from r2p.module import PATIENCE
-from r2p.msg import Encoder, Led, Log
+from r2p.msg import Encoder, Led, Log, Odometry
 from r2p.protocols.events import Mismatched, NameConflict
 from r2p.transports.link import Transport
 from r2p.transports.memory import network
@@ -330,6 +330,22 @@ async def test_another_layout_is_refused_and_both_sides_are_told(caplog: pytest.
         assert [event.topic async for event in stream if isinstance(event, Mismatched)] == ["leds"]
     assert "topic leds is refused: others publish messages of 5 bytes" in caplog.text
     assert "use one message type on both sides, or another topic" in caplog.text
+
+
+@pytest.mark.virtual_time
+async def test_types_that_change_all_the_time_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    async with joined("A") as a, joined("B") as b:
+        events = a.events()
+        a.start(hold).advertise("leds", Led)
+        node = b.start(hold)
+        for kind in (Encoder, Odometry) * 20:
+            subscription = node.subscribe("leds", kind)
+            await settle(0.05)
+            subscription.close()
+    refused = [event.topic async for event in events if isinstance(event, Mismatched)]
+    assert len(refused) > 20
+    told = [text for text in caplog.messages if "topic leds is refused" in text]
+    assert 0 < len(told) <= 4  # it takes 2 s, on two links
 
 
 # Observers

@@ -62,6 +62,8 @@ async def test_a_full_queue_drops_for_its_own_subscriber_only(keep: str, left: l
         *(({"timeout": bad}, "timeout is in seconds, 1e-06 to") for bad in (-1.0, 1e-9, math.nan, math.inf)),
         ({"keep": "latest"}, "keep is 'newest' or 'oldest', not 'latest'"),
         ({"callback": 5}, "a callback is a function, not 5: options are given by name"),
+        ({"timeout": 1.0, "on_timeout": 5}, "on_timeout is a function, called after a timeout="),
+        ({"on_timeout": print}, "on_timeout is a function, called after a timeout="),
     ],
 )
 async def test_options_without_sense_are_refused(options: dict[str, Any], text: str) -> None:

@@ -246,6 +246,8 @@ def _explain(device: str, error: Exception) -> str:
     """Why the device can't be had, and what to do."""
     if isinstance(error, OSError) and error.errno == errno.EACCES:
         return f"{device}: permission denied; add yourself to its group: sudo usermod -aG dialout $USER"
+    if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):
+        return f"{device} is in use by another program: end that one (fuser -v {device} names it)"
     if not Path(device).exists():
         return f"{device} is not there: plug it in (ls /dev/serial/by-id)"
     return re.sub(r"^\[Errno \d+\] ", "", str(error))

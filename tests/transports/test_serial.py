@@ -191,7 +191,7 @@ async def test_a_device_that_another_program_has(board: Board) -> None:
             async with module:
                 waits = await anext(events)
     assert isinstance(waits, r2p.LinkWaits)
-    assert "exclusively lock" in waits.reason
+    assert "is in use by another program: end that one (fuser -v " in waits.reason
 
 
 async def test_a_device_that_is_no_serial_port(tmp_path: Path) -> None:
