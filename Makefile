@@ -11,7 +11,7 @@ demo: $(RUN)
 	$(BIN)/r2p demo
 
 test: $(STAMP) system
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadgroup
 
 lint: $(STAMP)
 	$(BIN)/ruff check

@@ -55,6 +55,14 @@ class Sink(abc.ABC):
     def refill(self) -> None:
         """Give them what room there is."""
 
+    def remind(self, sample: Sample) -> None:
+        """Take a value that its publisher latches: as soon as there is room."""
+        room = self.room()
+        if not self.reachable:
+            self.force(sample)
+        elif room.line(sample) or not self.offer(sample):
+            room.owe(self, sample)
+
     def give_up(self, refusal: str) -> None:
         """It made no room in time: lossy until it has."""
         self.patient = False
@@ -95,6 +103,15 @@ class Claim(abc.ABC):
         return without
 
 
+class _Reminder(Claim):
+    """A latched value on its way to somebody who has joined."""
+
+    __slots__ = ()
+
+    def settled(self, sink: Sink, refusal: str) -> None:
+        """Nobody waits for it."""
+
+
 _Line = deque[tuple[Sink, Claim]]
 
 
@@ -118,6 +135,14 @@ class Room:
 
     def enter(self, sink: Sink, claim: Claim) -> None:
         self.line(claim.sample).append((sink, claim))
+
+    def owe(self, sink: Sink, sample: Sample) -> None:
+        """A latched value waits, too; of one publisher only the last."""
+        for each, claim in self.line(sample):
+            if each is sink and isinstance(claim, _Reminder) and claim.sample.source == sample.source:
+                claim.sample = sample
+                return
+        _Reminder(sample, [sink])
 
     def leave(self, sink: Sink, claim: Claim) -> None:
         line = self.line(claim.sample)

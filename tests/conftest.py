@@ -6,6 +6,7 @@ real threads: it runs twice, on asyncio's loop and on uvloop's.
 
 from __future__ import annotations
 
+import signal
 import sys
 from typing import Any
 
@@ -21,6 +22,8 @@ _NO_UVLOOP = pytest.mark.skipif(sys.platform == "win32", reason="uvloop is not m
 def pytest_configure(config: pytest.Config) -> None:
     if not config.pluginmanager.is_registered(plugin):  # not installed: no entry point has named it
         config.pluginmanager.register(plugin, "r2p")
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's job in the background: nobody would obey Ctrl-C
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(

@@ -10,6 +10,7 @@ import pytest
 
 import r2p
 from r2p.msg import Led
+from r2p.transports import memory
 from r2p.transports.memory import IN_FLIGHT, MemoryLink, network
 from tests.bench import Recorder, crashes, drain, elapsed, hold, joined, led, local, pair, settle
 
@@ -215,6 +216,30 @@ async def test_latched_values_go_to_modules_that_come_back() -> None:
                 b.links[0].went_down("cut")
                 b.links[0].went_up()
                 await settle(1.0)
+
+
+@pytest.mark.virtual_time
+async def test_latched_values_wait_for_room_on_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "IN_FLIGHT", 8)
+
+    async def babble(node: r2p.Node) -> None:
+        publisher = node.advertise("noise", Led)
+        await publisher.wait_subscriber()
+        while True:
+            await publisher.publish(led(0))
+
+    async with joined("A") as a, joined("B") as b:
+        network("lab").delay = 0.01
+        node, other = a.start(hold), b.start(hold)
+        for number in range(20):
+            await node.advertise(f"map{number}", Led, latch=True).publish(led(number))
+        a.start(babble, name="first")
+        a.start(babble, name="second")
+        other.subscribe("noise", Led, lossy=True)
+        await settle(2.0)
+        maps = [other.subscribe(f"map{number}", Led) for number in range(20)]
+        await settle(3.0)
+        assert [drain(each) for each in maps] == [[number] for number in range(20)]
 
 
 @pytest.mark.virtual_time

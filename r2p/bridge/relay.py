@@ -5,7 +5,7 @@ asks the clock whether its two ports may still forward: a gateway that was stopp
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, cast
 
 from r2p.bridge.port import BridgePort
@@ -13,7 +13,7 @@ from r2p.bridge.seen import Seen
 from r2p.bridge.shaping import Shaper
 from r2p.room import Sink
 from r2p.sample import PublisherClass, Sample
-from r2p.topic import Outlet, QueueSink, Topic, Waker
+from r2p.topic import Heard, Outlet, QueueSink, Topic, Waker
 
 if TYPE_CHECKING:
     from r2p.bridge.reserving import RelayedPeriodic
@@ -66,6 +66,10 @@ class BridgedTopic(Topic):
     def in_use(self) -> bool:
         return self.relay is not None or super().in_use
 
+    def heard(self, publisher: Hashable) -> Heard:
+        """Nothing is shared: a message that is dropped as its link is silent now has not been here (`Seen`)."""
+        return Heard()
+
     def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
         link = sample.source.link
         if not link:
@@ -88,7 +92,7 @@ class BridgedTopic(Topic):
         for way in self.open.get(sample.source.link, ()):
             if way.outlet is outlet:
                 for sink in self._forward(way, sample, self._monotonic(), None) or ():
-                    sink.force(sample)
+                    sink.remind(sample)
 
     def join(self, sink: QueueSink | Outlet) -> None:
         super().join(sink)
@@ -178,7 +182,7 @@ class _Reminder:
         self._topic = topic
         self._outlet = outlet
 
-    def force(self, sample: Sample) -> None:
+    def remind(self, sample: Sample) -> None:
         self._topic.replay(sample, self._outlet)
 
 

@@ -108,7 +108,7 @@ class BasePublisher(Generic[M]):
     def joined(self, sink: Sink) -> None:
         """Somebody joined, or came back after a reboot: a latched value is sent again."""
         if self._last is not None:
-            sink.force(self._last)
+            sink.remind(self._last)
         for waiter in self._waiters:
             if not waiter.done():
                 waiter.set_result(None)

@@ -156,7 +156,7 @@ class Intake:
         """Send the last message to a new subscriber, if the publisher latches it."""
         last = self._inlets[topic.name.encode()].last
         if last is not None and self._link.latched(topic.name):
-            sink.force(last)
+            sink.remind(last)
 
     def close(self) -> None:
         """Forget what was not handed out yet, and take no more."""

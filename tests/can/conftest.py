@@ -15,6 +15,13 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(replay.Writer(config))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """One worker of pytest-xdist gets all of them, for there is one kernel."""
+    for item in items:
+        if item.get_closest_marker(replay.MARK) and not replay.inside():
+            item.add_marker(pytest.mark.xdist_group(replay.MARK))
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> bool | None:
     if replay.inside() or not item.get_closest_marker(replay.MARK):

@@ -56,8 +56,9 @@ class Replay:
             self._reports = self._run()
         hook = item.ihook
         hook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-        reports = self._reports.get(item.nodeid, [])
+        reports = self._reports.get(_plain(item.nodeid), [])
         for report in reports:
+            report.nodeid = item.nodeid
             hook.pytest_runtest_logreport(report=report)
         if not reports or reports[-1].when != "teardown":
             hook.pytest_runtest_logreport(report=self._missing(item))
@@ -71,7 +72,7 @@ class Replay:
             return {}
         root = self._session.config.rootpath
         with kernel.folder() as shared:
-            tests = [item.nodeid for item in self._session.items if item.get_closest_marker(MARK)]
+            tests = [_plain(item.nodeid) for item in self._session.items if item.get_closest_marker(MARK)]
             (shared / "tests").write_text("\n".join(tests), encoding="utf-8")
             environment = {_REPORTS: str(shared / "reports"), "CI": os.environ.get("CI", "")}
             try:
@@ -102,9 +103,14 @@ class Replay:
         return pytest.TestReport(item.nodeid, item.location, keywords, self._outcome, text, "setup")
 
 
+def _plain(nodeid: str) -> str:
+    """Without the group that pytest-xdist has added."""
+    return nodeid.removesuffix(f"@{MARK}")
+
+
 def _pytest(shared: Path) -> list[str]:
     """The order is the one of the first pytest, which may be random. What takes long to import there is left out."""
-    without = ("randomly", "cacheprovider", "hypothesispytest")
+    without = ("randomly", "cacheprovider", "hypothesispytest", "xdist")
     plugins = [word for plugin in without for word in ("-p", f"no:{plugin}")]
     options = ["--color=no", "-o", f"faulthandler_timeout={_SILENT_FOR}", "-v"]
     return [sys.executable, "-m", "pytest", *plugins, *options, f"@{shared}/tests"]
