@@ -29,6 +29,7 @@ async def battery(node: r2p.Node) -> None:
 async def main(*links: str) -> None:
     async with r2p.Module("GW1", via=links, bridge=OPTIONS) as gateway:
         gateway.start(battery)
+        print("joined:", ", ".join(links), flush=True)
         while True:
             await asyncio.sleep(10)
             for way in gateway.gateway_statistics().ways:
@@ -37,4 +38,4 @@ async def main(*links: str) -> None:
 
 if __name__ == "__main__":
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(main(*sys.argv[1:]))
+        asyncio.run(main(*sys.argv[1:] or sys.exit(__doc__)))

@@ -1,7 +1,7 @@
 """A PC drives an omnidirectional robot along a square, by the robot's own odometry.
 
-r2p sim triskar2                                         in one terminal; it tells where its gateway is
-r2p run square.py:square --via tcp:127.0.0.1:PORT        in another one
+r2p sim triskar2 --via tcp-listen:2323                   in one terminal
+r2p run square.py:square --via tcp:127.0.0.1:2323        in another one
 """
 
 import itertools

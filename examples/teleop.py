@@ -1,7 +1,7 @@
-"""Drive a robot from the keyboard: w, a, s, d move it, q and e turn it, any other key stops it.
+"""Drive a robot by keys: w, a, s, d move it, q and e turn it, all others stop it.
 
-r2p sim triskar2                                         in one terminal; it tells where its gateway is
-r2p run teleop.py:keys --via tcp:127.0.0.1:PORT          in another one
+r2p sim triskar2 --via tcp-listen:2323                   in one terminal
+r2p run teleop.py:keys --via tcp:127.0.0.1:2323          in another one
 
 When this program ends, or the cable is pulled, commands stop coming and the robot stops by itself.
 """
@@ -16,14 +16,8 @@ import r2p
 from r2p.msg import Odometry, Velocity3
 
 SPEED, TURN = 0.3, 0.8  # m/s, rad/s
-MOVES = {
-    "w": Velocity3(x=SPEED),
-    "s": Velocity3(x=-SPEED),
-    "a": Velocity3(y=SPEED),
-    "d": Velocity3(y=-SPEED),
-    "q": Velocity3(w=TURN),
-    "e": Velocity3(w=-TURN),
-}
+MOVES = {"w": Velocity3(x=SPEED), "s": Velocity3(x=-SPEED), "a": Velocity3(y=SPEED), "d": Velocity3(y=-SPEED)}
+MOVES |= {"q": Velocity3(w=TURN), "e": Velocity3(w=-TURN)}
 
 
 @contextlib.contextmanager
@@ -48,10 +42,15 @@ def typed() -> str:
     return os.read(sys.stdin.fileno(), 100).decode(errors="ignore") if ready else ""
 
 
+def show(told: Odometry) -> None:
+    print(f"\rx {told.pose.x:6.2f} m   y {told.pose.y:6.2f} m   heading {told.pose.w:6.2f} rad ", end="", flush=True)
+
+
 async def keys(node: r2p.Node) -> None:
     commands = node.advertise("velocity_cmd", Velocity3, r2p.Sporadic(deadline=0.05))
-    odometry = node.subscribe("odometry", Odometry, lambda told: print(f"\r{told.pose}", end="   "), lossy=True)
+    odometry = node.subscribe("odometry", Odometry, show, queue=1, lossy=True)
     command = Velocity3()
+    print("w, a, s, d: move    q, e: turn    any other key: stop")
     with single_keys():
         async for _ in node.every(0.05):
             for key in typed():

@@ -40,19 +40,17 @@ def command(
         screen.conclude(robot)
 
     async def robot() -> None:
-        from r2p.tools._sim.play import Play, play
+        from r2p.tools._sim.play import Play, play, program
         from r2p.tools.sim import outside
 
         await play(Play(duration=duration or _ROBOT, outside=tuple(outside()), laps=1))
-        typer.echo(_NEXT)
+        typer.echo(_NEXT.format(r2p=program()))
 
     execute(robot if what == "robot" else line, verbose=verbose, quiet=quiet + 2)
 
 
 _NEXT = """
-Try next, in two terminals:
-  r2p sim triskar2             the same robot, to be driven by you
-  r2p topic list --via tcp:127.0.0.1:PORT
-  r2p run examples/teleop.py:keys --via tcp:127.0.0.1:PORT
-Or: r2p demo line
-With a robot: r2p doctor, then r2p topic list --via serial:/dev/ttyUSB0"""
+Try next, in two terminals: the same robot, which waits for you, and the keys
+  {r2p} sim triskar2 --via tcp-listen:2323
+  {r2p} run examples/teleop.py:keys --via tcp:127.0.0.1:2323
+Or: {r2p} demo line, and on a robot of yours: {r2p} doctor"""

@@ -225,17 +225,25 @@ class Session:
         return len(topics) + endpoints + len(self.module.network.modules())
 
     def _expects_more(self) -> bool:
-        """Whether there is a link on which no r2p module is heard that would answer at once."""
-        return any(link.up and link.name not in self._answering() for link in self.module.links)
+        """Whether there is a link on which no r2p module is heard that would answer at once, or nothing but modules.
+
+        A module has topics; a gateway passes those of others on only after it has looked for other gateways.
+        """
+        told = self._answering() & self._heard()
+        return any(link.up and link.name not in told for link in self.module.links)
 
     def _answering(self) -> set[str]:
         return {view.link for view in self.module.network.modules() if view.instance is not None}
 
     def _hears_firmware(self) -> bool:
         """Whether somebody is heard who does not answer."""
-        network = self.module.network
-        links = {link for view in network.topics().values() for link in view.published_on + view.subscribed_on if link}
-        return any(view.instance is None for view in network.modules()) or bool(links - self._answering())
+        modules = self.module.network.modules()
+        return any(view.instance is None for view in modules) or bool(self._heard() - self._answering())
+
+    def _heard(self) -> set[str]:
+        """Links on which there are topics."""
+        views = self.module.network.topics().values()
+        return {link for view in views for link in view.published_on + view.subscribed_on if link}
 
 
 async def _live(node: r2p.Node) -> None:

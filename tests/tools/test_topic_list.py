@@ -53,6 +53,17 @@ async def test_list_of_firmware(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.virtual_time
+async def test_list_behind_a_gateway(capsys: pytest.CaptureFixture[str]) -> None:
+    """It answers at once, but with nothing but its name: what others have it tells once it may forward."""
+    inside = "memory:inside"
+    async with r2p.Module("BOT", via=inside) as module, tool() as session:
+        module.start(blink)
+        async with r2p.Module("GW", via=[inside, VIA], bridge=True):
+            await list_(session)
+    assert set(by_topic(printed(capsys))) == {"leds", "log", "speed"}
+
+
+@pytest.mark.virtual_time
 async def test_list_of_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     async with tool() as session:
         await list_(session)

@@ -155,7 +155,8 @@ class Triskar2:
                 before = time()
                 for publisher in self.publishers():
                     await publisher.ready()
-                if time() > before or not all(link.up for board in self.modules.values() for link in board.links):
+                waited = time() > before + _LOOK  # by less, asking takes time, too
+                if waited or not all(link.up for board in self.modules.values() for link in board.links):
                     since = time()
 
     def publishers(self) -> list[AnyPublisher]:

@@ -1,7 +1,9 @@
 """What an emulated robot does, in figures: read from its counters, so that looking changes nothing."""
 
 import math
+from collections import deque
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import msgspec
 
@@ -13,16 +15,19 @@ from r2p.sim.physics.omni import Triple
 from r2p.sim.robots.emulated import MOTORS, Triskar2
 from r2p.transports.rtcan.link import RtcanLink
 
+_WINDOW = 1.0  # seconds of which rates are the mean
 _LEFT_OUT = ("log", "current", "power")
-_CLASSES = {1: "", 2: "by deadline", 3: "by the clock"}
+_HARD, _PERIODIC, _SOFT, _NOT = "hard: in slots", "by the clock", "soft: by deadline", "no"
+_CLASSES = {1: _NOT, 2: _SOFT, 3: _PERIODIC}
+_URGENCY = [_HARD, _PERIODIC, _SOFT, _NOT]
 
 
 class TopicFigures(msgspec.Struct, frozen=True):
-    """One publisher: how it sends, messages each second since the last look, and in all."""
+    """One publisher: what real time means to it, messages each second, and since the start."""
 
     topic: str
     source: str
-    how: str
+    real_time: str
     rate: float
     sent: int
     missed: int
@@ -39,7 +44,7 @@ class WheelFigures(msgspec.Struct, frozen=True):
 
 
 class BusFigures(msgspec.Struct, frozen=True):
-    """The bus: its load (0 to 1) and frames each second since the last look, and the slots that are reserved."""
+    """The bus: its load (0 to 1) and frames each second, what was since the start, and the slots that are reserved."""
 
     load: float
     rate: float
@@ -48,6 +53,8 @@ class BusFigures(msgspec.Struct, frozen=True):
     slots: float
     """Of each cycle, in the mean."""
     of: int
+    mean: float = 0.0
+    """Load since the start, 0 to 1."""
 
 
 class Figures(msgspec.Struct, frozen=True):
@@ -71,21 +78,27 @@ class Figures(msgspec.Struct, frozen=True):
         return sum(topic.missed for topic in self.topics)
 
 
+class _Reading(NamedTuple):
+    """The counters at an instant (s): messages by publisher; frames, bit times and errors of the bus."""
+
+    time: float
+    sent: dict[tuple[str, str], int]
+    bus: tuple[int, int, int]
+
+
 class Gauge:
-    """Reads the figures; rates are those since the reading before."""
+    """Reads the figures; rates are those since a reading at least a second before, or the first one."""
 
     def __init__(self, robot: Triskar2, bus: SimCan | None, modules: Iterable[r2p.Module] = ()) -> None:
-        """`modules`: other ones whose topics count. What was missed before now does not."""
+        """`modules`: other ones whose topics count. What was before now does not."""
         self._odometry: Odometry | None = None
         self._off: float | None = None
         self._robot = robot
         self._bus = bus
         self._others = list(modules)
-        self._at = 0.0
-        self._frames = self._occupied = 0
-        self._missed: dict[tuple[str, str], int] = {}
-        self._sent: dict[tuple[str, str], int] = {}
-        self._missed = {(topic.source, topic.topic): topic.missed for topic in self._topics(1.0)}
+        self._started = {_key(*each): (each[1].sent, each[1].missed) for each in self._publishers()}
+        self._began = self._count(0.0)
+        self._readings = deque([self._began])
 
     def told(self, odometry: Odometry) -> None:
         """Odometry came."""
@@ -96,9 +109,12 @@ class Gauge:
     def read(self, time: float) -> Figures:
         """At this moment, in s since the start."""
         hardware = self._robot.hardware
-        span = max(time - self._at, 1e-9)
-        self._at = time
         battery = hardware.battery
+        now = self._count(time)
+        self._readings.append(now)
+        while self._readings[1].time <= time - _WINDOW:
+            self._readings.popleft()
+        topics = (self._topic(*each, now) for each in self._publishers())
         return Figures(
             time,
             self._robot.pose,
@@ -107,8 +123,8 @@ class Gauge:
             self._off,
             [self._wheel(wheel, name) for wheel, name in enumerate(MOTORS)],
             (battery.voltage, battery.current, battery.charge),
-            self._topics(span),
-            None if self._bus is None else self._bus_figures(self._bus, span),
+            sorted(topics, key=_urgency),
+            None if self._bus is None else self._bus_figures(self._bus, now),
         )
 
     def _wheel(self, wheel: int, name: str) -> WheelFigures:
@@ -120,28 +136,41 @@ class Gauge:
     def _modules(self) -> list[r2p.Module]:
         return [*self._others, *self._robot.modules.values()]
 
-    def _topics(self, span: float) -> list[TopicFigures]:
+    def _publishers(self) -> list[tuple[r2p.Module, AnyPublisher]]:
         return [
-            self._topic(module, publisher, span)
+            (module, publisher)
             for module in self._modules()
             for supervisor in module.nodes.values()
             for publisher in supervisor.node.publishers
             if not publisher.topic.startswith(_LEFT_OUT)
         ]
 
-    def _topic(self, module: r2p.Module, publisher: AnyPublisher, span: float) -> TopicFigures:
-        key = (module.name, publisher.topic)
-        before, self._sent[key] = self._sent.get(key, 0), publisher.sent
-        rate = max(0, publisher.sent - before) / span
-        missed = max(0, publisher.missed - self._missed.get(key, 0))
-        return TopicFigures(publisher.topic, module.name, _how(module, publisher), rate, publisher.sent, missed)
+    def _count(self, time: float) -> _Reading:
+        sent = {_key(*each): each[1].sent for each in self._publishers()}
+        return _Reading(time, sent, (0, 0, 0) if self._bus is None else _counts(self._bus))
 
-    def _bus_figures(self, bus: SimCan, span: float) -> BusFigures:
-        total = bus.bus.statistics.total
-        frames, self._frames = total.frames - self._frames, total.frames
-        occupied, self._occupied = total.occupied - self._occupied, total.occupied
-        slots, of = self._slots()
-        return BusFigures(occupied * bus.bus.bit / span / 1e9, frames / span, total.frames, total.errors, slots, of)
+    def _topic(self, module: r2p.Module, publisher: AnyPublisher, now: _Reading) -> TopicFigures:
+        key = _key(module, publisher)
+        sent, missed = self._started.get(key, (0, 0))
+        if publisher.sent < sent:  # its module was switched off and on
+            sent, missed = self._started[key] = (0, 0)
+        before = self._readings[0]
+        return TopicFigures(
+            publisher.topic,
+            module.name,
+            _real_time(module, publisher),
+            max(0, now.sent[key] - before.sent.get(key, 0)) / _span(before, now),
+            publisher.sent - sent,
+            publisher.missed - missed,
+        )
+
+    def _bus_figures(self, bus: SimCan, now: _Reading) -> BusFigures:
+        before = self._readings[0]
+        span, bit = _span(before, now), bus.bus.bit / 1e9
+        frames, occupied, _ = (count - old for count, old in zip(now.bus, before.bus, strict=True))
+        all_frames, all_occupied, errors = (count - old for count, old in zip(now.bus, self._began.bus, strict=True))
+        mean = all_occupied * bit / _span(self._began, now)
+        return BusFigures(occupied * bit / span, frames / span, all_frames, errors, *self._slots(), mean)
 
     def _slots(self) -> tuple[float, int]:
         """How many of a cycle are reserved, and how many there are."""
@@ -155,9 +184,29 @@ class Gauge:
         return used, of
 
 
-def _how(module: r2p.Module, publisher: AnyPublisher) -> str:
-    """How it is sent: in slots of its own, by a deadline, by the local clock."""
+def _key(module: r2p.Module, publisher: AnyPublisher) -> tuple[str, str]:
+    return module.name, publisher.topic
+
+
+def _urgency(topic: TopicFigures) -> tuple[int, str]:
+    """What is hard real-time comes first."""
+    return _URGENCY.index(topic.real_time), topic.topic
+
+
+def _span(before: _Reading, now: _Reading) -> float:
+    """Seconds; the first reading is at once."""
+    return max(now.time - before.time, 1e-9)
+
+
+def _counts(bus: SimCan) -> tuple[int, int, int]:
+    """Frames, bit times and errors since the bus was made."""
+    total = bus.bus.statistics.total
+    return total.frames, total.occupied, total.errors
+
+
+def _real_time(module: r2p.Module, publisher: AnyPublisher) -> str:
+    """How it is sent: in slots of its own, by the local clock, by a deadline, or when there is room."""
     for link in module.links:
         if isinstance(link, RtcanLink) and publisher.topic in link.slots and link.slots[publisher.topic].period:
-            return "in slots"
+            return _HARD
     return _CLASSES[publisher.publisher_class]

@@ -43,6 +43,7 @@ BEARINGS = (67.5, 22.5, -22.5, -67.5)
 _STOP = 0.15  # m: closer than this a sensor's reading always stops the robot
 _BRAKING = 0.4  # s: and so much further away for each m/s
 _AHEAD = math.cos(math.radians(60))
+_BACKLOG = 250  # encoder readings, five seconds: each that is lost would bend the way
 _ROUNDS = 5  # encoder readings for one message of odometry: 10 Hz, thesis table 4.1
 _LOW = 20  # percent
 
@@ -96,37 +97,38 @@ async def inverse_kinematics(node: r2p.Node, traffic: Traffic = "hrt") -> None:
 
 
 async def forward_kinematics(node: r2p.Node) -> None:
-    """Make `odometry` of the three encoders: where the robot is since the node started, and how fast it goes."""
+    """Make `odometry` of the three encoders: where the robot is since the node started, and how fast it goes.
+
+    While a wheel is silent there is none; what the others told meanwhile counts as soon as it is back.
+    """
     odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=0.1))
+    turned, readings = [0.0] * WHEELS, [0] * WHEELS
+
+    def take(wheel: int, encoder: Encoder) -> None:
+        turned[wheel] += encoder.delta / MOTOR.ticks_per_radian
+        readings[wheel] += 1
+
+    for wheel in range(WHEELS):
+        node.subscribe(f"encoder{wheel + 1}", Encoder, functools.partial(take, wheel), queue=_BACKLOG)
     pose = Pose3()
     x = y = w = 0.0  # moved since the last message, in the frame of the robot
-    moved: dict[int, float] = {}
     rounds = 0
-
-    def finish_round() -> None:
-        """All wheels have told how far they turned."""
-        nonlocal pose, x, y, w, rounds
-        dx, dy, dw = BODY.body_velocity(*(moved.get(wheel, 0.0) for wheel in range(WHEELS)))
-        moved.clear()
+    while True:
+        await node.spin()
+        if not all(readings):
+            continue
+        # All wheels together: one alone would seem to turn the robot.
+        dx, dy, dw = BODY.body_velocity(*turned)
         heading = pose.w + dw / 2
         cos, sin = math.cos(heading), math.sin(heading)
         pose = Pose3(pose.x + dx * cos - dy * sin, pose.y + dx * sin + dy * cos, pose.w + dw)
-        x, y, w, rounds = x + dx, y + dy, w + dw, rounds + 1
-        if rounds == _ROUNDS:
+        x, y, w, rounds = x + dx, y + dy, w + dw, rounds + max(readings)
+        turned[:], readings[:] = [0.0] * WHEELS, [0] * WHEELS
+        if rounds >= _ROUNDS:
             span = rounds * PERIOD
             odometry.publish_nowait(Odometry(pose, Velocity3(x / span, y / span, w / span)))
             x = y = w = 0.0
             rounds = 0
-
-    def take(wheel: int, encoder: Encoder) -> None:
-        if wheel in moved:  # a new round: who has not told by now has lost a message
-            finish_round()
-        moved[wheel] = encoder.delta / MOTOR.ticks_per_radian
-
-    for wheel in range(WHEELS):
-        node.subscribe(f"encoder{wheel + 1}", Encoder, functools.partial(take, wheel))
-    while True:
-        await node.spin()
 
 
 async def battery_monitor(node: r2p.Node) -> None:

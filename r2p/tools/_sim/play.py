@@ -3,7 +3,11 @@
 import asyncio
 import contextlib
 import functools
+import os
+import shutil
+import sys
 from collections.abc import AsyncIterator
+from pathlib import Path
 
 import msgspec
 
@@ -44,7 +48,7 @@ class Play(msgspec.Struct, frozen=True, kw_only=True):
 async def play(wish: Play) -> None:
     """Run the robot and show it."""
     world = World(box(SIDE / 2, SIDE / 2, 3.8, 3.8))
-    screen = Screen(world, live=not wish.fast)
+    screen = Screen(world, live=not wish.fast, duration=wish.duration)
     bus = can_bus(_NAME, seed=wish.seed)
     robot = Triskar2(f"sim:{_NAME}", seed=wish.seed, world=world, outside=[*wish.outside, _INSIDE])
     async with robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:
@@ -55,7 +59,7 @@ async def play(wish: Play) -> None:
         pc.start(functools.partial(_watch, gauge=gauge), name="watch")
         if wish.laps:
             pc.start(functools.partial(square, side=SIDE, speed=SPEED, laps=wish.laps, wait=WAIT), name="square")
-        screen.introduce(*_introduction(robot))
+        screen.introduce(*_introduction(robot, driven=wish.laps > 0))
         figures = gauge.read(0.0)
         try:
             with screen:
@@ -63,7 +67,7 @@ async def play(wish: Play) -> None:
                     figures = gauge.read(time)
                     screen.show(figures)
         finally:  # also when Ctrl-C ends it
-            conclude(screen, figures)
+            conclude(screen, figures, fast=wish.fast)
             if wish.bus:
                 screen.say("", *bus_table(bus))
 
@@ -100,16 +104,28 @@ def addresses(robot: Triskar2) -> list[str]:
     return [*urls, *others]
 
 
-def _introduction(robot: Triskar2) -> list[str]:
+def program() -> str:
+    """What to type for this program in another terminal of the same folder."""
+    typed = sys.argv[0]
+    if Path(typed).name != "r2p" or not os.access(typed, os.X_OK):  # not started as a command
+        return "r2p"
+    found = shutil.which("r2p")
+    return "r2p" if found and Path(found).samefile(typed) else typed
+
+
+def _introduction(robot: Triskar2, *, driven: bool) -> list[str]:
     """What to do in another terminal meanwhile."""
     urls = addresses(robot)
     if not urls:
         return []
-    return ["In another terminal:", *(f"  r2p topic echo odometry --via {url}" for url in urls)]
+    hints = [f"topic echo odometry --via {url}" for url in urls]
+    if not driven:
+        hints.append(f"topic pub velocity_cmd x=0.2 -r 20 --via {urls[0]}")
+    return ["In another terminal:", *(f"  {program()} {hint}" for hint in hints)]
 
 
-def conclude(screen: Screen, figures: Figures) -> None:
-    """Sum up."""
+def conclude(screen: Screen, figures: Figures, *, fast: bool) -> None:
+    """Sum up. In real time, the computer may be why something was late."""
     x, y, _ = figures.pose
     screen.say("", f"{figures.time:.1f} s, {figures.path:.2f} m driven; the robot is at x {x:.3f}, y {y:.3f} m")
     if figures.off is not None:
@@ -118,9 +134,9 @@ def conclude(screen: Screen, figures: Figures) -> None:
     screen.say(f"{count} messages published, {figures.missed} missed a deadline")
     worst = max(figures.topics, key=lambda topic: topic.missed, default=None)
     if worst is not None and worst.missed:
-        screen.say(f"  most of them of {worst.topic}: {worst.missed}")
+        screen.say(f"  most of them of {worst.topic}: {worst.missed}{'' if fast else '; is this computer busy?'}")
     if figures.bus is not None:
-        screen.say(f"bus: {figures.bus.frames} frames, {figures.bus.errors} errors; load {figures.bus.load:.0%}")
+        screen.say(f"bus: {figures.bus.frames} frames, {figures.bus.errors} errors; load {figures.bus.mean:.0%}")
 
 
 def bus_table(bus: SimCan) -> list[str]:

@@ -1,10 +1,13 @@
-"""How the figures are shown: at a terminal all of them, live, in 80 columns and 24 lines; else lines of plain text."""
+"""How the figures are shown: at a terminal all of them, live, in 80 columns and 24 lines; else lines of plain text.
+
+A smaller terminal gets less of them: first the map goes, then topics. What to do next stays.
+"""
 
 import math
 from collections.abc import Iterable
 from typing import Self
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -13,17 +16,22 @@ from r2p.sim.physics.world import World
 from r2p.sim.robots.figures import BusFigures, Figures, TopicFigures, WheelFigures
 from r2p.tools._sim.chart import Chart
 
-_WIDTH, _HEIGHT = 28, 10  # of the map
-_TOPICS = 10  # lines
+_STATE = 48  # columns of the figures beside the map
+_WIDTH, _HEIGHT = 28, 9  # of the map
+_LABEL = 10  # columns
+_WIDE = 72  # ... of the whole table
+_FULL = _STATE + 2 + _WIDTH  # ... of figures and map
 
 
 class Screen:
     """Standard output, for the time of a `with` block."""
 
-    def __init__(self, world: World, *, live: bool = True) -> None:
+    def __init__(self, world: World, *, live: bool = True, duration: float | None = None) -> None:
+        """`duration` in s, if it is known."""
         self.console = Console(highlight=False)
         self.live = live and self.console.is_terminal and not self.console.is_dumb_terminal
         """Whether the figures stay where they are."""
+        self._duration = duration
         self._chart = Chart(world, _WIDTH, _HEIGHT)
         self._view = Live(console=self.console, auto_refresh=False)
         self._hints: list[str] = []
@@ -49,27 +57,47 @@ class Screen:
 
     def show(self, figures: Figures) -> None:
         """Draw the figures, or print a line of them."""
-        if not self.live:
+        if self.live:
+            self._view.update(self.draw(figures), refresh=True)
+        else:
             self.say(line(figures))
-            return
+
+    def draw(self, figures: Figures) -> RenderableType:
+        """The figures as they fit the terminal."""
+        width, height = self.console.size
+        lines = state(figures)
         upper = Table.grid(padding=(0, 2))
-        upper.add_column(min_width=46)
-        upper.add_column(min_width=_WIDTH)
-        upper.add_row(Text("\n".join(state(figures))), Text(self._chart.draw(figures.pose), style="green"))
-        self._view.update(Group(upper, _table(figures.topics), Text("\n".join(self._hints), style="dim")), refresh=True)
+        upper.add_column(width=min(_STATE, width), no_wrap=True)
+        if width >= _FULL:
+            upper.add_row(_labelled(lines), _coloured(self._chart.draw(figures.pose)))
+        else:
+            upper.add_row(_labelled(lines))
+        hints = sum(math.ceil(len(hint) / width) for hint in self._hints)
+        room = height - 1 - max(len(lines), _HEIGHT) - 1 - hints  # the title, and the head of the table
+        parts: list[RenderableType] = [_title(figures, self._duration, min(width, _FULL)), upper]
+        if room > 0:
+            parts.append(_table(figures.topics[:room], names_only=width < _WIDE))
+        return Group(*parts, *map(_hint, self._hints))
+
+
+def _title(figures: Figures, duration: float | None, width: int) -> Text:
+    """A line over all: how long, how far, and whether all was in time."""
+    until = f" of {duration:.0f}" if duration else ""
+    late = f"{figures.missed or 'no'} deadline{'' if figures.missed == 1 else 's'} missed"
+    text = f" Triskar2   {figures.time:.1f}{until} s   {figures.path:.2f} m driven  "
+    return Text(f"{text:{max(0, width - len(late) - 1)}}{late} ", style="bold reverse", no_wrap=True)
 
 
 def state(figures: Figures) -> list[str]:
-    """Ten lines of 46 characters: the robot and its bus."""
+    """Nine lines of 48 characters: the robot and its bus."""
     x, y, w = figures.pose
-    off = "" if figures.off is None else f"   off by {figures.off * 1000:.0f} mm"
+    off = "" if figures.off is None else f"  off by {figures.off * 1000:.0f} mm"
     told = figures.odometry.pose if figures.odometry else None
     volts, amperes, charge = figures.battery
     return [
-        f"Triskar2  {figures.time:.1f} s, {figures.path:.2f} m; {figures.missed} deadlines missed",
-        f"pose      x {x:6.2f}  y {y:6.2f} m  w {math.degrees(w):6.1f} deg",
-        f"odometry  x {told.x:6.2f}  y {told.y:6.2f} m{off}" if told else "odometry  nothing yet",
-        "wheel     setpoint   speed (rad/s)   current",
+        f"position  x {x:z6.2f}  y {y:z6.2f} m  heading {math.degrees(w):z4.0f} deg",
+        f"odometry  x {told.x:z6.2f}  y {told.y:z6.2f} m{off}" if told else "odometry  nothing yet",
+        "motors     wanted     speed (rad/s)    current",
         *(_wheel(wheel) for wheel in figures.wheels),
         f"battery   {volts:.1f} V  {amperes:.1f} A  {charge:.0%}",
         *bus_lines(figures.bus),
@@ -79,32 +107,56 @@ def state(figures: Figures) -> list[str]:
 def bus_lines(bus: BusFigures | None) -> list[str]:
     """Two lines."""
     if bus is None:
-        return ["bus       none: a network in memory"]
-    slots = f"{bus.slots:.1f} of {bus.of} reserved in each cycle" if bus.of else "none: no master yet"
-    return [f"bus       {bus.load:.0%} load, {bus.rate:.0f} frames/s, {bus.errors} errors", f"slots     {slots}"]
+        return ["CAN bus   none: a network in memory"]
+    slots = f"{bus.of} in a cycle, {bus.slots:.1f} of them reserved" if bus.of else "none: no master yet"
+    return [f"CAN bus   {bus.load:.0%} load  {bus.rate:.0f} frames/s  {bus.errors} errors", f"slots     {slots}"]
 
 
 def line(figures: Figures) -> str:
     """One line of plain text, at most 80 characters."""
     x, y, w = figures.pose
-    speeds = " ".join(f"{wheel.speed:6.2f}" for wheel in figures.wheels)
+    speeds = " ".join(f"{wheel.speed:z6.2f}" for wheel in figures.wheels)
     bus = "" if figures.bus is None else f"  bus {figures.bus.load:4.0%}"
-    return f"{figures.time:6.1f} s  at {x:5.2f} {y:5.2f} m {math.degrees(w):4.0f} deg  wheels {speeds}{bus}"
+    return f"{figures.time:6.1f} s  at {x:z5.2f} {y:z5.2f} m {math.degrees(w):z4.0f} deg  wheels {speeds}{bus}"
 
 
 def _wheel(wheel: WheelFigures) -> str:
     if not wheel.on:
         return f"{wheel.name}    switched off"
-    setpoint = "stopped" if wheel.setpoint is None else f"{wheel.setpoint:7.2f}"
-    return f"{wheel.name}    {setpoint:>7}   {wheel.speed:7.2f}        {wheel.current:6.2f} A"
+    wanted = "stopped" if wheel.setpoint is None else f"{wheel.setpoint:z7.2f}"
+    return f"{wheel.name}    {wanted:>7}   {wheel.speed:z7.2f}          {wheel.current:z6.2f} A"
 
 
-def _table(topics: Iterable[TopicFigures]) -> Table:
+def _table(topics: Iterable[TopicFigures], *, names_only: bool) -> Table:
     table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="bold")
-    for name, width in (("TOPIC", 13), ("FROM", 8), ("SENT", 14)):
+    table.add_column("TOPIC", min_width=13, no_wrap=True)
+    for name, width in () if names_only else (("FROM", 8), ("REAL TIME", 17)):
         table.add_column(name, min_width=width, no_wrap=True)
     for name in ("HZ", "COUNT", "MISSED"):
         table.add_column(name, justify="right", min_width=8, no_wrap=True)
-    for each in list(topics)[:_TOPICS]:
-        table.add_row(each.topic, each.source, each.how, f"{each.rate:.1f}", str(each.sent), str(each.missed))
+    for each in topics:
+        words = () if names_only else (each.source, each.real_time)
+        missed = Text(str(each.missed), style="bold red" if each.missed else "")
+        table.add_row(each.topic, *words, f"{each.rate:.1f}", str(each.sent), missed)
     return table
+
+
+def _labelled(lines: list[str]) -> Text:
+    text = Text("\n".join(lines))
+    start = 0
+    for each in lines:
+        text.stylize("bold", start, start + _LABEL)
+        start += len(each) + 1
+    return text
+
+
+def _coloured(chart: str) -> Text:
+    text = Text(chart, style="green")
+    text.highlight_regex("#+", "dim default")
+    text.highlight_regex(r"[<>^v]", "bold yellow")
+    return text
+
+
+def _hint(hint: str) -> Text:
+    """Commands are indented."""
+    return Text(hint, style="cyan" if hint.startswith(" ") else "bold")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import random
 import statistics
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
+from r2p.sim.modules.gateway import GatewayModule
 from r2p.sim.modules.imu import ImuModule, InertialUnit, Motion
 from r2p.sim.modules.input_output import IoModule, Pins, leds, sample
 from r2p.sim.modules.motor import MotorConfig, MotorModule
@@ -58,6 +60,29 @@ async def command(node: r2p.Node, ticks: float, seconds: float) -> None:
     setpoints.close()
 
 
+async def test_names_topics_and_rates_by_default(r2p_network: Network) -> None:
+    boards = [
+        Bench().module(r2p_network),
+        ProximityModule(look=lambda _: math.inf, noise=random.Random(1), via=r2p_network.transport()),
+        PowerModule(battery=Cells(), via=r2p_network.transport()),
+        ImuModule(unit=InertialUnit(Motion, random.Random(2)), via=r2p_network.transport()),
+        IoModule(pins=Pins(), via=r2p_network.transport()),
+        GatewayModule(via=r2p_network.transport()),
+    ]
+    async with contextlib.AsyncExitStack() as stack:
+        for board in boards:
+            await stack.enter_async_context(board)
+        await asyncio.sleep(10)
+        nodes = [(board.name, running.node) for board in boards for running in board.nodes.values()]
+        rates = {f"{name} {each.topic}": each.sent / 10 for name, node in nodes for each in node.publishers}
+        needs = [f"{name} {each.topic}" for name, node in nodes for each in node.subscribers]
+    imu = {"IMU1 imu": 100, "IMU1 imu_raw": 100, "IMU1 tilt": 100, "IMU1 pressure": 25}
+    others = {"MOTOR1 encoder": 50, "MOTOR1 current": 2, "PROX1 proximity": 20, "PS battery": 2}
+    assert rates == pytest.approx(imu | others, rel=0.06)
+    assert needs == ["MOTOR1 setpoint"]
+    assert MotorConfig().timeout == 0.2
+
+
 async def test_a_step_of_the_setpoint_goes_as_the_theory_says(r2p_network: Network) -> None:
     """With the encoder's ticks, the controller's period and the network in between: within 3 % of the step."""
     bench = Bench()
@@ -100,6 +125,18 @@ async def test_a_module_that_ends_stops_its_motor(r2p_network: Network) -> None:
             await command(node, 10_000, 0.5)
         assert bench.drive.setpoint is None
         assert bench.motor.voltage == 0
+
+
+def test_a_motor_that_was_stopped_begins_anew() -> None:
+    """What its controller had integrated is forgotten."""
+    bench = Bench(MotorSpec(damping=50.0))
+    bench.drive.setpoint = 10_000
+    bench.plant.step(1000)
+    bench.drive.stop()
+    bench.plant.step(3000)
+    bench.drive.setpoint = 0
+    bench.plant.step(1)
+    assert bench.motor.voltage == 0
 
 
 async def test_the_encoder_tells_all_ticks(r2p_network: Network) -> None:
@@ -177,6 +214,21 @@ async def test_the_imu_finds_its_attitude(r2p_network: Network) -> None:
     assert tilt.angle == pytest.approx(imu.pitch, abs=0.01)
     assert raw.acc_y == pytest.approx(500, abs=80)
     assert pressure.altitude == pytest.approx(120, abs=1)
+
+
+def test_the_rates_of_the_imu_are_without_the_gyroscopes_bias() -> None:
+    unit = InertialUnit(Motion, random.Random(2))
+    plant = Plant([unit], dt=0.0025)
+    plant.step(8000)
+    raw, filtered = [], []
+    for _ in range(2000):
+        plant.step()
+        counts, imu = unit.raw(), unit.imu()
+        raw.append([math.radians(each * 8.75e-3) for each in (counts.gyro_x, counts.gyro_y, counts.gyro_z)])
+        filtered.append([imu.roll_rate, imu.pitch_rate, imu.yaw_rate])
+    biases, rates = ([statistics.mean(axis) for axis in zip(*each, strict=True)] for each in (raw, filtered))
+    assert max(abs(bias) for bias in biases) > 0.005
+    assert rates == pytest.approx([0, 0, 0], abs=0.001)
 
 
 async def test_the_imu_publishes_only_what_it_is_configured_for(r2p_network: Network) -> None:

@@ -118,14 +118,11 @@ def test_the_output_saturates_and_the_integral_waits() -> None:
 
 
 def test_the_integral_of_a_saturated_controller_may_go_back() -> None:
-    """Saturated by a disturbance, it integrates the error that leads out of saturation."""
-    pid = Pid(Gains(kp=10.0, ki=1.0, limit=5.0))
-    for _ in range(10):
-        pid.step(0.4, 0.0, 1.0)
-    before = pid.step(0.0, 0.0, 1.0)
-    for _ in range(3):
-        pid.step(-0.1, 0.0, 1.0)
-    assert pid.step(0.0, 0.0, 1.0) < before
+    """Saturated by what is not the error, it integrates the error that leads out of saturation."""
+    pid = Pid(Gains(kp=1.0, ki=1.0, kd=100.0, limit=5.0))
+    assert pid.step(0.0, 10.0, 1.0) == -5.0
+    assert pid.step(0.0, 1.0, 1.0) == 5.0  # by the derivative; the error is -1
+    assert pid.step(1.0, 1.0, 1.0) == -1.0
 
 
 def test_a_step_of_the_setpoint_gives_no_kick_of_the_derivative() -> None:

@@ -12,11 +12,12 @@ import pytest
 
 import r2p
 from r2p import sim
-from r2p.msg import Battery, Odometry, Velocity3
+from r2p.msg import Battery, Encoder, Odometry, Velocity3
 from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
-from r2p.sim.robots.emulated import MOTORS, Triskar2
+from r2p.sim.robots.emulated import MOTORS, Hardware, Triskar2
 from r2p.sim.robots.square import square
+from r2p.testing.network import node_in
 from r2p.tools.run import load
 from r2p.transports.memory import network
 from tests.sim.robots.rig import WAIT, lap_time, odometry_of, until_at_rest, until_driving
@@ -29,7 +30,13 @@ pytestmark = pytest.mark.virtual_time
 VIA = "memory:robot"
 
 
-NODES = ("obstacle_avoidance", "inverse_kinematics", "forward_kinematics", "battery_monitor")
+NODES = {
+    "obstacle_avoidance": r2p.PublisherClass.SPORADIC,
+    "inverse_kinematics": r2p.PublisherClass.PERIODIC,
+    "forward_kinematics": r2p.PublisherClass.SPORADIC,
+    "battery_monitor": r2p.PublisherClass.NON_REAL_TIME,
+}
+"""And how each of them publishes."""
 
 
 async def forward(node: r2p.Node, speed: float = 0.5) -> None:
@@ -49,7 +56,7 @@ async def test_the_square_closes(seed: int) -> None:
         for leg in range(4 * laps):
             await asyncio.sleep((WAIT if leg == 0 else 0) + side / speed + 0.5)
             corners.append(robot.pose)
-        await asyncio.sleep(1)
+        await asyncio.sleep(3)
         told = (await odometry.fetch(1)).pose
         x, y, w = robot.pose
         path = robot.hardware.body.path
@@ -62,13 +69,18 @@ async def test_the_square_closes(seed: int) -> None:
         assert path / laps == pytest.approx(lap_time(side, speed) * speed - 4 * 0.5 * speed, rel=0.03)
 
 
-async def test_odometry_tells_the_velocity_too() -> None:
+async def test_odometry_follows_a_turning_robot_and_tells_its_velocity_too() -> None:
     async with Triskar2(VIA) as robot, r2p.Module("PC1", via=VIA) as pc, odometry_of(pc) as odometry:
         commands = pc.start(turn, name="turn")
         assert commands.name == "turn"
         await until_driving(robot, speed=0.25)
-        await asyncio.sleep(1)
-        velocity = (await odometry.fetch(1)).velocity
+        await asyncio.sleep(6)
+        told = await odometry.fetch(1)
+        x, y, w = robot.pose
+        assert w > 2.5
+        assert math.hypot(told.pose.x - x, told.pose.y - y) < 0.06  # it is up to 0.1 s old
+        assert told.pose.w == pytest.approx(w, abs=0.1)
+        velocity = told.velocity
         assert (velocity.x, velocity.y, velocity.w) == pytest.approx((0.2, -0.2, 0.5), abs=0.01)
 
 
@@ -121,12 +133,18 @@ async def test_a_box_in_the_way_stops_it_and_it_can_back_off() -> None:
 
 async def test_beside_a_wall_it_passes() -> None:
     """Only what is ahead counts."""
-    world = World([((-5.0, 0.45), (5.0, 0.45))])
+    world = World([((-5.0, 0.3), (5.0, 0.3))])
     async with Triskar2(VIA, world=world) as robot, r2p.Module("PC1", via=VIA) as pc:
         pc.start(forward)
         await until_driving(robot)
         await asyncio.sleep(2)
         assert robot.pose[0] > 0.9
+
+
+def test_a_sensor_sees_what_is_in_its_beam_beside_the_axis() -> None:
+    hardware = Hardware(world=World([((0.5, 0.02), (0.5, 0.06))]))
+    assert hardware.look(0.0) == pytest.approx(380 / math.cos(math.radians(8)))
+    assert hardware.look(180.0) == math.inf
 
 
 async def test_a_blocked_robot_still_turns() -> None:
@@ -208,7 +226,7 @@ async def test_without_eyes_it_does_not_go_where_they_looked() -> None:
         await until_driving(robot)
         await robot.switch_off("PROX2")
         await asyncio.sleep(2 * triskar2.FRESH + 0.1)
-        await until_at_rest(robot)
+        await until_at_rest(robot, limit=1.0)
         await pc.nodes["back"].stop()
         pc.start(forward)
         await until_driving(robot)
@@ -231,6 +249,23 @@ async def test_the_battery_is_watched() -> None:
         assert low.remaining < full.remaining
 
 
+async def test_the_battery_monitor_reckons_with_the_current_and_warns_once(caplog: pytest.LogCaptureFixture) -> None:
+    """Under load the voltage is lower than what the charge would give."""
+    readings = [(24_280, 2000), (23_400, 0), (23_300, 0), (25_000, 0), (23_400, 0)]  # mV, mA
+    async with r2p.Module("PS") as module, node_in(module) as node:
+        module.start(triskar2.battery_monitor, name="battery")
+        power = node.advertise("power", Battery)
+        states = node.subscribe("battery", Battery)
+        await power.wait_subscriber()
+        for voltage, current in readings:
+            await power.publish(Battery(voltage=voltage, current=current))
+        assert [(await states.fetch(1)).charge for _ in readings] == [50, 8, 4, 75, 8]
+        async with node_in(module, name="late") as late:
+            assert (await late.subscribe("battery", Battery).fetch(1)).charge == 8
+    warnings = [record.getMessage() for record in caplog.records if record.name == "r2p.PS.battery"]
+    assert warnings == ["battery is down to 8 %: 23.4 V"] * 2
+
+
 async def test_odometry_survives_a_lost_encoder_message() -> None:
     """Who lost one round is behind by it, not by all that follow."""
     heard: list[Odometry] = []
@@ -251,6 +286,24 @@ async def test_odometry_survives_a_lost_encoder_message() -> None:
         assert heard[-1].pose.x == pytest.approx(robot.pose[0], rel=0.1)
 
 
+async def test_odometry_makes_up_for_a_second_in_which_the_computer_was_busy() -> None:
+    """All that the encoders told comes at once, and counts."""
+    async with r2p.Module("MOTOR2") as module, node_in(module) as node:
+        module.start(triskar2.forward_kinematics, name="fwdkin")
+        encoders = [node.advertise(f"encoder{wheel}", Encoder) for wheel in (1, 2, 3)]
+        odometry = node.subscribe("odometry", Odometry)
+        for encoder in encoders:
+            await encoder.wait_subscriber()
+        turned = triskar2.PERIOD * triskar2.MOTOR.ticks_per_radian
+        for _ in range(round(1 / triskar2.PERIOD)):
+            for encoder, speed in zip(encoders, triskar2.BODY.wheel_speeds(0.5, 0.2, 0.0), strict=True):
+                encoder.publish_nowait(Encoder(delta=speed * turned))
+        told = await odometry.fetch(1)
+        assert (told.pose.x, told.pose.y, told.pose.w) == pytest.approx((0.5, 0.2, 0.0), abs=1e-3)
+        assert (told.velocity.x, told.velocity.y, told.velocity.w) == pytest.approx((0.5, 0.2, 0.0), abs=1e-3)
+        assert sum(encoder.missed for encoder in encoders) == 0
+
+
 @pytest.mark.parametrize("name", NODES)
 async def test_each_node_is_short_and_runs_anywhere(name: str) -> None:
     (program,) = load([f"r2p.sim.robots.triskar2:{name}=node"])
@@ -258,5 +311,5 @@ async def test_each_node_is_short_and_runs_anywhere(name: str) -> None:
     async with r2p.Module("PC1") as module:
         node = module.start(program.function, name=program.name)
         await asyncio.sleep(1)
-        assert node.publishers
+        assert [publisher.publisher_class for publisher in node.publishers] == [NODES[name]]
         assert node.subscribers

@@ -130,11 +130,18 @@ def test_load_does_not_move_hard_real_time_by_a_nanosecond_and_does_move_the_res
     assert without.error >= 5 * loaded.error
 
 
+MANAGEMENT = 450
+"""Frames a second at most of what the robot and a PC say to stay known to each other, the start included."""
+
+
 async def test_a_minute_of_squares() -> None:
     """As on the network in memory; all hops of the chain but the PC's are sent as the nodes choose."""
     async with Triskar2(BUS, seed=1) as robot, r2p.Module("PC1", via=BUS) as pc, odometry_of(pc) as odometry:
         pc.start(functools.partial(square, side=1.5, speed=0.4, laps=3, wait=WAIT), name="square")
         await asyncio.sleep(60)
+        carried = sim.can_bus("robot").bus.statistics.by_message
+        management = sum(count.frames for message, count in carried.items() if message >> 8 == rtcan.MANAGEMENT)
+        assert management / 60 < MANAGEMENT
         told = (await odometry.fetch(1)).pose
         x, y, _ = robot.pose
         path = robot.hardware.body.path
