@@ -1,24 +1,50 @@
-"""A gateway in a process of its own, between a robot's debug line and a PC: how much passes, types unknown."""
+"""A gateway between a robot and a PC: how much passes from a debug line, and how long a message from CAN takes."""
 
 import asyncio
+import contextlib
+import itertools
 import multiprocessing
 import socket
+import statistics
+import struct
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
+
+import zenoh
 
 import r2p
 from benchmarks.loops import run_on
 from benchmarks.network import Eight
-from benchmarks.table import Row, rate
-from r2p.codecs import debug, management
+from benchmarks.table import Row, p50_p99, rate
+from benchmarks.zenoh import config, free_port, url
+from r2p.clock import Ticker
+from r2p.codecs import debug, management, rtcan
+from r2p.codecs.rtcan import Frame
+from r2p.sim.can import CanBus, CanNode
+from r2p.sim.transport import SimCan
 from r2p.transports.tcp import TcpListenTransport
 from r2p.transports.url import parse
 
 MESSAGES = 200_192
 BURST = 256
 
+PACED = 2000
+RUNS = 3
+PERIOD = 1_000_000  # ns
+
 _REQUEST = 0x22
+_STAMP = struct.Struct("<Q")
+
+
+class Sent(r2p.Message):
+    """8 bytes: one frame."""
+
+    at: r2p.u64 = 0
+
+
+# How much passes
 
 
 async def _gateway(pipe: Connection, out: str) -> None:
@@ -106,6 +132,122 @@ def _through(out: str) -> tuple[float, int, float]:
             process.join()
 
 
+# How long it takes: each message carries the instant at which it was sent, by the monotonic clock of both processes
+
+
+async def _tick(send: Callable[[bytes], object]) -> None:
+    """Call it with the instant, 1000 times a second."""
+    loop, over, left = asyncio.get_running_loop(), asyncio.Event(), PACED
+
+    def due(*_: int) -> None:
+        nonlocal left
+        left -= 1
+        if left >= 0:
+            send(_STAMP.pack(time.monotonic_ns()))
+        else:
+            over.set()
+
+    ticker = Ticker(loop, PERIOD, due)
+    ticker.start()
+    await over.wait()
+    ticker.close()
+
+
+def _bare_links(pipe: Connection, port: int) -> None:
+    """The two links and nothing else: what a CAN controller receives is put into zenoh."""
+
+    async def main() -> None:
+        bus = CanBus(asyncio.get_running_loop())
+        robot, gateway = bus.attach(CanNode("ROBOT")), bus.attach(CanNode("GW"))
+        gateway.on_receive = lambda frame, _: publisher.put(frame.data)
+        identifier = rtcan.encode_identifier(10, rtcan.message_id(rtcan.FIRST_TOPIC, 20))
+        mailboxes = itertools.cycle(range(3))
+        await _tick(lambda data: robot.request(Frame(identifier, data), next(mailboxes)))
+        await asyncio.to_thread(pipe.recv)
+
+    pipe.recv()
+    with zenoh.open(config(port, listens=False)) as session:
+        publisher = session.declare_publisher("bench/sent", express=True)
+        while not publisher.matching_status:
+            time.sleep(0.01)
+        run_on("precise", main())
+
+
+def _robot_and_gateway(pipe: Connection, port: int) -> None:
+    """The same by r2p: a robot's module on a simulated bus, and a gateway."""
+
+    async def publish(node: r2p.Node) -> None:
+        publisher = node.advertise("sent", Sent, r2p.Sporadic(deadline=0.05, late="send"))
+        await publisher.wait_subscriber()
+        await asyncio.to_thread(pipe.recv)
+        await _tick(lambda data: publisher.publish_nowait(Sent(at=_STAMP.unpack(data)[0])))
+        await asyncio.to_thread(pipe.recv)
+
+    async def main() -> None:
+        bus = SimCan()
+        zenoh_url = url(port, listens=False)
+        async with (
+            r2p.Module("GW", via=[bus.transport(), zenoh_url], bridge=True, watchdog=False),
+            r2p.Module("ROBOT", via=[bus.transport()], watchdog=False) as robot,
+        ):
+            robot.start(publish)
+            await robot.wait()
+
+    run_on("precise", main())
+
+
+def _bare_pc(port: int, started: Connection) -> list[float]:
+    delays: list[float] = []
+    over = threading.Event()
+
+    def arrived(sample: zenoh.Sample) -> None:
+        delays.append((time.monotonic_ns() - _STAMP.unpack(sample.payload.to_bytes())[0]) / 1e9)
+        if len(delays) == PACED:
+            over.set()
+
+    with zenoh.open(config(port, listens=True)) as session:
+        session.declare_subscriber("bench/sent", arrived)
+        started.send(None)
+        over.wait(2 * PACED * PERIOD / 1e9)
+    return delays
+
+
+def _pc(port: int, started: Connection) -> list[float]:
+    delays: list[float] = []
+
+    async def receive(node: r2p.Node) -> None:
+        subscriber = node.subscribe("sent", Sent, queue=64)
+        await subscriber.wait_publisher()
+        await asyncio.sleep(2.5)  # the gateway has made sure that it is alone
+        started.send(None)
+        with contextlib.suppress(TimeoutError):
+            while len(delays) < PACED:
+                message = await subscriber.fetch(timeout=3.0)
+                delays.append((time.monotonic_ns() - message.at) / 1e9)
+
+    async def main() -> None:
+        async with r2p.Module("PC", via=url(port, listens=True), watchdog=False) as module:
+            module.start(receive)
+            await module.wait()
+
+    run_on("uvloop", main())
+    return delays
+
+
+def _delays(robot: Callable[[Connection, int], None], pc: Callable[[int, Connection], list[float]]) -> list[float]:
+    """Seconds from the robot to the PC, of each message."""
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    port = free_port()
+    process = context.Process(target=robot, args=(there, port), daemon=True)
+    process.start()
+    try:
+        return pc(port, here)
+    finally:
+        process.terminate()
+        process.join()
+
+
 def rows() -> Iterator[Row]:
     for name, out in (("TCP", "tcp"), ("zenoh", "zenoh:?network=r2pbench")):
         throughput, lost, cost = _through(out)
@@ -116,3 +258,19 @@ def rows() -> Iterator[Row]:
             "60 k/s, none lost" if name == "zenoh" else "",
             throughput >= 60e3 and not lost if name == "zenoh" else None,
         )
+    runs = [(_delays(_bare_links, _bare_pc), _delays(_robot_and_gateway, _pc)) for _ in range(RUNS)]
+    bare = [p50_p99(each, 1e-3) for each, _ in runs]
+    added = [
+        tuple(r2p_ms - bare_ms for r2p_ms, bare_ms in zip(p50_p99(ours, 1e-3), alone, strict=True))
+        for (_, ours), alone in zip(runs, bare, strict=True)
+    ]
+    median, worst = (statistics.median(each) for each in zip(*added, strict=True))
+    bare_median, bare_worst = (statistics.median(each) for each in zip(*bare, strict=True))
+    lost = sum(PACED - len(ours) for _, ours in runs)
+    yield Row(
+        "1 kHz from CAN by gateway and zenoh: r2p adds, p50, p99",
+        f"{median:.2f} ms, {worst:.2f} ms, {lost} lost",
+        f"the two links alone {bare_median:.2f} ms, {bare_worst:.2f} ms",
+        "0.3 ms, 1 ms, none lost",
+        median <= 0.3 and worst <= 1.0 and not lost,
+    )

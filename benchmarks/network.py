@@ -8,6 +8,8 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import r2p
+from benchmarks import ends
+from benchmarks.ends import Result
 from benchmarks.loops import run_on
 from benchmarks.table import Row, p50_p99, rate
 from r2p.transports.tcp import TcpListenTransport
@@ -24,33 +26,13 @@ class Eight(r2p.Message):
 
 
 MESSAGE = Eight(values=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0))
-LINE = b"@00000000:05eight:20" + bytes(32).hex().encode() + b":00\r\n"
+LOAD = ends.Load(MESSAGE, MESSAGES, ROUNDS)
+LINE = b"@00000000:07numbers:20" + bytes(32).hex().encode() + b":00\r\n"
 
 
 async def _serve(pipe: Connection) -> None:
-    """The other process: counts the stream `eight`, says how many came and how long it took, and echoes `ping`."""
     transport = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
-
-    async def count(node: r2p.Node) -> None:
-        left, started = MESSAGES, 0.0
-        subscriber = node.subscribe("eight", Eight, queue=64)
-        async for _ in subscriber:
-            started = started or time.perf_counter()
-            left -= 1
-            if not left:
-                break
-        pipe.send((MESSAGES - left, subscriber.lost, time.perf_counter() - started))
-
-    async def echo(node: r2p.Node) -> None:
-        back = node.advertise("pong", Eight)
-        async for message in node.subscribe("ping", Eight):
-            await back.publish(message)
-
-    async with r2p.Module("SERVER", via=[transport], watchdog=False) as module:
-        module.start(count)
-        module.start(echo)
-        pipe.send(transport.port)
-        await module.wait()
+    await ends.serve(r2p.Module("SERVER", via=[transport], watchdog=False), LOAD, pipe, lambda: transport.port)
 
 
 async def _serve_lines(pipe: Connection) -> None:
@@ -70,38 +52,11 @@ async def _serve_lines(pipe: Connection) -> None:
     await server.serve_forever()
 
 
-async def _drive(port: int, pipe: Connection) -> tuple[float, int, list[float]]:
-    """Stream, then ping: messages a second, messages lost, round trips in seconds."""
-    trips: list[float] = []
-    result: tuple[float, int] = (0.0, 0)
-
-    async def stream(node: r2p.Node) -> None:
-        nonlocal result
-        publisher = node.advertise("eight", Eight)
-        await publisher.wait_subscriber()
-        for _ in range(MESSAGES):
-            await publisher.publish(MESSAGE)
-        received, lost, seconds = await asyncio.to_thread(pipe.recv)
-        result = (received / seconds, MESSAGES - received + lost)
-        await ping(node)
-
-    async def ping(node: r2p.Node) -> None:
-        publisher, answers = node.advertise("ping", Eight), node.subscribe("pong", Eight)
-        await publisher.wait_subscriber()
-        await answers.wait_publisher()
-        for _ in range(ROUNDS):
-            at = time.perf_counter()
-            await publisher.publish(MESSAGE)
-            await answers.fetch()
-            trips.append(time.perf_counter() - at)
-
-    async with r2p.Module("CLIENT", via=f"tcp:127.0.0.1:{port}", watchdog=False) as module:
-        module.start(stream)
-        await module.wait()
-    return (*result, trips)
+async def _drive(port: int, pipe: Connection) -> Result:
+    return await ends.drive(r2p.Module("CLIENT", via=f"tcp:127.0.0.1:{port}", watchdog=False), LOAD, pipe)
 
 
-async def _drive_lines(port: int, pipe: Connection) -> tuple[float, int, list[float]]:
+async def _drive_lines(port: int, pipe: Connection) -> Result:
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     for _ in range(MESSAGES):
         writer.write(LINE)
@@ -118,14 +73,14 @@ async def _drive_lines(port: int, pipe: Connection) -> tuple[float, int, list[fl
 
 
 Server = Callable[[Connection], Coroutine[Any, Any, None]]
-Driver = Callable[[int, Connection], Coroutine[Any, Any, tuple[float, int, list[float]]]]
+Driver = Callable[[int, Connection], Coroutine[Any, Any, Result]]
 
 
 def _process(serve: Server, pipe: Connection, loop: str) -> None:
     run_on(loop, serve(pipe))
 
 
-def _both(serve: Server, drive: Driver, loop: str) -> tuple[float, int, list[float]]:
+def _both(serve: Server, drive: Driver, loop: str) -> Result:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     server = context.Process(target=_process, args=(serve, there, loop), daemon=True)

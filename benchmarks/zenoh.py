@@ -15,6 +15,8 @@ from multiprocessing.connection import Connection
 import zenoh
 
 import r2p
+from benchmarks import ends
+from benchmarks.ends import Result
 from benchmarks.loops import run_on
 from benchmarks.table import Row, p50_p99, rate
 
@@ -35,17 +37,16 @@ class Sixteen(r2p.Message):
 
 
 MESSAGE = Sixteen(values=tuple(map(float, range(16))))  # type: ignore[arg-type]  # sixteen of them
-Result = tuple[float, int, list[float]]
-"""Messages a second, messages lost, round trips in seconds."""
+LOAD = ends.Load(MESSAGE, MESSAGES, ROUNDS)
 
 
-def _free_port() -> int:
+def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port: int = probe.getsockname()[1]
         return port
 
 
-def _url(port: int, *, listens: bool) -> str:
+def url(port: int, *, listens: bool) -> str:
     if listens:
         return f"zenoh:?mode=peer&listen=tcp/127.0.0.1:{port}&scouting=off&network=bench"
     return f"zenoh:tcp/127.0.0.1:{port}?scouting=off&network=bench"
@@ -54,70 +55,20 @@ def _url(port: int, *, listens: bool) -> str:
 # r2p at both ends
 
 
-async def _serve(port: int, pipe: Connection) -> None:
-    """The other process: counts the stream `numbers`, and echoes `ping`."""
-
-    async def count(node: r2p.Node) -> None:
-        left, started = MESSAGES, 0.0
-        subscriber = node.subscribe("numbers", Sixteen, queue=64)
-        pipe.send("ready")
-        async for _ in subscriber:
-            started = started or time.perf_counter()
-            left -= 1
-            if not left:
-                break
-        pipe.send((MESSAGES - left, subscriber.lost, time.perf_counter() - started))
-
-    async def echo(node: r2p.Node) -> None:
-        back = node.advertise("pong", Sixteen)
-        async for message in node.subscribe("ping", Sixteen):
-            await back.publish(message)
-
-    async with r2p.Module("SERVER", via=_url(port, listens=True), watchdog=False) as module:
-        module.start(count)
-        module.start(echo)
-        await module.wait()
-
-
-async def _drive(port: int, pipe: Connection) -> Result:
-    """Stream, then ping."""
-    trips: list[float] = []
-    result: tuple[float, int] = (0.0, 0)
-
-    async def stream(node: r2p.Node) -> None:
-        nonlocal result
-        publisher = node.advertise("numbers", Sixteen)
-        await publisher.wait_subscriber()
-        for _ in range(MESSAGES):
-            await publisher.publish(MESSAGE)
-        received, lost, seconds = await asyncio.to_thread(pipe.recv)
-        result = (received / seconds, MESSAGES - received + lost)
-        await ping(node)
-
-    async def ping(node: r2p.Node) -> None:
-        publisher, answers = node.advertise("ping", Sixteen), node.subscribe("pong", Sixteen)
-        await publisher.wait_subscriber()
-        await answers.wait_publisher()
-        for _ in range(ROUNDS):
-            at = time.perf_counter()
-            await publisher.publish(MESSAGE)
-            await answers.fetch()
-            trips.append(time.perf_counter() - at)
-
-    async with r2p.Module("CLIENT", via=_url(port, listens=False), watchdog=False) as module:
-        module.start(stream)
-        await module.wait()
-    return (*result, trips)
-
-
 def _serve_r2p(port: int, pipe: Connection) -> None:
-    run_on("uvloop", _serve(port, pipe))
+    module = r2p.Module("SERVER", via=url(port, listens=True), watchdog=False)
+    run_on("uvloop", ends.serve(module, LOAD, pipe, lambda: "ready"))
+
+
+def _drive_r2p(port: int, pipe: Connection) -> Result:
+    module = r2p.Module("CLIENT", via=url(port, listens=False), watchdog=False)
+    return run_on("uvloop", ends.drive(module, LOAD, pipe))
 
 
 # bare zenoh at both ends
 
 
-def _config(port: int, *, listens: bool) -> zenoh.Config:
+def config(port: int, *, listens: bool) -> zenoh.Config:
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("mode", '"peer"' if listens else '"client"')
@@ -128,7 +79,7 @@ def _config(port: int, *, listens: bool) -> zenoh.Config:
 
 def _serve_bare(port: int, pipe: Connection) -> None:
     """Counts in a callback, and echoes in another one."""
-    session = zenoh.open(_config(port, listens=True))
+    session = zenoh.open(config(port, listens=True))
     done = threading.Event()
     count, started = 0, 0.0
     pong = session.declare_publisher("bench/pong")
@@ -151,7 +102,7 @@ def _serve_bare(port: int, pipe: Connection) -> None:
 
 
 def _drive_bare(port: int, pipe: Connection) -> Result:
-    session = zenoh.open(_config(port, listens=False))
+    session = zenoh.open(config(port, listens=False))
     block = zenoh.CongestionControl.BLOCK
     numbers = session.declare_publisher("bench/numbers", congestion_control=block)
     ping = session.declare_publisher("bench/ping")
@@ -178,12 +129,12 @@ def _drive_bare(port: int, pipe: Connection) -> Result:
 def _both(*, bare: bool) -> Result:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    port = _free_port()
+    port = free_port()
     server = context.Process(target=_serve_bare if bare else _serve_r2p, args=(port, there), daemon=True)
     server.start()
     try:
         here.recv()
-        return _drive_bare(port, here) if bare else run_on("uvloop", _drive(port, here))
+        return _drive_bare(port, here) if bare else _drive_r2p(port, here)
     finally:
         server.terminate()
         server.join()
@@ -205,7 +156,7 @@ def _populate(port: int, pipe: Connection) -> None:
         async with AsyncExitStack() as stack:
             await stack.enter_async_context(r2p.Module("ROUTER", via=router, watchdog=False))
             for number in range(MODULES):
-                module = r2p.Module(f"M{number}", via=_url(port, listens=False), watchdog=False)
+                module = r2p.Module(f"M{number}", via=url(port, listens=False), watchdog=False)
                 await stack.enter_async_context(module)
                 module.start(publish, number, name="many")
             await asyncio.sleep(SETTLED)
@@ -219,14 +170,14 @@ def _list_topics() -> tuple[float, int]:
     """Seconds that `r2p topic list` takes, and the topics that it finds."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    port = _free_port()
+    port = free_port()
     network = context.Process(target=_populate, args=(port, there), daemon=True)
     network.start()
     try:
         here.recv()
         command = [sys.executable, "-c", "from r2p.tools.main import main; main()", "topic", "list"]
         started = time.perf_counter()
-        listed = subprocess.run([*command, "--via", _url(port, listens=False)], capture_output=True, check=True)
+        listed = subprocess.run([*command, "--via", url(port, listens=False)], capture_output=True, check=True)
         return time.perf_counter() - started, sum(b'"m' in line for line in listed.stdout.splitlines())
     finally:
         network.terminate()

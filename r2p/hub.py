@@ -146,7 +146,7 @@ class ModuleHub:
                 self._suspect_namesakes(link, event.info)
                 self._events.tell(event)
             case ModuleGone():
-                self._events.tell(event)
+                self._tell_gone(link, event)
 
     def _log_mismatch(self, link: Link, event: Mismatched) -> None:
         """At most once a second: another type in each message would fill the log."""
@@ -154,6 +154,15 @@ class ModuleHub:
         if now - self._mismatches.get((link.name, event.topic), -_APART) >= _APART:
             self._mismatches[link.name, event.topic] = now
             logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
+
+    def _tell_gone(self, link: Link, event: ModuleGone) -> None:
+        """A module on the link itself is gone. While the link is up that is news; without a good-bye it is trouble."""
+        info = event.info
+        if link.up and not info.observer and not info.hops:
+            silence = f": nothing heard of it for {info.lease / 1e9:.0f} s; does it hang?" if event.silent else ""
+            level = logging.WARNING if event.silent else logging.INFO
+            logger.log(level, "link %s: module %s is gone%s", link.name, info.name, silence)
+        self._events.tell(event)
 
     # Names
 

@@ -41,8 +41,10 @@ class Sample(msgspec.Struct, gc=False):
     sender's, or else the reception's. `sequence` counts the messages of one publisher from 1; 0 where the link
     does not carry it.
     `message` is None until somebody decodes a sample that came over a link. `drop_late`: a link that could not send it
-    by its deadline gives it up, and does not send it late. `hops` counts the gateways that it has crossed; `clock` says
-    how the stamp was translated from another clock, and how well.
+    by its deadline gives it up, and does not send it late. `hops` counts the gateways that it has crossed.
+
+    `clock` is how the time of the network where it was stamped translates to UTC, and how well: `clock.utc(...)` is for
+    such times in the payload, which no gateway touches.
     """
 
     data: bytes

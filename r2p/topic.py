@@ -277,7 +277,9 @@ class Topic:
 
     def _send(self, sample: Sample, blocked: list[Sink] | None, driver: object) -> list[Sink] | None:
         for outlet in self.outlets:
-            if outlet.carrier is driver or (not outlet.room().line(sample) and outlet.offer(sample)):
+            room = outlet.room()
+            queues = (room.events or room.claims) and room.line(sample)
+            if outlet.carrier is driver or (not queues and outlet.offer(sample)):
                 continue
             if not outlet.patient and sample.publisher_class == PublisherClass.NON_REAL_TIME:
                 outlet.force(sample)

@@ -26,8 +26,8 @@ _TREE = (0x60, 0x61)
 _WORDS = {
     State.ALONE: "forwards",
     State.FORWARDING: "forwards, in agreement with {gateways}",
-    State.BLOCKED: "is blocked: {gateways} already join its network to our others",
-    State.CONVERGING: "is silent until {gateways} agree",
+    State.BLOCKED: "is blocked: its network is joined to our others by {gateways}",
+    State.CONVERGING: "is silent until it agrees with {gateways}",
     State.LISTENING: "listens for other gateways",
     State.LOOP: "is blocked: what we send on another link comes back here, through a gateway that is not one of r2p",
 }

@@ -1,5 +1,6 @@
 """What a gateway lets through, and as what."""
 
+import re
 from fnmatch import fnmatchcase
 from typing import TypeVar
 
@@ -10,6 +11,8 @@ from r2p.names import LOADER_PREFIX
 from r2p.sample import PublisherClass
 
 T = TypeVar("T")
+
+_PREFIX = re.compile(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_")
 
 IP = frozenset({"tcp", "tcp-listen", "zenoh"})
 """Schemes of links that anybody in an IP network may reach."""
@@ -64,6 +67,13 @@ def rule(text: str) -> Rule:
     return Rule(topic, source or "*", target or "*")
 
 
+def check_prefix(text: str) -> str:
+    """The prefix; raises Error for one that no topic can have."""
+    if text and not _PREFIX.fullmatch(text):
+        raise Error(f"{text!r} is no prefix: write up to 16 letters, digits and underscores, and a slash: robot1/")
+    return text
+
+
 def is_link(name: str, pattern: str) -> bool:
     """Whether a pattern means the link: its name, its scheme, or with stars and question marks."""
     return pattern in (name, name.partition(":")[0]) or fnmatchcase(name, pattern)
@@ -73,7 +83,9 @@ class Policy:
     """The options, ready to be asked."""
 
     def __init__(self, options: BridgeOptions) -> None:
+        """Raises Error for rules and a prefix without sense."""
         self._options = options
+        check_prefix(options.prefix)
         self._allow = [rule(each) for each in options.allow]
         self._deny = [rule(each) for each in options.deny]
 

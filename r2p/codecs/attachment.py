@@ -42,12 +42,16 @@ _ORIGIN = struct.Struct("<BII8s")
 _CREDIT = struct.Struct("<BBII")
 _unpack = _FIXED.unpack_from
 
-PLAIN = bytes((VERSION, 0))
-"""What almost all headers begin with: this version, and no flags. Then their origin begins at `ORIGIN_AT`, and
-`unpack_plain` gives hops, serial, sequence, stamp and deadline: for who has looked up the origin himself."""
+START = VERSION
+"""What almost all headers begin with, as a number: this version, no flags, no hops."""
+
+START_MASK = 0xFFFF & ~(FLAG_RESTAMPED << 8)
+"""Where no other of these bits than those of START are set there is no clock part. Then the origin begins at
+`ORIGIN_AT`, and `unpack_start` gives the number, serial, sequence, stamp and deadline: for who has looked up the origin
+himself. `hops_of` and `is_stamped` say what else is in the number."""
 
 ORIGIN_AT = _FIXED.size
-unpack_plain = struct.Struct("<xxBxIQqq").unpack_from
+unpack_start = struct.Struct("<IIQqq").unpack_from
 
 _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
 _NAMES = re.compile(rb"([A-Za-z0-9_]{0,7})/([A-Za-z0-9_]{0,8})")
@@ -64,6 +68,10 @@ class Clock(msgspec.Struct, frozen=True, gc=False):
     epoch: int
     offset: int
     error: int
+
+    def utc(self, time: int) -> int:
+        """UTC (ns) of an instant (ns) of that clock, such as one in a payload, known to +-`error`."""
+        return time + self.offset
 
 
 class Origin(msgspec.Struct, frozen=True):
@@ -94,15 +102,33 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     clock: Clock | None = None
 
 
-def encoder(origin: Origin) -> Callable[[int, int, int, int], bytes]:
-    """Headers of an own publisher's messages: takes serial (wraps), sequence, stamp and deadline."""
-    tail = _encode_origin(origin)
-    pack = _FIXED.pack
+class Packer:
+    """Headers without a clock part, of one origin: `pack(start, serial, sequence, stamp, deadline, tail)`.
 
-    def encode_fast(serial: int, sequence: int, stamp: int, deadline: int) -> bytes:
-        return pack(VERSION, 0, 0, serial & SERIAL_WRAP, sequence, stamp, deadline) + tail
+    `start` is `START` or what `start_of` says; the serial has to be cut to its 32 bits. No function of our own around
+    it: this is called for each message.
+    """
 
-    return encode_fast
+    __slots__ = ("pack", "tail")
+
+    def __init__(self, origin: Origin) -> None:
+        self.tail = _encode_origin(origin)
+        self.pack = struct.Struct(f"<IIQqq{len(self.tail)}s").pack
+
+
+def start_of(hops: int, *, stamped: bool) -> int:
+    """The first four bytes of a header without a clock part."""
+    return VERSION | (0 if stamped else FLAG_RESTAMPED << 8) | min(hops, 255) << 16
+
+
+def hops_of(start: int) -> int:
+    """The gateways that a header begins with."""
+    return start >> 16 & 0xFF
+
+
+def is_stamped(start: int) -> bool:
+    """Whether the stamp is the publisher's."""
+    return not start & FLAG_RESTAMPED << 8
 
 
 def encode(header: Header) -> bytes:

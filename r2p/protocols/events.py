@@ -132,9 +132,10 @@ class ModuleChanged(msgspec.Struct, frozen=True):
 
 
 class ModuleGone(msgspec.Struct, frozen=True):
-    """An r2p module said good-bye, or was silent for its lease."""
+    """An r2p module said good-bye, or was `silent` for its lease; on zenoh, which tells no more, it is just gone."""
 
     info: ModuleInfo
+    silent: bool = False
 
 
 class Declare(msgspec.Struct, frozen=True):

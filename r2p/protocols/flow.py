@@ -100,6 +100,10 @@ class Inflow:
         self.next = (serial + 1) & _WRAP
         return ahead
 
+    def interrupted(self) -> None:
+        """The sender is gone: should it come back, it knows nothing of us, so its first message is answered."""
+        self.until_credit = 1
+
     def credited(self) -> None:
         """The sender is told now: so when next?"""
         self.until_credit = max(1, self.window // 2) if self.window else NO_LIMIT

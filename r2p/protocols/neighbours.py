@@ -111,7 +111,7 @@ class Neighbours:
 
     def expired(self, now: int, name: str) -> None:
         """An r2p module was silent for its lease."""
-        self._gone(now, self._directory.modules[name])
+        self._gone(now, self._directory.modules[name], silent=True)
 
     def interrupted(self, now: int) -> None:
         """The link is down: nobody can be heard."""
@@ -168,10 +168,10 @@ class Neighbours:
             self._gone(now, forgotten)
         self._announcer.follow(r2p=self._directory.knows_r2p)
 
-    def _gone(self, now: int, info: ModuleInfo) -> None:
+    def _gone(self, now: int, info: ModuleInfo, *, silent: bool = False) -> None:
         self._directory.remove(info)
         self._timers.clear(("module", info.name))
-        self._outbox.tell(ModuleGone(info))
+        self._outbox.tell(ModuleGone(info, silent))
         self._exchange.moved_away(now, info)
         self._announcer.follow(r2p=self._directory.knows_r2p)
 

@@ -16,14 +16,13 @@ from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 from r2p.protocols.announcer import Relayed
+from r2p.protocols.census import Census
 from r2p.protocols.declarations import Declarations, Own
 from r2p.protocols.demand import Demand
-from r2p.protocols.directory import FOR_EVER, MOST, EndpointInfo, EndpointKey, TopicInfo
+from r2p.protocols.directory import MOST, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.events import (
     Command,
     Event,
-    ModuleChanged,
-    ModuleGone,
     ModuleInfo,
     NameConflict,
     Obey,
@@ -39,8 +38,6 @@ TOKENS = 4 * MOST
 _SECOND = 1_000_000_000
 _FRESHEN = _SECOND // 2
 """How often what lives is marked as heard (ns)."""
-_NAMESAKE = 1_500_000_000
-"""Ns for which two modules of one name must be there: the token of one that has hung may live for a second."""
 
 _ORDERS: dict[Command, Callable[[str], management.Management]] = {
     Command.STOP: management.Stop,
@@ -61,28 +58,35 @@ class Presence:
     ) -> None:
         self.counts: Counter[str] = Counter() if counts is None else counts
         """What came in and was dropped, by reason."""
-        self.modules: dict[str, ModuleInfo] = {}
-        """The other modules by name; one of our own name is another module that has it too."""
-        self.endpoints: dict[EndpointKey, EndpointInfo] = {}
-        """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
-        self.generation = 0
-        """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
         self._module = module
         self._instance = instance
         self._up = False
         self._events: list[Event] = []
         self._own = Declarations(module, instance, observer=observer)
         self._matching = Matching(self._own, self._events)
+        self._census = Census(module, instance, self._events, self.counts)
         self._tokens: dict[str, liveliness.Token] = {}
-        self._named: dict[str, dict[str, ModuleToken]] = {}
-        self._told: Counter[EndpointKey] = Counter()
         self._freshen_at: int | None = None
-        self._suspected: dict[str, int] = {}
 
     @property
     def flags(self) -> int:
         """Our own flags, as in ALIVE."""
         return self._own.flags
+
+    @property
+    def modules(self) -> dict[str, ModuleInfo]:
+        """The other modules by name; one of our own name is another module that has it too."""
+        return self._census.modules
+
+    @property
+    def endpoints(self) -> dict[EndpointKey, EndpointInfo]:
+        """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
+        return self._census.endpoints
+
+    @property
+    def generation(self) -> int:
+        """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
+        return self._census.generation
 
     @property
     def topics(self) -> dict[str, TopicInfo]:
@@ -189,8 +193,7 @@ class Presence:
         self._events += self._own.take_back()
         for key in list(self._tokens):
             self._remove_token(now, key)
-        for info in list(self.modules.values()):
-            self._gone(info)  # firmware that gateways told of
+        self._census.clear()  # firmware that gateways told of
         return self._take()
 
     def leave(self, now: int) -> list[Event]:
@@ -202,10 +205,8 @@ class Presence:
         """When to call `poll` (monotonic ns); a time in the past means at once."""
         if self._up and self._own.pending:
             return 0
-        due = list(self._suspected.values())
-        if self._freshen_at is not None:
-            due.append(self._freshen_at)
-        return min(due, default=None)
+        due = (self._census.next_deadline(), self._freshen_at)
+        return min((each for each in due if each is not None), default=None)
 
     def poll(self, now: int) -> list[Event]:
         """Declare what changed here; what lives is as good as just heard."""
@@ -213,9 +214,7 @@ class Presence:
             self._events += self._own.changes()
         if self._freshen_at is not None and self._freshen_at <= now:
             self._freshen(now)
-        for name in [name for name, due in self._suspected.items() if due <= now]:
-            del self._suspected[name]
-            self._tell_namesakes(name)
+        self._census.poll(now)
         return self._take()
 
     def receive(self, now: int, data: bytes, source: Source = None) -> list[Event]:
@@ -242,10 +241,9 @@ class Presence:
         if self._freshen_at is None:
             self._freshen_at = now + _FRESHEN
         if isinstance(token, ModuleToken):
-            self._named.setdefault(token.name, {})[key] = token
-            self._review_module(now, token.name)
+            self._census.module_appeared(now, key, token)
         else:
-            self._enter_endpoint(token)
+            self._census.endpoint_appeared(token)
             if not token.hops:  # behind a gateway: its own tokens say what it passes on
                 self._matching.appeared(now, key, token)
         return self._take()
@@ -268,99 +266,21 @@ class Presence:
         self._matching.changed(topic, role)
         return self._take()
 
-    def _enter_endpoint(self, token: TopicToken) -> None:
-        key = _endpoint_key(token)
-        if key is None or token.instance == self._instance:
-            return
-        self._told[key] += 1
-        name = next((each.name for each in self.modules.values() if each.instance == token.instance), "")
-        self.endpoints[key] = EndpointInfo(name, *key, token.publisher_class)
-        self.generation += 1
-
     def _remove_token(self, now: int, key: str) -> None:
         token = self._tokens.pop(key, None)
         if isinstance(token, ModuleToken):
-            named = self._named[token.name]
-            del named[key]
-            if not named:
-                del self._named[token.name]
-            self._review_module(now, token.name)
+            self._census.module_disappeared(now, key, token)
         elif token is not None:
-            self._remove_endpoint(token)
+            self._census.endpoint_disappeared(token)
             if not token.hops:
                 self._matching.disappeared(key, token)
         if not self._tokens:
             self._freshen_at = None
 
-    def _remove_endpoint(self, token: TopicToken) -> None:
-        """Unless another token tells of it, as when its class has changed."""
-        key = _endpoint_key(token)
-        if key is not None and key in self._told:
-            self._told[key] -= 1
-            if not self._told[key]:
-                del self._told[key], self.endpoints[key]
-                self.generation += 1
-
-    # Modules
-
-    def _review_module(self, now: int, name: str) -> None:
-        """The tokens of a name have changed: the nearest and latest of them is the module."""
-        tokens = [each for each in self._named.get(name, {}).values() if each.instance != self._instance]
-        before = self.modules.get(name)
-        if not tokens:
-            self._suspected.pop(name, None)
-            if before is not None:
-                self._gone(before)
-            return
-        nearest = min(reversed(tokens), key=lambda each: each.hops)
-        info = ModuleInfo(
-            name,
-            nearest.flags,
-            now,
-            nearest.instance,
-            nearest.observer,
-            FOR_EVER if nearest.instance is not None else 0,
-            nearest.hops,
-            nearest.session,
-        )
-        self._keep(before, info)
-        own = {self._instance} if name == self._module else set()
-        if len({each.instance for each in tokens} | own) > 1:
-            self._suspected.setdefault(name, now + _NAMESAKE)
-        else:
-            self._suspected.pop(name, None)
-
-    def _keep(self, before: ModuleInfo | None, info: ModuleInfo) -> None:
-        if before is None and len(self.modules) >= MOST:
-            self.counts["modules forgotten"] += 1
-            return
-        self.modules[info.name] = info
-        if before is None or msgspec.structs.replace(before, last_heard=info.last_heard) != info:
-            self.generation += 1
-            self._events.append(ModuleChanged(info))
-        for key, endpoint in self.endpoints.items():
-            if endpoint.instance == info.instance and endpoint.module != info.name:
-                self.endpoints[key] = msgspec.structs.replace(endpoint, module=info.name)
-
-    def _gone(self, info: ModuleInfo) -> None:
-        del self.modules[info.name]
-        self.generation += 1
-        self._events.append(ModuleGone(info))
-
-    def _tell_namesakes(self, name: str) -> None:
-        instances = [each.instance for each in self._named.get(name, {}).values()]
-        if name == self._module:
-            instances.insert(0, self._instance)
-        one, other, *_ = dict.fromkeys(instances)
-        self._events.append(NameConflict(name, one, other))
-
     def _freshen(self, now: int) -> None:
         self._freshen_at = now + _FRESHEN
         self._matching.freshen(now)
-        for name in self._named:
-            info = self.modules.get(name)
-            if info is not None and info.r2p:
-                self.modules[name] = msgspec.structs.replace(info, last_heard=now)
+        self._census.freshen(now)
 
     # Messages
 
@@ -374,8 +294,8 @@ class Presence:
                 self._events.append(Obey(Command.BOOTLOAD))
             case management.Conflict(self._module, a, b) if self._instance in (a, b):
                 self._events.append(NameConflict(self._module, a, b))
-            case management.Alive(name, flags) if name != self._module and name not in self._named:
-                self._keep(self.modules.get(name), ModuleInfo(name, flags, now, hops=1, source=source))
+            case management.Alive(name, flags):
+                self._census.firmware(ModuleInfo(name, flags, now, hops=1, source=source))
 
     def _say(self, message: management.Management, *, urgent: bool = False) -> None:
         if self._up:
@@ -394,9 +314,3 @@ class Presence:
         events = self._events[:]
         self._events.clear()
         return events
-
-
-def _endpoint_key(token: TopicToken) -> EndpointKey | None:
-    if not token.node or token.instance is None:
-        return None
-    return token.instance, token.node, token.topic, token.role

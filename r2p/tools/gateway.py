@@ -2,20 +2,22 @@
 
 import asyncio
 import logging
+import re
 import socket
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import typer
 
 import r2p
-from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics
-from r2p.bridge.options import rule
+from r2p.bridge import BridgeOptions, ClassOf
+from r2p.bridge.options import check_prefix, is_link, rule
 from r2p.msg import GatewayStatus
 from r2p.names import module_name_from
+from r2p.tools._gateway_table import Rates, Row, Screen
 from r2p.tools.options import class_choice, hertz
-from r2p.tools.output import Output, aligned
+from r2p.tools.output import Output
 from r2p.tools.session import Format, Quiet, Usage, Verbose, Via, execute, settings
 
 logger = logging.getLogger("r2p.gateway")
@@ -24,12 +26,14 @@ TOPIC = "gateway"
 """Where a gateway publishes its counters, as GatewayStatus."""
 
 _SUMMARY = 60  # seconds between two lines on what has passed, where there is no terminal
-_ROWS = 30  # ways that the table on a terminal shows at most
 
 _Rules = list[str] | None
 
 
-_Name = Annotated[str | None, typer.Option(metavar="NAME", help="The gateway's module name; default: GW_ and host.")]
+_Name = Annotated[
+    str | None,
+    typer.Option("--name", "--module", metavar="NAME", help="The gateway's module name; default: GW_ and host."),
+]
 _Allow = Annotated[
     _Rules, typer.Option(metavar="TOPIC[@FROM[>TO]]", help="Forward only such topics; patterns, quoted (may repeat).")
 ]
@@ -81,19 +85,19 @@ def command(
 
     async def main() -> None:
         chosen = settings(via)
+        if len(chosen.via) < 2 and not any(url.startswith("tcp-listen:") for url in chosen.via):
+            raise Usage("a gateway joins two links: --via rtcan:can0 --via zenoh:")
         options = BridgeOptions(
-            allow=_rules(allow, "--allow"),
-            deny=_rules(deny, "--deny"),
+            allow=_rules(allow, "--allow", chosen.via),
+            deny=_rules(deny, "--deny", chosen.via),
             rate_limit={topic: hertz(value) for topic, value in _pairs(rate_limit, "--rate-limit", "TOPIC=HZ")},
-            read_only=tuple(read_only or ()),
-            prefix=prefix,
-            prefix_on=tuple(prefix_on or ("zenoh",)),
+            read_only=_links(read_only, "--read-only", chosen.via),
+            prefix=_prefix(prefix),
+            prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or ("zenoh",),
             classes={topic: _class(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
             reserve=tuple(reserve or ()),
             allow_control=allow_control,
         )
-        if len(chosen.via) < 2 and not any(url.startswith("tcp-listen:") for url in chosen.via):
-            raise Usage("a gateway joins two links: --via rtcan:can0 --via zenoh:")
         await serve(name or chosen.module or default_name(), chosen.via, options, Output(format), quiet=format is None)
 
     execute(main, verbose=verbose, quiet=quiet)
@@ -128,8 +132,8 @@ async def _report_each_second(
     node: r2p.Node,
     module: r2p.Module,
     status: r2p.Publisher[GatewayStatus],
-    rates: "Rates",
-    screen: "Screen | None",
+    rates: Rates,
+    screen: Screen | None,
     output: Output | None,
 ) -> None:
     seconds = 0
@@ -149,121 +153,6 @@ async def _report_each_second(
             _summarise(rows)
 
 
-class Row(msgspec.Struct, frozen=True):
-    """One line of the table: a link (`topic` and `target` are empty), or a topic and its way."""
-
-    topic: str
-    source: str
-    target: str
-    state: str
-    gateways: int
-    rate: float
-    forwarded: int
-    dropped: dict[str, int]
-    offset: int | None = None
-    error: int | None = None
-
-    def status(self) -> GatewayStatus:
-        """As it is published."""
-        return GatewayStatus(
-            topic=self.topic[:16],
-            source=self.source[:24],
-            target=self.target[:24],
-            state=self.state,
-            forwarded=self.forwarded,
-            dropped=sum(self.dropped.values()),
-            rate=self.rate,
-        )
-
-    def cells(self) -> dict[str, Any]:
-        """As it is shown."""
-        dropped = ", ".join(f"{count} {reason}" for reason, count in sorted(self.dropped.items()))
-        if not self.topic:
-            others = f" ({self.gateways} more here)" if self.gateways else ""
-            clock = "" if self.error is None else f"+-{self.error / 1e3:.0f} us"
-            return {"link": self.source, "state": self.state + others, "clock": clock, "dropped": dropped}
-        return {
-            "topic": self.topic,
-            "from": self.source,
-            "to": self.target,
-            "rate": f"{self.rate:.1f}/s",
-            "forwarded": self.forwarded,
-            "dropped": dropped,
-        }
-
-
-class Rates:
-    """Turns counters into rates."""
-
-    def __init__(self) -> None:
-        self._last: dict[tuple[str, str, str], int] = {}
-        self._at = 0
-
-    def rows(self, statistics: GatewayStatistics, now: int) -> list[Row]:
-        """The links, and the ways that something has passed or was dropped on; `now` in ns."""
-        since = (now - self._at) / 1e9
-        last, self._last, self._at = self._last, {}, now
-        rows = [
-            Row("", each.link, "", each.state, each.gateways, 0.0, 0, each.dropped, each.offset, each.error)
-            for each in statistics.ports
-        ]
-        for way in statistics.ways:
-            key = (way.topic, way.source, way.target)
-            self._last[key] = way.forwarded
-            if way.forwarded or way.dropped:
-                rate = (way.forwarded - last.get(key, 0)) / since
-                rows.append(Row(*key, "", 0, round(rate, 3), way.forwarded, way.dropped))
-        return rows
-
-
-class _Noticed(logging.Handler):
-    """Counts what is logged: it stands between the table and the cursor."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.count += 1
-
-
-class Screen:
-    """A table that stays in its place, until something else is written below it."""
-
-    def __init__(self, output: Output) -> None:
-        self._output = output
-        self._noticed = _Noticed()
-        self._seen = 0
-        self._height = 0
-        logging.getLogger("r2p").addHandler(self._noticed)
-
-    def close(self) -> None:
-        """Write no more."""
-        logging.getLogger("r2p").removeHandler(self._noticed)
-
-    async def draw(self, rows: list[Row]) -> None:
-        """Write the table over the last one."""
-        text = table(rows)
-        up = f"\x1b[{self._height}F\x1b[J" if self._height and self._noticed.count == self._seen else ""
-        self._seen = self._noticed.count
-        self._height = text.count("\n") + 1
-        await self._output.remark(up + text)
-
-
-def table(rows: list[Row]) -> str:
-    """The rows for people: links, and below them the busiest topics."""
-    links = [row.cells() for row in rows if not row.topic]
-    ways = sorted((row for row in rows if row.topic), key=lambda row: (-row.rate, row.topic))
-    clocks = ["clock"] if any(each["clock"] for each in links) else []
-    text = aligned(links, ["link", "state", *clocks, "dropped"])
-    if ways:
-        columns = ["topic", "from", "to", "rate", "forwarded", "dropped"]
-        text += "\n" + aligned([row.cells() for row in ways[:_ROWS]], columns)
-    if len(ways) > _ROWS:
-        text += f"... and {len(ways) - _ROWS} more\n"
-    return text
-
-
 def _summarise(rows: list[Row]) -> None:
     forwarded = sum(row.forwarded for row in rows)
     dropped = sum(sum(row.dropped.values()) for row in rows)
@@ -271,13 +160,42 @@ def _summarise(rows: list[Row]) -> None:
     logger.info("%d messages forwarded, %d dropped so far; links: %s", forwarded, dropped, states)
 
 
-def _rules(given: _Rules, option: str) -> tuple[str, ...]:
+def _rules(given: _Rules, option: str, via: list[str]) -> tuple[str, ...]:
     for text in given or ():
         try:
-            rule(text)
+            parsed = rule(text)
         except r2p.Error as error:
             raise Usage(f"{option} {error}") from error
+        _links([parsed.source, parsed.target], option, via)
     return tuple(given or ())
+
+
+def _links(given: _Rules, option: str, via: list[str]) -> tuple[str, ...]:
+    """Patterns for links; one that means none of them protects nothing, so it is a mistake."""
+    for pattern in given or ():
+        if not any(_may_mean(pattern, url) for url in via):
+            names = ", ".join(_link_name(url) for url in via)
+            raise Usage(f"{option}: {pattern!r} is none of the links {names}")
+    return tuple(given or ())
+
+
+def _may_mean(pattern: str, url: str) -> bool:
+    """Whether a link of this URL can have such a name; that of a client of a server is known only when it comes."""
+    name = _link_name(url)
+    if name.startswith("tcp-listen"):
+        return pattern.startswith("tcp:") or is_link("tcp:192.168.0.10:1024", pattern)
+    return is_link(name, pattern) or pattern.startswith((f"{name}:", f"{name}#"))  # tcp:HOST has a port then
+
+
+def _link_name(url: str) -> str:
+    return re.split("[?,]", url)[0]
+
+
+def _prefix(text: str) -> str:
+    try:
+        return check_prefix(text)
+    except r2p.Error as error:
+        raise Usage(f"--prefix: {error}") from error
 
 
 def _pairs(given: _Rules, option: str, form: str) -> Iterable[tuple[str, str]]:

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 import r2p
@@ -144,12 +145,13 @@ class _Reader:
 
 
 def _meta(topic: str, sample: r2p.Sample) -> dict[str, Any]:
-    return {
-        META: {
-            "topic": topic,
-            "stamp": sample.stamp,
-            "stamp_from": "sender" if sample.stamped else "reception",
-            "source": str(sample.source),
-            "sequence": sample.sequence or None,
-        }
+    meta = {
+        "topic": topic,
+        "stamp": sample.stamp,
+        "stamp_from": "sender" if sample.stamped else "reception",
+        "source": str(sample.source),
+        "sequence": sample.sequence or None,
     }
+    if sample.clock is not None:
+        meta["clock"] = msgspec.to_builtins(sample.clock)
+    return {META: meta}

@@ -27,6 +27,7 @@ _GAP = 2.0  # times the usual period: a publisher that pauses
 _MEMORY = 1 / 16  # weight of a new period in the usual one
 _MISSING = 65536  # sequence numbers that are remembered, in case that they still come
 
+_STARTS = 4  # publishers that a report names
 _PRECISE = 9  # decimals of seconds: ns
 
 Window = Annotated[int, typer.Option("--window", "-w", min=2, metavar="N", help="Messages that are averaged.")]
@@ -242,8 +243,8 @@ class _Delay:
 
     def __init__(self, window: int) -> None:
         self._delays: deque[float] = deque(maxlen=window)
-        self._source = r2p.Source()
-        self._start = "publish"
+        self._link = ""
+        self._starts: dict[str, None] = {}
         self._error: int | None = None
 
     def note(self, sample: r2p.Sample, now: int) -> None:
@@ -252,21 +253,23 @@ class _Delay:
                 f"no stamps: link {sample.source.link} does not carry when a message was published, only its reception "
                 "is known here"
             )
-        self._source = sample.source
-        self._start = "publish" if sample.stamped else "on the first gateway's link"
+        self._link = sample.source.link
+        start = _start(sample)
+        if start in self._starts or len(self._starts) < _STARTS:
+            self._starts[start] = None
         self._error = None if sample.clock is None else sample.clock.error
         self._delays.append((now - sample.stamp) / _SECOND)
 
     def report(self, lost: int) -> tuple[Report, str] | None:
         if not self._delays:
             return None
-        here = self._source.link.partition(":")[0] in {"", "memory"}
+        here = self._link.partition(":")[0] in {"", "memory"}
         clocks = "one clock" if here else "clocks not compared"
         record = {
             "mean": round(statistics.fmean(self._delays), _PRECISE),
             **_spread(self._delays),
             "window": len(self._delays),
-            "from": f"{self._source} {self._start}",
+            "from": " or ".join(self._starts),
             "to": "this tool",
             "clocks": clocks,
             "lost_here": lost,
@@ -276,6 +279,14 @@ class _Delay:
             record["clock_error"] = self._error / _SECOND
             text += f"; network time is UTC within +-{_ms(self._error / _SECOND)}"
         return record, text
+
+
+def _start(sample: r2p.Sample) -> str:
+    """The instant that a sample's stamp tells."""
+    if sample.stamped:
+        return f"publish() in {sample.source}"
+    where = "arrival at the first gateway" if sample.clock is None else "first frame on the bus"
+    return f"{sample.source}'s {where}"
 
 
 def _per_second(arrivals: Sequence[int], amount: int) -> float | None:

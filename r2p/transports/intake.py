@@ -1,23 +1,29 @@
 """What comes in by a link, on its way to the topics: only what was opened, and a few messages at a time.
 
 A slow reader must not stop a line that others share, and a fast one should lose nothing. So a full queue gets PATIENCE
-turns of the event loop to make room; one that does not is lossy, for this link, until it has plenty.
+turns of the event loop to make room; one that does not is lossy, for this link, until it has plenty. What a gateway
+passes on from an end that waits while nothing is read gets STALL seconds, as from a publisher of this module: so the
+flow is from end to end.
 """
 
 import asyncio
 import functools
 from collections import Counter, deque
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any, Protocol
 
 import msgspec
 
 from r2p.room import Claim, Sink
 from r2p.sample import Sample
-from r2p.topic import PATIENCE, QueueSink, Topic
+from r2p.topic import PATIENCE, Outlet, QueueSink, Topic
 
 TURN = 64
 """Messages that a link hands out before it lets the event loop run once."""
+
+
+STALL = 1.0
+"""Seconds for which a line stands still, at most, as another link has no room."""
 
 
 class LinkStats(msgspec.Struct):
@@ -91,6 +97,10 @@ class Receiver(Protocol):
     def take_other(self, arrival: Any) -> None:
         """Something came in for which there is no inlet."""
 
+    @property
+    def waits(self) -> bool:
+        """Whether the other end waits while nothing is read, and nothing is lost by that."""
+
     def pause(self) -> None:
         """Stop reading, if possible: what came in is still being handed out."""
 
@@ -99,12 +109,18 @@ class Receiver(Protocol):
 
 
 class _Arrived(Claim):
-    """What came in, and waits in line with what this module publishes; whether it was placed is looked up each turn."""
+    """What came in, and waits in line with what this module publishes."""
 
-    __slots__ = ()
+    __slots__ = ("over",)
+
+    def __init__(self, sample: Sample, sinks: list[Sink]) -> None:
+        self.over: Callable[[], None] | None = None
+        """Called when it is placed; before that is set it is looked up each turn."""
+        super().__init__(sample, sinks)
 
     def settled(self, sink: Sink, refusal: str) -> None:
-        pass
+        if not self.lacking and self.over is not None:
+            self.over()
 
 
 class Intake:
@@ -121,6 +137,8 @@ class Intake:
         self._closed = False
         self._patience = 0
         self._lossy: set[Sink] = set()
+        self._stalled: _Arrived | None = None
+        self._stall: asyncio.TimerHandle | None = None
 
     def open(self, topic: Topic, size: int, sender: Hashable) -> None:
         """Take what `sender` publishes: messages of `size` bytes, 0: of any size. Again: with another size."""
@@ -162,6 +180,9 @@ class Intake:
         """Forget what was not handed out yet, and take no more."""
         self._closed = True
         self._backlog.clear()
+        if self._stalled is not None:
+            self._stalled.withdraw()
+            self._end_stall()
         for name in list(self._inlets):
             self.shut_all(name.decode())
 
@@ -227,9 +248,37 @@ class Intake:
         if claim.lacking and self._patience > 0 and not self._closed:
             self._loop.call_soon(self._look, claim)
             return
+        stands_still = self._link.waits and not self._closed
+        links: list[Sink] = [sink for sink in claim.lacking if stands_still and isinstance(sink, Outlet)]
         for sink in claim.withdraw():
-            sink.force(claim.sample)
-            self._lossy.add(sink)
-            sink.room().recoveries.append(functools.partial(self._lossy.discard, sink))
-        if not self._closed:
+            if sink not in links:
+                sink.force(claim.sample)
+                self._lossy.add(sink)
+                sink.room().recoveries.append(functools.partial(self._lossy.discard, sink))
+        if links:
+            self._stand_still(_Arrived(claim.sample, links))
+        elif not self._closed:
             self._hand_out()
+
+    def _stand_still(self, claim: _Arrived) -> None:
+        """Until these links have room, or have had none for too long."""
+        claim.over = self._go_on
+        self._stalled = claim
+        self._stall = self._loop.call_later(STALL, self._give_up, claim)
+
+    def _go_on(self) -> None:
+        """It is placed, in the middle of somebody's work: go on after it."""
+        self._end_stall()
+        self._loop.call_soon(self._hand_out)
+
+    def _end_stall(self) -> None:
+        self._stalled = None
+        if self._stall is not None:
+            self._stall.cancel()
+            self._stall = None
+
+    def _give_up(self, claim: _Arrived) -> None:
+        for sink in list(claim.lacking):
+            sink.refill()
+        for sink in list(claim.lacking):
+            sink.give_up(f"no room for {STALL} s")

@@ -46,6 +46,9 @@ class Carrier(abc.ABC):
     has none left; in between nothing is given to it, except the last words before `close()`.
     """
 
+    waits: ClassVar[bool] = False
+    """Whether the other end waits while nothing is read, and nothing is lost by that."""
+
     @abc.abstractmethod
     def send(self, data: bytes) -> None:
         """Send, or hold what can't be sent at once."""
@@ -203,6 +206,10 @@ class LineLink(Link):
         self._samples.clear()
         self._waiting = 0
         return discarded
+
+    @property
+    def waits(self) -> bool:
+        return self._carrier is not None and self._carrier.waits
 
     def pause(self) -> None:
         if self._carrier is not None:

@@ -243,6 +243,11 @@ class Link(abc.ABC):
         """The sender's address on a bus; None on a line with one other end."""
         return None
 
+    @property
+    def waits(self) -> bool:
+        """Whether the other end waits while nothing is read, and nothing is lost by that."""
+        return False
+
     def pause(self) -> None:
         """Stop reading, if possible: what came in is still being handed out."""
 

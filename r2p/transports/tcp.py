@@ -27,6 +27,8 @@ _DEAD_AFTER = 5  # seconds
 class _Tcp(asyncio.BufferedProtocol, Connection):
     """One TCP connection."""
 
+    waits = True
+
     def __init__(self) -> None:
         super().__init__()
         self.link: LineLink | None = None

@@ -284,6 +284,33 @@ async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.Monkey
             assert bool(ways(gw, "BOOT_IMU1")) is allowed
 
 
+async def test_who_leaves_or_hangs_is_gone_on_the_other_side_too(caplog: pytest.LogCaptureFixture) -> None:
+    loop = asyncio.get_running_loop()
+    async with gateway(), r2p.Module("PC", via="memory:b") as pc:
+        events = pc.events()
+
+        async def until_gone() -> None:
+            async for event in events:
+                if isinstance(event, r2p.ModuleGone) and event.info.name == "A":
+                    return
+
+        async with r2p.Module("A", via="memory:a"):
+            await asyncio.sleep(3)
+            assert "A" in {each.name for each in pc.network.modules()}
+            left_at = loop.time()
+        await until_gone()
+        assert loop.time() - left_at < 0.01
+        assert "gone: nothing heard" not in caplog.text
+        async with r2p.Module("A", via="memory:a"):
+            await asyncio.sleep(3)
+            network("a").loss = 1.0  # it says no good-bye
+            hangs_at = loop.time()
+            await until_gone()
+        assert loop.time() - hangs_at < 5.1
+        assert "link memory:a: module A is gone: nothing heard of it for 5 s; does it hang?" in caplog.text
+        assert "link memory:b: module A is gone: nothing" not in caplog.text
+
+
 async def test_firmware_is_seen_with_its_age() -> None:
     async with gateway(), r2p.Module("B", via="memory:b") as module:
         firmware = Tap("a")

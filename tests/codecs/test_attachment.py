@@ -51,9 +51,12 @@ def test_the_bytes_of_a_header() -> None:
 
 
 def test_a_fast_encoder_says_the_same() -> None:
-    fast = attachment.encoder(ORIGIN)
-    assert fast(7, 9, HEADER.stamp, HEADER.deadline) == attachment.encode(HEADER)
-    assert fast(7 + 2**32, 9, HEADER.stamp, HEADER.deadline) == attachment.encode(HEADER)
+    packer = attachment.Packer(ORIGIN)
+    for hops, stamped in [(0, True), (3, False), (300, True)]:
+        start = attachment.start_of(hops, stamped=stamped)
+        fast = packer.pack(start, HEADER.serial, HEADER.sequence, HEADER.stamp, HEADER.deadline, packer.tail)
+        assert fast == attachment.encode(msgspec.structs.replace(HEADER, hops=hops, stamped=stamped))
+        assert (attachment.hops_of(start), attachment.is_stamped(start)) == (min(hops, 255), stamped)
 
 
 def test_what_is_too_large_is_cut() -> None:
@@ -134,11 +137,16 @@ def test_any_bytes_are_a_credit_or_counted(data: bytes) -> None:
 
 
 def test_the_short_way_through_a_plain_header() -> None:
-    data = attachment.encode(HEADER)
-    assert data.startswith(attachment.PLAIN)
-    reader = Reader(lambda origin: origin)
-    reader.read(data)
-    assert reader.known[data[attachment.ORIGIN_AT :]] == ORIGIN
-    assert attachment.unpack_plain(data) == (0, 7, 9, HEADER.stamp, HEADER.deadline)
-    for odd in (msgspec.structs.replace(HEADER, stamped=False), msgspec.structs.replace(HEADER, clock=Clock(1, 2, 3))):
-        assert not attachment.encode(odd).startswith(attachment.PLAIN)
+    for hops, stamped in [(0, True), (2, False)]:
+        data = attachment.encode(msgspec.structs.replace(HEADER, hops=hops, stamped=stamped))
+        reader = Reader(lambda origin: origin)
+        reader.read(data)
+        assert reader.known[data[attachment.ORIGIN_AT :]] == ORIGIN
+        start, *rest = attachment.unpack_start(data)
+        assert start & attachment.START_MASK == attachment.START
+        assert (attachment.hops_of(start), attachment.is_stamped(start)) == (hops, stamped)
+        assert rest == [7, 9, HEADER.stamp, HEADER.deadline]
+    assert attachment.unpack_start(attachment.encode(HEADER))[0] == attachment.START
+    odd = attachment.encode(msgspec.structs.replace(HEADER, clock=Clock(1, 2, 3)))
+    for data in (odd, b"\x02" + odd[1:]):
+        assert attachment.unpack_start(data)[0] & attachment.START_MASK != attachment.START

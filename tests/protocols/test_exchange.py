@@ -244,6 +244,7 @@ class TestLeases:
             (8 * S, ModuleGone),
             (8 * S, Shut),
         ]
+        assert [event.silent for _, event in events if isinstance(event, ModuleGone)] == [True]
         assert list(discovery.modules) == ["IMU1"], "firmware does not say how long to believe it"
 
     def test_link_down_ends_leases(self) -> None:
@@ -302,7 +303,7 @@ class TestLostAnswers:
         unanswered = m.SubscribeRequest("cmd", 12, 5, m.UNANSWERED)
         assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == unanswered
         hear(discovery, S, RESPONSE)
-        assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == plain
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12, 0, m.UNANSWERED)))[-1] == plain
         discovery.unsubscribe(S, "cmd")
         discovery.subscribe(S, "cmd", 12, 5)
         assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == unanswered
@@ -314,6 +315,45 @@ class TestLostAnswers:
         assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == m.SubscribeRequest("cmd", 12, 5, m.UNANSWERED)
 
 
+class TestRepeats:
+    """Both sides of a subscription between r2p modules repeat themselves: neither has to answer all of the other's."""
+
+    def test_what_flows_already_is_not_asked_for_again(self) -> None:
+        discovery = started()
+        hear(discovery, S, PC2, RESPONSE)
+        assert not sent(hear(discovery, S, m.Advertise("cmd", 12)))
+
+    def test_a_publisher_without_subscribers_is_asked_at_once(self) -> None:
+        discovery = started()
+        hear(discovery, S, PC2, RESPONSE)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12, 0, m.UNANSWERED)))[-1] == m.SubscribeRequest("cmd", 12, 5)
+
+    def test_another_address_of_the_data_is_asked_for(self) -> None:
+        discovery = started()
+        hear(discovery, S, PC2, RESPONSE)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12, 0, b"\x42".ljust(10, b"\0"))))
+
+    def test_firmware_is_always_answered(self) -> None:
+        discovery = started()
+        hear(discovery, S, RESPONSE, REQUEST)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12))) == [m.SubscribeRequest("cmd", 12, 5)]
+        assert sent(hear(discovery, S, REQUEST)) == [m.SubscribeResponse("leds", 5, 8)]
+
+    def test_an_advertisement_tells_whether_anybody_has_subscribed(self) -> None:
+        discovery = started()
+        hear(discovery, S, PC2)
+
+        def told(now: int) -> list[bytes]:
+            sayings = [event.data for _, event in run(discovery, now, now + 2 * S) if isinstance(event, Send)]
+            return [each.params for each in map(m.decode, sayings) if isinstance(each, m.Advertise)]
+
+        assert set(told(S)) == {m.UNANSWERED}
+        hear(discovery, 3 * S, PC2, REQUEST)
+        assert set(told(3 * S)) == {m.NO_PARAMS}
+        hear(discovery, 5 * S, m.Unsubscribe("leds", PEER))
+        assert set(told(5 * S)) == {m.UNANSWERED}
+
+
 class TestTypes:
     def test_types_go_before_what_they_belong_to_but_only_to_r2p(self) -> None:
         discovery = started()
@@ -321,8 +361,9 @@ class TestTypes:
         mine = [m.TypeInfo(m.ROLE_PUBLISHES, "leds", ONE, 5), m.TypeInfo(m.ROLE_SUBSCRIBES, "cmd", TWO, 12)]
         repeated = sent(discovery.poll(S))
         unanswered = m.SubscribeRequest("cmd", 12, 5, m.UNANSWERED)
-        assert repeated[2:] == [mine[0], m.Advertise("leds", 5), mine[1], unanswered]
+        assert repeated[2:] == [mine[0], m.Advertise("leds", 5, 0, m.UNANSWERED), mine[1], unanswered]
         assert sent(hear(discovery, S, REQUEST)) == [mine[0], m.SubscribeResponse("leds", 5, 8)]
+        assert sent(hear(discovery, S, REQUEST)) == [m.SubscribeResponse("leds", 5, 8)], "a repeat"
         assert sent(hear(discovery, S, m.Advertise("cmd", 12))) == [mine[1], unanswered]
         assert sent(hear(discovery, S, REQUEST, source=0x28)) == [m.SubscribeResponse("leds", 5, 8)]
 

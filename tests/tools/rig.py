@@ -74,8 +74,8 @@ def printed(capsys: pytest.CaptureFixture[str]) -> list[Any]:
 
 
 @contextlib.contextmanager
-def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """`r2p` with these arguments; killed at the end if it still runs."""
+def process(*arguments: str, patience: float = PATIENCE, **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """`r2p` with these arguments; killed at the end if it still runs, or after `patience` seconds."""
     environment = {name: value for name, value in os.environ.items() if name != "R2P_VIA"}
     child = subprocess.Popen(
         [sys.executable, "-c", "from r2p.tools.main import main; main()", *arguments],
@@ -86,7 +86,7 @@ def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
         env=environment | options.pop("env", {}),
         **options,
     )
-    limit = threading.Timer(PATIENCE, child.kill)
+    limit = threading.Timer(patience, child.kill)
     limit.start()
     with child:
         try:

@@ -18,7 +18,8 @@ from r2p.msg import GatewayStatus, Led
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.testing.network import node_in
 from r2p.tools import gateway
-from r2p.tools.gateway import Rates, Screen, serve, table
+from r2p.tools._gateway_table import Rates, Screen, fitted, table
+from r2p.tools.gateway import serve
 from r2p.tools.output import Output
 from r2p.tools.session import Usage
 
@@ -51,6 +52,13 @@ def test_the_table() -> None:
         "TOPIC    FROM        TO      RATE     FORWARDED  DROPPED",
         "encoder  rtcan:can0  zenoh:  100.0/s  300        2 late",
     ]
+
+
+def test_the_table_fits_on_the_terminal() -> None:
+    text = "".join(f"{number} {'x' * 20}\n" for number in range(10))
+    assert fitted(text, 80, 12) == text
+    assert fitted(text, 10, 11).splitlines() == [*(f"{n} xxxxxxxx" for n in range(8)), "... and 2 "]
+    assert fitted(text, 80, 1) == "... and 10 more lines\n"
 
 
 @pytest.mark.virtual_time
@@ -112,6 +120,15 @@ def test_links_are_meant_by_name_kind_or_pattern() -> None:
     assert not any(is_link("tcp:10.0.0.5:23", each) for each in ("tcp-listen", "tcp:", "zenoh", ""))
 
 
+def test_links_that_are_meant_by_rules_and_options() -> None:
+    links = ["rtcan", "rtcan:can0", "rtcan:*", "zenoh", "zenoh:", "tcp:robot", "tcp:robot:2323", "tcp", "tcp:10.*", "*"]
+    assert gateway._links(links, "--read-only", VIA) == tuple(links)
+    assert gateway._links(["tcp:10.0.0.5:*"], "--read-only", ["tcp-listen:0"])
+    assert gateway._rules(["cmd_*@zenoh>rtcan", "log"], "--allow", VIA)
+    assert gateway._prefix("robot1/") == "robot1/"
+    assert gateway._prefix("") == ""
+
+
 def test_loader_topics_come_in_from_ip_links_only_with_permission() -> None:
     strict, open_ = Policy(BridgeOptions()), Policy(BridgeOptions(allow_control=True))
     for link in ("tcp:10.0.0.5:23", "zenoh:"):
@@ -123,9 +140,21 @@ def test_loader_topics_come_in_from_ip_links_only_with_permission() -> None:
     assert strict.allows("BOOT_IMU1", "serial:/dev/ttyUSB0", "rtcan:can0")
 
 
+VIA = ["rtcan:can0,priority=1", "zenoh:?network=lab", "tcp:robot", "tcp-listen:0"]
+
+
 def test_mistakes_are_told() -> None:
     with pytest.raises(Usage, match="--deny 'leds@': write TOPIC"):
-        gateway._rules(["leds@"], "--deny")
+        gateway._rules(["leds@"], "--deny", VIA)
+    with pytest.raises(Usage, match="--allow: 'can0' is none of the links rtcan:can0, zenoh:, tcp:robot, tcp-listen:0"):
+        gateway._rules(["leds@can0"], "--allow", VIA)
+    with pytest.raises(Usage, match="--read-only: 'serial' is none"):
+        gateway._links(["zenoh", "serial"], "--read-only", VIA)
+    for prefix in ("robot1", "rob ot/", "a/b/", "a_name_that_is_too_long/"):
+        with pytest.raises(Usage, match=r"--prefix: .* robot1/"):
+            gateway._prefix(prefix)
+        with pytest.raises(r2p.Error, match="is no prefix"):
+            Policy(BridgeOptions(prefix=prefix))
     with pytest.raises(Usage, match="--rate-limit leds: write it as TOPIC=HZ"):
         list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
     with pytest.raises(typer.BadParameter, match="periodic:10ms"):

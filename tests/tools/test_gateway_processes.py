@@ -1,8 +1,7 @@
-"""A robot, `r2p gateway` and a PC as three processes, over TCP: typed messages both ways."""
+"""`r2p gateway` as a process: how it ends, and what it says of mistakes. See test_main_job.py for what it is for."""
 
 from __future__ import annotations
 
-import json
 import signal
 from typing import TYPE_CHECKING
 
@@ -29,39 +28,6 @@ def robot() -> Iterator[subprocess.Popen[str]]:
 def gateway(robot: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
     with process("gateway", "--via", listening(robot), "--via", "tcp-listen:0") as child:
         yield child
-
-
-def test_from_the_robot_to_the_pc(gateway: subprocess.Popen[str]) -> None:
-    with process("topic", "echo", "leds", "-n", "3", "--via", listening(gateway)) as echo:
-        out, err = echo.communicate()
-    assert [json.loads(line) for line in out.splitlines()] == [{"led": 3, "value": 0}] * 3
-    assert (echo.returncode, err) == (0, "")
-
-
-def test_rate(gateway: subprocess.Popen[str]) -> None:
-    with process("topic", "hz", "leds", "--once", "--via", listening(gateway)) as hz:
-        out, _ = hz.communicate()
-    assert json.loads(out)["rate"] == pytest.approx(50, rel=0.5)
-
-
-def test_from_the_pc_to_the_robot() -> None:
-    with (
-        process("topic", "echo", "cmd", "-n", "3", "--type", "Velocity3", "--via", "tcp-listen:0") as robot,
-        process("gateway", "--via", listening(robot), "--via", "tcp-listen:0") as gateway,
-    ):
-        pub = ("topic", "pub", "cmd", "x=1.5", "--type", "Velocity3", "-r", "50", "-n", "3")
-        with process(*pub, "--via", listening(gateway)) as pc:
-            assert pc.wait() == 0
-        out, _ = robot.communicate()
-    assert [json.loads(line) for line in out.splitlines()] == [{"x": 1.5, "y": 0.0, "w": 0.0}] * 3
-
-
-def test_what_is_known_behind_it(robot: subprocess.Popen[str]) -> None:
-    with process("gateway", "--name", "BRIDGE", "--via", listening(robot), "--via", "tcp-listen:0") as gateway:
-        url = listening(gateway)
-        with process("topic", "list", "--via", url, "--wait", "4") as topics:
-            out, _ = topics.communicate()
-    assert "leds" in {json.loads(line)["topic"] for line in out.splitlines()}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

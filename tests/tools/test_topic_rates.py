@@ -138,7 +138,7 @@ async def test_delay(capsys: pytest.CaptureFixture[str]) -> None:
         "min": pytest.approx(0.25),
         "max": pytest.approx(0.25),
         "std": pytest.approx(0.0),
-        "from": "BOT/leds publish",
+        "from": "publish() in BOT/leds",
         "to": "this tool",
         "clocks": "one clock",
         "lost_here": 0,
@@ -191,4 +191,4 @@ async def test_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytes
     assert rate.endswith("), 0 gaps at the publisher, 0 lost on the way, 0 lost here")
     assert bandwidth.startswith("50.0 B/s, 10.00 messages/s of 5 B (over ")
     assert late.startswith("0.000 ms, 0.000 ms to 0.000 ms")
-    assert late.endswith("; from BOT/leds publish to this tool, one clock")
+    assert late.endswith("; from publish() in BOT/leds to this tool, one clock")

@@ -2,7 +2,9 @@
 
     options   what the URL says               config    ... as zenoh wants it
     session   one zenoh session: everything that comes from zenoh's threads enters the event loop here
-    link      discovery and topics over it    outlet    what goes out    streams   what comes in
+    link      discovery and topics over it; tokens: who is there
+    outlet    what goes out of a topic, with senders, in a burst, as far as there are credits; reach: whether it arrives
+    streams   what comes in; stream: of one topic
     trouble   why there is no connection, in words
 
 zenoh itself is imported when a session is opened, not before.

@@ -18,6 +18,9 @@ _OURS: dict[str, object] = {
     "connect/exit_on_failure": {"router": False, "peer": False, "client": True},
     "transport/unicast/open_timeout": 3000,
     "transport/link/tx/queue/size/data": 16,  # batches of 64 kB: what r2p.protocols.flow allows to be on the way fits
+    # Urgent messages are batches of their own: what comes while zenoh's threads do not get to run fits.
+    "transport/link/tx/queue/size/interactive_high": 16,
+    "transport/link/tx/queue/size/real_time": 16,
     "adminspace/enabled": True,  # this session's own: it tells where it listens
 }
 

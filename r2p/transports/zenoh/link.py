@@ -9,49 +9,37 @@ Keys, all under `r2p/NETWORK/`:
     schema/SESSION/TYPE     asks a module for the fields of a type, by fingerprint
 """
 
-from collections.abc import Callable, Hashable
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import msgspec
-
-from r2p.codecs import UnknownType, schemas
-from r2p.codecs.attachment import Credit, Origin, decode_credit, encode_credit
+from r2p.codecs import schemas
+from r2p.codecs.attachment import Credit, Origin, encode_credit
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
 from r2p.protocols.events import Declare, Event, Joined, Parted, Undeclare
-from r2p.protocols.flow import Outflow
-from r2p.protocols.presence import TOKENS, Presence
+from r2p.protocols.presence import Presence
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Topic
 from r2p.transports.announce import NOTHING
 from r2p.transports.link import Hub, Link
 from r2p.transports.losses import Losses
+from r2p.transports.zenoh.burst import Burst
+from r2p.transports.zenoh.credits import Credits
 from r2p.transports.zenoh.outlet import ZenohOutlet
+from r2p.transports.zenoh.reach import Reach
+from r2p.transports.zenoh.senders import Senders
 from r2p.transports.zenoh.session import ErrorOfZenoh, Funnel, Session, Tap
-from r2p.transports.zenoh.streams import MOST, Streams
+from r2p.transports.zenoh.stream import MOST
+from r2p.transports.zenoh.streams import Streams
+from r2p.transports.zenoh.tokens import Tokens
 
 if TYPE_CHECKING:
-    import asyncio
-
     import zenoh
 
 _EVENTS = 65_536
 """Tokens, messages of the protocol and the like that wait for the loop at most."""
-
-_SETTLE = 0.02
-"""Seconds after which a token that went is believed to: when the network goes, tokens go a moment before it."""
-
-_NEXT = 0.002
-"""Seconds between two looks whether messages reach a new subscriber; longer each time."""
-
-_TRIES = 50
-"""Looks, together 2.5 s, after which somebody has to be told."""
-
-_CHECK = 0.25
-"""Seconds between two looks whether what was sent is heard."""
-
-_REPEATS = 6
 
 _ANSWER = 1.0
 """Seconds for the modules to answer a query."""
@@ -61,13 +49,6 @@ _GUARANTEES = {
     PublisherClass.SPORADIC: "best effort, in order, sent at once; zenoh priority interactive high",
     PublisherClass.PERIODIC: "best effort, sent at once; zenoh priority real time",
 }
-
-
-class _Guest(msgspec.Struct, eq=False):
-    """A subscriber that is there, but not known to be within reach."""
-
-    window: int
-    waited: int = 0
 
 
 class ZenohLink(Link):
@@ -89,13 +70,13 @@ class ZenohLink(Link):
         super().__init__(name, hub, discovery=presence)
         self._presence = presence
         self._session: Session | None = None
+        self._funnels: list[Funnel] = []
         self._transports: set[str] = set()
-        self._early: dict[str, None] = {}
-        self._going: dict[str, asyncio.TimerHandle] = {}
-        self._senders: dict[tuple[str, int], zenoh.Publisher] = {}
-        self._flows: dict[tuple[str, int], Outflow] = {}
-        self._guests: dict[tuple[str, int], _Guest] = {}
-        self._checking: asyncio.TimerHandle | None = None
+        self._tokens = Tokens(hub.space.loop, self._believed)
+        self.senders = Senders()
+        self.burst = Burst(hub.space.loop, self.stats, self.send_error)
+        self.credits = Credits(hub.space.loop, self.stats, self.zenoh_outlets)
+        self._reach = Reach(self, hub.space.loop)
         self._streams = Streams(
             name,
             hub.space.loop,
@@ -113,21 +94,31 @@ class ZenohLink(Link):
         """There is a session: take part in the network."""
         self._session = session
         self.prefix = prefix
-        loop = self._space.loop
+        self.senders.connect(session, f"{prefix}/topic/")
         self._streams.connect()
         for name, told in self._told.items():
             if told.publishes:
-                self._declare_senders(self._space.topics[name])
+                self.senders.declare(self._space.topics[name])
         hexed = f"{self.instance:x}"
         if not self._connects:
             self.went_up()
-        session.watch(Funnel(loop, self._transport_changed, most=_EVENTS))
-        session.watch_tokens(f"{self.prefix}/live", Funnel(loop, self._token_changed, most=_EVENTS))
-        session.listen(f"{self.prefix}/control/*", Funnel(loop, self._controlled, most=_EVENTS))
+        session.watch(self._funnel(self._transport_changed))
+        session.watch_tokens(f"{self.prefix}/live", self._funnel(self._token_changed))
+        session.listen(f"{self.prefix}/control/*", self._funnel(self._controlled))
         session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema)
-        session.listen(f"{self.prefix}/credit/{hexed}", Funnel(loop, self._credited, most=_EVENTS))
+        self.credits.connect(session, f"{self.prefix}/credit/{hexed}")
+
+    def _funnel(self, take: Callable[[Any], None]) -> Funnel:
+        funnel = Funnel(self._space.loop, take, most=_EVENTS)
+        self._funnels.append(funnel)
+        return funnel
 
     # Link
+
+    @property
+    def losses(self) -> Counter[str]:
+        overflown = sum(each.overflown for each in self._funnels)
+        return super().losses + Counter({"events overflown": overflown})
 
     @property
     def full(self) -> bool:
@@ -148,7 +139,7 @@ class ZenohLink(Link):
     def discard(self) -> int:
         for outlet in self._outlets.values():
             outlet.room().refuse_all("link down")
-        return 0
+        return self.burst.discard()
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
         return _GUARANTEES[publisher_class]
@@ -157,9 +148,9 @@ class ZenohLink(Link):
         super().topic_changed(topic)
         told = self._told.get(topic.name, NOTHING)
         if told.publishes:
-            self._declare_senders(topic)
+            self.senders.declare(topic)
         else:
-            self._undeclare_senders(topic.name)
+            self.senders.undeclare(topic.name)
         if told.subscribes:
             self._streams.begin(topic)
             now, window = self._clock.monotonic(), self._streams.window(topic)
@@ -191,8 +182,16 @@ class ZenohLink(Link):
         super()._open(name, size, sender)
 
     def close(self) -> None:
+        self.burst.flush()
+        self._tokens.went_down()
         super().close()
+        self.credits.close()
+        self.senders.close()
         self._session = None
+
+    def _detach(self, name: str) -> None:
+        self.burst.flush()  # before what it is sent with is undeclared
+        super()._detach(name)
 
     def _act(self, event: Event) -> None:
         match event:
@@ -205,67 +204,37 @@ class ZenohLink(Link):
             case Joined(topic, _, window, int(session)):
                 self._welcome(topic, session, window)
             case Parted(topic, int(session)):
-                self._guests.pop((topic, session), None)
+                self._reach.left(topic, session)
                 outlet = self._outlet(topic)
                 if outlet is not None:
                     outlet.parted(session)
             case _:
                 super()._act(event)
 
-    # Subscribers. A token may come before the subscription that it tells of: zenoh knows when there is a way.
+    # Subscribers
 
     def _welcome(self, name: str, session: int, window: int) -> None:
         """A subscriber is new, or has another window."""
         outlet = self._outlet(name)
         if outlet is not None and outlet.topic is self._space.topics.get(name) and outlet.knows(session):
             outlet.joined(session, window)
-            return
-        guest = self._guests[name, session] = _Guest(window)
-        self._admit(name, session, guest)
+        else:
+            self._reach.came(name, session, window)
 
-    def _admit(self, name: str, session: int, guest: "_Guest") -> None:
-        """Let it in once messages reach it, and send it what is latched."""
-        topic = self._space.topics.get(name)
-        if self._guests.get((name, session)) is not guest or topic is None:
-            return
-        if not self._is_matched(name):
-            guest.waited += 1
-            if guest.waited == _TRIES:
-                self._tell_unheard(name, session)
-            self._space.loop.call_later(_NEXT * min(guest.waited, 100), self._admit, name, session, guest)
-            return
-        del self._guests[name, session]
+    def let_in(self, name: str, session: int, window: int) -> None:
+        """Messages reach it: send it what is latched, and all that comes."""
+        topic = self._space.topics[name]
         outlet = self._outlet(name)
         if outlet is not None and outlet.topic is topic:
-            outlet.joined(session, guest.window)
+            outlet.joined(session, window)
             outlet.welcome()
         else:
             outlet = self._outlets[name] = ZenohOutlet(self, topic)
-            outlet.joined(session, guest.window)
+            outlet.joined(session, window)
             topic.join(outlet)
-        if self._checking is None:
-            self._checking = self._space.loop.call_later(_CHECK, self._check)
 
-    def _is_matched(self, name: str) -> bool:
-        """Whether zenoh knows of somebody whom messages of the topic reach."""
-        senders = [sender for (topic, _), sender in self._senders.items() if topic == name]
-        return bool(senders) and all(sender.matching_status for sender in senders)
-
-    def _check(self) -> None:
-        """Whom messages do not seem to reach is sent what is latched again; then somebody has to be told."""
-        self._checking = None
-        for name, outlet in self._outlets.items():
-            if isinstance(outlet, ZenohOutlet):
-                for session in outlet.unheard():
-                    outlet.tries[session] += 1
-                    if outlet.tries[session] <= _REPEATS:
-                        outlet.welcome()
-                    elif outlet.tries[session] == _REPEATS + 1:
-                        self._tell_unheard(name, session)
-        if self._outlets and not self._closed:
-            self._checking = self._space.loop.call_later(_CHECK, self._check)
-
-    def _tell_unheard(self, topic: str, session: int) -> None:
+    def tell_unheard(self, topic: str, session: int) -> None:
+        """Messages do not reach a subscriber."""
         module = next((each.name for each in self._presence.modules.values() if each.instance == session), "?")
         key = f"{self.prefix}/topic/{topic}"
         text = (
@@ -273,18 +242,12 @@ class ZenohLink(Link):
         )
         self._hub.link_notice(self, "unheard", text, trouble=True)
 
-    # What zenoh sends with; declared as soon as somebody publishes, so that it looks for a way in good time
+    def knows(self, topic: str) -> bool:
+        """Whether this module has anything to do with a topic."""
+        return topic in self._space.topics
 
-    def _declare_senders(self, topic: Topic) -> None:
-        classes = {int(publisher.publisher_class) for publisher in topic.publishers}
-        for publisher_class in classes or {int(PublisherClass.NON_REAL_TIME)}:  # none of our own: a gateway
-            self.publisher(topic.name, publisher_class)
-
-    def _undeclare_senders(self, name: str) -> None:
-        for key in [key for key in self._senders if key[0] == name]:
-            sender = self._senders.pop(key)
-            if self._session is not None:
-                self._session.ends(sender)
+    def zenoh_outlets(self) -> Iterator[ZenohOutlet]:
+        return (each for each in self._outlets.values() if isinstance(each, ZenohOutlet))
 
     def _outlet(self, name: str) -> ZenohOutlet | None:
         outlet = self._outlets.get(name)
@@ -292,22 +255,11 @@ class ZenohLink(Link):
 
     # For outlets and streams
 
-    def publisher(self, topic: str, publisher_class: int) -> "zenoh.Publisher | None":
-        """What zenoh sends with."""
-        key = topic, publisher_class
-        if key not in self._senders and self._session is not None:
-            self._senders[key] = self._session.publisher(f"{self.prefix}/topic/{topic}", publisher_class)
-        return self._senders.get(key)
-
     def instance_of(self, module: str) -> int:
         """The number of a module on any link; 0: firmware, or not known."""
         links = (each for each in self._space.links if isinstance(each, Link))
         found = (each.discovery.modules.get(module) for each in links)
         return next((info.instance for info in found if info is not None and info.instance is not None), 0)
-
-    def flow(self, topic: str, publisher_class: int) -> Outflow:
-        """What went out on the topic; it counts on for as long as the link lives."""
-        return self._flows.setdefault((topic, publisher_class), Outflow())
 
     def _subscribe(self, topic: str, arrived: Callable[["zenoh.Sample"], None]) -> "Tap | None":
         if self._session is None:
@@ -336,36 +288,19 @@ class ZenohLink(Link):
 
     def went_up(self) -> None:
         super().went_up()
-        early, self._early = self._early, {}
-        for key in early:
-            self._apply(self._presence.appeared(self._clock.monotonic(), key))
+        self._tokens.went_up()
 
     def went_down(self, reason: str) -> None:
-        for timer in self._going.values():
-            timer.cancel()
-        self._going.clear()
+        self._tokens.went_down()
         super().went_down(reason)
 
     def _token_changed(self, change: tuple[str, bool]) -> None:
-        key, there = change
-        if self._closed:
-            return
-        if not self.up:
-            if there and len(self._early) < TOKENS:
-                self._early[key] = None
-            else:
-                self._early.pop(key, None)
-        elif there:
-            timer = self._going.pop(key, None)
-            if timer is not None:
-                timer.cancel()
-            self._apply(self._presence.appeared(self._clock.monotonic(), key))
-        elif key not in self._going:
-            self._going[key] = self._space.loop.call_later(_SETTLE, self._token_gone, key)
+        if not self._closed:
+            self._tokens.changed(*change)
 
-    def _token_gone(self, key: str) -> None:
-        self._going.pop(key, None)
-        self._apply(self._presence.disappeared(self._clock.monotonic(), key))
+    def _believed(self, key: str, there: bool) -> None:
+        now = self._clock.monotonic()
+        self._apply(self._presence.appeared(now, key) if there else self._presence.disappeared(now, key))
 
     def _controlled(self, message: tuple[str, bytes]) -> None:
         key, data = message
@@ -374,19 +309,6 @@ class ZenohLink(Link):
             self.stats.lost["foreign"] += 1
         elif sender != self.instance and self.up:
             self.manage(data, sender)
-
-    def _credited(self, message: tuple[str, bytes]) -> None:
-        try:
-            credit = decode_credit(message[1])
-            publisher_class = PublisherClass(credit.publisher_class)
-        except UnknownType:
-            self.stats.lost["unknown type"] += 1
-        except (DecodeError, ValueError):
-            self.stats.lost["undecodable"] += 1
-        else:
-            outlet = self._outlet(credit.topic)
-            if outlet is not None:
-                outlet.credited(credit.session, publisher_class, credit.serial)
 
 
 def _sender(key: str) -> int | None:

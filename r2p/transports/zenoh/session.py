@@ -141,11 +141,11 @@ class Session:
         self._kept.append(live.declare_subscriber(f"{prefix}/**", Callback(changed), history=True))
 
     def listen(self, key: str, funnel: Funnel) -> None:
-        """Tell of each message: (its key, payload)."""
+        """Tell of each message: (its key, payload); of one that is none of ours by its length, without the payload."""
 
         def arrived(sample: zenoh.Sample) -> None:
-            if len(sample.payload) <= _MESSAGE_MAX:
-                funnel.put((str(sample.key_expr), sample.payload.to_bytes()))
+            payload = sample.payload
+            funnel.put((str(sample.key_expr), payload.to_bytes() if len(payload) <= _MESSAGE_MAX else b""))
 
         self._kept.append(
             self._session.declare_subscriber(key, Callback(arrived), allowed_origin=zenoh.Locality.REMOTE)

@@ -1,6 +1,7 @@
 """Opens a zenoh session for a module, and keeps it: zenoh itself reconnects, and we say why it can't."""
 
 import asyncio
+import importlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -8,7 +9,7 @@ from r2p.backoff import Backoff
 from r2p.errors import TransportError
 from r2p.transports.link import Hub, Transport
 from r2p.transports.zenoh.options import Options, chosen, default_network
-from r2p.transports.zenoh.trouble import why
+from r2p.transports.zenoh.trouble import NOT_US, why
 
 if TYPE_CHECKING:
     import zenoh
@@ -32,7 +33,8 @@ class ZenohTransport(Transport):
         self._options = options
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
-        try:
+        try:  # in a thread: loading zenoh takes longer than a loop should be blocked
+            await asyncio.to_thread(importlib.import_module, "r2p.transports.zenoh.link")
             from r2p.transports.zenoh.config import config_of, way_of
             from r2p.transports.zenoh.link import ZenohLink
         except ImportError as error:
@@ -92,9 +94,12 @@ class ZenohTransport(Transport):
         """For ever: say what is wrong while the link is down."""
         from r2p.transports.zenoh.config import way_of
 
+        reason = ""
         while True:
             await asyncio.sleep(_LOOK)
             if not link.up:
-                reason = await why(way_of(config))
+                before, reason = reason, await why(way_of(config))
+                if NOT_US in reason and reason != before:
+                    continue  # zenoh may be about to try again
                 if not link.up:
                     link.unreachable(reason)

@@ -18,6 +18,9 @@ _ALERT = 0.5
 _HANDSHAKE = 1.0
 """Seconds for one that speaks TLS to answer in it."""
 
+NOT_US = "takes the connection, but not us"
+"""What also seems so for a moment when a router comes back, until zenoh tries again."""
+
 _NO_TLS = "it does not speak TLS: connect to tcp/ instead of tls/, or mend the router's listen endpoint"
 
 
@@ -63,7 +66,7 @@ async def _why(endpoint: str, way: Way) -> str:
         return f"nobody listens at {address}: is the router running, is the port the right one?"
     except (OSError, OverflowError) as error:
         return f"{address}: {error}"
-    return f"{address} takes the connection, but not us: {_refusal_words(protocol, way)}"
+    return f"{address} {NOT_US}: {_refusal_words(protocol, way)}"
 
 
 @contextlib.asynccontextmanager

@@ -2,7 +2,7 @@
 
     router              takes connections
     count               publishes 1, 2, 3, ... on `count`, 1000 a second
-    watch               subscribes `count`, and prints the number of messages at each line of input
+    watch               subscribes `count` and `flood`, and prints how many of the first came, at each line of input
     many                50 modules M0 .. M49 in one process; each publishes 10 topics
 
 Says `ready` when it is open.
@@ -11,10 +11,18 @@ Says `ready` when it is open.
 import asyncio
 import sys
 from contextlib import AsyncExitStack
+from typing import Annotated
 
 import r2p
 from r2p.msg import Float32, Led
 from r2p.runner import run_main
+
+
+class Page(r2p.Message):
+    """A long message."""
+
+    text: Annotated[str, r2p.Len(1000)] = ""
+
 
 MODULES = 50
 TOPICS = 10
@@ -39,6 +47,7 @@ async def watch(node: r2p.Node) -> None:
         received += 1
 
     node.subscribe("count", Float32, heard)
+    node.subscribe("flood", Page, lossy=True)
     asking = asyncio.create_task(asyncio.to_thread(sys.stdin.readline))
     while True:
         await node.spin(0.01)

@@ -1,0 +1,364 @@
+"""What comes in of one topic by zenoh, on its way to the queues.
+
+    zenoh's ring -> Tap (one wake-up of the loop for a batch) -> Stream.arrived -> Topic.deliver -> credit
+
+A non real-time message waits for as long as its subscribers have no room: its publisher waits with it, or goes on
+without them, as its class says; that is decided there (r2p.protocols.flow). Others wait a few turns of the loop.
+"""
+
+from collections import deque
+from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from r2p.codecs import UnknownType
+from r2p.codecs.attachment import (
+    FLAG_RESTAMPED,
+    ORIGIN_AT,
+    START,
+    START_MASK,
+    Origin,
+    Reader,
+    hops_of,
+    is_stamped,
+    unpack_start,
+)
+from r2p.errors import DecodeError
+from r2p.protocols.events import Shape
+from r2p.protocols.flow import Inflow
+from r2p.room import Claim, Sink
+from r2p.sample import PublisherClass, Sample, Source
+from r2p.topic import PATIENCE, Heard, Topic
+from r2p.transports.intake import TURN
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from r2p.transports.zenoh.session import Tap
+    from r2p.transports.zenoh.streams import Streams
+
+MOST = 4096
+"""Messages that wait for one topic at most."""
+
+SENDERS = 4096
+"""Senders of which a stream, or the link, keeps count."""
+
+_NRT = PublisherClass.NON_REAL_TIME
+
+
+class _Lane(msgspec.Struct, eq=False):
+    """One way of a publisher's messages into a stream. `size` of them in bytes, -1: any; `usual` and `sequence` are
+    size and number of the last one. `heard` is shared by all its ways: by other gateways, and by other links.
+    """
+
+    origin: Origin
+    source: Source
+    publisher_class: PublisherClass
+    flow: Inflow
+    size: int
+    fits: bool
+    heard: Heard
+    usual: int = -1
+    sequence: int = 0
+
+
+class _Held(Claim):
+    """A message that waits for room, and the stream with it."""
+
+    __slots__ = ("_go_on",)
+
+    def __init__(self, sample: Sample, sinks: list[Sink], go_on: Callable[[], None]) -> None:
+        self._go_on = go_on
+        super().__init__(sample, sinks)
+
+    def settled(self, sink: Sink, refusal: str) -> None:
+        if not self.lacking:
+            self._go_on()
+
+
+class _Blocked(msgspec.Struct):
+    """The message that has no room, and where; `turns` of the loop are left in which it is just tried again."""
+
+    lane: _Lane
+    serial: int
+    sample: Sample
+    sinks: list[Sink]
+    turns: int = PATIENCE
+    held: _Held | None = None
+
+
+class Stream:
+    """What comes in of one topic."""
+
+    def __init__(self, topic: Topic, streams: "Streams") -> None:
+        self.topic = topic
+        self.senders: set[Hashable] = set()
+        self.tap: Tap | None = None
+        self.last: Sample | None = None
+        self._streams = streams
+        self._loop = streams.loop
+        self._flows: dict[tuple[int, int], Inflow] = {}
+        self._blocked: _Blocked | None = None
+        self._waiting: deque[tuple[_Lane, int, Sample]] = deque()
+        self._paused = False
+        self._queueing = False
+        self.retype()
+
+    def retype(self) -> None:
+        """The topic's type may be another one."""
+        layout = self.topic.layout
+        self._shape = Shape() if layout is None else Shape(layout.size, layout.fingerprint)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._reader = Reader(self._lane)
+
+    def parted(self, sender: Hashable) -> None:
+        """A publisher's module is gone: should it come back, what it repeats is as good as new."""
+        if sender in self.senders:
+            self.senders.discard(sender)
+            self.topic.inlets -= 1
+            self._forget()
+        for (session, _), flow in self._flows.items():
+            if session == sender:
+                flow.interrupted()
+
+    def close(self) -> None:
+        tap, self.tap = self.tap, None
+        if tap is not None:
+            tap.close()
+        self._waiting.clear()
+        blocked, self._blocked = self._blocked, None
+        if blocked is not None and blocked.held is not None:
+            blocked.held.withdraw()
+
+    def arrived(self, arrived: "zenoh.Sample | None") -> None:  # noqa: C901 - see below
+        """In the loop: hand out what is there, at most TURN messages in one turn."""
+        # One long function, because almost every message passes here: calls would take as long as the work.
+        tap = self.tap
+        if tap is None:
+            return
+        take, known, deliver = tap.take, self._reader.known, self.topic.deliver
+        count = size = 0
+        for _ in range(TURN):
+            if arrived is None:
+                break
+            data = arrived.payload.to_bytes()
+            attachment = arrived.attachment
+            header = b"" if attachment is None else attachment.to_bytes()
+            lane = known.get(header[ORIGIN_AT:])
+            if lane is None or self._blocked is not None:
+                self._accept(data, header)
+            else:
+                start, serial, sequence, stamp, deadline = unpack_start(header)
+                flow, heard = lane.flow, lane.heard
+                if (
+                    start & START_MASK != START
+                    or len(data) != lane.usual
+                    or serial != flow.next
+                    or (sequence and sequence <= heard.sequence)
+                ):
+                    self._accept(data, header)
+                else:
+                    flow.next = serial + 1
+                    lane.sequence = heard.sequence = sequence
+                    heard.stamp = stamp
+                    self.last = sample = Sample(data, lane.source, stamp, deadline, sequence, lane.publisher_class)
+                    if start != START:
+                        sample.hops = hops_of(start)
+                        sample.stamped = is_stamped(start)
+                    count += 1
+                    size += len(data)
+                    sinks = deliver(sample)
+                    if sinks is not None:
+                        self._block(lane, serial, sample, sinks)
+                    else:
+                        flow.until_credit -= 1
+                        if not flow.until_credit:
+                            self._give_credit(lane, serial)
+            if self._blocked is not None and not self._queueing:
+                self._paused = True  # the rest stays where it is for now
+                break
+            arrived = take()
+        self._streams.stats.received += count
+        self._streams.stats.bytes_received += size
+        if self._paused:
+            return
+        if arrived is None:
+            self._loop.call_soon(self._look_again)  # after those who were woken: they may want to answer
+        else:
+            self._loop.call_soon(self.arrived, arrived)
+
+    def _look_again(self) -> None:
+        tap = self.tap
+        if tap is not None:
+            sample = tap.take()
+            if sample is None:
+                tap.wait()
+            else:
+                self.arrived(sample)
+
+    def _accept(self, data: bytes, header: bytes) -> None:
+        """The first message of a publisher, one with something special about it, or none of ours."""
+        try:
+            lane, serial, sequence, stamp, deadline, hops, flags, clock = self._reader.read(header)
+        except DecodeError as error:
+            self._streams.stats.lost["unknown type" if isinstance(error, UnknownType) else "undecodable"] += 1
+            return
+        if self._is_good(lane, len(data), serial, sequence, stamp):
+            stamped = not flags & FLAG_RESTAMPED
+            sample = Sample(
+                data, lane.source, stamp, deadline, sequence, lane.publisher_class, None, stamped, True, hops, clock
+            )
+            self._hand_out(lane, serial, sample)
+
+    def _is_good(self, lane: _Lane, size: int, serial: int, sequence: int, stamp: int) -> bool:
+        """Whether it is a new message of the right type; what is wrong is counted."""
+        if size != lane.usual and not self._may_have(lane, size):
+            return False
+        lane.usual = size
+        flow = lane.flow
+        if serial == flow.next:
+            flow.next = serial + 1
+        elif not self._is_new(lane, serial):
+            return False
+        heard = lane.heard
+        if sequence <= heard.sequence and sequence and stamp <= heard.stamp:
+            self._came_again(lane, serial, sequence)
+            return False
+        lane.sequence = heard.sequence = sequence
+        heard.stamp = stamp
+        stats = self._streams.stats
+        stats.received += 1
+        stats.bytes_received += size
+        return True
+
+    def _came_again(self, lane: _Lane, serial: int, sequence: int) -> None:
+        """A message that was here before: by this way, as somebody wants to know whether it came, or by another one."""
+        if sequence == lane.sequence:
+            self._streams.credit(self.topic.name, lane.origin, serial)
+        else:
+            lane.sequence = sequence
+            self._streams.stats.lost["seen before"] += 1
+            self._taken(lane, serial)
+
+    def _hand_out(self, lane: _Lane, serial: int, sample: Sample) -> None:
+        self.last = sample
+        if self._blocked is None:
+            self._deliver(lane, serial, sample)
+        else:
+            self._queue(lane, serial, sample)
+
+    def _may_have(self, lane: _Lane, size: int) -> bool:
+        """Whether a publisher's messages may have so many bytes; counts those that may not."""
+        if not lane.fits:
+            self._streams.stats.lost["wrong type"] += 1
+        elif size != lane.size and (lane.size >= 0 or not 0 < size <= self._streams.longest):
+            self._streams.stats.lost["wrong size"] += 1
+        else:
+            return True
+        return False
+
+    def _is_new(self, lane: _Lane, serial: int) -> bool:
+        """Not the one that was expected: count what is missing. False for one that came before."""
+        gap = lane.flow.gap(serial)
+        if gap < 0:
+            self._streams.stats.lost["repeated"] += 1
+        elif gap:
+            self._streams.count_gap(self.topic.name, lane.source, gap)
+        return gap >= 0
+
+    def _queue(self, lane: _Lane, serial: int, sample: Sample) -> None:
+        """Another one waits for room: events and periods don't wait behind a message that does not expire."""
+        if lane.publisher_class != _NRT:
+            for sink in self.topic.deliver(sample) or ():
+                sink.force(sample)
+        elif len(self._waiting) < MOST:
+            self._waiting.append((lane, serial, sample))
+        else:
+            self._streams.stats.lost["receive queue full"] += 1
+
+    def _deliver(self, lane: _Lane, serial: int, sample: Sample) -> None:
+        sinks = self.topic.deliver(sample)
+        if sinks is None:
+            self._taken(lane, serial)
+        else:
+            self._block(lane, serial, sample, sinks)
+
+    def _block(self, lane: _Lane, serial: int, sample: Sample, sinks: list[Sink]) -> None:
+        """There is no room for this one."""
+        self._blocked = _Blocked(lane, serial, sample, sinks)
+        self._loop.call_soon(self._retry, self._blocked)
+
+    def _retry(self, blocked: _Blocked) -> None:
+        """Most readers make room within a turn of the loop. For the others an event or a period does not wait; what
+        does not expire gets in line, and lets others pass.
+        """
+        if blocked is not self._blocked:
+            return
+        sample = blocked.sample
+        blocked.sinks = [sink for sink in blocked.sinks if not sink.offer(sample)]
+        blocked.turns -= 1
+        if not blocked.sinks:
+            self._go_on()
+        elif blocked.turns:
+            self._loop.call_soon(self._retry, blocked)
+        elif blocked.lane.publisher_class != _NRT:
+            for sink in blocked.sinks:
+                sink.force(sample)
+            self._go_on()
+        else:
+            blocked.held = _Held(sample, blocked.sinks, self._settled)
+            self._queueing = True
+            self._read_on()
+
+    def _settled(self) -> None:
+        """The message that was held is placed; it may be in the middle of the reader's work, so go on after it."""
+        self._loop.call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        blocked, self._blocked = self._blocked, None
+        if blocked is not None:
+            self._taken(blocked.lane, blocked.serial)
+        waiting = self._waiting
+        while waiting and self._blocked is None:
+            self._deliver(*waiting.popleft())
+        if self._blocked is None:
+            self._queueing = False
+            self._read_on()
+
+    def _read_on(self) -> None:
+        if self._paused:
+            self._paused = False
+            if self.tap is not None:
+                self.arrived(self.tap.take())
+
+    def _taken(self, lane: _Lane, serial: int) -> None:
+        """The queues have it: tell its publisher now and then."""
+        lane.flow.until_credit -= 1
+        if not lane.flow.until_credit:
+            self._give_credit(lane, serial)
+
+    def _give_credit(self, lane: _Lane, serial: int) -> None:
+        lane.flow.credited()
+        self._streams.credit(self.topic.name, lane.origin, serial)
+
+    def _lane(self, origin: Origin) -> _Lane:
+        """A publisher is new."""
+        key = origin.sender, origin.publisher_class
+        if key not in self._flows:
+            if len(self._flows) >= SENDERS:
+                self._flows.clear()
+            window = self._streams.window(self.topic) if origin.publisher_class == _NRT else 0
+            self._flows[key] = Inflow(window)
+        fits = self._shape.fits(Shape(0, origin.fingerprint))
+        return _Lane(
+            origin,
+            Source(origin.module, origin.node, self._streams.link),
+            PublisherClass(origin.publisher_class),
+            self._flows[key],
+            (self._shape.size or -1) if fits else -1,
+            fits,
+            self.topic.heard((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
+        )

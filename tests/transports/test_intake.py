@@ -1,0 +1,132 @@
+"""What comes in and finds no room: who waits, for how long, and what is lost."""
+
+import asyncio
+from collections.abc import Hashable
+from typing import Any
+
+import msgspec
+import pytest
+
+from r2p.room import Room
+from r2p.sample import Sample, Source
+from r2p.topic import PATIENCE, Outlet, Topic, Waker
+from r2p.transports.intake import STALL, Arrival, Intake, LinkStats
+
+pytestmark = pytest.mark.virtual_time
+
+
+class Line(msgspec.Struct):
+    topic: bytes
+    data: bytes
+
+
+class Other(Outlet):
+    """The way to another link; it takes as many as there is `space` for."""
+
+    def __init__(self) -> None:
+        super().__init__("other", self)
+        self.place = Room()
+        self.space = 0
+        self.taken: list[bytes] = []
+
+    def offer(self, sample: Sample) -> bool:
+        if not self.space:
+            return False
+        self.space -= 1
+        self.taken.append(sample.data)
+        return True
+
+    def force(self, sample: Sample) -> None:
+        if not self.offer(sample):
+            self.lost += 1
+
+    def room(self) -> Room:
+        return self.place
+
+    def refill(self) -> None:
+        self.place.serve()
+
+
+class Passing(Topic):
+    """A topic of a gateway: what comes in goes out by the other link."""
+
+    def deliver(self, sample: Sample, own: object = None, driver: object = None) -> Any:
+        return self._send(sample, None, driver)
+
+
+class End:
+    """The link where it comes in."""
+
+    def __init__(self, *, waits: bool) -> None:
+        self.waits = waits
+        self.reads = True
+
+    def sample(self, topic: str, arrival: Arrival) -> Sample:
+        return Sample(arrival.data, Source(link="line"), 0)
+
+    def sender(self, arrival: Arrival) -> Hashable:
+        return None
+
+    def latched(self, topic: str) -> bool:
+        return False
+
+    def take_other(self, arrival: Arrival) -> None:
+        raise AssertionError(arrival)
+
+    def pause(self) -> None:
+        self.reads = False
+
+    def resume(self) -> None:
+        self.reads = True
+
+
+def gateway(*, waits: bool) -> tuple[End, Intake, Other]:
+    loop = asyncio.get_running_loop()
+    end, other, topic = End(waits=waits), Other(), Passing("leds", Waker(loop))
+    topic.join(other)
+    intake = Intake(end, loop, LinkStats())
+    intake.open(topic, 1, None)
+    return end, intake, other
+
+
+LINES = [Line(b"leds", bytes((number,))) for number in range(5)]
+ALL = [line.data for line in LINES]
+
+
+async def test_an_end_that_waits_is_made_to_wait_and_nothing_is_lost() -> None:
+    end, intake, other = gateway(waits=True)
+    intake.take(LINES)
+    await asyncio.sleep(STALL / 2)
+    assert (other.taken, end.reads) == ([], False)
+    for _ in LINES:
+        other.space = 1
+        other.refill()
+        await asyncio.sleep(STALL / 2)
+    assert (other.taken, other.lost, end.reads) == (ALL, 0, True)
+
+
+async def test_a_link_that_hangs_holds_it_up_once() -> None:
+    end, intake, other = gateway(waits=True)
+    intake.take(LINES)
+    await asyncio.sleep(STALL * 1.5)
+    assert (other.taken, other.lost, other.patient, end.reads) == ([], len(LINES), False, True)
+
+
+async def test_one_that_does_not_wait_loses_soon() -> None:
+    end, intake, other = gateway(waits=False)
+    intake.take(LINES)
+    for _ in range(2 * PATIENCE):
+        await asyncio.sleep(0)
+    assert (other.taken, other.lost, end.reads) == ([], len(LINES), True)
+
+
+async def test_closed_while_it_waits() -> None:
+    _, intake, other = gateway(waits=True)
+    intake.take(LINES)
+    await asyncio.sleep(STALL / 2)
+    intake.close()
+    assert not other.room()
+    other.space = len(LINES)
+    other.refill()
+    await asyncio.sleep(STALL * 2)
+    assert (other.taken, other.lost) == ([], 0)
