@@ -64,6 +64,7 @@ class BusMonitor:
         self._tell = on_news or (lambda _text: None)
         self._queue: deque[SeenFrame] = deque(maxlen=QUEUE)
         self._wanted = False
+        self._trouble = ""
         self._arrived = asyncio.Event()
         self._synced = asyncio.Event()
         self._running: asyncio.Task[None] | None = None
@@ -183,6 +184,7 @@ class BusMonitor:
 
     def up(self) -> None:
         """The bus can be used."""
+        self._trouble = ""
         self._tell(f"{self.via} is up")
 
     def down(self, reason: str) -> None:
@@ -190,8 +192,10 @@ class BusMonitor:
         self._tell(f"{self.via} is down: {reason}")
 
     def waits(self, reason: str) -> None:
-        """It can't yet."""
-        self._tell(f"{self.via}: {reason}; trying again")
+        """It can't yet: told once for each reason."""
+        if reason != self._trouble:
+            self._trouble = reason
+            self._tell(f"{self.via}: {reason}; trying again")
 
     def fault(self, kind: str) -> None:
         """An error frame."""

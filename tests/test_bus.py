@@ -6,6 +6,7 @@ import json
 from collections.abc import AsyncIterator
 
 import pytest
+import typer
 
 import r2p
 from r2p.bus import BusMonitor, FrameKind
@@ -28,6 +29,7 @@ async def robot() -> AsyncIterator[tuple[SimCan, BusMonitor]]:
 
     async def motor(node: r2p.Node) -> None:
         node.advertise("encoder", Led, r2p.Periodic(1 / RATE, lambda: Led(led=7)))
+        node.advertise("unheard", Led, r2p.Periodic(1 / RATE, Led))
         await node.spin()
 
     async def watch(node: r2p.Node) -> None:
@@ -75,6 +77,9 @@ async def test_the_slots_show_their_owner_and_who_died() -> None:
         cells = bus_schedule.cells_of(listener)
         assert [cell.owner for cell in cells].count("encoder") == 1
         assert cells[0].owner == "sync"
+        assert [cell.owner for cell in cells].count(
+            "reserved, and not used: nobody subscribes, or the owner is gone"
+        ) == 1
         assert [row["used"] for row in bus_schedule.rows(listener) if row["owner"] == "encoder"] == [20]
         bus.power_off()
         assert not await listener.cycles(20, patience=1.0)
@@ -141,6 +146,27 @@ async def test_a_bus_that_can_not_be_had_is_an_error() -> None:
     with pytest.raises(r2p.TransportError, match="slots"):
         async with BusMonitor("rtcan:can0,slots=1"):
             pass
+
+
+async def test_what_it_waits_for_is_told_once() -> None:
+    told: list[str] = []
+    async with BusMonitor(SimPort(SimCan(), CanNode("listener")), on_news=told.append) as listener:
+        for reason in ("no adapter", "no adapter", "no power"):
+            listener.waits(reason)
+        listener.up()
+        listener.waits("no power")
+    assert told == [
+        "listener is up",
+        "listener: no adapter; trying again",
+        "listener: no power; trying again",
+        "listener is up",
+        "listener: no power; trying again",
+    ]
+
+
+def test_a_topic_that_can_not_be_is_a_wrong_usage() -> None:
+    with pytest.raises(typer.BadParameter, match="letters, digits and underscores"):
+        bus_dump.dump(topic=["no-name"], via=["rtcan:can0"])
 
 
 @pytest.mark.parametrize("via", [["memory:lab"], ["rtcan:can0", "rtcan:can1"]])

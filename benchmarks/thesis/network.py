@@ -6,12 +6,14 @@ is measured is what a perfect listener sees: the true instants of all frames.
 
 import asyncio
 import random
+from collections import defaultdict
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import msgspec
 
 from r2p.codecs import rtcan
+from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Due, Granted, Ready
@@ -249,7 +251,7 @@ class Listener:
     """Writes down what is on the bus, from now on."""
 
     def __init__(self, bus: CanBus, sources: dict[int, Source]) -> None:
-        self.periodic: dict[int, list[int]] = {}
+        self.periodic: defaultdict[int, list[int]] = defaultdict(list)
         self.syncs: list[int] = []
         self.strays = 0
         self.payload = 0
@@ -260,17 +262,21 @@ class Listener:
         bus.observers.append(self._write)
 
     def _write(self, record: Record) -> None:
-        identifier, data = record.frame.id, record.frame.data
-        message = identifier >> 7 & 0xFFFF
+        frame = record.frame
+        message = frame.id >> 7
         self.frames += 1
-        if not identifier >> 23:
-            if message >> 8 == rtcan.SYNC:
-                self.syncs.append(record.start)
-            else:
-                self.periodic.setdefault(message, []).append(record.start)
-                self.payload += 8 * len(data)
-        elif message in self._sources:
-            self._event(self._sources[message], message, identifier & 0x7F, data, record.end)
+        if message > 0xFFFF:
+            self._unslotted(message & 0xFFFF, frame, record.end)
+        elif message >> 8 == rtcan.SYNC:
+            self.syncs.append(record.start)
+        else:
+            self.periodic[message].append(record.start)
+            self.payload += 8 * len(frame.data)
+
+    def _unslotted(self, message: int, frame: Frame, end: int) -> None:
+        source = self._sources.get(message)
+        if source is not None:
+            self._event(source, message, frame.id & 0x7F, frame.data, end)
         else:
             self.strays += message >> 8 in self._cyclic
 
@@ -307,7 +313,13 @@ def _failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
 
 def simulated(scenario: Scenario) -> Outcome:
     """The same, in virtual time of its own."""
-    return run(simulate(scenario), seed=scenario.seed)
+    outcomes = []
+
+    async def main() -> None:  # without a result: asyncio's runner makes a text of that, and this one is long
+        outcomes.append(await simulate(scenario))
+
+    run(main, seed=scenario.seed)
+    return outcomes[0]
 
 
 async def _come_up(group: asyncio.TaskGroup, nodes: list[Node], scenario: Scenario) -> list[asyncio.Task[None]]:
@@ -365,14 +377,11 @@ def _outcome(
 def _track(master: Node, node: Node, message: Cyclic, listener: Listener) -> Track:
     clock, now = master.port.controller.clock, master.shell.now()
     zero = now - (master.engine.network_time(now) or 0)
-    track = Track(message, node.grants[message.high].phase)
-    for start in listener.periodic.get(rtcan.message_id(message.high, node.engine.id8 or 0), ()):
-        at = clock.local(start) - zero
-        slot = (at + TIMING.slot // 2) // TIMING.slot
-        track.slots.append(slot)
-        track.starts.append(start)
-        track.errors.append(at - slot * TIMING.slot)
-    return track
+    starts = listener.periodic[rtcan.message_id(message.high, node.engine.id8 or 0)]
+    at = [clock.local(start) - zero for start in starts]
+    slots = [(each + TIMING.slot // 2) // TIMING.slot for each in at]
+    errors = [each - slot * TIMING.slot for each, slot in zip(at, slots, strict=True)]
+    return Track(message, node.grants[message.high].phase, slots, starts, errors)
 
 
 def _owners(nodes: list[Node]) -> dict[int, tuple[str, str]]:

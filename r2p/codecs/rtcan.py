@@ -8,6 +8,7 @@ last, how often) and each byte which state is next and how many bits were stuffe
 """
 
 from functools import lru_cache
+from typing import TypeAlias
 
 import msgspec
 
@@ -95,7 +96,10 @@ def firmware_message_id(index: int, id8: int) -> int:
 
 def srt_laxity(remaining: int) -> int:
     """The laxity of a soft real-time message with `remaining` ns to its deadline, which may be over: 1..62."""
-    return min(max(remaining // _MILLISECOND, SRT_MIN), SRT_MAX)
+    laxity = remaining // _MILLISECOND
+    if laxity < SRT_MIN:
+        return SRT_MIN
+    return min(laxity, SRT_MAX)
 
 
 def fragment_count(size: int) -> int:
@@ -142,25 +146,22 @@ def frame_bits_max(size: int) -> int:
     return frame_bits_min(size) + (_HEADER + 8 * size + _CRC - 1) // 4
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=64)  # whoever deals with one frame asks at about the same time
 def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
     """How many bits a data frame takes from its start to its end, those stuffed in included, without intermission.
 
     `extended=False` is for frames with 11-bit identifiers, which only others send. Raises `MessageError` when the
     identifier or the data are too long.
     """
-    state, crc, bits = _header(identifier, len(data), extended)
-    for byte in data:
-        step = _STUFFING[state << 8 | byte]
-        state = step & 7
-        bits += 8 + (step >> 3)
-        crc = (crc << 8 ^ _REMAINDERS[crc >> 7 ^ byte]) & 0x7FFF
-    high = _STUFFING[state << 8 | crc >> 7]
-    low = _STUFFING_7[(high & 7) << 7 | crc & 0x7F]
-    return bits + _CRC + (high >> 3) + (low >> 3) + TAIL
+    row, crc, bits = _header(identifier, len(data), extended)
+    for byte, remainders in zip(data, _REMAINDERS[len(data)], strict=True):
+        row, sent = row[byte]
+        bits += sent
+        crc ^= remainders[byte]
+    row, high = row[crc >> 7]
+    return bits + high + row[_SEVEN | crc & 0x7F][1] + TAIL
 
 
-@lru_cache(maxsize=4096)
 def bits_until_lost(winner: int, loser: int) -> int:
     """Bits from the start of frame to the end of the one where `loser` gives up: the first in which the two differ.
 
@@ -168,7 +169,7 @@ def bits_until_lost(winner: int, loser: int) -> int:
     """
     bit = (winner ^ loser).bit_length() - 1
     before = 29 - bit if bit > 17 else 31 - bit  # SRR and IDE are sent between bits 18 and 17
-    return before + (_stuff(_START, _arbitration(winner) >> 32 - before, before) >> 3) + 1
+    return before + _stuffed(_arbitration(winner) >> 32 - before, before) + 1
 
 
 def wire_bits(frame: Frame) -> str:
@@ -190,6 +191,8 @@ def wire_bits(frame: Frame) -> str:
 _HEADER = 39  # bits: start of frame, 11 of the identifier, SRR, IDE, 18 of the identifier, RTR, 2 reserved, 4 of length
 _CRC = 15
 _START = 1 << 2  # before a frame the bus is recessive; the start of frame is dominant, so how long does not matter
+_Row: TypeAlias = "list[tuple[_Row, int]]"
+"""A state of the stuffing: for each byte, and then for each 7 bits, the next state and how many bits are sent."""
 
 
 def _arbitration(identifier: int) -> int:
@@ -198,21 +201,27 @@ def _arbitration(identifier: int) -> int:
 
 
 @lru_cache(maxsize=4096)
-def _header(identifier: int, size: int, extended: bool) -> tuple[int, int, int]:
-    """What the bits before the data leave: state of the stuffing, CRC, bits so far."""
+def _stuffed(bits: int, count: int) -> int:
+    """How many bits are stuffed into the first `count` of a frame."""
+    return _stuff(_START, bits, count) >> 3
+
+
+@lru_cache(maxsize=4096)
+def _header(identifier: int, size: int, extended: bool) -> tuple[_Row, int, int]:
+    """What the bits before the data leave: state of the stuffing, CRC as if all data were 0, bits so far."""
     if identifier >> (29 if extended else 11) or size > FRAME_MAX:
         raise MessageError(f"identifier {identifier:#x} with {size} bytes: no frame has room")
     bits = _arbitration(identifier) << 7 | size if extended else identifier << 7 | size
     count = _HEADER if extended else _HEADER - 20
     step = _stuff(_START, bits, count)
-    return step & 7, _crc(bits.to_bytes(5, "big")), count + (step >> 3)
+    return _ROWS[step & 7], _crc(bits.to_bytes(5, "big") + bytes(size)), count + (step >> 3)
 
 
 def _crc(data: bytes) -> int:
     """CRC-15. Zeros in front leave it as it is."""
     crc = 0
     for byte in data:
-        crc = (crc << 8 ^ _REMAINDERS[crc >> 7 ^ byte]) & 0x7FFF
+        crc = (crc << 8 ^ _REMAINDER[crc >> 7 ^ byte]) & 0x7FFF
     return crc
 
 
@@ -239,6 +248,14 @@ def _remainder(byte: int) -> int:
     return crc & 0x7FFF
 
 
-_STUFFING = tuple(_stuff(state, byte, 8) for state in range(8) for byte in range(256))
-_STUFFING_7 = tuple(_stuff(state, bits, 7) for state in range(8) for bits in range(128))
-_REMAINDERS = tuple(_remainder(byte) for byte in range(256))
+_SEVEN = 1 << 8  # where the 7 bits begin
+_ROWS: list[_Row] = [[] for _ in range(8)]
+for _state, _row in enumerate(_ROWS):
+    for _count in 8, 7:
+        for _step in [_stuff(_state, bits, _count) for bits in range(1 << _count)]:
+            _row.append((_ROWS[_step & 7], _count + (_step >> 3)))
+
+_REMAINDER = tuple(_remainder(byte) for byte in range(256))
+_PLACES = [tuple(_crc(bytes((byte, *bytes(after)))) for byte in range(256)) for after in range(FRAME_MAX)]
+_REMAINDERS = [_PLACES[:size][::-1] for size in range(FRAME_MAX + 1)]
+"""CRC-15 is linear: the sum of what each byte makes alone. By size of the data, place of the byte, and its value."""

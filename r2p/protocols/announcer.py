@@ -38,6 +38,8 @@ class Announcer:
         self.r2p = False
         self.answered: set[str] = set()
         """The subscribed topics that somebody publishes to us."""
+        self.wanted: set[str] = set()
+        """The published topics that somebody subscribes."""
         self._module = module
         self._instance = instance
         self._observer = observer
@@ -125,6 +127,12 @@ class Announcer:
         unanswered = self.r2p and topic not in self.answered
         return management.SubscribeRequest(topic, own.shape.size, own.queue, UNANSWERED if unanswered else NO_PARAMS)
 
+    def _advertisement(self, topic: str, own: Own) -> management.Advertise:
+        """Our advertisement; r2p modules are told whether anybody has subscribed yet."""
+        unanswered = self.r2p and topic not in self.wanted
+        params = own.params[:-1] + UNANSWERED[-1:] if unanswered else own.params
+        return management.Advertise(topic, own.shape.size, 0, params)
+
     def _enter(self, table: dict[str, Own], kind: Kind, topic: str, own: Own) -> bool:
         if table.get(topic) == own:
             return False
@@ -149,7 +157,7 @@ class Announcer:
         match item.kind, item.key:
             case Kind.PUBLISHER, (str(topic),):
                 own = self.publishers[topic]
-                return self._typed(own, topic, ROLE_PUBLISHES, _advertise(topic, own))
+                return self._typed(own, topic, ROLE_PUBLISHES, self._advertisement(topic, own))
             case Kind.SUBSCRIBER, (str(topic),):
                 own = self.subscribers[topic]
                 return self._typed(own, topic, ROLE_SUBSCRIBES, self.request(topic, own))
@@ -173,7 +181,3 @@ class Announcer:
     def _presence(self, flags: int) -> list[management.Management]:
         hello = self.introduction(flags)
         return [hello] if self._observer else [hello, management.Alive(self._module, self.flags)]
-
-
-def _advertise(topic: str, own: Own) -> management.Advertise:
-    return management.Advertise(topic, own.shape.size, 0, own.params)

@@ -1,8 +1,9 @@
 """Who may exchange what: both sides of ADVERTISE, SUBSCRIBE_REQUEST and SUBSCRIBE_RESPONSE (PROTOCOL.md 4).
 
-Every message is answered every time; only what it changes becomes an event. A type that does not fit is refused by both
-sides because each tells its own, with every repetition and as the answer to what it refuses. A TYPE is never answered,
-so two that disagree don't argue.
+Firmware is answered every time; between r2p modules what only repeats itself brings no more than a response, for both
+sides repeat. Only what a message changes becomes an event. A type that does not fit is refused by both sides because
+each tells its own, with every repetition and as the answer to what it refuses. A TYPE is never answered, so two that
+disagree don't argue.
 """
 
 from collections import Counter
@@ -42,6 +43,8 @@ class Exchange:
         if own is None or peer is None:
             return
         if peer.is_r2p(now):
+            if peer.opened.get(topic) == (message.params, message.size):
+                return  # it knows of subscribers: the next one of our own requests is soon enough
             self._outbox.say(own.type(topic, ROLE_SUBSCRIBES))
         if self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
             self._outbox.say(self._own.request(topic, own))
@@ -56,14 +59,15 @@ class Exchange:
         peer = self._peers.obtain(source) if own is not None else None
         if own is None or peer is None:
             return
-        if peer.is_r2p(now):
+        unanswered = peer.is_r2p(now) and message.params == UNANSWERED
+        if peer.is_r2p(now) and (unanswered or peer.requests.get(topic) is not False):
             self._outbox.say(own.type(topic, ROLE_PUBLISHES))
         theirs = peer.types.get((topic, ROLE_SUBSCRIBES))
         if theirs is not None and not self._fits(peer, topic, ROLE_SUBSCRIBES, theirs):
             return
         self._outbox.say(management.SubscribeResponse(topic, own.shape.size, max(message.queue, 1), own.params))
-        unanswered = peer.is_r2p(now) and message.params == UNANSWERED
         if self._peers.join(now, peer, topic, unanswered=unanswered):
+            self._own.wanted.add(topic)
             self._outbox.tell(Joined(topic, message.params, message.queue, source))
         self._renew(now, peer, topic)
 
@@ -220,6 +224,7 @@ class Exchange:
     def _end(self, peer: Peer, topic: str) -> None:
         self._timers.clear(("lease", peer.source, topic))
         if self._peers.end(peer, topic):
+            self._own.wanted.discard(topic)
             self._outbox.tell(Left(topic))
 
     def _shut(self, peer: Peer, topic: str) -> None:

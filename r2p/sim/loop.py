@@ -15,11 +15,11 @@ in asyncio that goes through the loop works unchanged. What virtual time can't s
 from __future__ import annotations
 
 import asyncio
-import heapq
 import itertools
 import random
 import selectors
 from collections.abc import Callable, Coroutine
+from heapq import heappop, heappush
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
@@ -39,6 +39,7 @@ _HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two flo
 _BUSY: Final = 100_000  # turns of the loop at one instant
 _END: Final = 2**22 * _SECOND  # the same in ns
 _AHEAD: Final = 1000  # events; then the loop has its turn, for signals and real file descriptors
+_OFTEN: Final = 64  # turns of the loop; so often it looks for signals
 _RESOLUTION: Final = 0.4e-9  # seconds; tells nanoseconds apart, and is more than rounding error at the horizon
 
 
@@ -92,6 +93,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self.task_numbers = itertools.count(1)
         self._timer_numbers = itertools.count()
         self._jobs = 0
+        self._limit = 0  # ns; up to here, not including, `run_ahead` may go
         self._turns = 0
         self._instant = 0
         self._clock_resolution = _RESOLUTION
@@ -116,9 +118,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         if self.is_closed():
             raise RuntimeError("Event loop is closed")
         if when < _HORIZON:
-            when = _nanoseconds(when) / _SECOND
+            instant = _nanoseconds(when)
+            when = instant / _SECOND
+            if instant < self._limit:
+                self._limit = instant
         timer = _Timer(when, next(self._timer_numbers), callback, args, self, context)
-        heapq.heappush(self._scheduled, timer)
+        heappush(self._scheduled, timer)
         return timer
 
     def run_in_executor(
@@ -127,6 +132,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """As in asyncio; virtual time stands still until the job is done, or nobody waits for it any more."""
         future = super().run_in_executor(executor, func, *args)
         self._jobs += 1
+        self._limit = 0
         future.add_done_callback(self._job_done)
         return future
 
@@ -144,21 +150,21 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         For whoever has many events, and keeps them in order himself: a turn of the loop for each would cost more than
         the event. What is over is now. After some events, the loop has its turn all the same.
         """
-        ready, timers, clock = self._ready, self._scheduled, self.clock
-        first, limit = None, _END
+        ready, clock = self._ready, self.clock
+        self._limit = 0 if self._jobs else self._next_timer()
         for _ in range(_AHEAD):
             if not events:
                 return
-            when, _, callback, args = events[0]
+            when, _, callback, args = event = heappop(events)
             if when > clock.elapsed:
-                if timers and timers[0] is not first:
-                    first = timers[0]
-                    limit = _nanoseconds(min(first.when(), _HORIZON))
-                if ready or when >= limit or self._jobs:
+                if when >= self._limit or ready:
+                    heappush(events, event)
                     return
                 clock.elapsed = when
-            heapq.heappop(events)
             callback(*args)
+
+    def _next_timer(self) -> int:
+        return _nanoseconds(min(self._scheduled[0].when(), _HORIZON)) if self._scheduled else _END
 
     def _job_done(self, _future: asyncio.Future[Any]) -> None:
         self._jobs -= 1
@@ -199,15 +205,17 @@ class _Selector(selectors.DefaultSelector):
         super().__init__()
         self._idle = idle
         self._turn = turn
+        self._looked = itertools.count()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        events = super().select(0)
-        if events:
-            return events
+        if len(self.get_map()) > 1 or not next(self._looked) % _OFTEN:  # asyncio's own descriptor is the first one
+            events = super().select(0)
+            if events:
+                return events
         if timeout == 0:  # what asyncio says when callbacks are ready
             self._turn()
-            return events
-        return super().select(None) if self._idle() else events
+            return []
+        return super().select(None) if self._idle() else []
 
 
 class _Timer(asyncio.TimerHandle):

@@ -31,6 +31,7 @@ from r2p.transports.url import Url, duration
 _BILLION = 1_000_000_000
 _NO_POWER = "no power"
 _MAILBOXES = (Mailbox.HRT, *[Mailbox.SRT] * (rtcan.NRT - 1), Mailbox.NRT)  # by laxity
+_SENT, _LOST, _LATE = Outcome.SENT, Outcome.LOST, Outcome.LATE  # Python 3.11 takes its time to find a member of an enum
 DEFAULTS = Options(priority=1, utc=0.0)
 """Of `sim:` URLs: anybody may be the master, and knows UTC."""
 
@@ -135,11 +136,11 @@ class SimPort(CanPort):
         last = None if order.not_after == NEVER else order.not_after
         frame, mailbox = order.frame, order.mailbox
         if not self.controller.request(frame, mailbox, not_before=order.not_before, not_after=last):
-            self._confirm(mailbox, Outcome.LATE, self.now())
+            self._confirm(mailbox, _LATE, self.now())
 
     def withdraw(self, order: Withdraw) -> None:
         if self.controller.abort(order.mailbox):
-            self._confirm(order.mailbox, Outcome.LATE, self.now())
+            self._confirm(order.mailbox, _LATE, self.now())
 
     def set_filters(self, filters: list[tuple[int, int]]) -> None:
         self.controller.filters = filters
@@ -168,13 +169,13 @@ class SimPort(CanPort):
         return self._clock.monotonic()
 
     def _sent(self, frame: Frame, stamp: int) -> None:
-        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.SENT, stamp - self.receive_latency)
+        self._confirm(_MAILBOXES[frame.id >> 23], _SENT, stamp - self.receive_latency)
 
     def _lost(self, frame: Frame, stamp: int) -> None:
-        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.LOST, stamp)
+        self._confirm(_MAILBOXES[frame.id >> 23], _LOST, stamp)
 
     def _late(self, frame: Frame, stamp: int) -> None:
-        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.LATE, stamp)
+        self._confirm(_MAILBOXES[frame.id >> 23], _LATE, stamp)
 
     def _failed(self, frame: Frame, kind: ErrorKind, stamp: int) -> None:
         if self._user is not None and self._up:

@@ -77,10 +77,19 @@ def parse(text: str) -> Wanted:
     size = int(match["size"])
     if not 1 <= size <= rtcan.PAYLOAD_MAX:
         raise typer.BadParameter(f"{text!r}: RTCAN carries 1 to {rtcan.PAYLOAD_MAX} bytes in a message")
-    rate = match["rate"]
-    lower = rate.lower()
-    period = 1 / hertz(lower.removesuffix("hz")) if lower.endswith("hz") else seconds(rate)
-    return Wanted(match["name"], size, round(period * _SECOND))
+    return Wanted(match["name"], size, round(_period(match["rate"]) * _SECOND))
+
+
+def _period(text: str) -> float:
+    """Seconds, of a rate or a period. A number alone could be either."""
+    lower = text.lower()
+    if lower.endswith("khz"):
+        return 1e-3 / hertz(lower.removesuffix("khz"))
+    if lower.endswith("hz"):
+        return 1 / hertz(lower.removesuffix("hz"))
+    if not lower.endswith("s"):
+        raise typer.BadParameter(f"{text!r}: write a rate as in 200Hz, or a period as in 5ms")
+    return seconds(text)
 
 
 async def _tell(wanted: list[Wanted], grid: Timing, drawing: Path | None, output: Output) -> None:

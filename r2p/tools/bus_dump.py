@@ -34,9 +34,10 @@ def dump(
 
     Topics and modules go by number until they have told their names.
     """
-    kinds, topics = set(kind or FrameKind), {topic_name(name) for name in topic or ()}
+    kinds = set(kind or FrameKind)
 
     async def main() -> None:
+        topics = {topic_name(name) for name in topic or ()}
         output = Output(format)
         printed = 0
         async with output.while_read(), listen(via) as bus, patience("the bus", timeout) as heard:

@@ -12,6 +12,7 @@ from r2p.tools.bus_admit import Svg
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Quiet, TimedOut, Verbose, Via, execute
 
+_UNUSED = "reserved, and not used: nobody subscribes, or the owner is gone"
 _PATIENCE = 3.0  # s without a sync
 
 Cycles = Annotated[int, typer.Option("--cycles", "-n", min=1, metavar="N", help="Watch so many cycles.")]
@@ -53,7 +54,7 @@ def cells_of(bus: BusMonitor) -> list[Cell]:
     """The slot map as a picture's cells."""
     return [
         Cell(
-            _owner(slot) or ("?" if slot.reserved else ""),
+            _owner(slot) or (_UNUSED if slot.reserved else ""),
             slot.missed,
             slot.shared,
             f"{', '.join(slot.owners) or 'free'}: {slot.used} of {slot.reserved} used, {slot.shared} events",

@@ -59,7 +59,7 @@ async def at(watch: Watch, instant: int) -> None:
 
 
 def counters(controller: CanController) -> tuple[int, int]:
-    return controller.transmit_errors, controller.receive_errors
+    return controller.confinement.transmit, controller.confinement.receive
 
 
 # Error frames
@@ -142,7 +142,7 @@ async def test_noise_at_one_node_destroys_frames_for_all_until_it_is_error_passi
     assert deaf.state is State.PASSIVE
     assert watch.outcomes == [(FRAME, ErrorKind.BIT)] * (len(watch.records) - 1) + [(FRAME, None)]
     assert [name for name, *_ in watch.of("received")] == ["good"]
-    assert good.receive_errors == len(watch.records) - 2
+    assert good.confinement.receive == len(watch.records) - 2
 
 
 @pytest.mark.virtual_time
@@ -163,7 +163,7 @@ async def test_a_lone_node_tries_for_ever_and_never_goes_to_bus_off() -> None:
     b.power_off()
     a.request(FRAME)
     await asyncio.sleep(1)
-    assert (a.state, a.transmit_errors) == (State.PASSIVE, 128)
+    assert (a.state, a.confinement.transmit) == (State.PASSIVE, 128)
     assert len(watch.records) > 4000
     b.power_on()
     await asyncio.sleep(0.001)
@@ -176,7 +176,7 @@ async def test_a_lone_node_tries_for_ever_and_never_goes_to_bus_off() -> None:
 async def test_an_error_passive_sender_waits_8_bits_longer() -> None:
     watch = Watch()
     a, b = watch.attach("A"), watch.attach("B")
-    a.transmit_errors = 200
+    a.confinement.transmit = 200
     for box in range(2):
         a.request(FRAME, box)
     await asyncio.sleep(0.01)
@@ -236,15 +236,15 @@ async def test_colliding_for_ever_ends_when_the_one_that_sees_it_is_error_passiv
     assert {kind for _, kind in collisions} == {ErrorKind.BIT}
     assert (first, second) == ((dominant, None), (recessive, None))
     assert [frame for name, frame, _ in watch.of("received") if name == "C"] == [dominant, recessive]
-    assert a.transmit_errors == 16 * 8 + 8 - 1
-    assert b.transmit_errors == 16 * 8 - 1
+    assert a.confinement.transmit == 16 * 8 + 8 - 1
+    assert b.confinement.transmit == 16 * 8 - 1
 
 
 @pytest.mark.virtual_time
 async def test_error_passive_colliders_do_not_acknowledge() -> None:
     watch = Watch()
     a, b = watch.attach("A", one_shot=True), watch.attach("B", one_shot=True)
-    a.transmit_errors = b.transmit_errors = 150
+    a.confinement.transmit = b.confinement.transmit = 150
     a.disturbed(0)
     b.disturbed(0)
     for controller, frame in zip((a, b), colliding(b"\xff", b"\x0f"), strict=True):
@@ -259,7 +259,7 @@ async def test_the_error_passive_ones_leave_one_after_the_other() -> None:
     nodes = [watch.attach(name, one_shot=True) for name in "ABC"]
     watch.attach("D")
     for node, frame in zip(nodes, colliding(b"\x80", b"\x01", b"\x00"), strict=True):
-        node.transmit_errors = 150
+        node.confinement.transmit = 150
         node.disturbed(0)
         node.request(frame)
     await asyncio.sleep(0.01)
@@ -351,9 +351,26 @@ async def test_a_node_that_dies_in_the_middle_of_its_frame() -> None:
         ("sent", "B", OTHER, watch.records[1].end),
         ("received", "C", OTHER, watch.records[1].end),
     ]
-    assert b.receive_errors == 1
+    assert b.confinement.receive == 1
     assert a.state is State.DOWN
     assert not a.request(FRAME)
+
+
+@pytest.mark.virtual_time
+async def test_frames_that_a_node_filters_out_make_up_for_errors_all_the_same() -> None:
+    watch = Watch()
+    a, b = watch.attach("A"), watch.attach("B")
+    b.filters = [(OTHER.id, -1)]
+    b.disturbed(2)
+    for number, frame in enumerate([FRAME, OTHER, FRAME, FRAME]):
+        a.request(frame)
+        await asyncio.sleep(0.001)
+        assert b.confinement.receive == max(0, 1 - number)
+    assert [(name, frame) for name, frame, _ in watch.of("received")] == [("B", OTHER)]
+    b.filters = ()
+    a.request(FRAME)
+    await asyncio.sleep(0.001)
+    assert [frame for _, frame, _ in watch.of("received")] == [OTHER, FRAME]
 
 
 @pytest.mark.virtual_time
@@ -437,7 +454,7 @@ async def test_a_node_that_returns_is_new_and_waits_for_11_recessive_bits() -> N
     watch = Watch()
     a, b = watch.attach("A"), watch.attach("B")
     a.request(FRAME)
-    a.transmit_errors = 100
+    a.confinement.transmit = 100
     a.power_off()
     await at(watch, 1_000_000)
     a.power_on()
@@ -467,7 +484,7 @@ async def test_what_a_node_was_about_to_hear_dies_with_it() -> None:
 
 
 async def into_bus_off(watch: Watch, node: CanController) -> None:
-    node.transmit_errors = 255
+    node.confinement.transmit = 255
     watch.bus.disturb_next(30)
     node.request(FRAME)
     await asyncio.sleep(0.000_2)
@@ -564,12 +581,12 @@ async def test_a_noisy_bus_drives_its_senders_to_bus_off() -> None:
     await asyncio.sleep(0.02)
     assert [state for name, state, _ in watch.of("state") if name == "A"][:2] == [State.PASSIVE, State.BUS_OFF]
     assert len(watch.records) == 32  # 8 for each, over 255
-    assert b.receive_errors == 32
+    assert b.confinement.receive == 32
     watch.bus.noise = 0.0  # it can be set at any time
     for _ in range(40):
         a.request(FRAME)
         await asyncio.sleep(0.001)
-    assert b.receive_errors == 0
+    assert b.confinement.receive == 0
 
 
 @pytest.mark.virtual_time
@@ -580,4 +597,4 @@ async def test_a_good_frame_takes_the_receive_counter_back_below_passive() -> No
     assert b.state is State.PASSIVE
     a.request(FRAME)
     await asyncio.sleep(0.001)
-    assert (b.receive_errors, b.state) == (119, State.ACTIVE)
+    assert (b.confinement.receive, b.state) == (119, State.ACTIVE)

@@ -30,6 +30,7 @@ def admit(*arguments: str) -> tuple[int, list[dict[str, object]], str]:
     [
         ("imu:18@200Hz", Wanted("imu", 18, 5_000_000)),
         ("imu:18@5ms", Wanted("imu", 18, 5_000_000)),
+        ("enc:8@1kHz", Wanted("enc", 8, 1_000_000)),
         ("e:1024@0.5hz", Wanted("e", 1024, 2_000_000_000)),
     ],
 )
@@ -37,7 +38,9 @@ def test_a_plan_is_name_bytes_and_rate_or_period(text: str, wanted: Wanted) -> N
     assert parse(text) == wanted
 
 
-@pytest.mark.parametrize("text", ["imu", "imu:18", "imu@5ms", "imu:0@5ms", "imu:1025@5ms", "imu:8@0Hz", "imu:8@x"])
+@pytest.mark.parametrize(
+    "text", ["imu", "imu:18", "imu@5ms", "imu:0@5ms", "imu:1025@5ms", "imu:8@0Hz", "imu:8@x", "imu:8@200"]
+)
 def test_what_can_not_be_a_plan_is_refused(text: str) -> None:
     with pytest.raises(typer.BadParameter):
         parse(text)

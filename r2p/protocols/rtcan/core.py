@@ -23,6 +23,7 @@ from r2p.protocols.rtcan.sending import Mode, Sender
 from r2p.protocols.rtcan.settings import Settings
 
 _DEADLINE = 50_000_000  # of management, ns
+_CONTROL = 10_000_000  # of what keeps the network: slots must not wait for all that discovery has to say
 _URGENT = 1_000_000
 _DEPTH = 128  # management messages that wait
 _PAUSE = 500_000  # ns after a bus error, before the same topic is tried again
@@ -39,6 +40,8 @@ class Core:
         self.counts: Counter[str] = Counter()
         self.out: list[Action] = []
         self.periodics: dict[int, Periodic] = {}
+        self.joined = False
+        """Whether messages may be sent: the node has an id8, and knows how the network works."""
         self.timing = timing(settings.slots, settings.cycle, settings.bit_rate)
         self.timers = Alarms()
         self.reassembly = Reassembly()
@@ -82,7 +85,6 @@ class Core:
             self.grants,
             self.wishes,
             self.timers,
-            self.periodics,
             self.out,
             self.counts,
             self.say,
@@ -108,6 +110,8 @@ class Core:
         else:
             mode = Mode.SLOTTED if self.network.verified else Mode.SILENT
         self.sender.enter(now, mode)
+        if not self.joined and self.identity.stage is Stage.OWNING and self.network.settled:
+            self._join(now)
         if held and not electing:
             self.sender.kick(now)
 
@@ -123,12 +127,17 @@ class Core:
 
     def say(self, now: int, message: management.Management) -> None:
         """Send a management message of our own."""
-        self.manage(now, management.encode(message))
+        data = management.encode(message)
+        if self.profile is Profile.FIRMWARE:
+            self.manage(now, data)
+        else:
+            self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, None, _CONTROL)
 
     def manage(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> None:
         """Send a management message; before the others, if it is urgent."""
         if self.profile is not Profile.FIRMWARE:
-            self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, handle, urgent=urgent)
+            within = _URGENT if urgent else _DEADLINE
+            self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, handle, within)
             return
         dropped = self.pacer.put(data, urgent=urgent, handle=handle)
         self.post.report(dropped, Fate.FULL, missed=False, at=now)
@@ -137,7 +146,7 @@ class Core:
         """Among firmware: send management if it is quiet."""
         due = self.pacer.pop(now)
         if due is not None:
-            self._queue_management(now, rtcan.FIRMWARE_MANAGEMENT, *due, urgent=False)
+            self._queue_management(now, rtcan.FIRMWARE_MANAGEMENT, *due, _DEADLINE)
 
     def listen(self, identifier: int) -> None:
         """What any frame tells while we only listen."""
@@ -211,7 +220,7 @@ class Core:
 
     def tick(self, now: int, periodic: Periodic) -> None:
         """Without slots the node's own clock says when a periodic message is due."""
-        if not periodic.active and self.identity.stage is Stage.OWNING and ("tick", periodic.high) not in self.timers:
+        if not periodic.active and self.joined and ("tick", periodic.high) not in self.timers:
             self.timers.set(("tick", periodic.high), now)
 
     def _periodic_timer(self, now: int, kind: str, periodic: Periodic) -> None:
@@ -219,6 +228,7 @@ class Core:
             self.wishes.request(now, periodic)
         elif kind == "lease":
             self.wishes.suspend(periodic, "the master does not answer")
+            self.wishes.want(now, periodic)
             self.tick(now, periodic)
         elif not periodic.active or self.cycle.counter < periodic.from_cycle:
             at = now if periodic.tick is None else now - (now - periodic.tick) % periodic.interval
@@ -256,24 +266,28 @@ class Core:
     def _stage_changed(self, now: int) -> None:
         stage = self.identity.stage
         if stage is Stage.LISTENING:
+            self.joined = False
             self.detector.start()
             self.discard(now)
             self.network.resign(now)
         elif stage is Stage.OWNING:
             for periodic in self.periodics.values():
                 periodic.message = self.message_id(periodic.high)
-            self.out.append(Ready(self.identity.id8, self.profile))
             if self.profile is not Profile.FIRMWARE:
                 self.network.owned(now)
-            for periodic in self.periodics.values():
-                self.wishes.want(now, periodic)
-                self.tick(now, periodic)
         self.settle(now)
 
-    def _queue_management(self, now: int, message: int, data: bytes, handle: Hashable, *, urgent: bool) -> None:
-        deadline = now + (_URGENT if urgent else _DEADLINE)
-        outgoing = Outgoing(message, data, deadline, drop=False, handle=handle)
-        if self.queue.put(outgoing, urgent=urgent, management=True):
+    def _join(self, now: int) -> None:
+        """Whose network it is has been found out: messages may be sent."""
+        self.joined = True
+        self.out.append(Ready(self.identity.id8, self.profile))
+        for periodic in self.periodics.values():
+            self.wishes.want(now, periodic)
+            self.tick(now, periodic)
+
+    def _queue_management(self, now: int, message: int, data: bytes, handle: Hashable, within: int) -> None:
+        outgoing = Outgoing(message, data, now + within, drop=False, handle=handle)
+        if self.queue.put(outgoing, urgent=within < _DEADLINE, management=True):
             self.sender.kick(now)
         else:
             self.counts["management dropped"] += 1

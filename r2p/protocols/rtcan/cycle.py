@@ -6,6 +6,8 @@ its own calibrated latency. A sync that does not come is made up for by the slav
 """
 
 import enum
+from collections.abc import Container
+from functools import lru_cache
 
 import msgspec
 
@@ -14,6 +16,8 @@ from r2p.codecs.rtcan import Frame
 
 HOLDOVER = 3
 """Cycles without a sync that a slave bridges."""
+NO_SLOT = 1 << 16
+"""Behind every slot of a cycle."""
 _MICROSECOND = 1000
 _SECOND = 1_000_000_000
 
@@ -64,7 +68,8 @@ class Alignment(enum.Enum):
 class Cycle:
     """The cycle of one node. `mask` None: it is not known which slots of this cycle are free.
 
-    `counter` is the whole cycle counter once `anchored`; before, only its low 8 bits mean something.
+    `free` are those of which it is; `next_free` has for each slot the first of them behind it. `counter` is the whole
+    cycle counter once `anchored`; before, only its low 8 bits mean something.
     """
 
     def __init__(self, timing: Timing, receive_latency: int = 0) -> None:
@@ -73,6 +78,7 @@ class Cycle:
         self.reference = 0
         self.counter = 0
         self.mask: int | None = None
+        self.free, self.next_free = _free(None, timing.slots)
         self.missed = 0
         self.anchored = False
         self._slot = timing.slot
@@ -80,6 +86,7 @@ class Cycle:
         self._first = 0
         self._first_at = 0
         self._length = 0
+        self._widest = 0  # how far a sync was from where the one before it let expect it
 
     @property
     def running(self) -> bool:
@@ -118,12 +125,18 @@ class Cycle:
             return Alignment.REPEATED
         self.counter += cycles
         self._length = (start - self._first_at) // max(1, self.counter - self._first)
+        self._widest = max(self._widest, abs(off))
         self._follow(start, sync.mask)
         return Alignment.ALIGNED if cycles else Alignment.LATE
 
-    def measured(self) -> int | None:
-        """The length of a cycle by the syncs heard since it started (ns); None before there are two."""
-        return self._length or None
+    def measured(self) -> tuple[int, int] | None:
+        """The length of a cycle by the syncs heard since it started, and how far off that may be as they jitter (ns).
+
+        None before there are two.
+        """
+        if not self._length:
+            return None
+        return self._length, 2 * self._widest // max(1, self.counter - self._first)
 
     def roll(self) -> bool:
         """The next cycle began without a sync. False: that is one too many, the cycle is lost."""
@@ -134,7 +147,7 @@ class Cycle:
         self.state = State.HOLDING
         self.counter += 1
         self.reference += self.timing.cycle
-        self.mask = None
+        self._reserve(None)
         return True
 
     def anchor(self, counter: int) -> bool:
@@ -149,51 +162,73 @@ class Cycle:
     def stop(self) -> None:
         """There is no cycle any more."""
         self.state = State.NONE
-        self.mask = None
+        self._reserve(None)
         self._length = 0
 
     # At the master
 
-    def lead(self, now: int) -> None:
-        """Become the master. The grid and the counter go on if there were any: the next cycle is the first one."""
-        if self.anchored:
-            cycles = -(-(now - self.reference) // self.timing.cycle)
-            self.counter += cycles - 1
-            self.reference += (cycles - 1) * self.timing.cycle
-        else:
-            self.counter = 0
-            self.reference = now - self.timing.cycle
+    def upcoming(self, now: int) -> tuple[int, int]:
+        """Start and count of the next cycle: the grid and the counter of before go on, if there were any."""
+        if not self.anchored:
+            return now, 1
+        cycles = -(-(now - self.reference) // self.timing.cycle)
+        return self.reference + cycles * self.timing.cycle, self.counter + cycles
+
+    def lead(self, start: int, counter: int, mask: int | None) -> None:
+        """Be the master, from the cycle on that began there."""
         self.state = State.LEADING
+        self.reference = start
+        self.counter = counter
+        self._reserve(mask)
         self.anchored = True
-        self.mask = None
         self.missed = 0
 
     def advance(self, mask: int) -> Frame:
         """The next cycle begins: its sync frame."""
         self.counter += 1
         self.reference += self.timing.cycle
-        self.mask = mask
+        self._reserve(mask)
         return rtcan.encode_sync(self.counter, mask)
 
     def _start(self, start: int, low: int, mask: int) -> Alignment:
         cycles, off = self._distance(start)
         counter = self.counter + cycles
-        resumed = self.anchored and counter & 0xFF == low and abs(off) <= self.timing.slot // 4
+        resumed = self.anchored and counter & 0xFF == low and abs(off) <= self.timing.slot
         self.counter = max(0, _nearest(counter, low)) if self.anchored else low
         self._follow(start, mask)
-        self._first, self._first_at = self.counter, start
+        self._first, self._first_at, self._widest = self.counter, start, 0
         return Alignment.RESUMED if resumed else Alignment.STARTED
 
     def _follow(self, start: int, mask: int) -> None:
         self.state = State.FOLLOWING
         self.reference = start
-        self.mask = mask
+        self._reserve(mask)
         self.missed = 0
+
+    def _reserve(self, mask: int | None) -> None:
+        if mask != self.mask:
+            self.mask = mask
+            self.free, self.next_free = _free(mask, self.timing.slots)
 
     def _distance(self, start: int) -> tuple[int, int]:
         """How many cycles after this one a start of frame lies, and by how much off (ns)."""
         cycles = (start - self.reference + self.timing.cycle // 2) // self.timing.cycle
         return cycles, start - self.reference - cycles * self.timing.cycle
+
+
+def following(chosen: Container[int], slots: int) -> list[int]:
+    """For each slot from 0 to `slots`: the first one behind it that is chosen, up to `slots`; else NO_SLOT."""
+    behind = [NO_SLOT]
+    for slot in range(slots, 0, -1):
+        behind.append(slot if slot in chosen else behind[-1])
+    return behind[::-1]
+
+
+@lru_cache(maxsize=64)  # few masks come, again and again
+def _free(mask: int | None, slots: int) -> tuple[frozenset[int], list[int]]:
+    """The slots that this mask leaves free, and which one is next behind each slot."""
+    free = frozenset() if mask is None else frozenset(slot for slot in range(1, slots) if not mask >> slot & 1)
+    return free, following(free, slots)
 
 
 def _nearest(counter: int, low: int) -> int:

@@ -1,7 +1,8 @@
 """Who is the master: the highest (priority, id8) of those that say they could be (PROTOCOL.md 6, thesis 4.3.3).
 
 Every claim of an id8 carries a priority. Who knows no master announces itself and waits for a while; then it takes
-over if it has heard of nobody better, or else later, the later the more were better: one of those may have died.
+over if it has heard of nobody better, or else later, the later the more were better: one of those may have died. Till
+the new master has sent its first sync, nobody sends anything but management.
 Priority 0 never takes over: such a node (a PC by default) would hold the cycle worse than none, and a better one that
 comes later does not take it away.
 """
@@ -51,15 +52,18 @@ class Election:
 
     def decide(self, now: int, id8: int) -> bool:
         """The time is over. Says whether to take over."""
-        if not self._priority:
-            self.role = Role.NONE
-            return False
         better = self._better(now, id8)
         if better > self._patience:
             self._timers.set("election", now + (better - self._patience) * self._window)
             self._patience = better
             return False
-        return True
+        if not self._priority:
+            self.role = Role.NONE
+        return bool(self._priority)
+
+    def again(self, at: int) -> None:
+        """Taking over did not work: try it once more then."""
+        self._timers.set("election", at)
 
     def end(self, role: Role) -> None:
         """Somebody is the master."""

@@ -41,6 +41,7 @@ from r2p.protocols.rtcan.periodic import Periodic
 from r2p.protocols.rtcan.settings import Settings
 
 _NOTHING: tuple[Action, ...] = ()
+_LISTENING = Stage.LISTENING  # Python 3.11 takes its time to find a member of an enum
 _NOT_SYNC = ~(0xFF << 7)
 
 
@@ -71,7 +72,7 @@ class Engine:
     @property
     def ready(self) -> bool:
         """Whether messages can be sent."""
-        return self._running and self._identity.stage is Stage.OWNING
+        return self._running and self._core.joined
 
     @property
     def profile(self) -> Profile:
@@ -186,7 +187,7 @@ class Engine:
             return self._take()
         if identifier >> 7 & 0xFF == self._identity.id8:
             core.intruded(now, identifier)
-        if self._identity.stage is Stage.LISTENING:
+        if self._identity.stage is _LISTENING:
             core.listen(identifier)
         high = identifier >> 15 & 0xFF
         if high > rtcan.MANAGEMENT:
@@ -208,7 +209,9 @@ class Engine:
         """When to call `poll`; an instant in the past means at once."""
         if not self._running:
             return None
-        due = min(self._sender.due, self._timers.due)
+        due = self._sender.due
+        if self._timers.due < due:
+            due = self._timers.due
         if self._reassembly.open:
             due = min(due, self._reassembly.due)
         if self._pacer.waiting:

@@ -44,6 +44,7 @@ class Fate(enum.Enum):
     FULL = "no room"  # refused: too many wait
     FAILED = "bus errors"  # given up
     DISCARDED = "discarded"  # the node may not send, or stopped
+    REPLACED = "newer data in a slot"  # its topic got slots while it waited
     ABANDONED = "slot missed"  # a frame of a hard real-time message missed its slot
 
 

@@ -68,6 +68,7 @@ class Identity:
         self._noticed = LONG_AGO
         self._claimed_by_other = LONG_AGO
         self._suspected: int | None = None
+        self._waiting = False  # for a fixed id8 that is taken, which has been told
 
     @property
     def flags(self) -> int:
@@ -101,9 +102,12 @@ class Identity:
     def listened(self, now: int) -> None:
         """It is time to claim an id8; for a fixed one that is taken, to listen on."""
         if self.fixed and self.id8 in self._taken:
-            self._notice(now, yielded=True)
+            if not self._waiting:
+                self._waiting = True
+                self._notice(now, yielded=True)
             self.start(now)
             return
+        self._waiting = False
         if not self.fixed:
             free = [id8 for id8 in range(1, 255) if id8 not in self._taken] or list(range(1, 255))
             if self.id8 not in free:  # else it is the one that we had before
@@ -157,6 +161,7 @@ class Identity:
     def _yield(self, now: int) -> None:
         self._noticed = LONG_AGO
         self._notice(now, yielded=True)
+        self._waiting = self.fixed
         taken = self.id8
         self.start(now)
         self._taken.add(taken)

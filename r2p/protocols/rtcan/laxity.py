@@ -25,7 +25,7 @@ class Outgoing(msgspec.Struct, eq=False):
     """A message on its way. `deadline` NEVER: non real-time. `drop`: given up when overdue, unless it has started.
 
     Once its first frame is out it is always finished: a receiver of 2014 loses the next message as well when the end of
-    one is missing.
+    one is missing. `recalled`: its frame was asked back from the port, as the bus is used in another way from now on.
     """
 
     message: int
@@ -38,6 +38,7 @@ class Outgoing(msgspec.Struct, eq=False):
     sent: int = 0
     errors: int = 0
     unknown: bool = False
+    recalled: bool = False
 
     @property
     def expiry(self) -> int:
@@ -79,7 +80,7 @@ class LaxityQueue:
         return self.size >= self._capacity
 
     def put(self, message: Outgoing, *, urgent: bool = False, management: bool = False) -> bool:
-        """Queue it; `urgent` before all others of its topic that have not started. False: there is no room.
+        """Queue it; `urgent` before what of its topic has not started and may wait longer. False: there is no room.
 
         `management` has room of its own, and goes before others of the same laxity, as it does on the bus: else events
         that are overdue but not dropped would stop leases and discovery. Raises `MessageError` for what RTCAN can't
@@ -97,7 +98,7 @@ class LaxityQueue:
         elif urgent:
             self._leave(lane)
             lane.deadline = min(lane.deadline, message.deadline)
-            lane.waiting.insert(1 if lane.busy or lane.waiting[0].sent else 0, message)
+            lane.waiting.insert(self._place(lane, message.deadline), message)
             self._enter(lane)
         else:
             self._append(lane, message)
@@ -129,16 +130,19 @@ class LaxityQueue:
             lane = self._lanes.get(self.only)
             return lane.waiting[0] if lane is not None and not lane.busy and lane.held <= now else None
         chosen: tuple[int, int, _Lane] | None = None
-        limit = 0
+        limit: int | None = None
         for entry in self._sorted:
-            if chosen is not None and entry[0] >= limit:
-                break
             lane = entry[2]
             if lane.busy or lane.held > now:
                 continue
             if chosen is None:
-                chosen, limit = entry, _same_laxity_until(entry[0], now)
-            elif entry[1] < chosen[1]:
+                chosen = entry
+                continue
+            if limit is None:
+                limit = _same_laxity_until(chosen[0], now)
+            if entry[0] >= limit:
+                break
+            if entry[1] < chosen[1]:
                 chosen = entry
         if chosen is None or (chosen[0] == NEVER and not nrt):
             return None
@@ -240,6 +244,12 @@ class LaxityQueue:
         if message.expiry < lane.expiry:
             lane.expiry = message.expiry
             self._expiry = min(self._expiry, lane.expiry)
+
+    def _place(self, lane: _Lane, deadline: int) -> int:
+        """Where a message with this deadline goes; not into one that has started."""
+        started = lane.busy or lane.waiting[0].sent > 0
+        later = (place for place, each in enumerate(lane.waiting) if each.deadline > deadline and place >= started)
+        return next(later, len(lane.waiting))
 
     def _enter(self, lane: _Lane) -> None:
         """Sort it in, as urgent as its most urgent message."""

@@ -11,7 +11,7 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.management import NO_PHASE, Grant, Refuse, Renew, Renewed, Reserve
 from r2p.protocols.rtcan.calendar import Calendar, Reason, Refusal, Reservation
 from r2p.protocols.rtcan.cycle import Cycle
-from r2p.protocols.rtcan.events import Action, Degraded, Granted, Refused
+from r2p.protocols.rtcan.events import LONG_AGO, Action, Degraded, Granted, Refused
 from r2p.protocols.rtcan.periodic import Agenda, Periodic
 from r2p.protocols.schedule import Timers
 
@@ -89,7 +89,7 @@ class Wishes:
         enabled: bool = True,
     ) -> None:
         self.open = False
-        """There is a master to ask."""
+        """Whether there is a master to ask."""
         self._cycle = cycle
         self._agenda = agenda
         self._timers = timers
@@ -98,8 +98,26 @@ class Wishes:
         self._ask = ask
         self._enabled = enabled
         self._serial = 0
-        self._asked: dict[int, tuple[int, int]] = {}  # by high byte: serial, when
+        self._asked: dict[int, dict[int, int]] = {}  # by high byte: when it was asked, by serial
+        self._confirmed: dict[int, int] = {}  # by high byte: when what the master granted was asked
         self._refused: dict[int, str] = {}
+
+    def resume(self, now: int) -> None:
+        """There is a master to ask."""
+        self.open = True
+        for each in self._periodics.values():
+            self.want(now, each)
+
+    def pause(self, reason: str) -> None:
+        """There is none: nobody has slots."""
+        self.open = False
+        for each in self._periodics.values():
+            self.suspend(each, reason)
+
+    def void(self, reason: str) -> None:
+        """What was granted is worth nothing any more."""
+        for each in self._periodics.values():
+            self.lapse(each, reason)
 
     def want(self, now: int, periodic: Periodic) -> None:
         """Ask for slots for this message, now and again, if there is a master."""
@@ -114,6 +132,7 @@ class Wishes:
         for kind in "ask", "lease":
             self._timers.clear((kind, periodic.high))
         self._asked.pop(periodic.high, None)
+        self._confirmed.pop(periodic.high, None)
         self._refused.pop(periodic.high, None)
         self._agenda.changed()
         return had
@@ -144,39 +163,41 @@ class Wishes:
             self._ask(now, Renew(serial, part.ljust(management.RENEW_MAX, b"\0")))
 
     def granted(self, now: int, periodic: Periodic, grant: Grant) -> None:
-        """The master answered. Only the answer to the last request counts: it says from when the lease runs."""
-        serial, asked = self._asked.get(periodic.high, (None, 0))
-        if serial != grant.serial or grant.fragments != periodic.fragments or grant.period <= grant.fragments:
+        """The master answered, be it late: the lease runs from the request on that it answers."""
+        asked = self._asked.get(periodic.high, {}).get(grant.serial)
+        if asked is None or grant.fragments != periodic.fragments or grant.period <= grant.fragments:
+            return
+        if periodic.active:
+            self._confirm(periodic, asked, grant.lease_ms)
             return
         periodic.reservation = Reservation(periodic.message, grant.period, grant.phase, grant.fragments)
         self._refused.pop(periodic.high, None)
         self._timers.clear(("ask", periodic.high))
-        self._timers.set(("lease", periodic.high), asked + grant.lease_ms * 1_000_000)
+        self._confirm(periodic, asked, grant.lease_ms)
         if "renew" not in self._timers:
             self._timers.set("renew", now + _RENEWAL)
-        if not periodic.active:
-            periodic.active = True
-            periodic.restart()
-            periodic.from_cycle = max(grant.from_cycle, self._cycle.counter + 1)
-            self._agenda.changed()
-            interval = grant.period * self._cycle.timing.slot
-            self._out.append(Granted(periodic.high, grant.period, grant.phase, interval))
+        periodic.active = True
+        periodic.restart()
+        periodic.from_cycle = max(grant.from_cycle, self._cycle.counter + 1)
+        self._agenda.changed()
+        interval = grant.period * self._cycle.timing.slot
+        self._out.append(Granted(periodic.high, grant.period, grant.phase, interval))
 
     def renewed(self, now: int, answer: Renewed) -> None:
-        """The master answered. What it does not know any more has to be asked for anew."""
-        for high, (serial, asked) in list(self._asked.items()):
-            periodic = self._periodics.get(high)
-            if serial != answer.serial or periodic is None or not periodic.active:
+        """The master answered, be it late. What it does not know any more has to be asked for anew."""
+        for high, asked_at in list(self._asked.items()):
+            periodic, asked = self._periodics.get(high), asked_at.get(answer.serial)
+            if asked is None or periodic is None or not periodic.active:
                 continue
             if high in answer.highs:
-                self._timers.set(("lease", high), asked + answer.lease_ms * 1_000_000)
-            else:
+                self._confirm(periodic, asked, answer.lease_ms)
+            elif asked > self._confirmed.get(high, LONG_AGO):
                 self.suspend(periodic, "the master does not know of it")
                 self.want(now, periodic)
 
     def refused(self, now: int, periodic: Periodic, refuse: Refuse) -> None:
         """The master answered: no."""
-        if self._asked.get(periodic.high, (None, 0))[0] != refuse.serial:
+        if periodic.active or refuse.serial not in self._asked.get(periodic.high, {}):
             return
         try:
             reason = Reason(refuse.reason)
@@ -191,8 +212,9 @@ class Wishes:
             self._out.append(Refused(periodic.high, text))
 
     def lapse(self, periodic: Periodic, reason: str) -> None:
-        """Its slots are gone."""
+        """Its slots are gone. What was answered to earlier requests does not count any more."""
         periodic.reservation = None
+        self._asked.pop(periodic.high, None)
         self.suspend(periodic, reason)
 
     def suspend(self, periodic: Periodic, reason: str) -> None:
@@ -207,5 +229,12 @@ class Wishes:
     def _next_serial(self, now: int, *highs: int) -> int:
         self._serial = self._serial + 1 & 0xFF
         for high in highs:
-            self._asked[high] = (self._serial, now)
+            asked = {serial: at for serial, at in self._asked.get(high, {}).items() if now < at + LEASE}
+            self._asked[high] = asked | {self._serial: now}
         return self._serial
+
+    def _confirm(self, periodic: Periodic, asked: int, lease_ms: int) -> None:
+        """The lease runs on; answers may come out of order."""
+        if asked >= self._confirmed.get(periodic.high, LONG_AGO):
+            self._confirmed[periodic.high] = asked
+            self._timers.set(("lease", periodic.high), asked + lease_ms * 1_000_000)

@@ -15,6 +15,7 @@ from r2p.protocols.rtcan.census import Census
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.reassembly import Reassembly
 
+_SYNC = -1  # in place of a message id
 _EARLY = 8  # a frame that starts less than this part of a slot early belongs to the slot
 
 
@@ -110,7 +111,6 @@ class Monitor:
 
     def __init__(self, timing: Timing) -> None:
         self.census = Census(timing)
-        self.slots: list[BusSlot] = []
         self.cycles = 0
         """Whole cycles watched since the last `reset`."""
         self._reassembly = Reassembly()
@@ -128,7 +128,11 @@ class Monitor:
         self._reserved = 0
         self._nrt: int | None = None
         self._nrt_gap: int | None = None
-        self.slots = []
+        self._forget_slots()
+
+    def _forget_slots(self) -> None:
+        self._slots: list[BusSlot] = []
+        self._owners: list[Counter[int]] = []  # by message id; names may be learnt later
         self.cycles = 0
         self._whole = False
 
@@ -167,6 +171,15 @@ class Monitor:
             text,
         )
 
+    @property
+    def slots(self) -> list[BusSlot]:
+        """The use of each slot since the last `reset`, with the names that are known by now."""
+        for slot, owners in zip(self._slots, self._owners, strict=True):
+            slot.owners = Counter()
+            for message, count in owners.items():
+                slot.owners["sync" if message == _SYNC else self.census.topic(message)] += count
+        return self._slots
+
     def load(self, now: int) -> BusLoad:
         """What was carried since the last `reset`."""
         gap = self._nrt_gap
@@ -199,7 +212,7 @@ class Monitor:
         """The cycle that ends was watched from its beginning."""
         self.cycles += 1
         self._grow(self._mask.bit_length() - 1)
-        for index, slot in enumerate(self.slots):
+        for index, slot in enumerate(self._slots):
             if self._mask >> index & 1:
                 slot.reserved += 1
                 slot.used += index in self._filled
@@ -219,16 +232,16 @@ class Monitor:
 
     def _note_slot(self, index: int, message: int, kind: FrameKind) -> None:
         self._grow(index)
-        slot = self.slots[index]
         if kind in {FrameKind.SYNC, FrameKind.HRT}:
             self._filled.add(index)
-            slot.owners["sync" if kind is FrameKind.SYNC else self.census.topic(message)] += 1
+            self._owners[index][_SYNC if kind is FrameKind.SYNC else message] += 1
         else:
-            slot.shared += 1
+            self._slots[index].shared += 1
 
     def _grow(self, index: int) -> None:
-        while len(self.slots) <= max(index, self.census.timing.slots - 1):
-            self.slots.append(BusSlot())
+        while len(self._slots) <= max(index, self.census.timing.slots - 1):
+            self._slots.append(BusSlot())
+            self._owners.append(Counter())
 
     def _note_nrt(self, stamp: int) -> None:
         since = self._since if self._nrt is None else self._nrt
@@ -238,7 +251,13 @@ class Monitor:
     def _hear(self, frame: Frame, message: int, stamp: int) -> str:
         self._reassembly.subscribe(message, management.SIZE)
         received = self._reassembly.receive(frame, stamp)
-        return "" if received is None else self.census.learn(received.payload, rtcan.id8_of(message))
+        if received is None:
+            return ""
+        before = self.census.timing
+        text = self.census.learn(received.payload, rtcan.id8_of(message))
+        if self.census.timing != before:
+            self._forget_slots()
+        return text
 
     def _kind(self, frame: Frame, message: int) -> FrameKind:
         if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX:

@@ -1,8 +1,7 @@
 """The periodic messages of this node, and its local calendar: what to do in which slot of a cycle.
 
 Where a message owns slots, they are its clock: `lead` before the first one of each occurrence its data are asked for,
-then each fragment has its slot. Everything lies on slot boundaries; so a cycle is a set of bits, of which the next one
-says when to wake up.
+then each fragment has its slot. Everything lies on slot boundaries, so to wake up in time is to know the next slot.
 """
 
 from collections.abc import Hashable, Iterable
@@ -10,7 +9,7 @@ from collections.abc import Hashable, Iterable
 import msgspec
 
 from r2p.protocols.rtcan.calendar import Reservation, occupied
-from r2p.protocols.rtcan.cycle import Timing
+from r2p.protocols.rtcan.cycle import Timing, following
 
 
 class Periodic(msgspec.Struct, eq=False):
@@ -49,15 +48,15 @@ class Periodic(msgspec.Struct, eq=False):
 
 
 class Agenda:
-    """What to do in the slots of one cycle: `fills` asks for data, `sends` has a message and its fragment.
-
-    Bit i of `bits` says that there is something in slot i. Slot 0 of the next cycle counts as the last one of this.
+    """What to do in the slots of one cycle. `fills`: messages whose data are wanted now, and how many slots ahead of
+    theirs. `sends`: a message, its fragment, and whether its data are wanted only now. `next` has for each slot the
+    first one behind it with something to do. Slot 0 of the next cycle counts as the last one of this.
     """
 
     def __init__(self, timing: Timing) -> None:
-        self.bits = 0
-        self.sends: dict[int, tuple[Periodic, int]] = {}
-        self.fills: dict[int, list[Periodic]] = {}
+        self.next = following((), timing.slots)
+        self.sends: dict[int, tuple[Periodic, int, bool]] = {}
+        self.fills: dict[int, list[tuple[Periodic, int]]] = {}
         self._timing = timing
         self._stale = True
 
@@ -77,24 +76,20 @@ class Agenda:
                 self._enter(cycle, each, each.reservation)
                 longer = each.reservation.period > self._timing.slots
                 self._stale = self._stale or longer or each.from_cycle > cycle
-        self.bits = sum(1 << slot for slot in self.sends.keys() | self.fills.keys())
-
-    def lead_slots(self, each: Periodic) -> int:
-        """Slots from where the data are wanted to the slot; 0: in the slot itself."""
-        assert each.reservation is not None
-        return min(-(-each.lead // self._timing.slot), each.reservation.period - each.fragments)
+        self.next = following(self.sends.keys() | self.fills.keys(), self._timing.slots)
 
     def _enter(self, cycle: int, each: Periodic, reservation: Reservation) -> None:
         slots = self._timing.slots
-        lead = self.lead_slots(each)
+        lead = min(-(-each.lead // self._timing.slot), reservation.period - each.fragments)
         start = cycle * slots
         if cycle >= each.from_cycle:
             for slot in _set_bits(occupied(reservation, start, slots)):
-                self.sends[slot] = each, (start + slot - reservation.phase) % reservation.period
+                fragment = (start + slot - reservation.phase) % reservation.period
+                self.sends[slot] = each, fragment, not lead and not fragment
         if lead:
             first = reservation.first_from(max(start + 1 + lead, each.from_cycle * slots))
             for number in range(first, start + slots + lead + 1, reservation.period):
-                self.fills.setdefault(number - lead - start, []).append(each)
+                self.fills.setdefault(number - lead - start, []).append((each, lead))
 
 
 def _set_bits(bits: int) -> Iterable[int]:

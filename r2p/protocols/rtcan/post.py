@@ -22,13 +22,21 @@ class Sync(msgspec.Struct, frozen=True):
     """Stands for the sync frame in its mailbox."""
 
 
+class FirstSync(msgspec.Struct, frozen=True):
+    """Stands for the sync frame that makes a node the master: who is to be told what became of it, and when."""
+
+    done: Callable[[int, Outcome, int], None]
+
+
 class Gone(msgspec.Struct, frozen=True):
     """Stands for a frame whose message was discarded."""
 
 
+_HRT, _SRT, _NRT = Mailbox  # Python 3.11 takes its time to find a member of an enum
+_SENT, _UNKNOWN, _LOST = Outcome.SENT, Outcome.UNKNOWN, Outcome.LOST
 SYNC = Sync()
 GONE = Gone()
-Item = Outgoing | Periodic | Sync | Gone
+Item = Outgoing | Periodic | Sync | FirstSync | Gone
 
 
 class Post:
@@ -39,17 +47,13 @@ class Post:
 
     def __init__(self, queue: LaxityQueue, out: list[Action], counts: Counter[str], pause: Callable[[], int]) -> None:
         self.boxes: list[Item | None] = [None, None, None]
+        self.idle = True
+        """Whether no frame of the queue is with the port."""
         self._queue = queue
         self._out = out
         self._counts = counts
         self._pause = pause
         self._held = NEVER
-
-    @property
-    def idle(self) -> bool:
-        """Whether no frame of the queue is with the port."""
-        _, srt, nrt = self.boxes
-        return srt is None and nrt is None
 
     @property
     def due(self) -> int:
@@ -58,11 +62,24 @@ class Post:
     def put(self, item: Item, frame: Frame, mailbox: Mailbox, first: int, last: int) -> None:
         """Hand over a frame, to start between two instants."""
         self.boxes[mailbox] = item
+        self.idle = self.idle and mailbox is _HRT
         self._out.append(Transmit(frame, mailbox, first, last))
+
+    def take(self, mailbox: Mailbox) -> Item | None:
+        """The port has done with the frame in this mailbox: empty it, and return whose it was."""
+        boxes = self.boxes
+        item, boxes[mailbox] = boxes[mailbox], None
+        self.idle = boxes[_SRT] is None and boxes[_NRT] is None
+        return item
+
+    def reset(self) -> None:
+        """The port has lost all frames."""
+        self.boxes = [None, None, None]
+        self.idle = True
 
     def hand_over(self, message: Outgoing, frame: Frame, first: int, last: int) -> None:
         """Hand over a frame of the queue."""
-        self.put(message, frame, Mailbox.NRT if frame.id >> 23 == rtcan.NRT else Mailbox.SRT, first, last)
+        self.put(message, frame, _NRT if frame.id >> 23 == rtcan.NRT else _SRT, first, last)
 
     def fill(self, now: int) -> None:
         """Without slots: hand over one frame of each class."""
@@ -71,11 +88,11 @@ class Post:
         if not len(self._queue):
             return
         self.expire(now)
-        if self.boxes[Mailbox.SRT] is None:
+        if self.boxes[_SRT] is None:
             message = self._queue.best(now, nrt=False)
             if message is not None:
                 self.hand_over(message, self._queue.take(message, now), now, message.expiry)
-        if self.boxes[Mailbox.NRT] is None:
+        if self.boxes[_NRT] is None:
             message = self._queue.best_nrt(now)
             if message is not None:
                 self.hand_over(message, self._queue.take(message, now), now, NEVER)
@@ -83,12 +100,15 @@ class Post:
     def withdraw(self) -> None:
         """Take back what has not started."""
         for mailbox in Mailbox:
-            if self.boxes[mailbox] is not None:
+            item = self.boxes[mailbox]
+            if item is not None:
                 self._out.append(Withdraw(mailbox))
+            if isinstance(item, Outgoing):
+                item.recalled = True
 
     def discard(self) -> list[Outgoing]:
         """Forget everything that waits; it comes back."""
-        for mailbox in Mailbox.SRT, Mailbox.NRT:
+        for mailbox in _SRT, _NRT:
             if self.boxes[mailbox] is not None:
                 self.boxes[mailbox] = GONE
         return self._queue.clear()
@@ -100,18 +120,19 @@ class Post:
 
     def confirm(self, now: int, message: Outgoing, outcome: Outcome, at: int, *, slotted: bool) -> None:
         """The port says what became of a frame of the queue."""
-        if outcome is Outcome.SENT or outcome is Outcome.UNKNOWN:
-            message.unknown = message.unknown or outcome is Outcome.UNKNOWN
+        if outcome is _SENT or outcome is _UNKNOWN:
+            message.unknown = message.unknown or outcome is _UNKNOWN
             if self._queue.sent(message):
                 fate = Fate.UNKNOWN if message.unknown else Fate.SENT
                 self.report(message.handle, fate, missed=at > message.deadline, at=at)
         elif outcome is Outcome.ERROR:
             self._failed(now, message, at)
         else:
-            if outcome is Outcome.LOST:
+            if outcome is _LOST:
                 self._counts["arbitration lost"] += 1
-            elif slotted:
+            elif slotted and not message.recalled:
                 self._counts["late_to_slot"] += 1
+            message.recalled = False
             self._queue.put_back(message)
 
     def report(self, handle: Hashable, fate: Fate, *, missed: bool, at: int) -> None:

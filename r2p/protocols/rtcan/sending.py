@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import FRAME_MAX, INTERMISSION, Frame
-from r2p.protocols.rtcan.cycle import Cycle, State
+from r2p.protocols.rtcan.cycle import NO_SLOT, Cycle, State
 from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Action, Due, Fate, Mailbox, Outcome
 from r2p.protocols.rtcan.laxity import LaxityQueue, Outgoing
 from r2p.protocols.rtcan.periodic import Agenda, Periodic
-from r2p.protocols.rtcan.post import GONE, SYNC, Post
+from r2p.protocols.rtcan.post import GONE, SYNC, FirstSync, Post
 
 _CLOSE = 5  # bits between the hand-over and the last moment
 
@@ -25,6 +25,11 @@ class Mode(enum.Enum):
     SILENT = "silent"
     FREE = "without slots"
     SLOTTED = "in slots"
+
+
+_FREE, _SLOTTED = Mode.FREE, Mode.SLOTTED  # Python 3.11 takes its time to find a member of an enum
+_HRT = Mailbox.HRT
+_SENT, _UNKNOWN = Outcome.SENT, Outcome.UNKNOWN
 
 
 class Sender:
@@ -63,8 +68,9 @@ class Sender:
         self._done = 0
         self._tried = 0  # the last slot in which nothing more can be tried
         self._last = 0
-        self._all = (1 << self._timing.slots) - 1
         bit = self._timing.bit
+        # A try now would come too late for the slots before `now + ahead`; a coarse port may still try in that one.
+        self._ahead = latency - (self._timing.slot if coarse else bit)
         self._close = _CLOSE * bit
         self._longest = [(rtcan.frame_bits_max(size) + INTERMISSION) * bit for size in range(FRAME_MAX + 1)]  # ns
 
@@ -78,14 +84,14 @@ class Sender:
         """There is one less."""
         self._periodics.remove(periodic)
         self._agenda.changed()
-        if self._post.boxes[Mailbox.HRT] is periodic:
-            self._post.boxes[Mailbox.HRT] = GONE
+        if self._post.boxes[_HRT] is periodic:
+            self._post.boxes[_HRT] = GONE
 
     def enter(self, now: int, mode: Mode) -> None:
         """Use the bus in another way from now on."""
         if mode is self.mode:
             return
-        if mode is Mode.SILENT or self.mode is Mode.FREE:
+        if mode is Mode.SILENT or self.mode is _FREE:
             self._post.withdraw()
         self.mode = mode
         self.kick(now)
@@ -99,10 +105,10 @@ class Sender:
 
     def kick(self, now: int) -> None:
         """There may be something new to send."""
-        if self.mode is Mode.FREE:
+        if self.mode is _FREE:
             self._post.fill(now)
             self.due = self._post.due
-        elif self.mode is Mode.SLOTTED or self._cycle.running:
+        elif self.mode is _SLOTTED or self._cycle.running:
             self._plan(now)
         else:
             self.due = NEVER
@@ -111,10 +117,17 @@ class Sender:
         """The cycle begins with this sync frame."""
         start = self._cycle.reference
         last = start + self._timing.slot - self._longest[FRAME_MAX]
-        if now + self._latency > last or self._post.boxes[Mailbox.HRT] is not None:
+        if now + self._latency > last or self._post.boxes[_HRT] is not None:
             self._counts["syncs not sent"] += 1
             return
-        self._post.put(SYNC, frame, Mailbox.HRT, start, last)
+        self._post.put(SYNC, frame, _HRT, start, last)
+
+    def found(self, first: FirstSync, frame: Frame, start: int) -> bool:
+        """The first sync of a master. There are no slots yet: it may come late. False: an old frame is in the way."""
+        if self._post.boxes[Mailbox.HRT] is not None:
+            return False
+        self._post.put(first, frame, Mailbox.HRT, start, NEVER)
+        return True
 
     def fill(self, now: int, periodic: Periodic, payload: bytes | None) -> None:
         """The data of a periodic message that owns slots; None: nothing this time."""
@@ -127,13 +140,13 @@ class Sender:
 
     def reset(self) -> None:
         """The bus is gone, and all frames with it."""
-        self._post.boxes = [None, None, None]
+        self._post.reset()
         self.due = NEVER
 
     def poll(self, now: int) -> None:
         """The time has come for a slot, or for the next cycle."""
         while self.due <= now:
-            if self.mode is Mode.FREE:
+            if self.mode is _FREE:
                 self.kick(now)
                 return
             current = self._cycle.slot_at(now + self._latency)
@@ -146,19 +159,20 @@ class Sender:
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         """The port says what became of the frame in this mailbox, and when it was over."""
-        item = self._post.boxes[mailbox]
-        self._post.boxes[mailbox] = None
+        item = self._post.take(mailbox)
         if isinstance(item, Outgoing):
-            self._post.confirm(now, item, outcome, at, slotted=self.mode is Mode.SLOTTED)
-            if self.mode is not Mode.SLOTTED:
+            self._post.confirm(now, item, outcome, at, slotted=self.mode is _SLOTTED)
+            if self.mode is not _SLOTTED:
                 self.kick(now)
             elif self._queue.size:
                 self._plan(now)
         elif isinstance(item, Periodic):
             self._confirm_periodic(now, item, outcome, at)
         elif item is SYNC:
-            if outcome is not Outcome.SENT:
+            if outcome is not _SENT:
                 self._counts["syncs not sent"] += 1
+        elif isinstance(item, FirstSync):
+            item.done(now, outcome, at)
         elif item is GONE:
             self.kick(now)
         else:
@@ -169,41 +183,35 @@ class Sender:
     def _plan(self, now: int) -> None:
         """Wake up for the next slot where there is something to do, or to send something, or for the next cycle."""
         cycle, slot_length = self._cycle, self._timing.slot
-        bits = self._agenda.bits & -2 << self._done
-        mask = cycle.mask
-        if mask is not None and self._post.idle and self._queue.size and self.mode is Mode.SLOTTED:
-            ahead = now + self._latency - cycle.reference
-            # A try would come too late for the slots up to this one; a coarse port may still try in the present one.
-            over = ahead // slot_length - 1 if self._coarse else (ahead - self._timing.bit) // slot_length
-            bits |= ~mask & self._all & -2 << max(over, self._tried)
-        slot = (bits & -bits).bit_length() - 1
-        if not bits or slot > self._last:
+        slot = self._agenda.next[self._done]
+        if self._queue.size and self._post.idle and self.mode is _SLOTTED:
+            over = max((now + self._ahead - cycle.reference) // slot_length, self._tried)
+            if over < self._timing.slots and cycle.next_free[over] < slot:
+                slot = cycle.next_free[over]
+        if slot > self._last:
             slot = self._last
         self.due = cycle.reference + slot * slot_length - self._latency
 
     def _run(self, now: int, upto: int, current: int) -> None:
         """Do what is to be done in the slots up to one; it is slot `current` now."""
-        bits = self._agenda.bits & -2 << self._done & (2 << upto) - 1 if self.mode is Mode.SLOTTED else 0
+        slot = self._agenda.next[self._done] if self.mode is _SLOTTED else NO_SLOT
         self._done = upto
-        while bits:
-            slot = (bits & -bits).bit_length() - 1
-            bits &= bits - 1
-            for periodic in self._agenda.fills.get(slot, ()):
+        while slot <= upto:
+            for periodic, lead in self._agenda.fills.get(slot, ()):
                 if periodic.active:
-                    self._ask(now, periodic, slot + self._agenda.lead_slots(periodic))
-            if slot in self._agenda.sends:
-                periodic, fragment = self._agenda.sends[slot]
-                if periodic.active:
-                    self._periodic_slot(now, periodic, fragment, slot, current)
+                    self._ask(now, periodic, slot + lead)
+            send = self._agenda.sends.get(slot)
+            if send is not None and send[0].active:
+                self._periodic_slot(now, *send, slot, current)
+            slot = self._agenda.next[slot]
         if not self._coarse:
             self._tried = upto
-        if self._queue.size and current == upto and self.mode is Mode.SLOTTED:
+        if self._queue.size and current == upto and self.mode is _SLOTTED:
             self._try(now, current)
 
     def _try(self, now: int, slot: int) -> None:
         """In a free slot: try the message of the least laxity."""
-        mask = self._cycle.mask
-        if mask is None or not self._post.idle or not 0 < slot < self._timing.slots or mask >> slot & 1:
+        if slot not in self._cycle.free or not self._post.idle:
             return
         self._post.expire(now)
         message = self._queue.best(now)
@@ -212,7 +220,7 @@ class Sender:
             return
         frame = self._queue.take(message, now)
         end = slot + 1
-        while self._coarse and end < self._timing.slots and not mask >> end & 1:
+        while self._coarse and end in self._cycle.free:
             end += 1
         start = self._cycle.start_of(slot)
         last = self._latest_start(now, frame, start + (end - slot) * self._timing.slot)
@@ -240,13 +248,13 @@ class Sender:
         if periodic.restart():
             self._abandon(now, periodic, "not sent in time")
         for message in self._queue.withdraw(periodic.message):  # from the time before it had slots
-            self._post.report(message.handle, Fate.OVERDUE, missed=True, at=now)
+            self._post.report(message.handle, Fate.REPLACED, missed=False, at=now)
         self._out.append(Due(periodic.high, self._cycle.start_of(slot), True))
 
-    def _periodic_slot(self, now: int, periodic: Periodic, fragment: int, slot: int, current: int) -> None:
+    def _periodic_slot(self, now: int, periodic: Periodic, fragment: int, asks: bool, slot: int, current: int) -> None:
         if self._queue.waits(periodic.message):  # its frames and ours would mix
             self._counts["slots without data"] += fragment == 0
-        elif fragment == 0 and not self._agenda.lead_slots(periodic):
+        elif asks:
             self._ask(now, periodic, slot)
             periodic.waiting = self._cycle.number_of(slot)
         elif periodic.payload is not None and periodic.sent == fragment:
@@ -265,13 +273,13 @@ class Sender:
         last = self._exact_latest_start(frame, start + self._timing.slot) if slot == current else LONG_AGO
         if mask is not None and not mask >> slot & 1:
             self._abandon(now, periodic, "not in the mask")
-        elif self._post.boxes[Mailbox.HRT] is not None:
+        elif self._post.boxes[_HRT] is not None:
             self._abandon(now, periodic, "mailbox full")
         elif now + self._latency > last:
             self._counts["late_to_slot"] += 1
             self._abandon(now, periodic, "too late for the slot")
         else:
-            self._post.put(periodic, frame, Mailbox.HRT, start, last)
+            self._post.put(periodic, frame, _HRT, start, last)
 
     def _abandon(self, now: int, periodic: Periodic, reason: str) -> None:
         periodic.restart()
@@ -281,10 +289,10 @@ class Sender:
     def _confirm_periodic(self, now: int, periodic: Periodic, outcome: Outcome, at: int) -> None:
         if periodic.payload is None:
             return  # abandoned meanwhile
-        if outcome not in (Outcome.SENT, Outcome.UNKNOWN):
+        if outcome is not _SENT and outcome is not _UNKNOWN:
             self._abandon(now, periodic, outcome.value)
             return
-        periodic.unknown = periodic.unknown or outcome is Outcome.UNKNOWN
+        periodic.unknown = periodic.unknown or outcome is _UNKNOWN
         periodic.sent += 1
         if periodic.sent == periodic.fragments:
             fate = Fate.UNKNOWN if periodic.unknown else Fate.SENT

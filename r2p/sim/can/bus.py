@@ -10,9 +10,12 @@ from __future__ import annotations
 import random
 from typing import TYPE_CHECKING, Final
 
+import msgspec
+
 from r2p.codecs.rtcan import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
-from r2p.sim.can.controller import CanController, Request
+from r2p.sim.can.controller import CanController
 from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
+from r2p.sim.can.listeners import Listeners
 from r2p.sim.can.node import NEVER, CanNode, ErrorKind, Record, State
 from r2p.sim.can.recovery import Recovery
 from r2p.sim.can.statistics import Statistics
@@ -22,26 +25,24 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Sequence
 
+    from r2p.codecs.rtcan import Frame
+    from r2p.sim.can.mailboxes import Mailboxes, Request
+
 _SECOND: Final = 1_000_000_000
 _SUSPEND: Final = 8  # bits that an error passive sender waits longer
 _AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge
 
 
-class _Transfer:
+class _Transfer(msgspec.Struct, eq=False):
     """A frame on the wire: its senders, who receives it, and whether an error frame will end it."""
 
-    __slots__ = ("bits", "doomed", "frame", "heard_by", "names", "requests", "start")
-
-    def __init__(
-        self, requests: list[Request], names: tuple[str, ...], heard_by: Sequence[CanController], start: int
-    ) -> None:
-        self.frame = frame = requests[0].frame
-        self.requests = requests
-        self.names = names
-        self.heard_by = heard_by
-        self.start = start
-        self.bits = frame_bits(frame.id, frame.data)
-        self.doomed = False
+    frame: Frame
+    requests: list[Request]
+    names: tuple[str, ...]
+    heard_by: Sequence[CanController]
+    start: int
+    bits: int
+    doomed: bool = False
 
     @property
     def owners(self) -> list[CanController]:
@@ -73,11 +74,11 @@ class CanBus:
         self._seed = seed
         self._numbers = random.Random(f"{seed}")
         self._names: set[str] = set()
-        self._live: list[CanController] = []
-        self._others: dict[CanController, list[CanController]] = {}
+        self._listeners = Listeners()
         self._noisy = False  # whether a node has noise of its own
         self._disturb: list[int] = []
         self._free = 0  # from when on a frame may start
+        self._contenders: dict[Mailboxes, None] = {}  # may have something to send; nobody else has
         self._start: int | None = None  # when the next one does
         self._plan = 0  # the number of that plan: it can change until the window is over
         self._transfer: _Transfer | None = None
@@ -114,9 +115,15 @@ class CanBus:
 
     def contend(self, request: Request) -> bool:
         """Try this frame as soon as the bus is free. False: it is not, or this frame would come too late."""
+        boxes = request.owner.mailboxes
+        self._contenders[boxes] = None
         if self._busy:
             return False
-        start = max(request.ready, self._free, request.owner.not_before)
+        start = self._free
+        if start < request.ready:
+            start = request.ready
+        if start < boxes.not_before:
+            start = boxes.not_before
         if start > request.last:
             return False
         if self._start is None or start < self._start:
@@ -128,7 +135,7 @@ class CanBus:
         start = self._start
         if start is None or self.timeline.now() < max(start, request.ready):
             return False
-        return request.owner.choose(start, start + self.bit) is request
+        return request.owner.mailboxes.choose(start, start + self.bit) is request
 
     def withdrawn(self) -> None:
         """A frame is not to be sent any more."""
@@ -137,9 +144,7 @@ class CanBus:
 
     def left(self, controller: CanController) -> None:
         """A controller takes no part any more: no power, or bus-off."""
-        if controller in self._live:
-            self._live.remove(controller)
-            self._others.clear()
+        self._listeners.leave(controller)
         if controller.state is State.DOWN:
             self._recovery.forget(controller)
         if self._transfer:
@@ -148,8 +153,11 @@ class CanBus:
 
     def joined(self, controller: CanController) -> None:
         """A controller takes part again."""
-        self._live.append(controller)
-        self._others.clear()
+        self._listeners.join(controller)
+
+    def reconsider(self) -> None:
+        """Other frames than before may concern a controller."""
+        self._listeners.reconsider()
 
     def recover(self, controller: CanController) -> None:
         """A controller wants to leave bus-off."""
@@ -166,41 +174,39 @@ class CanBus:
         self._start = None
         self._plan += 1
         free, start = self._free, NEVER
-        for controller in self._live:
-            if controller.boxes and (first := controller.first(free)) < start:
+        for boxes in list(self._contenders):
+            if not boxes.requests:
+                del self._contenders[boxes]
+            elif (first := boxes.first(free)) < start:
                 start = first
         if start < NEVER:
             self._plan_start(start)
 
     def _arbitrate(self, plan: int) -> None:
-        if plan != self._plan or self._start is None:
+        start = self._start
+        if plan != self._plan or start is None:
             return
-        start, self._start = self._start, None
+        self._start = None
         self._busy = True
         if self._recovery.left:
             self._recovery.busy(start)
         tries = self._tries(start, start + self.bit)
         if len(tries) > 1:
             tries = self._winners(tries, start)
-        if len(tries) > 1 and any(request.frame != tries[0].frame for request in tries):
-            self._collide(tries, start)
-        else:
-            self._send(tries, start)
+            if any(request.frame != tries[0].frame for request in tries):
+                self._collide(tries, start)
+                return
+        self._send(tries, start)
 
     def _tries(self, start: int, end: int) -> list[Request]:
         """What takes part; `end` is one bit after the start of frame."""
         tries = []
-        for node in self._live:
-            boxes = node.boxes
-            if not boxes:
-                continue
-            request = node.choose(start, end)
-            if request is None:
-                node.passed(None)
-                continue
-            tries.append(request)
-            if len(boxes) > 1:
-                node.passed(request)
+        for boxes in self._contenders:
+            request = boxes.choose(start, end)
+            if request is not None:
+                tries.append(request)
+            if request is None or len(boxes.requests) > 1:
+                boxes.passed(request)
         return tries
 
     def _winners(self, tries: list[Request], start: int) -> list[Request]:
@@ -231,17 +237,14 @@ class CanBus:
             self._destroy(transfer, wire_bits(transfer.frame)[:-_AFTER_ACK], ErrorKind.ACK, transfer.owners)
 
     def _transfer_of(self, requests: list[Request], start: int, deaf: Sequence[CanController]) -> _Transfer:
-        first = requests[0].owner
+        frame, owner = requests[0].frame, requests[0].owner
         if len(requests) == 1 and not deaf:
-            return _Transfer(requests, (first.name,), self._others.get(first) or self._others_of(first), start)
-        owners = [request.owner for request in requests]
-        heard_by = [node for node in self._live if node not in owners and node not in deaf]
-        return _Transfer(requests, tuple([owner.name for owner in owners]), heard_by, start)
-
-    def _others_of(self, node: CanController) -> list[CanController]:
-        """All that hear what this one sends."""
-        self._others[node] = others = [each for each in self._live if each is not node]
-        return others
+            names, heard_by = self._listeners.audience(owner)
+        else:
+            owners = [request.owner for request in requests]
+            names = tuple([owner.name for owner in owners])
+            heard_by = [node for node in self._listeners.live if node not in owners and node not in deaf]
+        return _Transfer(frame, requests, names, heard_by, start, frame_bits(frame.id, frame.data))
 
     def _finish(self, transfer: _Transfer, end: int) -> None:
         if transfer.doomed:
@@ -249,8 +252,9 @@ class CanBus:
         frame = transfer.frame
         for request in transfer.requests:
             request.owner.sent(request, end)
-        for node in transfer.heard_by:
-            node.arrived(frame, end)
+        for node in self._listeners.concerned(frame.id):
+            if node in transfer.heard_by:
+                node.arrived(frame, end)
         self._over(transfer, transfer.bits, None, end)
 
     def _over(self, transfer: _Transfer, bits: int, error: ErrorKind | None, end: int) -> None:
@@ -260,8 +264,8 @@ class CanBus:
         self._busy = False
         self._free = end + INTERMISSION * self.bit
         for request in transfer.requests:
-            if request.owner.state is State.PASSIVE:
-                request.owner.not_before = self._free + _SUSPEND * self.bit
+            if request.owner.confinement.passive:
+                request.owner.mailboxes.not_before = self._free + _SUSPEND * self.bit
         if self._recovery.left:
             self._recovery.free(self._free)
         self._plan_anew()

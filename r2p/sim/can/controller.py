@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from r2p.codecs.rtcan import FRAME_MAX
 from r2p.errors import MessageError
+from r2p.sim.can.confinement import Confinement
+from r2p.sim.can.interrupts import Interrupts, ignore
+from r2p.sim.can.mailboxes import BABBLE, Mailboxes, Request
 from r2p.sim.can.node import NEVER, ErrorKind, LocalAlarm, LocalClock, State
 from r2p.sim.can.recovery import RECESSIVE
 
@@ -16,31 +19,6 @@ if TYPE_CHECKING:
     from r2p.codecs.rtcan import Frame
     from r2p.sim.can.node import CanNode
     from r2p.sim.can.timeline import Timeline, Timer
-
-_PASSIVE: Final = 127
-_OFF: Final = 255
-_RECEIVED_WELL: Final = 119  # what the receive error counter goes back to from above 127
-_REMEMBERED: Final = 4096  # identifiers of which it is known whether the filters let them through
-_BABBLE: Final = -1  # the mailbox of a node that has gone mad
-
-
-class Request:
-    """A frame in a mailbox.
-
-    `ready`: from when on the controller tries it; `last`: until when it may start; `held`: until when it is on the
-    wire. `guarded`: it will be aborted at `last`, unless it is on the wire.
-    """
-
-    __slots__ = ("frame", "guarded", "held", "last", "mailbox", "owner", "ready")
-
-    def __init__(self, owner: CanController, frame: Frame, mailbox: int, ready: int, last: int) -> None:
-        self.owner = owner
-        self.frame = frame
-        self.mailbox = mailbox
-        self.ready = ready
-        self.last = last
-        self.held = 0
-        self.guarded = False
 
 
 class Wire(Protocol):
@@ -60,6 +38,9 @@ class Wire(Protocol):
     def withdrawn(self) -> None:
         """A frame is not to be sent any more."""
 
+    def reconsider(self) -> None:
+        """Other frames than before may concern a controller."""
+
     def left(self, controller: CanController) -> None:
         """A controller takes no part any more: no power, or bus-off."""
 
@@ -77,38 +58,39 @@ class CanController:
         self.name = node.name
         self.node = node
         self.clock = LocalClock(bus.timeline, node.offset, node.drift_ppm)
-        self.state = State.ACTIVE
-        self.transmit_errors = 0  # the controller's two counters
-        self.receive_errors = 0
         self.missed = 0  # frames that the software lost (`CanNode.loss`, `lose_next`)
-        self.on_receive: Callable[[Frame, int], object] = _ignore
+        self.on_receive: Callable[[Frame, int], object] = ignore
         """A frame of another node has arrived."""
-        self.on_sent: Callable[[Frame, int], object] = _ignore
+        self.on_sent: Callable[[Frame, int], object] = ignore
         """A frame that was requested here has been acknowledged."""
-        self.on_lost: Callable[[Frame, int], object] = _ignore
+        self.on_lost: Callable[[Frame, int], object] = ignore
         """One-shot: a frame has lost arbitration, and leaves its mailbox now."""
-        self.on_error: Callable[[Frame, ErrorKind, int], object] = _ignore
+        self.on_error: Callable[[Frame, ErrorKind, int], object] = ignore
         """A frame has left its mailbox because of an error: one-shot, or bus-off."""
-        self.on_late: Callable[[Frame, int], object] = _ignore
+        self.on_late: Callable[[Frame, int], object] = ignore
         """A frame has not started by its `not_after`, and left its mailbox: nobody has seen it."""
-        self.on_state: Callable[[State, int], object] = _ignore
+        self.on_state: Callable[[State, int], object] = ignore
         """`state` has changed."""
         self.numbers = random.Random(f"{seed}/{node.name}")
-        self.boxes: dict[int, Request] = {}  # for the bus, as is the next one
-        self.not_before = 0  # no start of frame here earlier than this
-        self._ahead = node.transmit.nominal
-        self._mailboxes = node.mailboxes
+        self.mailboxes = Mailboxes(self._guard)  # for the bus, as is the next one
+        self.confinement = Confinement(self._changed)
         self._transmit_delay = node.transmit.drawer(self.numbers)
-        self._receive_delay = node.receive.drawer(self.numbers)
+        self._interrupts = Interrupts(bus.timeline, self.clock, node.receive.drawer(self.numbers))
         self._bus = bus
         self._timeline = bus.timeline
         self._filters: Sequence[tuple[int, int]] = ()
-        self._wanted: dict[int, bool] = {}
-        self._loss = node.loss
         self._lose_next = 0
         self._mad: Frame | None = None
-        self._life = 0  # counts deaths: what it was about to hear is not heard any more
-        self._heard = 0  # when its software hears the last thing so far: it hears them in order
+
+    @property
+    def state(self) -> State:
+        """Whether it takes part, and how far it trusts itself."""
+        return self.confinement.state
+
+    @property
+    def live(self) -> bool:
+        """Whether it takes part: neither down nor in bus-off."""
+        return self.confinement.live
 
     # What software does
 
@@ -123,13 +105,13 @@ class CanController:
 
         Raises IndexError for a mailbox that the controller does not have, and `MessageError` for what is no frame.
         """
-        if not 0 <= mailbox < self._mailboxes:
-            raise IndexError(f"{self.name} has {self._mailboxes} mailboxes: there is no mailbox {mailbox}")
-        if mailbox in self.boxes or self.state is State.BUS_OFF or self.state is State.DOWN:
+        if not 0 <= mailbox < self.node.mailboxes:
+            raise IndexError(f"{self.name} has {self.node.mailboxes} mailboxes: there is no mailbox {mailbox}")
+        if mailbox in self.mailboxes.requests or not self.confinement.live:
             return False
         given = self._timeline.now()
         if not_before is not None:
-            ahead = self.clock.true(not_before) - self._ahead
+            ahead = self.clock.true(not_before) - self.node.transmit.nominal
             if ahead > given:
                 given = ahead
         last = NEVER if not_after is None else self.clock.true(not_after + 1) - 1
@@ -138,16 +120,12 @@ class CanController:
 
     def abort(self, mailbox: int = 0) -> bool:
         """Withdraw the frame of this mailbox. False: its start of frame has begun, or there is none."""
-        request = self.boxes.get(mailbox)
-        if request is None or self._timeline.now() < request.held or self._bus.trying(request):
-            return False
-        del self.boxes[mailbox]
-        self._bus.withdrawn()
-        return True
+        request = self.mailboxes.requests.get(mailbox)
+        return request is not None and self._withdraw(request)
 
     def pending(self, mailbox: int = 0) -> Frame | None:
         """The frame in this mailbox."""
-        request = self.boxes.get(mailbox)
+        request = self.mailboxes.requests.get(mailbox)
         return request.frame if request else None
 
     @property
@@ -158,7 +136,7 @@ class CanController:
     @filters.setter
     def filters(self, filters: Sequence[tuple[int, int]]) -> None:
         self._filters = filters
-        self._wanted.clear()
+        self._bus.reconsider()
 
     def call_at(self, local: int, callback: Callable[..., object], *args: Any) -> Timer:
         """Call it when this node's clock shows `local` ns: a timer interrupt, without latency."""
@@ -178,7 +156,7 @@ class CanController:
     def babble(self, frame: Frame | None) -> None:
         """Go mad: send this frame over and over, whatever happens. None: be well again."""
         self._mad = frame
-        self.boxes.pop(_BABBLE, None)
+        self.mailboxes.requests.pop(BABBLE, None)
         self._bus.withdrawn()
         self._babble()
 
@@ -190,110 +168,71 @@ class CanController:
         """Die, in the middle of a frame if need be. Nothing is called back; the mailboxes are lost."""
         if self.state is State.DOWN:
             return
-        self.state = State.DOWN
+        self.confinement.enter(State.DOWN)
         self._mad = None
-        self._life += 1
-        self.boxes.clear()
+        self._interrupts.forget()
+        self.mailboxes.clear()
         self._bus.left(self)
 
     def power_on(self) -> None:
         """Come back, as new: sends nothing before it has seen 11 recessive bits."""
         if self.state is State.DOWN:
-            self.not_before = self._timeline.now() + RECESSIVE * self._bus.bit
+            self.mailboxes.not_before = self._timeline.now() + RECESSIVE * self._bus.bit
             self.restarted()
-
-    @property
-    def live(self) -> bool:
-        """Whether it takes part: neither down nor in bus-off."""
-        return self.state is State.ACTIVE or self.state is State.PASSIVE
 
     # What the bus tells it
 
-    def choose(self, start: int, end: int) -> Request | None:
-        """The frame that this controller tries when a start of frame comes at `start`; `end` is one bit later.
-
-        Of those ready by then the one with the lowest identifier, else the first that gets ready before `end`.
-        """
-        chosen = None
-        not_before = max(start, self.not_before)
-        for request in self.boxes.values():
-            begins = request.ready
-            if begins < not_before:
-                begins = not_before
-            if begins > request.last:
-                continue
-            if begins < end or (begins == end and chosen is not None and request.frame.id < chosen.frame.id):
-                chosen, end = request, begins
-        return chosen
-
-    def first(self, free: int) -> int:
-        """When this controller wants to start a frame, given when the bus is free. NEVER: not at all."""
-        earliest = NEVER
-        not_before = max(free, self.not_before)
-        for request in self.boxes.values():
-            begins = request.ready
-            if begins < not_before:
-                begins = not_before
-            if begins > request.last:
-                self._guard(request)
-            elif begins < earliest:
-                earliest = begins
-        return earliest
-
-    def passed(self, chosen: Request | None) -> None:
-        """A frame has started, and of this controller at most this one takes part: watch the others' last instants."""
-        for request in self.boxes.values():
-            if request.last < NEVER and request is not chosen:
-                self._guard(request)
+    def concerned(self, identifier: int) -> bool:
+        """Whether a good frame of another node matters here: it may be wanted, or make up for an error."""
+        return self.confinement.receive > 0 or self._wants(identifier)
 
     def arrived(self, frame: Frame, end: int) -> None:
-        """A good frame of another node ended."""
-        if self.receive_errors:
-            self._count(receive=-1 if self.receive_errors <= _PASSIVE else _RECEIVED_WELL - self.receive_errors)
-        if self._filters:
-            wanted = self._wanted.get(frame.id)
-            if wanted is False or (wanted is None and not self._passes(frame.id)):
+        """A good frame of another node ended, which concerns this one."""
+        if self.confinement.receive:
+            self.confinement.received()
+            self._bus.reconsider()
+            if not self._wants(frame.id):
                 return
         if self._lose_next:
             self._lose_next -= 1
             self.missed += 1
-        elif self._loss and self.numbers.random() < self._loss:
+        elif self.node.loss and self.numbers.random() < self.node.loss:
             self.missed += 1
         else:
-            self._tell(end, self.on_receive, frame)
+            self._interrupts.tell(end, self.on_receive, frame)
 
     def sent(self, request: Request, end: int) -> None:
         """This request's frame got through."""
-        if self.transmit_errors:
-            self._count(transmit=-1)
-        if self._free(request):
-            self._tell(end, self.on_sent, request.frame)
+        if self.confinement.transmit:
+            self.confinement.transmitted()
+        if self.mailboxes.remove(request):
+            self._interrupts.tell(end, self.on_sent, request.frame)
 
     def outdone(self, request: Request, at: int) -> None:
         """This request's frame loses arbitration, at this instant."""
         request.held = at
-        if self.node.one_shot and request.mailbox != _BABBLE:
+        if self.node.one_shot and request.mailbox != BABBLE:
             request.ready = NEVER
-            self._tell(at, self._lost, request)
+            self._interrupts.tell(at, self._lost, request)
         elif request.last < NEVER:
             self._guard(request)
 
     def failed(self, request: Request, kind: ErrorKind, at: int) -> None:
         """This request's frame was destroyed: an error frame begins."""
-        alone = kind is ErrorKind.ACK and self.state is State.PASSIVE
+        alone = kind is ErrorKind.ACK and self.confinement.passive
         if not alone:  # or a lone node would go to bus-off
-            self._count(transmit=8)
-        if self.node.one_shot and self._free(request):
-            self._tell(at, self.on_error, request.frame, kind)
+            self.confinement.failed(transmit=8)
+        if self.node.one_shot and self.mailboxes.remove(request):
+            self._interrupts.tell(at, self.on_error, request.frame, kind)
 
     def disturbed(self, count: int) -> None:
         """A frame that this node was receiving was destroyed."""
-        self._count(receive=count)
+        self.confinement.failed(receive=count)
+        self._bus.reconsider()
 
     def restarted(self) -> None:
         """It takes part again, with its error counters at 0."""
-        self.transmit_errors = self.receive_errors = 0
-        self._enter(State.ACTIVE)
+        self.confinement.restart()
         self._bus.joined(self)
         self._babble()
 
@@ -302,85 +241,48 @@ class CanController:
     def _put(self, frame: Frame, mailbox: int, ready: int, last: int = NEVER) -> None:
         if frame.id >> 29 or len(frame.data) > FRAME_MAX:
             raise MessageError(f"identifier {frame.id:#x} with {len(frame.data)} bytes: no frame has room")
-        self.boxes[mailbox] = request = Request(self, frame, mailbox, ready, last)
+        self.mailboxes.requests[mailbox] = request = Request(self, frame, mailbox, ready, last)
         if not self._bus.contend(request) and last < NEVER:
             self._guard(request)
 
-    def _passes(self, identifier: int) -> bool:
-        """Whether the filters let it through."""
-        if len(self._wanted) >= _REMEMBERED:
-            self._wanted.clear()
-        self._wanted[identifier] = wanted = any(identifier & mask == value for value, mask in self._filters)
-        return wanted
+    def _wants(self, identifier: int) -> bool:
+        return not self._filters or any(identifier & mask == value for value, mask in self._filters)
 
     def _guard(self, request: Request) -> None:
         """Abort it at its last instant, if it still waits by then: its software is told, and only then looks."""
         if not request.guarded and request.ready < NEVER:
             request.guarded = True
-            heard = max(request.last, request.held, self._timeline.now()) + self._receive_delay()
-            self._timeline.at(heard, self._hear, heard, self._life, self._late, (request,))
+            self._interrupts.look(max(request.last, request.held, self._timeline.now()), self._late, request)
 
-    def _free(self, request: Request) -> bool:
-        """Empty its mailbox. False if it is no longer there; a babbling node never ends."""
-        if request.mailbox == _BABBLE or self.boxes.get(request.mailbox) is not request:
+    def _changed(self, state: State) -> None:
+        if state is State.DOWN:
+            return
+        now = self._timeline.now()
+        given_up = self.mailboxes.clear() if state is State.BUS_OFF else ()
+        self._interrupts.tell(now, self.on_state, state)
+        for frame in given_up:
+            self._interrupts.tell(now, self.on_error, frame, ErrorKind.BUS_OFF)
+        if state is State.BUS_OFF:
+            self._bus.left(self)
+            if self.node.recovery:
+                self._bus.recover(self)
+
+    def _withdraw(self, request: Request) -> bool:
+        """Empty its mailbox, unless it is on the wire or about to be."""
+        if self._timeline.now() < request.held or self._bus.trying(request) or not self.mailboxes.remove(request):
             return False
-        del self.boxes[request.mailbox]
+        self._bus.withdrawn()
         return True
 
-    def _count(self, transmit: int = 0, receive: int = 0) -> None:
-        self.transmit_errors = max(0, self.transmit_errors + transmit)
-        self.receive_errors = max(0, self.receive_errors + receive)
-        if self.transmit_errors > _OFF:
-            self._off()
-        elif max(self.transmit_errors, self.receive_errors) > _PASSIVE:
-            self._enter(State.PASSIVE)
-        else:
-            self._enter(State.ACTIVE)
-
-    def _off(self) -> None:
-        now = self._timeline.now()
-        given_up = [request.frame for request in self.boxes.values() if request.mailbox != _BABBLE]
-        self.boxes.clear()
-        self._enter(State.BUS_OFF)
-        for frame in given_up:
-            self._tell(now, self.on_error, frame, ErrorKind.BUS_OFF)
-        self._bus.left(self)
-        if self.node.recovery:
-            self._bus.recover(self)
-
-    def _enter(self, state: State) -> None:
-        if state is not self.state:
-            self.state = state
-            self._tell(self._timeline.now(), self.on_state, state)
-
     def _lost(self, request: Request, stamp: int) -> None:
-        if self._free(request):  # only now: one event less for each loss, and software can't know before
+        if self.mailboxes.remove(request):  # only now: one event less for each loss, and software can't know before
             self.on_lost(request.frame, stamp)
 
     def _late(self, request: Request, stamp: int) -> None:
         request.guarded = False  # if it has started, and is not sent, this comes again
-        if self._timeline.now() < request.held or self._bus.trying(request) or not self._free(request):
-            return
-        self._bus.withdrawn()
-        self.on_late(request.frame, stamp)
+        if self._withdraw(request):
+            self.on_late(request.frame, stamp)
 
     def _babble(self) -> None:
         if self._mad and self.live:
-            self._put(self._mad, _BABBLE, self._timeline.now())
-
-    def _tell(self, when: int, callback: Callable[..., object], *args: Any) -> None:
-        if callback is _ignore:
-            return
-        heard = when + self._receive_delay()
-        if heard < self._heard:
-            heard = self._heard
-        self._heard = heard
-        self._timeline.at(heard, self._hear, heard, self._life, callback, args)
-
-    def _hear(self, at: int, life: int, callback: Callable[..., object], args: tuple[Any, ...]) -> None:
-        if life == self._life:
-            callback(*args, self.clock.local(at))
-
-
-def _ignore(*_args: object) -> None:
-    pass
+            self._put(self._mad, BABBLE, self._timeline.now())

@@ -80,7 +80,7 @@ class CanNode(msgspec.Struct, frozen=True):
     recovery: bool = True
 
 
-class Record(msgspec.Struct, frozen=True):
+class Record(msgspec.Struct, frozen=True, gc=False):
     """What really happened: one frame, or an attempt at one.
 
     `start` and `end` are true time, in ns: start of frame, and end of frame or of the error frame; `bits` lie between
@@ -103,6 +103,7 @@ class LocalClock:
         self._timeline = timeline
         self._offset = offset
         self._drift = round(drift_ppm * 1000)  # ns a second
+        self._second = _BILLION + self._drift  # what it shows of a true one
 
     def monotonic(self) -> int:
         """What this clock shows now, in ns."""
@@ -121,7 +122,8 @@ class LocalClock:
 
     def true(self, local: int) -> int:
         """The first true instant at which this clock shows `local`, or more."""
-        return -((self._offset - local) * _BILLION // (_BILLION + self._drift))
+        since = local - self._offset
+        return since - since * self._drift // self._second
 
 
 class LocalAlarm:

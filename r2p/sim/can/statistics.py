@@ -23,6 +23,11 @@ class Count:
         self.error_bits = 0  # ... and the bits they took, error frame included
         self.lost = 0  # arbitrations lost
 
+    def add(self, other: Count) -> None:
+        """Count what the other one has counted."""
+        for name in self.__slots__:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
     @property
     def occupied(self) -> int:
         """Bit times that nobody else could use: everything, with the intermission that follows."""
@@ -34,28 +39,45 @@ class Statistics:
 
     def __init__(self, bit: int, since: int) -> None:
         """`bit` is the length of one, and `since` the instant from which the load counts, in ns."""
-        self.total = Count()
-        self.by_message: defaultdict[int, Count] = defaultdict(Count)
-        self.by_node: defaultdict[str, Count] = defaultdict(Count)
         self.since = since
         self._bit = bit
+        self._counts: defaultdict[tuple[int, tuple[str, ...]], Count] = defaultdict(Count)  # by message id and senders
+
+    @property
+    def total(self) -> Count:
+        total = Count()
+        for count in self._counts.values():
+            total.add(count)
+        return total
+
+    @property
+    def by_message(self) -> dict[int, Count]:
+        counts: defaultdict[int, Count] = defaultdict(Count)
+        for (message, _), count in self._counts.items():
+            counts[message].add(count)
+        return dict(counts)
+
+    @property
+    def by_node(self) -> dict[str, Count]:
+        counts: defaultdict[str, Count] = defaultdict(Count)
+        for (_, senders), count in self._counts.items():
+            for name in senders:
+                counts[name].add(count)
+        return dict(counts)
 
     def add(self, record: Record) -> None:
         """Count one attempt."""
-        bits, message = record.bits, record.frame.id >> 7 & 0xFFFF
-        for count in (self.total, self.by_message[message], *[self.by_node[name] for name in record.senders]):
-            if record.error is None:
-                count.frames += 1
-                count.bits += bits
-            else:
-                count.errors += 1
-                count.error_bits += bits
+        count = self._counts[record.frame.id >> 7 & 0xFFFF, record.senders]
+        if record.error is None:
+            count.frames += 1
+            count.bits += record.bits
+        else:
+            count.errors += 1
+            count.error_bits += record.bits
 
     def add_lost(self, name: str, identifier: int) -> None:
         """Count an arbitration that this node lost with this identifier."""
-        self.total.lost += 1
-        self.by_message[identifier >> 7 & 0xFFFF].lost += 1
-        self.by_node[name].lost += 1
+        self._counts[identifier >> 7 & 0xFFFF, (name,)].lost += 1
 
     def load(self, now: int) -> float:
         """The share of the time up to `now` in which the bus was occupied: 1.0 is saturated."""

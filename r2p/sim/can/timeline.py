@@ -48,7 +48,7 @@ class Timeline:
         self._heap: list[Event] = []
         self._number = 0
         self._alarm = Alarm(loop, self._run)
-        self._virtual = loop if isinstance(loop, VirtualLoop) else None
+        self._virtual = loop if isinstance(loop, VirtualLoop) and loop.clock.virtual else None
         self._running = False
         self._now = 0
         self.now: Callable[[], int] = self.clock.monotonic if self._virtual else self._present

@@ -13,8 +13,9 @@ SECOND = 1_000_000_000
 @contextlib.asynccontextmanager
 async def listen(via: list[str] | None) -> AsyncIterator[BusMonitor]:
     """Open the bus. Raises Usage when there is none, or more than one."""
-    urls = [url for url in settings(via, tool=True).via if url.startswith("rtcan:")]
+    given = settings(via, tool=True).via
+    urls = [url for url in given if url.startswith("rtcan:")]
     if len(urls) != 1:
-        raise Usage(f"give one CAN bus, as in --via rtcan:can0 (got {len(urls)})")
+        raise Usage(f"give one CAN bus, as in --via rtcan:can0 (not {' and '.join(urls or given) or 'none'})")
     async with BusMonitor(urls[0], on_news=say) as bus:
         yield bus

@@ -27,7 +27,7 @@ def _taken_apart(url: Url) -> tuple[Callable[[], CanPort], Options]:
     if not colon:
         interface, channel = "socketcan", url.address
     if not channel:
-        raise TransportError(f"{url}: give the CAN interface: rtcan:can0, or rtcan:slcan:/dev/ttyACM0")
+        raise TransportError(f"{url} lacks the CAN interface: rtcan:can0, or rtcan:slcan:/dev/ttyACM0")
     return _port(interface, channel, options), options
 
 

@@ -77,6 +77,7 @@ class Handover:
             self._missed(handed, done)
 
     def _missed(self, handed: Handed, done: Done) -> None:
+        """It was late, or never sent. What newer data replaced was not promised: there were no slots yet."""
         publisher, late = handed.publisher, max(0, done.at - handed.deadline) / _SECOND
         if done.fate in (Fate.SENT, Fate.UNKNOWN):
             if publisher is not None:
@@ -87,5 +88,5 @@ class Handover:
             self._stats.lost["link down"] += 1
             return
         self._stats.lost[done.fate.value] += 1
-        if publisher is not None:
+        if publisher is not None and done.fate is not Fate.REPLACED:
             publisher.link_missed(self._link, done.fate.value, late)

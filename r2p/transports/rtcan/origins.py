@@ -19,7 +19,7 @@ R2P = 256
 _MARK = b"r2p"
 _MARKED = slice(22, 25)  # of a management message with params, which are bytes 20 to 29: behind the message id
 _WITH_PARAMS = range(0x21, 0x24)  # ADVERTISE, SUBSCRIBE_REQUEST, SUBSCRIBE_RESPONSE
-_ALIVE = 0x11
+_ALIVE, _ADVERTISE, _RESPONSE = 0x11, 0x21, 0x23
 _OURS = 0x40  # from here on types are r2p's
 
 
@@ -58,6 +58,20 @@ def message_of(params: bytes) -> int:
 def params_of(message: int) -> bytes:
     """Params with this message id."""
     return message.to_bytes(2, "little").ljust(len(management.NO_PARAMS), b"\0")
+
+
+def publisher_in(data: bytes, source: int) -> tuple[str, int] | None:
+    """Topic and message id of a publisher that a management message of this address offers, if it can be true.
+
+    Publishers of r2p tell it in all that they offer, those of firmware only when asked.
+    """
+    kind, message = data[-1], message_of(data[20:22])
+    if kind != _RESPONSE and (kind != _ADVERTISE or source == FIRMWARE):
+        return None
+    shared = source in (FIRMWARE, R2P)
+    if rtcan.high_byte(message) < rtcan.FIRST_TOPIC or not (shared or rtcan.id8_of(message) == source):
+        return None
+    return data[:16].partition(b"\0")[0].decode("ascii", "replace"), message
 
 
 class Origins:

@@ -5,6 +5,7 @@ on who listens. It is used only while somebody does. Until the master grants it,
 own ticker sends, as for every other link, and the link makes soft real-time messages of that.
 """
 
+import asyncio
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -12,6 +13,7 @@ import msgspec
 
 from r2p.clock import Clock
 from r2p.codecs import rtcan
+from r2p.protocols.rtcan.calendar import Calendar, Refusal
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Degraded, Done, Due, Fate, Granted, Refused
@@ -64,6 +66,14 @@ class Slotted(msgspec.Struct, eq=False):
         return text
 
 
+def inadmissible(timing: Timing, size: int, period: float) -> str | None:
+    """Why there can never be slots for messages of `size` bytes each `period` seconds; None: there may be."""
+    wanted = round(period * _SECOND) // timing.slot
+    fragments = rtcan.fragment_count(size)
+    answer = Calendar(timing.slots).admit(rtcan.FIRST_TOPIC << 8, wanted, fragments, round_down=True)
+    return answer.text if isinstance(answer, Refusal) else None
+
+
 class SlottedLink(Protocol):
     """What this needs of its link."""
 
@@ -78,9 +88,6 @@ class SlottedLink(Protocol):
     def carries(self, topic: str) -> bool:
         """Whether somebody subscribes the topic, and is in reach."""
 
-    def admitted(self) -> None:
-        """A topic sends in its slots from now on, or never will."""
-
 
 class Periodics:
     """The periodic topics of one link. `now` is the engine's clock, `monotonic` translates it to that of the module."""
@@ -94,6 +101,7 @@ class Periodics:
         self._now = now
         self._monotonic = monotonic
         self._by_high: dict[int, Slotted] = {}
+        self._waiters: list[asyncio.Future[None]] = []
 
     def follow(self, topic: Topic, high: int | None) -> None:
         """The publishers of a topic changed, or its high byte: of those that are periodic the first gets slots."""
@@ -105,29 +113,46 @@ class Periodics:
         if known is None and publisher is not None and high is not None:
             self._reserve(Slotted(topic, publisher, high))
 
+    async def until(self, condition: Callable[[], bool]) -> None:
+        """Wait for something that news about slots bring about."""
+        while not condition():
+            waiter = asyncio.get_running_loop().create_future()
+            self._waiters.append(waiter)
+            await waiter
+
+    def look(self) -> None:
+        """There are news: who waits may look."""
+        waiters, self._waiters = self._waiters, []
+        for waiter in waiters:
+            if not waiter.done():
+                waiter.set_result(None)
+
     def close(self) -> None:
         """Give all slots back."""
         for each in list(self.by_topic.values()):
             self._drop(each)
 
-    def granted(self, news: Granted) -> None:
+    def undecided(self, topic: Topic) -> bool:
+        """Whether it may still come to slots for a topic that wants some."""
+        if not any(isinstance(each, PeriodicPublisher) for each in topic.publishers):
+            return False
+        slotted = self.by_topic.get(topic.name)
+        return slotted is None or not (slotted.driven or slotted.elsewhere)
+
+    def learn(self, news: Granted | Refused | Degraded) -> None:
+        """A topic got slots, or not, or lost them."""
         each = self._by_high.get(news.high)
-        if each is not None:
+        if each is None:
+            return
+        if isinstance(news, Granted):
             each.period, each.phase, each.interval = news.period, news.phase, news.interval
             each.refusal, each.due, each.sent, each.missed = "", 0, 0, 0
-
-    def refused(self, news: Refused) -> None:
-        each = self._by_high.get(news.high)
-        if each is not None:
-            self._end(each)
+            return
+        self._end(each)
+        if isinstance(news, Refused):
             each.refusal = news.reason
-
-    def degraded(self, news: Degraded) -> None:
-        each = self._by_high.get(news.high)
-        if each is not None:
-            self._end(each)
-            if self._link.up:  # else the publisher is told that the link is down
-                each.publisher.degraded(self._link.name, f"slots lost: {news.reason}")
+        elif self._link.up:  # else the publisher is told that the link is down
+            each.publisher.degraded(self._link.name, f"slots lost: {news.reason}")
 
     def due(self, due: Due) -> None:
         """The engine wants data: for a slot, or because the time has come and there is no slot."""
@@ -151,7 +176,7 @@ class Periodics:
         if not each.driven:
             each.driven = each.publisher.drive(self._link, each.interval / _SECOND)
             each.elsewhere = not each.driven
-            self._link.admitted()
+            self.look()
             if each.elsewhere:
                 return None  # here it is soft real-time
         since = round((due.at - each.due) / each.interval) if each.due else 1

@@ -9,7 +9,7 @@ port's own clock `now()`, which is the module's monotonic clock, except where a 
 import abc
 import asyncio
 from collections.abc import Callable
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from r2p.clock import ExactAlarm, clock_of
 from r2p.codecs.rtcan import Frame
@@ -98,3 +98,41 @@ class CanPort(abc.ABC):
     def alarm(self, callback: Callable[[], object]) -> PortAlarm:
         """A timer on the port's clock; never early. As exact as the system allows."""
         return ExactAlarm(asyncio.get_running_loop(), callback)
+
+
+class OpenInterface(Protocol):
+    """An interface while it can be used."""
+
+    def transmit(self, order: Transmit) -> None:
+        """As `CanPort.transmit`."""
+
+    def withdraw(self, order: Withdraw) -> None:
+        """As `CanPort.withdraw`."""
+
+    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+        """As `CanPort.set_filters`."""
+
+
+B = TypeVar("B", bound=OpenInterface)
+
+
+class InterfacePort(CanPort, Generic[B]):
+    """A port whose interface comes and goes: `_bus`, None while it can't be used. What is sent then is lost."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._filters: list[tuple[int, int]] = [(0, 0)]
+        self._bus: B | None = None
+
+    def transmit(self, order: Transmit) -> None:
+        if self._bus is not None:
+            self._bus.transmit(order)
+
+    def withdraw(self, order: Withdraw) -> None:
+        if self._bus is not None:
+            self._bus.withdraw(order)
+
+    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+        self._filters = filters
+        if self._bus is not None:
+            self._bus.set_filters(filters)

@@ -8,6 +8,7 @@ stands in python-can's own configuration file.
 import asyncio
 import concurrent.futures
 import importlib
+import logging
 import threading
 import time
 from collections import deque
@@ -21,7 +22,7 @@ from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.rtcan.mailboxes import Mailboxes
-from r2p.transports.rtcan.port import CanPort, PortAlarm, PortUser
+from r2p.transports.rtcan.port import InterfacePort, PortAlarm, PortUser
 
 if TYPE_CHECKING:
     import can
@@ -47,7 +48,7 @@ _LONGEST_WAIT = 2.0  # seconds between attempts to open it
 _LATENCY = 300_000  # ns that two changes of thread take, about
 
 
-class PythonCanPort(CanPort):
+class PythonCanPort(InterfacePort["_Bus"]):
     """The interface `interface`, such as "slcan", on `channel`, such as "/dev/ttyACM0", at `bitrate` bit/s."""
 
     transmit_latency = _LATENCY
@@ -64,8 +65,6 @@ class PythonCanPort(CanPort):
         self._interface = interface
         self._channel = channel
         self._bitrate = bitrate
-        self._filters: list[tuple[int, int]] = [(0, 0)]
-        self._bus: _Bus | None = None
 
     async def run(self, user: PortUser, opened: Callable[[], object]) -> None:
         backoff = Backoff(random_of(), longest=_LONGEST_WAIT)
@@ -73,19 +72,6 @@ class PythonCanPort(CanPort):
             if await self._use(user, opened):
                 backoff.reset()
             await asyncio.sleep(backoff.delay())
-
-    def transmit(self, order: Transmit) -> None:
-        if self._bus is not None:
-            self._bus.transmit(order)
-
-    def withdraw(self, order: Withdraw) -> None:
-        if self._bus is not None:
-            self._bus.withdraw(order.mailbox)
-
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
-        self._filters = filters
-        if self._bus is not None:
-            self._bus.set_filters(filters)
 
     def alarm(self, callback: Callable[[], object]) -> PortAlarm:
         return ExactAlarm(asyncio.get_running_loop(), callback)
@@ -116,7 +102,7 @@ class PythonCanPort(CanPort):
         except _NEVER as error:
             raise TransportError(f"rtcan:{self.name}: {_explain(error)}") from error
         except (self._can.CanError, OSError) as error:
-            return f"{self.name}: {_explain(error)}"
+            return _explain(error)
         return ""
 
     def _make(self) -> "can.BusABC":
@@ -174,8 +160,8 @@ class _Bus:
         self._mailboxes.put(self._clock.monotonic(), order)
         self._arm()
 
-    def withdraw(self, mailbox: Mailbox) -> None:
-        self._mailboxes.withdraw(self._clock.monotonic(), mailbox)
+    def withdraw(self, order: Withdraw) -> None:
+        self._mailboxes.withdraw(self._clock.monotonic(), order.mailbox)
         self._arm()
 
     def set_filters(self, filters: list[tuple[int, int]]) -> None:
@@ -279,10 +265,15 @@ class _Bus:
 
 def _library() -> Any:
     try:
-        return importlib.import_module("can")
+        library = importlib.import_module("can")
     except ImportError as error:
         raise TransportError("this CAN interface needs python-can: pip install 'r2p[can]'") from error
+    logger = logging.getLogger("can")
+    if logger.level == logging.NOTSET:  # else the user wants it otherwise
+        logger.setLevel(logging.ERROR)  # it warns of each attempt that failed; we tell what is wrong, and once
+    return library
 
 
 def _explain(error: BaseException) -> str:
-    return str(error) or type(error).__name__
+    text, cause = str(error) or type(error).__name__, error.__cause__
+    return text if cause is None or str(cause) in text else f"{text} ({cause})"

@@ -9,8 +9,8 @@ may publish from within `act`.
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
@@ -45,6 +45,7 @@ class Shell:
         self.now = port.now
         """The clock of the engine and of all its instants (ns)."""
         self._port = port
+        self._orders: dict[type, Callable[[Any], object]] = {Transmit: port.transmit, Withdraw: port.withdraw}
         self._owner = owner
         self._alarm = port.alarm(self._poll)
         self._actions: deque[Action] = deque()
@@ -107,16 +108,11 @@ class Shell:
         self.do(self.engine.poll(self.now()))
 
     def _act(self) -> None:
-        actions, port, act = self._actions, self._port, self._owner.act
+        actions, orders, act = self._actions, self._orders, self._owner.act
         self._acting = True
         try:
             while actions:
                 action = actions.popleft()
-                if isinstance(action, Transmit):
-                    port.transmit(action)
-                elif isinstance(action, Withdraw):
-                    port.withdraw(action)
-                else:
-                    act(action)
+                orders.get(type(action), act)(action)
         finally:
             self._acting = False

@@ -21,7 +21,7 @@ from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.rtcan import errorframes, interface, rawsocket
 from r2p.transports.rtcan.mailboxes import Mailboxes
-from r2p.transports.rtcan.port import CanPort, PortAlarm, PortUser
+from r2p.transports.rtcan.port import InterfacePort, PortAlarm, PortUser
 from r2p.transports.rtcan.rawsocket import RawSocket
 
 PRIORITIES = {Mailbox.HRT: 6, Mailbox.SRT: 0, Mailbox.NRT: 2}
@@ -38,7 +38,7 @@ _BATCHES = 16  # more than the socket's queue holds
 _LONGEST_WAIT = 2.0  # seconds between looks at an interface that is not there; changes are noticed before
 
 
-class SocketCanPort(CanPort):
+class SocketCanPort(InterfacePort["_Bus"]):
     """The interface `name`, such as "can0"."""
 
     transmit_latency = 100_000
@@ -48,8 +48,6 @@ class SocketCanPort(CanPort):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self._monotonic = clock_of().monotonic
-        self._filters: list[tuple[int, int]] = [(0, 0)]
-        self._bus: _Bus | None = None
 
     def now(self) -> int:
         """While a batch of frames is handed out, the instant when it was read."""
@@ -68,19 +66,6 @@ class SocketCanPort(CanPort):
                 if await self._use(user):
                     backoff.reset()
                 await watch.wait(backoff.delay())
-
-    def transmit(self, order: Transmit) -> None:
-        if self._bus is not None:
-            self._bus.transmit(order)
-
-    def withdraw(self, order: Withdraw) -> None:
-        if self._bus is not None:
-            self._bus.withdraw(order.mailbox)
-
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
-        self._filters = filters
-        if self._bus is not None:
-            self._bus.set_filters(filters)
 
     def alarm(self, callback: Callable[[], object]) -> PortAlarm:
         """Before it goes off, what has come in is taken: no time-out may outrun a frame that waits in the kernel."""
@@ -167,8 +152,8 @@ class _Bus:
         self._mailboxes.put(self._clock.monotonic(), order)
         self._arm()
 
-    def withdraw(self, mailbox: Mailbox) -> None:
-        self._mailboxes.withdraw(self._clock.monotonic(), mailbox)
+    def withdraw(self, order: Withdraw) -> None:
+        self._mailboxes.withdraw(self._clock.monotonic(), order.mailbox)
         self._arm()
 
     def set_filters(self, filters: list[tuple[int, int]]) -> None:

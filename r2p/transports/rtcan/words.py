@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import IdConflict, LostSync, NewMaster, Profile, Silenced, Unsilenced
+from r2p.protocols.rtcan.events import Action, IdConflict, LostSync, NewMaster, Profile, Silenced, Unsilenced
 from r2p.protocols.rtcan.settings import Settings
 from r2p.sample import PublisherClass
 from r2p.transports.rtcan.periodics import Slotted
@@ -23,6 +23,7 @@ class Words:
         self._engine = engine
         self._port = port
         self._reserves = settings.reserves
+        self._fixed = settings.id8 is not None
 
     @property
     def no_slots(self) -> str:
@@ -33,6 +34,12 @@ class Words:
         if self._engine.profile is Profile.FIRMWARE:
             return "firmware of 2014 keeps no cycle"
         return ""
+
+    def notice(self, news: Action) -> tuple[str, str, bool]:
+        """What happened on the bus: its kind, a text, and whether it is trouble."""
+        if isinstance(news, IdConflict):
+            return _conflict(news, self._fixed)
+        return _NOTICES[type(news)](news)
 
     def guarantee(self, publisher_class: PublisherClass, slotted: Slotted | None) -> str:
         """What a class means for a topic, which may have slots."""
@@ -63,8 +70,10 @@ class Words:
         return f"{slotted.words(self._engine.timing)}{master}; meanwhile {_SOFT}"
 
 
-def _conflict(news: IdConflict) -> tuple[str, str, bool]:
-    then = "it is the other's, this module takes another one" if news.yielded else "the other one should yield"
+def _conflict(news: IdConflict, fixed: bool) -> tuple[str, str, bool]:
+    then = "the other one should yield"
+    if news.yielded:
+        then = "it is the other's, this module " + ("waits till it is free" if fixed else "takes another one")
     return "id conflict", f"another node uses the id {news.id8} of this one: {then}", True
 
 
@@ -75,8 +84,7 @@ def _master(news: NewMaster) -> tuple[str, str, bool]:
     return "master", f"{who} is the RTCAN master", False
 
 
-NOTICES: dict[type, Callable[[Any], tuple[str, str, bool]]] = {
-    IdConflict: _conflict,
+_NOTICES: dict[type, Callable[[Any], tuple[str, str, bool]]] = {
     NewMaster: _master,
     LostSync: lambda news: ("no master", f"no RTCAN master: {news.reason}", True),
     Silenced: lambda news: ("other parameters", f"nothing is sent: {news.reason}", True),

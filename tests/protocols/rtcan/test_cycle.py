@@ -3,7 +3,7 @@
 import pytest
 
 from r2p.codecs import rtcan
-from r2p.protocols.rtcan.cycle import HOLDOVER, Alignment, Cycle, State, timing
+from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, Alignment, Cycle, State, following, timing
 from tests.can_vectors import CanCase, can_cases
 
 TIMING = timing()
@@ -43,7 +43,7 @@ def test_it_follows_the_sync_and_not_its_own_clock() -> None:
     heard(cycle, START, 1)
     assert heard(cycle, START + TIMING.cycle + 480, 2, 0b10) is Alignment.ALIGNED
     assert (cycle.reference, cycle.counter, cycle.mask) == (START + TIMING.cycle + 480, 2, 0b10)
-    assert cycle.measured() == TIMING.cycle + 480
+    assert cycle.measured() == (TIMING.cycle + 480, 960)
 
 
 def test_the_counter_goes_on_beyond_8_bits() -> None:
@@ -81,7 +81,7 @@ def test_resynchronised_after_missed_syncs() -> None:
     cycle.roll()
     assert heard(cycle, START + 3 * TIMING.cycle + 90, 2, 0b100) is Alignment.ALIGNED
     assert (cycle.counter, cycle.missed, cycle.mask, cycle.state) == (258, 0, 0b100, State.FOLLOWING)
-    assert cycle.measured() == TIMING.cycle + 30
+    assert cycle.measured() == (TIMING.cycle + 30, 60)
 
 
 def test_a_sync_that_is_read_late_belongs_to_the_cycle_that_began_without_it() -> None:
@@ -112,17 +112,35 @@ def test_a_lost_cycle_starts_anew_with_any_sync_and_keeps_the_count() -> None:
     assert cycle.counter == 0x329
 
 
+@pytest.mark.parametrize(
+    ("late", "alignment"),
+    [
+        (0, Alignment.RESUMED),
+        (TIMING.slot, Alignment.RESUMED),
+        (-TIMING.slot, Alignment.RESUMED),
+        (TIMING.slot + 1, Alignment.STARTED),
+    ],
+)
+def test_a_lost_cycle_goes_on_where_a_new_master_begins_at_most_a_slot_late(late: int, alignment: Alignment) -> None:
+    cycle = slave()
+    heard(cycle, START, 1)
+    cycle.anchor(0x301)
+    cycle.stop()
+    assert heard(cycle, START + 7 * TIMING.cycle + late, 8) is alignment
+    assert (cycle.counter, cycle.reference) == (0x308, START + 7 * TIMING.cycle + late)
+
+
 def test_a_master_keeps_its_grid() -> None:
     cycle = slave()
-    cycle.lead(START)
-    assert cycle.reference + TIMING.cycle == START
-    frame = cycle.advance(0b1001)
-    assert frame == rtcan.encode_sync(1, 0b1001)  # the original's first cycle is 1, too
+    assert cycle.upcoming(START) == (START, 1)  # the original's first cycle is 1, too
+    cycle.lead(START, 1, 0b1001)
     assert (cycle.reference, cycle.counter, cycle.mask) == (START, 1, 0b1001)
     for _ in range(300):
         frame = cycle.advance(0)
+    assert cycle.reference == START + 300 * TIMING.cycle
     assert (cycle.counter, frame.id) == (301, (301 & 0xFF) << 7)
     assert cycle.network_time(START) == TIMING.cycle
+    assert frame == rtcan.encode_sync(301 & 0xFF, 0)
 
 
 def test_a_new_master_goes_on_with_the_grid_and_the_count_of_the_old_one() -> None:
@@ -132,9 +150,7 @@ def test_a_new_master_goes_on_with_the_grid_and_the_count_of_the_old_one() -> No
     for _ in range(HOLDOVER + 1):
         cycle.roll()
     now = START + 7 * TIMING.cycle + 5
-    cycle.lead(now)
-    cycle.advance(0)
-    assert (cycle.reference, cycle.counter) == (START + 8 * TIMING.cycle, 0x309)
+    assert cycle.upcoming(now) == (START + 8 * TIMING.cycle, 0x309)
 
 
 @pytest.mark.golden
@@ -144,8 +160,24 @@ def test_recorded_network_time(case: CanCase) -> None:
     words = {step.verb: step.words for step in case.steps}
     clock, slots = int(words["start"][0]), int(words["start"][1])
     cycle = Cycle(timing(slots, 1_000_000_000 // clock))
-    cycle.lead(0)
-    cycle.counter = int(words["cycle"][0])
+    cycle.lead(0, int(words["cycle"][0]), None)
     at = cycle.start_of(int(words["slot"][0])) + int(words["cnt"][0]) * 1_000
     recorded = case.of("time")[0].fields
     assert cycle.network_time(at) == recorded["sec"] * 1_000_000_000 + recorded["nsec"]
+
+
+def test_the_slot_that_follows() -> None:
+    assert following({2, 4}, 4) == [2, 2, 4, 4, NO_SLOT]
+    assert following((), 2) == [NO_SLOT] * 3
+    assert following({0}, 1) == [NO_SLOT] * 2, "slot 0 is before all others"
+
+
+def test_free_slots_are_those_of_the_mask() -> None:
+    cycle = Cycle(timing())
+    assert not cycle.free
+    cycle.lead(0, 1, 0b1011)
+    assert cycle.free == {2, *range(4, 60)}
+    assert [cycle.next_free[slot] for slot in (0, 2, 58, 59, 60)] == [2, 4, 59, NO_SLOT, NO_SLOT]
+    cycle.stop()
+    assert not cycle.free
+    assert set(cycle.next_free) == {NO_SLOT}

@@ -176,6 +176,19 @@ def test_the_network_tells_its_own_timing() -> None:
         monitor.frame(frame, start + rtcan.frame_bits(frame.id, frame.data) * BIT)
     assert monitor.census.told
     assert (monitor.census.timing.slots, monitor.census.timing.slot) == (10, MS)
+    assert len(monitor.slots) == 10  # not those of before it was told
+    assert monitor.cycles > 10
+
+
+def test_an_owner_whose_name_comes_late_is_one_owner() -> None:
+    watched = Watched()
+    granted = watched.reserve()
+    watched.watch(5)
+    assert list(watched.monitor.slots[granted.phase].owners) == [f"0x{TOPIC:02X}0B"]
+    params = rtcan.message_id(TOPIC, 11).to_bytes(2, "little").ljust(10, b"\0")
+    watched.say(watched.owner, management.SubscribeResponse("encoder", 8, 1, params))
+    watched.run(5 * CYCLE)
+    assert watched.monitor.slots[granted.phase].owners == {"encoder": 10}
 
 
 @given(

@@ -281,6 +281,20 @@ def test_a_master_that_sends_no_network_is_believed_by_its_cycle() -> None:
     assert node.engine.network_time(node.now) is None
 
 
+def test_a_cycle_of_the_same_length_does_not_make_up_for_other_slots() -> None:
+    bus = Bus()
+    network(bus, 1, 0)
+    other = bus.add(id8=20, slots=30, cycle=CYCLE)
+    bus.start(other)
+    bus.run(6 * SECOND)
+    assert other.engine.timing.cycle == CYCLE
+    assert [each.reason for each in other.of(Silenced)] == [
+        "the network has 60 slots of 166 us, this node 30 of 332 us"
+    ]
+    assert [each.id8 for each in other.of(NewMaster)] in ([], [10])
+    assert not any(node is other for _, _, node in bus.sent)
+
+
 def test_two_nodes_that_want_the_same_id8() -> None:
     bus = Bus()
     a = bus.add(id8=10, number=0x500)

@@ -163,3 +163,7 @@ def test_the_owner_stops_when_the_master_does_not_answer() -> None:
     assert owner.of(Degraded) == [Degraded(TOPIC, "the master does not answer")]
     assert master.engine.mask == 0b1
     assert {frame.id >> 23 for at, frame, _ in bus.sent[-50:] if frame.id >> 15 & 0xFF == TOPIC} != {0}
+    master.deaf = lambda frame: False
+    bus.run(SECOND)
+    assert len(owner.of(Granted)) == 2  # it has asked all the time
+    assert starts(bus, TOPIC, 0)[-1] > bus.now - 2 * CYCLE

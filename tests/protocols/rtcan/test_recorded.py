@@ -39,9 +39,8 @@ class Master:
         self.engine = Engine(settings)
         low, high = (int(word, 0) for word in words["mask"])
         self.engine._core.grants.calendar.mask = lambda cycle: low | high << 32  # type: ignore[method-assign]
-        self.engine._core.manage = lambda *_, **__: None  # type: ignore[method-assign]  # there was no management
+        self.engine._core._queue_management = lambda *_: None  # type: ignore[method-assign]  # there was no management
         self._run(self.engine.start(0))
-        self._until(lambda: self.engine.ready)
         for step in case.steps:
             if step.verb == "hrt":
                 self._reserve(*step.words)
@@ -76,9 +75,11 @@ class Master:
             if isinstance(action, Due):
                 self._run(self.engine.fill(action.at, action.high, self.data[action.high]))
             elif isinstance(action, Transmit):
+                cycle = self.engine._core.cycle
                 if self.engine.role is Role.MASTER:
-                    cycle = self.engine._core.cycle
                     self.frames.append((cycle.counter, cycle.slot_at(action.not_before), action.frame))
+                elif rtcan.is_sync(action.frame.id):  # the one that makes it the master
+                    self.frames.append((rtcan.decode_sync(action.frame).cycle, 0, action.frame))
                 end = action.not_before + 150_000
                 self._run(self.engine.confirm(end, action.mailbox, Outcome.SENT, end))
 

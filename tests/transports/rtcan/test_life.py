@@ -1,7 +1,9 @@
 """What happens when modules and masters come, go, fail, and get in each other's way."""
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 
 import pytest
 
@@ -169,7 +171,7 @@ async def test_bus_off_and_recovery() -> None:
         await publisher.wait_subscriber()
         events = made.host("A").events()
         controller = made.can.port("A").controller
-        controller.transmit_errors = 250
+        controller.confinement.transmit = 250
         made.can.bus.noise = 1.0
         while controller.state is not State.BUS_OFF:
             await publisher.publish(Led())
@@ -261,3 +263,22 @@ async def test_stop_is_urgent() -> None:
         made.host("B").command(r2p.Command.STOP, "A")
         await asyncio.sleep(0.010)
         assert made.host("A").stopped
+
+
+async def test_a_fixed_id_that_is_taken_is_waited_for_and_that_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "r2p")
+    made = Lab()
+    async with AsyncExitStack() as stack, made.module("C"):
+        await stack.enter_async_context(made.module("A", options={"id": 5}))
+        await asyncio.sleep(3.0)
+        async with made.module("B", options={"id": 5}):
+            caplog.clear()
+            await asyncio.sleep(20.0)
+            assert not made.link("B").up
+            await stack.aclose()
+            await until(lambda: made.link("B").up)
+            assert made.link("B").engine.id8 == 5
+    conflicts = [line for line in caplog.messages if "another node uses" in line]
+    assert conflicts == [
+        "link sim:: another node uses the id 5 of this one: it is the other's, this module waits till it is free"
+    ]

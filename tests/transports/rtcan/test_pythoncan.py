@@ -167,13 +167,21 @@ class Broken:
 _VirtualBus = can.interface._get_class_for_interface("virtual")
 
 
+async def test_the_cause_is_told_too(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    error = can.CanInitializationError("could not configure socket")
+    error.__cause__ = OSError(22, "Invalid argument")
+    monkeypatch.setattr(can, "Bus", Broken(error))
+    async with using(port_on(channel)) as user:
+        assert user.news == ["waits: could not configure socket ([Errno 22] Invalid argument)"]
+
+
 async def test_it_waits_until_it_can_be_opened(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(can, "Bus", Broken(can.CanInitializationError("no adapter"), OSError(19, "No such device")))
     async with using(port_on(channel)) as user:
         await user.until(lambda: user.news[-1] == "up")
         assert user.news == [
-            f"waits: virtual:{channel}: no adapter",
-            f"waits: virtual:{channel}: [Errno 19] No such device",
+            "waits: no adapter",
+            "waits: [Errno 19] No such device",
             "up",
         ]
 
