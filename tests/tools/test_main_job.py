@@ -61,18 +61,17 @@ class Robot(msgspec.Struct):
 
 
 def multicast_group() -> str | None:
-    """A group of our own; None where this computer sends no multicast to itself."""
-    group = f"239.{random.randrange(256)}.{random.randrange(256)}.{random.randrange(1, 255)}"
+    """A group of our own that no packet leaves the computer for; None where IPv6 can't do that."""
+    group = f"ff01::{random.randrange(1 << 16):x}:{random.randrange(1 << 16):x}"
     with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here,
+        socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as there,
+        socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as here,
     ):
-        there.bind((group, 0))
-        there.settimeout(1.0)
         try:
-            there.setsockopt(
-                socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, struct.pack("4sl", socket.inet_aton(group), 0)
-            )
+            there.bind(("::", 0))
+            there.settimeout(1.0)
+            joined = socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", 0)
+            there.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, joined)
             here.sendto(b"?", (group, there.getsockname()[1]))
             there.recv(1)
         except OSError:
@@ -112,10 +111,11 @@ def path(request: pytest.FixtureRequest, robot: Robot, router: int) -> Iterator[
     inside = url if request.param == "line" else f"{url},priority=1"  # the bus needs a master
     with process("gateway", "--via", inside, "--via", network, patience=2 * PATIENCE) as child:
         assert child.stderr is not None
-        silent = [url.partition(",")[0], network.partition(",")[0]]
+        silent, said = [url.partition(",")[0], network.partition(",")[0]], ""
         while silent:
             line = child.stderr.readline()
-            assert line, "the gateway has ended"
+            said += line
+            assert line, f"the gateway has ended: {said}"
             silent = [each for each in silent if f"link {each}: forwards" not in line]
         yield request.param, network
 

@@ -1,8 +1,8 @@
 """One zenoh session. Everything that comes from zenoh's threads enters the event loop here, in batches.
 
-zenoh calls back in a thread of its own for each subscriber. There nothing is done but to put what came into a deque,
-and to wake the loop once for a batch: no code of the user, and none of the protocols, runs outside of the loop. What
-blocks (opening, closing) runs in a thread, so the loop never waits for a network.
+A thread waits at zenoh's channel of each subscriber. There nothing is done but to put what came into a deque, and to
+wake the loop once for a batch: no code of the user, and none of the protocols, runs outside of the loop. What blocks
+(opening, closing) runs in a thread, so the loop never waits for a network.
 """
 
 import asyncio
@@ -16,9 +16,10 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
-from zenoh.handlers import Callback, Handler, RingChannel
+from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from r2p.errors import TransportError
+from r2p.transports.zenoh import threads
 
 T = TypeVar("T")
 
@@ -87,7 +88,7 @@ class Tap:
         self._emptied.acquire()
         self.wait = self._emptied.release
         """Nothing waits any more. Once for each sample that the thread has handed over."""
-        threading.Thread(target=self._watch, name="r2p zenoh", daemon=True).start()
+        threads.start(self._watch)
 
     def close(self) -> None:
         self._subscriber.undeclare()
@@ -128,7 +129,8 @@ class Session:
         def changed(event: zenoh.TransportEvent) -> None:
             funnel.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
 
-        self._kept.append(self._session.info.declare_transport_events_listener(Callback(changed), history=True))
+        events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_AT_ONCE)
+        self._hear(self._session.info.declare_transport_events_listener(events, history=True), changed)
 
     def watch_tokens(self, prefix: str, funnel: Funnel) -> None:
         """Tell of each token under a prefix, also those that are there: (rest of its key, whether it is there)."""
@@ -137,8 +139,8 @@ class Session:
         def changed(sample: zenoh.Sample) -> None:
             funnel.put((str(sample.key_expr)[start:], sample.kind == zenoh.SampleKind.PUT))
 
-        live = self._session.liveliness()
-        self._kept.append(live.declare_subscriber(f"{prefix}/**", Callback(changed), history=True))
+        tokens: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
+        self._hear(self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True), changed)
 
     def listen(self, key: str, funnel: Funnel) -> None:
         """Tell of each message: (its key, payload); of one that is none of ours by its length, without the payload."""
@@ -147,9 +149,8 @@ class Session:
             payload = sample.payload
             funnel.put((str(sample.key_expr), payload.to_bytes() if len(payload) <= _MESSAGE_MAX else b""))
 
-        self._kept.append(
-            self._session.declare_subscriber(key, Callback(arrived), allowed_origin=zenoh.Locality.REMOTE)
-        )
+        messages: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
+        self._hear(self._session.declare_subscriber(key, messages, allowed_origin=zenoh.Locality.REMOTE), arrived)
 
     def serve(self, key: str, answer: Callable[[str], bytes | None]) -> None:
         """Answer queries: `answer` gives, in the loop, the payload for a key."""
@@ -164,7 +165,20 @@ class Session:
                 query.drop()
 
         funnel = Funnel(loop, reply, most=_QUERIES)
-        self._kept.append(self._session.declare_queryable(key, Callback(funnel.put)))
+        queries: FifoChannel[zenoh.Query] = FifoChannel(_AT_ONCE)
+        self._hear(self._session.declare_queryable(key, queries), funnel.put)
+
+    def _hear(self, declared: Any, heard: Callable[[Any], object]) -> None:
+        """Call it, in a thread, with each item that comes."""
+
+        def listen() -> None:
+            receive = declared.handler.recv
+            with contextlib.suppress(zenoh.ZError):  # it is undeclared
+                while True:
+                    heard(receive())
+
+        self._kept.append(declared)
+        threads.start(listen)
 
     def subscribe(self, key: str, most: int, arrived: Callable[[zenoh.Sample], None]) -> "Tap":
         """Tell in the loop of the first sample that comes; the ones behind it are there to be taken out of the tap.
@@ -246,6 +260,7 @@ class Session:
 
 _MESSAGE_MAX = 4096
 _QUERIES = 1024
+_AT_ONCE = 256  # that wait in zenoh until their thread runs
 
 
 async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] | None = None) -> T:
@@ -260,7 +275,7 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
         if not future.cancelled():
             future.set_result(result)
         elif abandoned is not None:
-            threading.Thread(target=abandoned, args=(result,), daemon=True).start()
+            threads.start(functools.partial(abandoned, result))
 
     def fail(error: Exception) -> None:
         if not future.cancelled():
@@ -279,7 +294,7 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
             if abandoned is not None:
                 abandoned(result)
 
-    threading.Thread(target=work, name="r2p zenoh", daemon=True).start()
+    threads.start(work)
     return await future
 
 
