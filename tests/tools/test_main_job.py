@@ -60,8 +60,8 @@ class Robot(msgspec.Struct):
     bus: str
 
 
-def multicast_group() -> str | None:
-    """A group of our own that no packet leaves the computer for; None where IPv6 can't do that."""
+def multicast() -> tuple[str, int] | None:
+    """A group that no packet leaves the computer for, and a port of our own; None where IPv6 can't do that."""
     group = f"ff01::{random.randrange(1 << 16):x}:{random.randrange(1 << 16):x}"
     with (
         socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as there,
@@ -76,15 +76,18 @@ def multicast_group() -> str | None:
             there.recv(1)
         except OSError:
             return None
-    return group
+        return group, there.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[Robot]:
-    group = multicast_group()
-    bus = "" if group is None else f"rtcan:udp_multicast:{group}"
+    group, port = multicast() or ("", 0)
+    bus = f"rtcan:udp_multicast:{group}" if group else ""
     links = ["--via", "tcp-listen:0", *(["--via", bus] if bus else [])]
-    with process("sim", "triskar2", *links, patience=4 * PATIENCE) as child:
+    with contextlib.ExitStack() as stack:
+        # To one port Linux brings the packets of all groups, those of other tests, too.
+        stack.enter_context(pytest.MonkeyPatch.context()).setenv("CAN_CONFIG", json.dumps({"port": port}))
+        child = stack.enter_context(process("sim", "triskar2", *links, patience=4 * PATIENCE))
         assert child.stdout is not None
         line = next(found[1] for line in child.stdout if (found := re.search(r"--via (tcp:\S+)", line)))
         yield Robot(line, bus)
