@@ -6,6 +6,7 @@ from r2p.errors import TransportError
 from r2p.transports.rtcan.options import OPTIONS, Options, checked
 from r2p.transports.rtcan.port import CanPort
 from r2p.transports.rtcan.transport import RtcanTransport
+from r2p.transports.rtcan.words import HOLDABLE
 from r2p.transports.url import Url
 
 
@@ -23,6 +24,12 @@ def open_port(url: Url) -> tuple[CanPort, Options]:
 
 def _taken_apart(url: Url) -> tuple[Callable[[], CanPort], Options]:
     options = checked(str(url), url.parsed(OPTIONS), Options())
+    slot = options.timing.slot
+    if options.priority and slot < HOLDABLE:
+        raise TransportError(
+            f"{url}: a PC can't be the master with slots of {slot // 1000} us, its syncs would come too late: leave it "
+            "to a module (priority=0), or give the whole network longer ones, such as slots=20,cycle=10ms"
+        )
     interface, colon, channel = url.address.partition(":")
     if not colon:
         interface, channel = "socketcan", url.address

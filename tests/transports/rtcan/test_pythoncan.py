@@ -15,6 +15,7 @@ from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.rtcan import pythoncan
 from r2p.transports.rtcan.pythoncan import PythonCanPort
+from r2p.transports.url import open_transport
 from tests.can.rig import GUARD, User, now, using
 
 if TYPE_CHECKING:
@@ -231,3 +232,9 @@ def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(TransportError, match=r"pip install 'r2p\[can\]'"):
         PythonCanPort("virtual", "x", BITRATE)
+
+
+def test_a_pc_is_no_master_of_short_slots() -> None:
+    with pytest.raises(TransportError, match=r"can't be the master with slots of 166 us.*slots=20,cycle=10ms"):
+        open_transport("rtcan:virtual:x?priority=1")
+    open_transport("rtcan:virtual:x?priority=1&slots=20&cycle=10ms")
