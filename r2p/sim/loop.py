@@ -5,8 +5,8 @@ in asyncio that goes through the loop works unchanged. What virtual time can't s
 
 - Jobs in threads (`asyncio.to_thread`, `loop.run_in_executor`) are counted: time stands still until they are done.
   Other threads are not seen, nor are subprocesses.
-- A task that never waits, such as one that publishes in a loop, would stop the world: after 100 000 turns of the loop
-  at one instant the next timer comes all the same.
+- A task that never waits, such as one that publishes in a loop, would stop the world, and so would a descriptor that
+  is always ready: after 100 000 turns of the loop at one instant the next timer comes all the same.
 - Real file descriptors are polled, but never waited for: time goes on without them. Keep sockets and devices out.
 - `time.time`, `time.sleep`, `random` and the order of sets of strings are as real as ever: use `r2p.clock` for the
   first three.
@@ -211,6 +211,7 @@ class _Selector(selectors.DefaultSelector):
         if len(self.get_map()) > 1 or not next(self._looked) % _OFTEN:  # asyncio's own descriptor is the first one
             events = super().select(0)
             if events:
+                self._turn()
                 return events
         if timeout == 0:  # what asyncio says when callbacks are ready
             self._turn()

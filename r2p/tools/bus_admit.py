@@ -19,6 +19,7 @@ from r2p.tools.session import Format, execute, seconds
 _MESSAGE = re.compile(r"(?P<name>[^:@]+):(?P<size>\d+)@(?P<rate>.+)")
 _SECOND = 1_000_000_000
 _CYCLE = 0.010  # s, as in the thesis
+_SHORTEST, _LONGEST = 1e-9, 1e9  # s; what is counted in ns, and is no slip of the finger
 
 Messages = Annotated[
     list[str],
@@ -63,6 +64,8 @@ def admit(
 
 def grid(slots: int, cycle: float | None, bitrate: int) -> Timing:
     """The slots of a cycle (s). Raises BadParameter when no frame fits in."""
+    if cycle is not None and cycle > _LONGEST:
+        raise typer.BadParameter(f"a cycle of {cycle:g} s")
     try:
         return timing(slots, round((cycle or _CYCLE) * _SECOND), bitrate)
     except ValueError as error:
@@ -77,7 +80,10 @@ def parse(text: str) -> Wanted:
     size = int(match["size"])
     if not 1 <= size <= rtcan.PAYLOAD_MAX:
         raise typer.BadParameter(f"{text!r}: RTCAN carries 1 to {rtcan.PAYLOAD_MAX} bytes in a message")
-    return Wanted(match["name"], size, round(_period(match["rate"]) * _SECOND))
+    period = _period(match["rate"])
+    if not _SHORTEST <= period <= _LONGEST:
+        raise typer.BadParameter(f"{text!r}: a period of {period:g} s")
+    return Wanted(match["name"], size, round(period * _SECOND))
 
 
 def _period(text: str) -> float:

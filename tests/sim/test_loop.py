@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import r2p.sim.loop
 from r2p.clock import clock_of, random_of
 from r2p.errors import Deadlock
 from r2p.sim import run
@@ -137,6 +138,20 @@ async def test_real_descriptors_are_polled() -> None:
     near.close()
     far.close()
     assert clock_of().monotonic() == 1 * SECOND
+
+
+@pytest.mark.virtual_time
+async def test_a_descriptor_that_is_always_ready_does_not_stop_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(r2p.sim.loop, "_BUSY", 100)
+    loop = asyncio.get_running_loop()
+    near, far = socket.socketpair()
+    turns = itertools.count()
+    loop.add_writer(near, next, turns)
+    await asyncio.sleep(1)
+    loop.remove_writer(near)
+    near.close()
+    far.close()
+    assert 98 <= next(turns) <= 102
 
 
 # Threads

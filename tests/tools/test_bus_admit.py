@@ -39,11 +39,29 @@ def test_a_plan_is_name_bytes_and_rate_or_period(text: str, wanted: Wanted) -> N
 
 
 @pytest.mark.parametrize(
-    "text", ["imu", "imu:18", "imu@5ms", "imu:0@5ms", "imu:1025@5ms", "imu:8@0Hz", "imu:8@x", "imu:8@200"]
+    "text",
+    [
+        "imu",
+        "imu:18",
+        "imu@5ms",
+        "imu:0@5ms",
+        "imu:1025@5ms",
+        "imu:8@0Hz",
+        "imu:8@x",
+        "imu:8@200",
+        "imu:8@1e-12s",
+        "imu:8@1e300s",
+        "imu:8@1e-300Hz",
+    ],
 )
 def test_what_can_not_be_a_plan_is_refused(text: str) -> None:
     with pytest.raises(typer.BadParameter):
         parse(text)
+
+
+def test_a_cycle_that_nobody_can_mean_is_refused() -> None:
+    with pytest.raises(typer.BadParameter):
+        grid(60, 1e300, 1_000_000)
 
 
 def test_the_networks_of_the_thesis_fill_39_of_59_slots() -> None:

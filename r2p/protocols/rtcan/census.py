@@ -39,7 +39,7 @@ class Census:
             case management.SubscribeResponse(topic, size, _, params):
                 number = int.from_bytes(params[:2], "little")
                 self.topics[number], self.sizes[number] = topic, size
-            case management.Network(slots=slots, slot=slot):
+            case management.Network(slots=slots, slot=slot) if 2 <= slots <= rtcan.SLOTS_MAX and slot:
                 self.told = True
                 self.timing = Timing(slots, slot, self.timing.bit)
         return describe(message)

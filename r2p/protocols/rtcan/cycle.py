@@ -194,7 +194,7 @@ class Cycle:
         cycles, off = self._distance(start)
         counter = self.counter + cycles
         resumed = self.anchored and counter & 0xFF == low and abs(off) <= self.timing.slot
-        self.counter = max(0, _nearest(counter, low)) if self.anchored else low
+        self.counter = _nearest(counter, low) if self.anchored else low
         self._follow(start, mask)
         self._first, self._first_at, self._widest = self.counter, start, 0
         return Alignment.RESUMED if resumed else Alignment.STARTED
@@ -233,4 +233,5 @@ def _free(mask: int | None, slots: int) -> tuple[frozenset[int], list[int]]:
 
 def _nearest(counter: int, low: int) -> int:
     """The counter with the low 8 bits of `low` that is next to this one: up to 16 before it, or else after it."""
-    return counter + ((low - counter + 16) & 0xFF) - 16
+    nearest = counter + ((low - counter + 16) & 0xFF) - 16
+    return nearest if nearest >= 0 else nearest + 256

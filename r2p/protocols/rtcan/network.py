@@ -28,6 +28,7 @@ from r2p.protocols.schedule import Timers
 
 REPEAT = 1_000_000_000
 """NETWORK is sent this often (ns)."""
+_LONGEST = (1 << 63) - 1  # ns, 292 years: what no network has lasted, and no field of ours could tell
 _PAUSE = 20_000_000  # ns before the first sync is tried again, at most
 
 
@@ -106,6 +107,9 @@ class Network:
 
     def network(self, now: int, told: management.Network) -> None:
         """A master says who it is and what its network is like."""
+        if told.cycle * self._cycle.timing.cycle > _LONGEST:
+            self._counts["undecodable"] += 1
+            return
         if self._election.role is Role.MASTER:
             if self._election.beats(self._identity.id8, told.priority, told.id8):
                 self._introduce(now)
@@ -162,7 +166,7 @@ class Network:
             return
         self._told = now
         self._timers.set("network", now + REPEAT)
-        timing, counter = self._cycle.timing, self._cycle.counter & (1 << 64) - 1
+        timing, counter = self._cycle.timing, self._cycle.counter
         offset, error = self.utc_offset, self.utc_error
         self._say(
             now,
@@ -244,6 +248,7 @@ class Network:
         if self.silenced is None:
             self.silenced = reason
             self.verified = False
+            self._reign.cancel()
             self._wishes.pause("the network has other parameters")
             self._out.append(Silenced(reason))
 

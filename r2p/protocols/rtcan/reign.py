@@ -49,8 +49,9 @@ class Reign:
         start, counter = self._cycle.upcoming(now)
         mask = self._grants.calendar.mask(counter)
         frame = rtcan.encode_sync(counter, mask)
-        self._first = frame, counter, mask
-        if not self._sender.found(FirstSync(self._sent), frame, start):
+        if self._sender.found(FirstSync(self._sent), frame, start):
+            self._first = frame, counter, mask
+        else:
             self._again(now)
 
     def cancel(self) -> None:

@@ -124,9 +124,9 @@ class Sender:
 
     def found(self, first: FirstSync, frame: Frame, start: int) -> bool:
         """The first sync of a master. There are no slots yet: it may come late. False: an old frame is in the way."""
-        if self._post.boxes[Mailbox.HRT] is not None:
+        if self._post.boxes[_HRT] is not None:
             return False
-        self._post.put(first, frame, Mailbox.HRT, start, NEVER)
+        self._post.put(first, frame, _HRT, start, NEVER)
         return True
 
     def fill(self, now: int, periodic: Periodic, payload: bytes | None) -> None:
@@ -153,6 +153,8 @@ class Sender:
             if current >= self._last:
                 self._run(now, self._timing.slots, current)
                 self._turn(now)
+                if not self._cycle.running:  # a node that is silent stays so: nothing else has moved `due`
+                    self.kick(now)
             else:
                 self._run(now, current, current)
                 self._plan(now)

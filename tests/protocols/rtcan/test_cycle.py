@@ -60,6 +60,15 @@ def test_the_counter_goes_on_beyond_8_bits() -> None:
     assert cycle.anchor(7 + (0x1_0000_00FA + 599 & 0xFF))
 
 
+@pytest.mark.parametrize("low", range(0, 256, 5))
+def test_there_is_no_cycle_before_the_first_one(low: int) -> None:
+    """Whatever a NETWORK says: a count is a field without a sign."""
+    cycle = slave()
+    heard(cycle, START, low)
+    cycle.anchor(0)
+    assert (cycle.counter & 0xFF, cycle.counter >= 0) == (low, True)
+
+
 def test_missed_syncs_are_bridged_for_three_cycles() -> None:
     cycle = slave()
     heard(cycle, START, 255, 0b10)

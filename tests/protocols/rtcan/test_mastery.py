@@ -2,7 +2,7 @@
 
 import pytest
 
-from r2p.codecs import rtcan
+from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.election import Role
 from r2p.protocols.rtcan.engine import Engine
@@ -147,21 +147,39 @@ def test_who_is_alone_becomes_the_master_of_nobody_and_others_join() -> None:
     assert other.engine.master == 10
 
 
+@pytest.mark.parametrize("heard", [300 * MS, 1_190 * MS])
+def test_a_master_that_dies_while_somebody_still_listens(heard: int) -> None:
+    """The newcomer follows its cycle without a word, so it must notice the end without a word, too."""
+    bus = Bus()
+    (master,) = network(bus, 1)
+    late = bus.add(id8=20, priority=1)
+    bus.start(late)
+    bus.run(heard)
+    bus.kill(master)
+    bus.run(5 * CYCLE)
+    assert [type(news) for news in late.of(LostSync)] == [LostSync]
+    bus.run(2 * SECOND)
+    assert late.engine.role is Role.MASTER
+
+
+def until_first_sync(engine: Engine) -> int:
+    """All else is sent at once; comes back: when."""
+    while True:
+        now = engine.next_deadline() or 0
+        actions = list(engine.poll(now))
+        for action in actions:
+            if isinstance(action, Transmit) and is_sync(action.frame):
+                return now
+            if isinstance(action, Transmit):
+                actions += engine.confirm(now, action.mailbox, Outcome.SENT, now)
+
+
 @pytest.mark.parametrize("outcome", [Outcome.LATE, Outcome.LOST, Outcome.SENT])
 def test_a_sync_of_somebody_else_comes_first(outcome: Outcome) -> None:
     """Ours is taken back, if that is still possible."""
     engine = Engine(Settings(number=1 << 40, id8=10, priority=1, profile=Profile.RTCAN))
-    actions = list(engine.start(0))
-    first: Transmit | None = None
-    now = 0
-    while first is None:
-        now = engine.next_deadline() or now
-        actions = list(engine.poll(now))
-        for action in actions:
-            if isinstance(action, Transmit) and is_sync(action.frame):
-                first = action
-            elif isinstance(action, Transmit):
-                actions += engine.confirm(now, action.mailbox, Outcome.SENT, now)
+    engine.start(0)
+    now = until_first_sync(engine)
     other = rtcan.encode_sync(200, 1)
     taken = engine.receive(now, other, now)
     assert Withdraw(Mailbox.HRT) in taken
@@ -169,6 +187,38 @@ def test_a_sync_of_somebody_else_comes_first(outcome: Outcome) -> None:
     assert not any(isinstance(action, NewMaster) for action in news)
     assert (engine.role, engine.cycle) == (Role.SLAVE, 200)
     assert engine.counts == {}
+
+
+def test_a_first_sync_that_was_given_up_makes_no_master_when_it_comes_through_at_last() -> None:
+    """It says nothing of the cycle that this node would lead now."""
+    engine = Engine(Settings(number=1 << 40, id8=10, priority=1, profile=Profile.RTCAN))
+    engine.start(0)
+    now = until_first_sync(engine)
+    engine.receive(now, rtcan.encode_sync(200, 1), now)
+    for at in range(now, now + 20 * CYCLE, MS):  # the master is gone, and that frame still with the controller
+        for action in engine.poll(at):
+            if isinstance(action, Transmit):
+                engine.confirm(at, action.mailbox, Outcome.SENT, at)
+    news = engine.confirm(at, Mailbox.HRT, Outcome.SENT, at)
+    assert not any(isinstance(action, NewMaster) for action in news)
+    now = until_first_sync(engine)
+    engine.confirm(now, Mailbox.HRT, Outcome.SENT, now)
+    assert engine.role is Role.MASTER
+
+
+def test_who_learns_that_its_slots_are_wrong_does_not_become_the_master_any_more() -> None:
+    """Its first sync is on the bus already."""
+    engine = Engine(Settings(number=1 << 40, id8=10, priority=1, profile=Profile.RTCAN))
+    engine.start(0)
+    now = until_first_sync(engine)
+    told = management.encode(management.Network(20, 1, 77, 5, 30, 2 * SLOT))
+    for left, data in rtcan.fragments(told):
+        frame = Frame(rtcan.encode_identifier(10, rtcan.message_id(rtcan.MANAGEMENT, 20), left), data)
+        engine.receive(now, frame, now)
+    assert engine.silenced
+    engine.confirm(now, Mailbox.HRT, Outcome.SENT, now)
+    assert engine.role is not Role.MASTER
+    assert until_first_sync(engine) > now + 3 * SECOND  # nobody has said so again
 
 
 def test_a_new_master_of_an_old_network_may_begin_late_and_nobody_minds() -> None:

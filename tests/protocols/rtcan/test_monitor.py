@@ -180,6 +180,18 @@ def test_the_network_tells_its_own_timing() -> None:
     assert monitor.cycles > 10
 
 
+@pytest.mark.parametrize(("slots", "slot"), [(60, 0), (0, 166_000), (1, 166_000), (65, 166_000)])
+def test_a_timing_that_cannot_be_is_not_learnt(slots: int, slot: int) -> None:
+    monitor = Monitor(timing())
+    monitor.frame(rtcan.encode_sync(1, 0b11), MS)
+    told = management.encode(management.Network(10, 1, 1, 1, slots, slot))
+    for left, data in rtcan.fragments(told):
+        identifier = rtcan.encode_identifier(10, rtcan.message_id(rtcan.MANAGEMENT, 10), left)
+        monitor.frame(Frame(identifier, data), 2 * MS)
+    monitor.frame(rtcan.encode_sync(2, 0b11), MS + CYCLE)
+    assert (monitor.census.told, monitor.census.timing, monitor.cycles) == (False, timing(), 1)
+
+
 def test_an_owner_whose_name_comes_late_is_one_owner() -> None:
     watched = Watched()
     granted = watched.reserve()

@@ -23,7 +23,7 @@ from r2p.protocols.rtcan.events import (
     Unsilenced,
     Withdraw,
 )
-from tests.protocols.rtcan.bus import MS, SECOND, Bus
+from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import (
     CYCLE,
     SLOT,
@@ -36,6 +36,13 @@ from tests.protocols.rtcan.networks import (
     starts,
     syncs,
 )
+
+
+def said(node: Node, message: management.Network) -> None:
+    """A master says something to this node alone."""
+    for left, data in rtcan.fragments(management.encode(message)):
+        identifier = rtcan.encode_identifier(10, rtcan.message_id(rtcan.MANAGEMENT, message.id8), left)
+        node.act(node.engine.receive(node.now, Frame(identifier, data), node.now))
 
 
 def test_the_highest_priority_becomes_the_master_and_all_know_it() -> None:
@@ -201,6 +208,25 @@ def test_a_returning_better_master_does_not_take_over() -> None:
     bus.run(3 * SECOND)
     assert (second.engine.role, again.engine.role) == (Role.MASTER, Role.SLAVE)
     assert again.engine.epoch == second.engine.epoch
+
+
+@pytest.mark.parametrize("count", [(1 << 64) - 1, 1 << 63, (1 << 63) // CYCLE + 1])
+def test_a_count_of_cycles_that_cannot_be_is_not_taken_over(count: int) -> None:
+    """It would get into grants and stamps, whose fields it does not fit."""
+    bus = Bus()
+    first, second, owner = network(bus, 9, 5, 0)
+    epoch = second.engine.epoch or 0
+    for node in second, owner:
+        said(node, management.Network(first.engine.id8 or 0, 9, epoch, count, 60, SLOT))
+        assert node.engine.counts == {"undecodable": 1}
+    bus.kill(first)
+    wanting = counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
+    bus.run(SECOND)
+    assert (second.engine.role, owner.engine.epoch, len(owner.of(Granted))) == (Role.MASTER, epoch, 1)
+    assert wanting
+    assert owner.engine.cycle == second.engine.cycle
+    assert (owner.engine.cycle or 0) < 1_000
 
 
 def test_two_masters_that_meet_the_lesser_one_yields_at_once() -> None:
