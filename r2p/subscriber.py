@@ -119,6 +119,8 @@ class Subscriber(Generic[T]):
 
     async def wait_publisher(self) -> None:
         """Wait until somebody publishes the topic. Raises Closed if the subscription is closed before."""
+        if self._closed:
+            raise self._is_closed()
         if not self.publishers:
             waiter = self._space.loop.create_future()
             self._sink.matches.append(waiter)

@@ -90,6 +90,8 @@ async def test_a_closed_publisher_says_so() -> None:
             await publisher.publish(led(1))
         with pytest.raises(r2p.Closed):
             publisher.publish_nowait(led(1))
+        with pytest.raises(r2p.Closed):
+            await publisher.wait_subscriber()
 
 
 @pytest.mark.virtual_time

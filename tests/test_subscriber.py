@@ -295,6 +295,8 @@ async def test_subscribers_know_when_somebody_publishes() -> None:
         leds.close()
         with pytest.raises(r2p.Closed):
             await waiter
+        with pytest.raises(r2p.Closed):
+            await leds.wait_publisher()
 
 
 # Types

@@ -50,6 +50,10 @@ class BridgePort:
     def speaks(self) -> bool:
         return self.place.in_tree or self._bridge.tree.gateway not in self.place.gateways
 
+    @property
+    def shares(self) -> bool:
+        return bool(self.place.neighbours)
+
     def looked(self) -> None:
         changed = self.demand.changed()
         if changed:

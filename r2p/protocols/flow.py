@@ -39,8 +39,9 @@ class Outflow:
         taker = self.takers.get(session)
         if taker is None:
             self.takers[session] = _Taker(window, self.serial, self.serial)
-        else:
+        elif taker.window != window:  # it need not have granted anything for what went out before
             taker.window = window
+            taker.taken = self.serial
         self._update()
 
     def parted(self, session: int) -> None:
@@ -100,10 +101,20 @@ class Inflow:
         self.next = (serial + 1) & _WRAP
         return ahead
 
+    def resized(self, window: int) -> None:
+        """The subscribers want another window. The sender counts anew from when it is told, and so do we."""
+        self.window = window
+        self.until_credit = min(self.until_credit, self._share)
+
     def interrupted(self) -> None:
         """The sender is gone: should it come back, it knows nothing of us, so its first message is answered."""
         self.until_credit = 1
 
     def credited(self) -> None:
         """The sender is told now: so when next?"""
-        self.until_credit = max(1, self.window // 2) if self.window else NO_LIMIT
+        self.until_credit = self._share
+
+    @property
+    def _share(self) -> int:
+        """Messages from one credit to the next: so many that the sender need not stop for it."""
+        return max(1, self.window // 2) if self.window else NO_LIMIT

@@ -58,6 +58,8 @@ class BasePublisher(Generic[M]):
 
     async def wait_subscriber(self) -> None:
         """Wait until somebody subscribes. Raises Closed if the publisher is closed before."""
+        if self not in self._topic.publishers:
+            raise self._is_closed()
         if not self.subscribers:
             waiter = self._space.loop.create_future()
             self._waiters.append(waiter)

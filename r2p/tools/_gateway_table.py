@@ -75,8 +75,9 @@ class Rates:
             key = (way.topic, way.source, way.target)
             self._last[key] = way.forwarded
             if way.forwarded or way.dropped:
-                rate = (way.forwarded - last.get(key, 0)) / since
-                rows.append(Row(*key, "", 0, round(rate, 3), way.forwarded, way.dropped))
+                before = last.get(key, 0)
+                new = way.forwarded - (before if before <= way.forwarded else 0)  # else the way was made anew
+                rows.append(Row(*key, "", 0, round(new / since, 3), way.forwarded, way.dropped))
         return rows
 
 

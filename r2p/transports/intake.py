@@ -25,6 +25,10 @@ TURN = 64
 STALL = 1.0
 """Seconds for which a line stands still, at most, as another link has no room."""
 
+STALL_AGAIN = 0.05
+"""... and right after that was in vain: where many topics have no room, the line must not stand still once for each. It
+grows with the time that has passed since."""
+
 
 class LinkStats(msgspec.Struct):
     """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions; `faults`
@@ -139,6 +143,7 @@ class Intake:
         self._lossy: set[Sink] = set()
         self._stalled: _Arrived | None = None
         self._stall: asyncio.TimerHandle | None = None
+        self._in_vain = -STALL
 
     def open(self, topic: Topic, size: int, sender: Hashable) -> None:
         """Take what `sender` publishes: messages of `size` bytes, 0: of any size. Again: with another size."""
@@ -193,6 +198,8 @@ class Intake:
         self._backlog.extend(arrivals)
         if not self._busy:
             self._hand_out()
+        elif self._paused:
+            self._link.pause()  # the line has been connected anew
 
     def _hand_out(self) -> None:
         self._busy = True
@@ -264,7 +271,8 @@ class Intake:
         """Until these links have room, or have had none for too long."""
         claim.over = self._go_on
         self._stalled = claim
-        self._stall = self._loop.call_later(STALL, self._give_up, claim)
+        longest = min(STALL, max(STALL_AGAIN, self._loop.time() - self._in_vain))
+        self._stall = self._loop.call_later(longest, self._give_up, claim, f"no room for {longest:.2g} s")
 
     def _go_on(self) -> None:
         """It is placed, in the middle of somebody's work: go on after it."""
@@ -277,8 +285,9 @@ class Intake:
             self._stall.cancel()
             self._stall = None
 
-    def _give_up(self, claim: _Arrived) -> None:
+    def _give_up(self, claim: _Arrived, refusal: str) -> None:
         for sink in list(claim.lacking):
             sink.refill()
         for sink in list(claim.lacking):
-            sink.give_up(f"no room for {STALL} s")
+            sink.give_up(refusal)
+            self._in_vain = self._loop.time()

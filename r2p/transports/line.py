@@ -209,7 +209,9 @@ class LineLink(Link):
 
     @property
     def waits(self) -> bool:
-        return self._carrier is not None and self._carrier.waits
+        if self._carrier is None or (self.gate is not None and self.gate.shares):
+            return False  # hellos of gateways that come late would part the tree
+        return self._carrier.waits
 
     def pause(self) -> None:
         if self._carrier is not None:

@@ -89,6 +89,10 @@ class Gate(Protocol):
     def speaks(self) -> bool:
         """Whether discovery may say anything: where two links lead to one network, only one of them does."""
 
+    @property
+    def shares(self) -> bool:
+        """Whether there are other gateways on the link's network."""
+
     def looked(self) -> None:
         """Discovery may have learnt something."""
 

@@ -15,6 +15,7 @@ from r2p.codecs import management
 from r2p.msg import Float32, Led, Text
 from r2p.testing.network import node_in
 from r2p.transports.memory import Frame, Port, network
+from tests.transports.conversation import Script, manage
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -323,6 +324,24 @@ async def test_firmware_is_seen_with_its_age() -> None:
         await asyncio.sleep(2)
         (imu,) = [view for view in module.network.modules() if view.name == "IMU1"]
         assert imu.age < 2
+
+
+async def test_a_line_with_a_gateway_at_its_other_end_is_read_whoever_has_no_room() -> None:
+    """Hellos that wait behind messages would part the tree."""
+
+    class Line(Script):
+        waits = True
+
+    line = Line()
+    async with r2p.Module("GW", via=[line, "memory:b"], bridge=True):
+        await asyncio.sleep(CONVERGED)
+        assert line.link.waits
+        for count in range(5):
+            line.hear(manage(management.Bridge(7, 0, count, 0, bytes(18))))
+            await asyncio.sleep(0.08)
+            assert not line.link.waits
+        await asyncio.sleep(CONVERGED)  # it is gone
+        assert line.link.waits
 
 
 class FirmwareGateway:

@@ -132,3 +132,35 @@ def test_it_never_runs_ahead_nor_sticks(window: int, steps: list[str]) -> None:
                 out.credited(A, serial & 0xFFFFFFFF)
         assert len(on_the_way) <= window
         assert out.serial - taken <= 2 * window
+
+
+@given(st.integers(0, 64), st.integers(0, 64), st.integers(0, 200), st.integers(0, 200))
+def test_another_window_leaves_nobody_waiting(before: int, after: int, sent: int, on_the_way: int) -> None:
+    """A topic's first subscriber was a tool that would rather lose some, or the next one knows its type."""
+    out, inward = Outflow(), Inflow(before)
+    out.joined(A, before)
+    flying: list[int] = []
+
+    def send() -> None:
+        if out.serial < out.limit:
+            out.serial += 1
+            flying.append(out.serial)
+
+    def arrive() -> None:
+        serial = flying.pop(0)
+        inward.until_credit -= 1
+        if not inward.until_credit:
+            inward.credited()
+            out.credited(A, serial)
+
+    for _ in range(sent):
+        send()
+        while len(flying) > on_the_way:
+            arrive()
+    inward.resized(after)
+    out.joined(A, after)
+    for _ in range(300):
+        while flying:
+            arrive()
+        send()
+        assert flying

@@ -54,6 +54,13 @@ def test_the_table() -> None:
     ]
 
 
+def test_a_way_that_is_made_anew_counts_anew() -> None:
+    rates = Rates()
+    rates.rows(GatewayStatistics(PORTS, ways(100)), 1 * SECOND)
+    rows = rates.rows(GatewayStatistics(PORTS, ways(20)), 2 * SECOND)
+    assert [row.rate for row in rows if row.topic] == [20.0]
+
+
 def test_the_table_fits_on_the_terminal() -> None:
     text = "".join(f"{number} {'x' * 20}\n" for number in range(10))
     assert fitted(text, 80, 12) == text

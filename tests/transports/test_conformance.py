@@ -1,6 +1,7 @@
 """What holds on every transport: each test here runs over all of them."""
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import count
@@ -413,8 +414,9 @@ async def test_cancelled_at_any_await(cable: Cable) -> None:
             await subscriber.wait_publisher()
             while True:
                 await publisher.publish(Led())
-                await subscriber.fetch()
-                answered.set()
+                with contextlib.suppress(TimeoutError):  # on zenoh A may hear the question before it knows of us
+                    await subscriber.fetch(1.0)
+                    answered.set()
 
     async with module("A", cable.a()) as a:
         a.start(answer)

@@ -112,6 +112,37 @@ async def test_a_link_that_hangs_holds_it_up_once() -> None:
     assert (other.taken, other.lost, other.patient, end.reads) == ([], len(LINES), False, True)
 
 
+async def test_many_topics_without_room_hold_it_up_hardly_longer_than_one() -> None:
+    end, intake, _ = gateway(waits=True)
+    loop = asyncio.get_running_loop()
+    others = [Other() for _ in range(8)]
+    for number, other in enumerate(others):
+        topic = Passing(f"topic{number}", Waker(loop))
+        topic.join(other)
+        intake.open(topic, 1, None)
+    intake.take(Line(f"topic{number}".encode(), b"1") for number in range(len(others)))
+    await asyncio.sleep(STALL * 1.5)
+    assert [other.lost for other in others] == [1] * len(others)
+    assert end.reads
+    await asyncio.sleep(STALL)
+    intake.take(LINES[:1])
+    await asyncio.sleep(STALL * 0.9)  # it is given its time again
+    assert not end.reads
+
+
+async def test_a_line_that_is_connected_anew_is_held_up_as_the_old_one_was() -> None:
+    end, intake, other = gateway(waits=True)
+    intake.take(LINES)
+    await asyncio.sleep(STALL / 2)
+    end.reads = True
+    intake.take(LINES)
+    assert not end.reads
+    other.space = 2 * len(LINES)
+    other.refill()
+    await asyncio.sleep(0.01)
+    assert (other.taken, end.reads) == (2 * ALL, True)
+
+
 async def test_one_that_does_not_wait_loses_soon() -> None:
     end, intake, other = gateway(waits=False)
     intake.take(LINES)

@@ -185,6 +185,7 @@ class ZenohLink(Link):
         self.burst.flush()
         self._tokens.went_down()
         super().close()
+        self._reach.close()
         self.credits.close()
         self.senders.close()
         self._session = None

@@ -50,6 +50,12 @@ class Reach:
     def left(self, topic: str, session: int) -> None:
         self._guests.pop((topic, session), None)
 
+    def close(self) -> None:
+        """Look no more."""
+        self._guests.clear()
+        if self._checking is not None:
+            self._checking.cancel()
+
     def _look(self, topic: str, session: int, guest: _Guest) -> None:
         if self._guests.get((topic, session)) is not guest or not self._link.knows(topic):
             return
@@ -75,5 +81,5 @@ class Reach:
                     outlet.welcome()
                 elif outlet.tries[session] == _REPEATS + 1:
                     self._link.tell_unheard(outlet.topic.name, session)
-        if outlets:  # none is left where the link is closed
+        if outlets:
             self._checking = self._loop.call_later(_CHECK, self._check)

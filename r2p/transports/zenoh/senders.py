@@ -46,7 +46,7 @@ class Senders:
     def reach(self, topic: str) -> bool:
         """Whether zenoh knows of somebody whom messages of the topic reach."""
         senders = [sender for (name, _), sender in self._senders.items() if name == topic]
-        return bool(senders) and all(sender.matching_status for sender in senders)
+        return bool(senders) and all(_reaches(sender) for sender in senders)
 
     def publisher(self, topic: str, publisher_class: int) -> "zenoh.Publisher | None":
         """What zenoh sends with."""
@@ -58,3 +58,9 @@ class Senders:
     def flow(self, topic: str, publisher_class: int) -> Outflow:
         """What went out on the topic; it counts on for as long as the link lives."""
         return self._flows.setdefault((topic, publisher_class), Outflow())
+
+
+def _reaches(sender: "zenoh.Publisher") -> bool:
+    """zenoh's stubs tell of a bool; what comes is an object that says it, and is itself always true."""
+    status: object = sender.matching_status
+    return bool(getattr(status, "matching", status))

@@ -103,23 +103,28 @@ class Stream:
         self._waiting: deque[tuple[_Lane, int, Sample]] = deque()
         self._paused = False
         self._queueing = False
-        self.retype()
+        self._shape = _shape(topic)
+        self._reader = Reader(self._lane)
 
     def retype(self) -> None:
-        """The topic's type may be another one."""
-        layout = self.topic.layout
-        self._shape = Shape() if layout is None else Shape(layout.size, layout.fingerprint)
-        self._forget()
-
-    def _forget(self) -> None:
-        self._reader = Reader(self._lane)
+        """The topic's type, or what its subscribers put up with, may be another one."""
+        shape = _shape(self.topic)
+        if shape != self._shape:
+            self._shape = shape
+            self._reader = Reader(self._lane)
+        window = self._streams.window(self.topic)
+        for (_, publisher_class), flow in self._flows.items():
+            if publisher_class == _NRT and flow.window != window:
+                flow.resized(window)
 
     def parted(self, sender: Hashable) -> None:
         """A publisher's module is gone: should it come back, what it repeats is as good as new."""
         if sender in self.senders:
             self.senders.discard(sender)
             self.topic.inlets -= 1
-            self._forget()
+            known = self._reader.known
+            for key in [key for key, lane in known.items() if lane.origin.sender == sender]:
+                del known[key]
         for (session, _), flow in self._flows.items():
             if session == sender:
                 flow.interrupted()
@@ -362,3 +367,7 @@ class Stream:
             fits,
             self.topic.heard((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
+
+
+def _shape(topic: Topic) -> Shape:
+    return Shape() if topic.layout is None else Shape(topic.layout.size, topic.layout.fingerprint)

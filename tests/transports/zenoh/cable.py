@@ -1,7 +1,9 @@
 """Two modules on one zenoh network: A listens, B connects through a proxy that can be cut. Multicast stays off."""
 
 import asyncio
+import contextlib
 import functools
+import secrets
 import socket
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
@@ -18,10 +20,11 @@ P = ParamSpec("P")
 
 
 def free_port() -> int:
-    """A port of loopback that is free now."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port: int = probe.getsockname()[1]
-        return port
+    """A port of loopback that is free now; none of those that the kernel may give somebody before it is used."""
+    while True:
+        port = 20_000 + secrets.randbelow(10_000)
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
 
 
 class Proxy:

@@ -12,10 +12,13 @@ import zenoh
 
 import r2p
 from r2p.clock import SystemClock
-from r2p.codecs import attachment
+from r2p.codecs import attachment, liveliness
 from r2p.codecs.attachment import Header, Origin
+from r2p.codecs.liveliness import TopicToken
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import layout
 from r2p.msg import Led, Text
+from r2p.protocols.flow import NO_LIMIT
 from r2p.testing.network import node_in
 from r2p.transports.zenoh.link import ZenohLink
 from r2p.transports.zenoh.outlet import ZenohOutlet
@@ -124,6 +127,22 @@ async def test_a_tool_that_watches_never_makes_a_publisher_wait() -> None:
 
 
 @guarded
+async def test_a_node_that_joins_a_tool_in_its_module_is_waited_for_from_then_on() -> None:
+    async with nodes(Net(), "A", "B") as (alice, bob):
+        publisher = alice.advertise("leds", Led, r2p.NonRealTime(stall=30.0))
+        bob.subscribe("leds", Led, lossy=True)
+        await publisher.wait_subscriber()
+        for number in range(2 * WINDOW):
+            await publisher.publish(Led(number))
+        subscriber = bob.subscribe("leds", Led, queue=4 * WINDOW)
+        await until(lambda: link_of(alice).senders.flow("leds", 1).limit != NO_LIMIT)
+        for number in range(2 * WINDOW):  # would take 30 s if it waited for credit that nobody thinks of
+            await publisher.publish(Led(number))
+        await until(lambda: len(subscriber.queue) >= 2 * WINDOW)
+        assert publisher.missed == 0
+
+
+@guarded
 async def test_many_topics_at_once_lose_nothing() -> None:
     async with nodes(Net(), "A", "B") as (alice, bob):
         pairs = [
@@ -179,6 +198,35 @@ async def test_a_latched_value_comes_once_to_each() -> None:
         assert not bobs.queue
         again = carol.subscribe("leds", Led)
         assert await again.fetch() == Led(8)
+
+
+@guarded
+async def test_a_subscriber_is_let_in_when_messages_reach_it() -> None:
+    """Its token may come before its subscription."""
+    net = Net()
+    async with nodes(net, "A") as (alice,), alien_on(net) as alien:
+        publisher = alice.advertise("leds", Led, latch=True)
+        await publisher.publish(Led(1))
+        told = liveliness.encode(TopicToken(7, ROLE_SUBSCRIBES, "leds", 7, "node", window=8))
+        token = alien.liveliness().declare_token(f"r2p/lab/live/{told}")
+        reach = link_of(alice)._reach
+        await until(lambda: ("leds", 7) in reach._guests and reach._guests["leds", 7].waited > 3)
+        assert not publisher.subscribers
+        heard = alien.declare_subscriber("r2p/lab/topic/leds", zenoh.handlers.FifoChannel(8))
+        await publisher.wait_subscriber()
+        arrived = await asyncio.to_thread(heard.recv)
+        assert Led.decode(arrived.payload.to_bytes()) == Led(1)
+        token.undeclare()
+
+
+@guarded
+async def test_who_is_not_let_in_is_forgotten_with_the_link() -> None:
+    async with nodes(Net(), "A") as (alice,):
+        alice.advertise("leds", Led)
+        reach = link_of(alice)._reach
+        reach.came("leds", 7, 8)
+        assert reach._guests
+    assert not reach._guests
 
 
 @guarded
@@ -328,6 +376,35 @@ async def test_what_two_gateways_send_comes_once() -> None:
         for expected in (1, 2, 3, 1, 4):
             assert (await subscriber.fetch()).led == expected
         assert link_of(alice).losses == {"seen before": 2}
+
+
+@guarded
+async def test_when_a_publisher_leaves_the_others_are_still_known() -> None:
+    net = Net()
+    async with nodes(net, "A") as (alice,), alien_on(net) as alien:
+        subscriber = alice.subscribe("leds", Led)
+        live, size = alien.liveliness(), layout(Led).size
+        tokens = [
+            live.declare_token(
+                f"r2p/lab/live/{liveliness.encode(TopicToken(each, ROLE_PUBLISHES, 'leds', each, 'node', size=size))}"
+            )
+            for each in (7, 8)
+        ]
+        await until(lambda: subscriber.publishers == 2)
+
+        def put(sender: int, serial: int, sequence: int) -> None:
+            origin = msgspec.structs.replace(HEADER.origin, sender=sender, instance=sender)
+            header = attachment.encode(Header(origin, serial, sequence, sequence * 10))
+            alien.put("r2p/lab/topic/leds", Led(sequence).encode(), attachment=header)
+
+        put(8, 1, 1)
+        assert (await subscriber.fetch()).led == 1
+        tokens[0].undeclare()
+        await until(lambda: subscriber.publishers == 1)
+        put(8, 2, 1)  # again, as one does who has not heard that it came
+        put(8, 3, 2)
+        assert (await subscriber.fetch()).led == 2
+        tokens[1].undeclare()
 
 
 @guarded
