@@ -178,6 +178,8 @@ def _what_was_seen(session: Session, command: r2p.Command, name: str, timeout: f
         text += "; it is a program on a PC, those have no boot loader and refuse"
     elif command is r2p.Command.REBOOT and view.rebooted:
         text += "; it had been rebooted before, so its ALIVE may not tell"
+    elif view.link.partition(":")[0] in {"tcp", "zenoh"}:
+        text += "; if there is a gateway in between, does it have --allow-control?"
     return text
 
 

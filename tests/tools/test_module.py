@@ -7,6 +7,7 @@ import contextlib
 import json
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 
 import r2p
@@ -96,6 +97,17 @@ async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatc
         with pytest.raises(
             TimedOut, match=r"BOT did not confirm REBOOT in 4 s: it is running, heard .* rebooted before"
         ):
+            await reboot(session, "BOT", timeout=4.0)
+
+
+async def test_an_order_that_a_gateway_may_have_refused_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with robot(hold) as bot, tool() as session:
+        monkeypatch.setattr(bot._hub, "_obey", lambda _command: None)
+        await session.settle()
+        (seen,) = (view for view in session.module.network.modules() if view.name == "BOT")
+        far = msgspec.structs.replace(seen, link="zenoh:tcp/10.0.0.5:7447")
+        monkeypatch.setattr("r2p.tools.module._find", lambda _session, _name: far)
+        with pytest.raises(TimedOut, match=r"BOT did not confirm REBOOT in 4 s: .* does it have --allow-control\?"):
             await reboot(session, "BOT", timeout=4.0)
 
 
