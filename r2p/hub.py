@@ -118,7 +118,9 @@ class ModuleHub:
         """The link went up or down."""
         if link.up:
             first = link.stats.ups == 1
-            meanwhile = "" if first else f", after {outage:.1f} s; {lost} messages lost meanwhile"
+            meanwhile = "" if first else f", after {outage:.1f} s"
+            if lost:
+                meanwhile += f"; {lost} messages lost meanwhile"
             expected = self.observer and first and outage < _PROMPT
             logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.name, meanwhile)
             self._events.tell(LinkUp(link.name, outage, lost))

@@ -16,7 +16,7 @@ from r2p.bridge.port import BridgePort
 from r2p.bridge.relay import BridgedTopic, Relay, Way
 from r2p.bridge.reserving import RelayedPeriodic
 from r2p.bridge.shaping import Shaper
-from r2p.codecs.management import ANY_TYPE
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.events import Shape
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told
@@ -43,7 +43,7 @@ class Relays:
         self._policy = policy
         self._dirty: dict[str, None] = {}
         self._reviewing = False
-        self._shapes: dict[tuple[str, str], Shape] = {}
+        self._shapes: dict[tuple[str, str], tuple[Shape, Shape]] = {}
         self._too_long: set[str] = set()
 
     # What has changed
@@ -62,7 +62,7 @@ class Relays:
         """See whether other types, or sizes, are told than before."""
         for (topic, link), shape in list(self._shapes.items()):
             port = self._bridge.ports.get(link)
-            if port is not None and self._shape(topic, port) != shape:
+            if port is not None and self._types(topic, port) != shape:
                 self._mark((topic,))
 
     def _mark(self, topics: Iterable[str]) -> None:
@@ -132,7 +132,7 @@ class Relays:
             name = self._policy.called(topic, port.name)
             here = (topics or self._space.topics).get(name)
             if here is not None:
-                self._shapes[topic, port.name] = self._shape(topic, port)
+                self._shapes[topic, port.name] = self._types(topic, port)
                 port.link.topic_changed(here)
             if topics is not None:
                 self._shapes.pop((topic, port.name), None)
@@ -150,25 +150,32 @@ class Relays:
         subscribes = any(self._wants(name, each) and allows(name, port.name, each.name) for each in others)
         if not publishes and not subscribes:
             return own
-        shape = Shape(own.size, own.fingerprint) if topic.layout is not None else self._shape(name, port)
+        shape, asked = (own.asked, own.asked) if topic.layout is not None else self._types(name, port)
         return msgspec.structs.replace(
             own,
             publishes=own.publishes or publishes,
             subscribes=own.subscribes or subscribes,
             size=shape.size,
             fingerprint=shape.fingerprint,
+            asked=asked,
             queue=max(own.queue, QUEUE),
         )
 
-    def _shape(self, topic: str, port: BridgePort) -> Shape:
-        """The topic's type as it is known on other links; publishers know best."""
+    def _types(self, topic: str, port: BridgePort) -> tuple[Shape, Shape]:
+        """The types in which a link is told that we publish and subscribe: what publishers say of it, if there are any.
+
+        Those that it has itself are asked for what they have, so that one of another type elsewhere does not end it.
+        """
         others = [each for each in self._bridge.ports.values() if each is not port and each.in_tree]
-        others.sort(key=lambda each: not self._offers(topic, each))
-        infos = [
-            info for each in others if (info := each.link.discovery.topics.get(self._policy.called(topic, each.name)))
-        ]
-        size = next((info.size for info in infos if info.size), 0)
-        return Shape(size, next((info.fingerprint for info in infos if info.fingerprint), ANY_TYPE))
+        here = self._told(topic, [port], ROLE_PUBLISHES)
+        published = self._told(topic, others, ROLE_PUBLISHES)
+        asked = self._told(topic, others, ROLE_SUBSCRIBES)
+        return published or asked or Shape(), here or asked or published or Shape()
+
+    def _told(self, topic: str, ports: list[BridgePort], role: int) -> Shape | None:
+        """The type that the first link tells."""
+        infos = (each.link.discovery.topics.get(self._policy.called(topic, each.name)) for each in ports)
+        return next((info.shapes[role] for info in infos if info is not None and role in info.shapes), None)
 
     # One topic on one link
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import msgspec
 
 from r2p.codecs import management
-from r2p.protocols.events import ModuleInfo, Source
+from r2p.protocols.events import ModuleInfo, Shape, Source
 
 MOST = 4096
 """Entries in each table."""
@@ -26,7 +26,10 @@ V = TypeVar("V")
 
 
 class TopicInfo(msgspec.Struct):
-    """A topic as heard on the link. Instants are in monotonic ns, None: never; `size` in bytes, 0: not said."""
+    """A topic as heard on the link. Instants are in monotonic ns, None: never; `size` in bytes, 0: not said.
+
+    `shapes` are its type by the role of those who said it; `size` and `fingerprint` are the publishers', if they did.
+    """
 
     name: str
     size: int = 0
@@ -34,6 +37,18 @@ class TopicInfo(msgspec.Struct):
     advertised_at: int | None = None
     requested_at: int | None = None
     mismatch: bool = False
+    shapes: dict[int, Shape] = {}
+    typed_at: dict[int, int] = {}
+
+    def typed(self, role: int, shape: Shape | None) -> None:
+        """Those in this role say so; None: there is nobody any more."""
+        if shape is None:
+            self.shapes.pop(role, None)
+        else:
+            self.shapes[role] = shape
+        best = self.shapes.get(management.ROLE_PUBLISHES) or self.shapes.get(management.ROLE_SUBSCRIBES, Shape())
+        self.size = best.size
+        self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
 
 
 class EndpointInfo(msgspec.Struct, frozen=True):
@@ -142,13 +157,19 @@ class Directory:
         self._put(self.topics, name, info, "topics forgotten")
         return info
 
-    def typed(self, message: management.TypeInfo) -> None:
-        """The type of a topic; a publisher's word counts more than a subscriber's."""
-        info = self.topic(message.topic)
-        if message.role == management.ROLE_PUBLISHES or info.fingerprint is None:
-            known = message.fingerprint != management.ANY_TYPE
-            info.fingerprint = message.fingerprint if known else info.fingerprint
-            info.size = message.size or info.size
+    def typed(self, now: int, topic: str, role: int, shape: Shape) -> TopicInfo:
+        """The type of a topic. Of several that differ the first one stays, as long as it is repeated."""
+        info = self.topic(topic)
+        for each, at in list(info.typed_at.items()):
+            if now > at + LEASE:
+                del info.typed_at[each]
+                info.typed(each, None)
+        known = info.shapes.get(role, Shape())
+        if shape != Shape() and known.fits(shape):
+            if known.fingerprint in {management.ANY_TYPE, shape.fingerprint}:
+                info.typed_at[role] = now
+            info.typed(role, known.joined(shape))
+        return info
 
     def endpoint(self, message: management.Endpoint) -> tuple[EndpointKey | None, EndpointKey | None]:
         """An endpoint exists or is gone: the key that was entered, and the key that has left the table."""

@@ -34,6 +34,11 @@ class Shape(msgspec.Struct, frozen=True):
         typed = self.fingerprint != management.ANY_TYPE and other.fingerprint != management.ANY_TYPE
         return not typed or self.fingerprint == other.fingerprint
 
+    def joined(self, other: "Shape") -> "Shape":
+        """What one of two that fit knows."""
+        typed = self.fingerprint != management.ANY_TYPE
+        return Shape(self.size or other.size, self.fingerprint if typed else other.fingerprint)
+
 
 class ModuleInfo(msgspec.Struct, frozen=True):
     """A module as heard on the link.

@@ -36,8 +36,7 @@ class Exchange:
     def advertised(self, now: int, message: management.Advertise, source: Source) -> None:
         """A publisher: ask for its data if somebody here wants it."""
         topic = message.topic
-        info = self._directory.topic(topic)
-        info.advertised_at, info.size = now, message.size or info.size
+        self._directory.typed(now, topic, ROLE_PUBLISHES, Shape(message.size)).advertised_at = now
         own = self._own.subscribers.get(topic)
         peer = self._peers.obtain(source) if own is not None else None
         if own is None or peer is None:
@@ -52,9 +51,7 @@ class Exchange:
     def requested(self, now: int, message: management.SubscribeRequest, source: Source) -> None:
         """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
         topic = message.topic
-        heard = self._directory.topic(topic)
-        heard.requested_at = now
-        heard.size = heard.size or message.size
+        self._directory.typed(now, topic, ROLE_SUBSCRIBES, Shape(message.size)).requested_at = now
         own = self._own.publishers.get(topic)
         peer = self._peers.obtain(source) if own is not None else None
         if own is None or peer is None:
@@ -77,8 +74,7 @@ class Exchange:
         peer = self._peers.obtain(source) if topic in self._own.subscribers else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
             return
-        info = self._directory.topic(topic)
-        info.size = message.size or info.size
+        self._directory.typed(now, topic, ROLE_PUBLISHES, Shape(message.size))
         if peer.opened.get(topic) != (message.params, message.size):
             peer.opened[topic] = (message.params, message.size)
             self._own.answered.add(topic)
@@ -86,7 +82,7 @@ class Exchange:
 
     def typed(self, now: int, message: management.TypeInfo, source: Source) -> None:
         """A peer's type of a topic: compare it if the topic is ours too."""
-        self._directory.typed(message)
+        self._directory.typed(now, message.topic, message.role, Shape(message.size, message.fingerprint))
         own = self._counterpart(message.role).get(message.topic)
         peer = self._peers.obtain(source) if own is not None else None
         if peer is not None:

@@ -58,6 +58,7 @@ class Matching:
         self._review(token.session, session, topic_role)
         if not session.tokens:
             del self._sessions[token.session]
+        self._retype(self.topics[token.topic], token.role)
         self._told[topic_role] -= 1
         if not self._told[topic_role]:
             del self._told[topic_role]
@@ -122,11 +123,13 @@ class Matching:
     def _note(self, now: int, token: TopicToken) -> None:
         info = self.topics.setdefault(token.topic, TopicInfo(token.topic))
         self._mark(now, info, token.role)
-        typed = token.fingerprint != ANY_TYPE
-        if typed and (token.role == ROLE_PUBLISHES or info.fingerprint is None):
-            info.fingerprint = token.fingerprint
-        if token.size and (token.role == ROLE_PUBLISHES or not info.size):
-            info.size = token.size
+        self._retype(info, token.role)
+
+    def _retype(self, info: TopicInfo, role: int) -> None:
+        """The type of a topic is that of the first session that tells one."""
+        tokens = (session.tokens.get((info.name, role)) for session in self._sessions.values())
+        shapes = (_shape(each) for each in tokens if each)
+        info.typed(role, next((shape for shape in shapes if shape != Shape()), None))
 
     def _mark(self, now: int, info: TopicInfo, role: int) -> None:
         if role == ROLE_PUBLISHES:

@@ -4,17 +4,18 @@ import msgspec
 
 from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.door import Door
-from r2p.protocols.events import Event
+from r2p.protocols.events import Event, Shape
 from r2p.topic import Topic
 
 
 class Told(msgspec.Struct, frozen=True):
-    """What the other ends have been told of a topic."""
+    """What the other ends have been told of a topic; `asked` is the type in which it is subscribed."""
 
     publishes: bool = False
     subscribes: bool = False
     size: int = 0
     fingerprint: bytes = bytes(8)
+    asked: Shape = Shape()
     queue: int = 1
     params: bytes = NO_PARAMS
     endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
@@ -31,11 +32,13 @@ def wish_of(topic: Topic) -> Told:
         publisher_class = int(each.publisher_class) | (CLASS_LATCHES if each.latch else 0)
         publishers[key] = max(publisher_class, publishers.get(key, 0))  # a node may have several, of several classes
     subscribers = {(each.owner, ROLE_SUBSCRIBES): 0 for each in topic.queues}
+    shape = Shape() if topic.layout is None else Shape(topic.layout.size, topic.layout.fingerprint)
     return Told(
         publishes=bool(publishers),
         subscribes=bool(subscribers),
-        size=topic.layout.size if topic.layout is not None else 0,
-        fingerprint=topic.layout.fingerprint if topic.layout is not None else bytes(8),
+        size=shape.size,
+        fingerprint=shape.fingerprint,
+        asked=shape,
         queue=min(max((each.limit for each in topic.queues), default=1), 0xFFFF),
         endpoints=publishers | subscribers,
     )
@@ -48,8 +51,8 @@ def announce(discovery: Door, now: int, topic: str, told: Told, wish: Told) -> l
         events += discovery.advertise(now, topic, wish.size, wish.fingerprint, wish.params)
     elif told.publishes and not wish.publishes:
         events += discovery.withdraw(now, topic)
-    if wish.subscribes and (retyped or not told.subscribes):
-        events += discovery.subscribe(now, topic, wish.size, wish.queue, wish.fingerprint)
+    if wish.subscribes and (wish.asked != told.asked or not told.subscribes):
+        events += discovery.subscribe(now, topic, wish.asked.size, wish.queue, wish.asked.fingerprint)
     elif told.subscribes and not wish.subscribes:
         events += discovery.unsubscribe(now, topic)
     for (node, role), publisher_class in wish.endpoints.items():

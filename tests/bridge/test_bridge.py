@@ -216,6 +216,25 @@ async def test_two_types_are_refused_across_the_gateway() -> None:
         assert not far.queue
 
 
+async def test_another_type_elsewhere_does_not_end_what_flows() -> None:
+    """Whoever publishes or subscribes it wrongly is refused where he is, and leaves nothing behind."""
+    async with gateway(), node("A", "a") as a, node("B", "b") as b:
+        publisher, subscriber = a.advertise("leds", Led), b.subscribe("leds", Led, queue=100)
+        await publisher.wait_subscriber()
+        for kind in ("publishes", "subscribes"):
+            async with node("C", "b") as c:
+                if kind == "publishes":
+                    c.advertise("leds", Float32, latch=True)
+                else:
+                    c.subscribe("leds", Float32)
+                await asyncio.sleep(4.0)
+                await publisher.publish(Led(led=1))
+            await asyncio.sleep(8.0)
+            await publisher.publish(Led(led=2))
+            await asyncio.sleep(0.1)
+            assert drain(subscriber) == [1, 2]
+
+
 async def test_own_nodes_of_a_gateway() -> None:
     async with gateway() as gw, node_in(gw, name="own") as own, node("A", "a") as a, node("B", "b") as b:
         text = own.advertise("text", Text)
