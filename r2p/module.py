@@ -107,18 +107,19 @@ class Module:
         self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
-        self._watchdog = Watchdog(loop) if self._with_watchdog and not clock.virtual else None
+        self._watchdog: Watchdog | None = None
         self._tasks = asyncio.TaskGroup()
         await self._tasks.__aenter__()
         self._open = True
-        if self._watchdog is not None:
-            self._watchdog.start()
         try:
             for via in self._via:
                 await self._open_transport(self._tasks, via)
         except BaseException:  # cancelled, too: who does not come to the block does not leave it either
             await self._close(self._tasks)
             raise
+        if self._with_watchdog and not clock.virtual:  # not before: opening imports the transports' libraries
+            self._watchdog = Watchdog(loop)
+            self._watchdog.start()
         return self
 
     async def __aexit__(

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
+from r2p.transports.link import Hub, Transport
 from r2p.watchdog import Watchdog
 from tests.bench import local
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 PATIENCE = 30.0
 
@@ -44,6 +45,29 @@ def reports() -> Iterator[Reports]:
 
 async def greedy(node: r2p.Node, came: threading.Event) -> None:
     assert came.wait(PATIENCE)
+
+
+class Opening(Transport):
+    """Tells whether the watchdog watches while it is opened, when it may import a library for long."""
+
+    watched: bool | None = None
+
+    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+        self.watched = watches()
+        opened()
+
+
+def watches() -> bool:
+    return "r2p-watchdog" in {each.name for each in threading.enumerate()}
+
+
+@pytest.mark.anyio
+async def test_it_watches_as_soon_as_the_transports_are_open() -> None:
+    transport = Opening()
+    async with r2p.Module("A", via=transport):
+        assert watches()
+    assert transport.watched is False
+    assert not watches()
 
 
 @pytest.mark.anyio

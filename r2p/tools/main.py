@@ -38,6 +38,13 @@ class LazyGroup(TyperGroup):
         name, command, rest = super().resolve_command(ctx, args)
         return name, command if name is None else _load(name), rest
 
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")  # pydantic's words, by way of typer
+            raise
+
 
 app = typer.Typer(
     cls=LazyGroup,
@@ -51,9 +58,7 @@ app = typer.Typer(
 
 def main() -> None:
     """The entry point."""
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by the shell: >&-
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - stays open
+    _open_missing_streams()
     try:
         app(prog_name="r2p")
     except OSError as error:
@@ -69,6 +74,17 @@ def main() -> None:
         raise
     finally:
         _flush()
+
+
+def _open_missing_streams() -> None:
+    """What the shell has closed (`<&-`, `>&-`) reads and writes nothing; else a socket would get its number."""
+    for fd, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(fd)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest free number: fd
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115, PTH123 - stays open
 
 
 def _flush() -> None:

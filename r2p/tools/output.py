@@ -9,12 +9,15 @@ import contextlib
 import csv
 import functools
 import io
+import itertools
 import json
 import os
 import select
+import shutil
 import stat
 import sys
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+import textwrap
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, TextIO
 
 Record = Mapping[str, Any]
@@ -80,7 +83,7 @@ class Output:
         rows = list(rows)
         match self.format:
             case "text":
-                text = aligned(rows, columns)
+                text = aligned(rows, columns, shutil.get_terminal_size().columns)
             case "csv":
                 text = _csv(columns) + "".join(_csv([_cell(row[name]) for name in columns]) for row in rows)
             case _:
@@ -196,13 +199,43 @@ def _yaml_dumper() -> Callable[[Any], str]:
     )
 
 
-def aligned(rows: Iterable[Record], columns: list[str]) -> str:
-    """A table for people: columns aligned, lists joined by blanks, nothing for None."""
+def aligned(rows: Iterable[Record], columns: list[str], width: int | None = None) -> str:
+    """A table for people: columns aligned, lists joined by blanks, nothing for None.
+
+    Where it is wider than `width` characters, lists are folded between their items, onto lines of their own.
+    """
+    rows = list(rows)
     lines = [[name.upper() for name in columns], *([_cell(row[name]) for name in columns] for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    if width is not None and sum(widths) + 2 * (len(widths) - 1) > width:
+        lists = [i for i, name in enumerate(columns) if any(isinstance(row[name], list | tuple) for row in rows)]
+        widths = _narrowed(widths, lists, width - 2 * (len(widths) - 1))
+        lines = [folded for line in lines for folded in _folded(line, lists, widths)]
+        widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
     return "".join(
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() + "\n" for line in lines
     )
+
+
+def _narrowed(widths: list[int], lists: list[int], room: int) -> list[int]:
+    """These widths, with what the others leave of `room` shared by the columns of lists, the narrowest served first."""
+    left = room - sum(width for i, width in enumerate(widths) if i not in lists)
+    narrowed = list(widths)
+    for served, i in enumerate(sorted(lists, key=widths.__getitem__)):
+        narrowed[i] = max(1, min(widths[i], left // (len(lists) - served)))
+        left -= narrowed[i]
+    return narrowed
+
+
+def _folded(line: list[str], lists: list[int], widths: list[int]) -> Iterator[list[str]]:
+    """A line of a table as the lines that it takes; an item that is wider than its column is left whole."""
+    cells = [_wrapped(cell, widths[i]) if i in lists else [cell] for i, cell in enumerate(line)]
+    for each in itertools.zip_longest(*cells, fillvalue=""):
+        yield list(each)
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False) or [""]
 
 
 def _cell(value: Any) -> str:

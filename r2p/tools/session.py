@@ -43,6 +43,9 @@ PATIENCE = 1.0
 
 _SETTLED = 0.3  # seconds without news, after which an r2p peer has told everything
 _FIRMWARE = 1.5  # seconds in which a module that repeats itself each half second should have said something
+_PASSED_ON = 1.7  # seconds; a gateway tells a bus what is behind it each 1.5 s, and whoever is new there not sooner
+_MOST = 8.0  # seconds that a tool listens while there is news: a bus of 1 Mbit/s bears 100 messages a second
+_BUSES = ("rtcan", "sim")
 _LOOK = 0.05  # seconds between two looks for news
 _LOOPBACK = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 _LINK_UP = 5.0  # seconds that a look at the network waits for the first link
@@ -188,8 +191,9 @@ class Session:
     async def settle(self, wait: float | None = None, *, of: str = "topics") -> None:
         """Listen to the network until the others have told what they have, or for `wait` seconds.
 
-        `of` is what it listens for, in words. r2p modules are asked and answer at once; firmware repeats itself step
-        by step, so there may be more to come, which is said. Raises r2p.TransportError if no link comes up.
+        `of` is what it listens for, in words. r2p modules are asked and answer at once, but those behind a gateway on
+        a bus; firmware repeats itself step by step. Where there may be more to come, that is said. Raises
+        r2p.TransportError if no link comes up.
         """
         if not self.settings.via:
             return
@@ -198,17 +202,26 @@ class Session:
             await asyncio.sleep(wait)
             return
         self.module.query()
+        told = await self._told()
+        if self._hears_firmware() and (not told or self._expects_more()):
+            self.say(f"firmware tells one thing each half second: there may be more {of}, listen longer with --wait 5")
+        elif not told:
+            self.say(f"there was news to the end: there may be more {of}, listen longer with --wait 20")
+
+    async def _told(self) -> bool:
+        """Wait until nobody has news any more; False if that was given up."""
+        on_bus = any(url.partition(":")[0] in _BUSES for url in self.settings.via)
+        quiet = _PASSED_ON if on_bus else _SETTLED
         loop = asyncio.get_running_loop()
         start = news_at = loop.time()
         known = 0
-        while loop.time() - start < _FIRMWARE:
+        while (now := loop.time()) - start < _MOST:
+            if now - news_at > quiet and (now - start > _FIRMWARE or not self._expects_more()):
+                return True
             await asyncio.sleep(_LOOK)
             if (count := self._known()) != known:
                 known, news_at = count, loop.time()
-            if loop.time() - news_at > _SETTLED and not self._expects_more():
-                return
-        if self._hears_firmware():
-            self.say(f"firmware tells one thing each half second: there may be more {of}, listen longer with --wait 5")
+        return False
 
     async def _link_up(self) -> None:
         loop = asyncio.get_running_loop()

@@ -263,6 +263,8 @@ _HINTS = {
 
 def _host_port(url: Url) -> tuple[str, int]:
     """The address's host (may be empty) and port."""
+    if url.address.startswith("//"):
+        raise TransportError(f"{url}: leave out the //: {url.scheme}:{url.address.lstrip('/')}")
     host, colon, port = url.address.rpartition(":")
     if url.address.isdecimal():
         port = url.address

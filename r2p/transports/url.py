@@ -4,6 +4,7 @@ The built-in schemes are a table of import strings, so that a transport's librar
 packages add theirs through the entry-point group `r2p.transports`.
 """
 
+import difflib
 import importlib
 import math
 import re
@@ -33,6 +34,8 @@ BUILT_IN = {
 GROUP = "r2p.transports"
 
 _OPTIONS = re.compile(r"[?,&]")
+_CAN = re.compile(r"[a-z]*can[0-9]+")
+_CLOSE = 0.65  # how much of a name must be right (difflib): of can and rtcan it is 0.75
 _UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
 
 
@@ -65,7 +68,8 @@ def parse(text: str) -> Url:
     """Take a URL apart. Raises TransportError if it has no scheme or an option without `=`."""
     scheme, colon, rest = text.partition(":")
     if not colon or not scheme:
-        raise TransportError(f"transport {text!r}: give it as SCHEME:ADDRESS, for example tcp:192.168.0.10:23")
+        hint = f"did you mean rtcan:{text}?" if _CAN.match(text) else "for example tcp:192.168.0.10:23"
+        raise TransportError(f"transport {text!r}: give it as SCHEME:ADDRESS, {hint}")
     address, *pairs = _OPTIONS.split(rest)
     options: dict[str, str] = {}
     for pair in filter(None, pairs):
@@ -83,7 +87,7 @@ def open_transport(text: str) -> Transport:
     """
     url = parse(text)
     try:
-        factory = _factory(url.scheme)
+        factory = _factory(url)
     except ImportError as error:
         raise TransportError(f"transport {url.scheme!r} can't be used here: {error}") from error
     return factory(url)
@@ -105,14 +109,19 @@ def duration(text: str) -> float:
     return seconds
 
 
-def _factory(scheme: str) -> Callable[[Url], Transport]:
-    if scheme in BUILT_IN:
-        module, _, name = BUILT_IN[scheme].partition(":")
+def _factory(url: Url) -> Callable[[Url], Transport]:
+    if url.scheme in BUILT_IN:
+        module, _, name = BUILT_IN[url.scheme].partition(":")
         return cast("Callable[[Url], Transport]", getattr(importlib.import_module(module), name))
     for entry in _added():
-        if entry.name == scheme:
+        if entry.name == url.scheme:
             return cast("Callable[[Url], Transport]", entry.load())
-    raise TransportError(f"unknown transport {scheme!r}: use one of {', '.join(schemes())}")
+    known = schemes()
+    hint = "".join(
+        f"; did you mean {scheme}:{url.address}?"
+        for scheme in difflib.get_close_matches(url.scheme, known, n=1, cutoff=_CLOSE)
+    )
+    raise TransportError(f"unknown transport {url.scheme!r}: use one of {', '.join(known)}{hint}")
 
 
 def _added() -> "EntryPoints":

@@ -35,7 +35,12 @@ def test_every_command_has_help(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "hint"),
-    [(["topc"], "Did you mean 'topic'?"), (["topic", "ehco"], "Did you mean 'echo'?"), (["topic", "echo"], "Missing")],
+    [
+        (["topc"], "Did you mean 'topic'?"),
+        (["topic", "ehco"], "Did you mean 'echo'?"),
+        (["topic", "echo"], "Missing"),
+        (["topic", "list", "--format", "xml"], "Invalid value for '--format': 'xml' is not one of 'yaml'"),
+    ],
 )
 def test_mistakes_are_usage_errors(arguments: list[str], hint: str) -> None:
     result = CliRunner().invoke(app, arguments)
@@ -53,6 +58,14 @@ def test_output_that_can_not_be_written_is_an_error_of_one_line(arguments: tuple
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
     assert done.returncode == 1
     assert done.stderr == "r2p: can't write the output: No space left on device\n"
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(sys.platform == "win32", reason="closes descriptors as a shell of Unix does")
+def test_closed_standard_streams_are_no_trouble() -> None:
+    shell = ["sh", "-c", '"$@" <&- >&- 2>&-', "sh", sys.executable, "-c", "from r2p.tools.main import main; main()"]
+    arguments = ["topic", "echo", "leds", "--via", "tcp-listen:0", "--timeout", "10ms"]
+    assert subprocess.run([*shell, *arguments], timeout=60).returncode == 3
 
 
 def test_version() -> None:

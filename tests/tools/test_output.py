@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from r2p.tools.output import Output, PipeClosed, flatten
+from r2p.tools.output import Output, PipeClosed, aligned, flatten
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -67,6 +67,23 @@ async def test_csv_has_a_header_and_flat_columns() -> None:
         "5,0,1.5,-2.0,on,0.1,nan\n"
         ',,1,2,"a ""b"", c",,\n'
     )
+
+
+def test_a_table_that_is_too_wide_folds_its_lists() -> None:
+    rows = [
+        {"topic": "log", "publishers": ["IMU1/log", "MOTOR/log", "PC1/log"], "subscribers": ["TOOL/echo"]},
+        {"topic": "leds", "publishers": ["PC1/blink"], "subscribers": []},
+    ]
+    columns = ["topic", "publishers", "subscribers"]
+    folded = """\
+TOPIC  PUBLISHERS          SUBSCRIBERS
+log    IMU1/log MOTOR/log  TOOL/echo
+       PC1/log
+leds   PC1/blink
+"""
+    assert aligned(rows, columns, 40) == folded
+    assert aligned(rows, columns, 80) == aligned(rows, columns)
+    assert "MOTOR/log\n" in aligned(rows, ["topic", "publishers"], 5)  # no item is cut
 
 
 def test_flatten() -> None:

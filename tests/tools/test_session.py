@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 import logging
 import re
 from typing import TYPE_CHECKING, Annotated
@@ -135,6 +137,38 @@ async def test_it_settles_as_soon_as_the_others_have_told_everything(capsys: pyt
         assert asyncio.get_running_loop().time() - start < 1.0
         assert set(session.module.network.topics()) == {"leds", "log"}
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("late", [0.1, 0.8, 1.3])
+async def test_on_a_bus_it_waits_for_those_behind_a_gateway(late: float, capsys: pytest.CaptureFixture[str]) -> None:
+    """Who is new on the bus is told of them when the gateway repeats itself, each 1.5 s."""
+    names = {f"M{number}" for number in range(6)}
+    async with contextlib.AsyncExitStack() as stack:
+        options = r2p.BridgeOptions()
+        vias = ["memory:behind", "sim:lab,slots=20,cycle=20ms"]
+        await stack.enter_async_context(r2p.Module("GW", via=vias, bridge=options, watchdog=False))
+        for name in sorted(names):
+            module = await stack.enter_async_context(r2p.Module(name, via="memory:behind", watchdog=False))
+            module.start(leds)
+        await asyncio.sleep(10 + late)
+        session = await stack.enter_async_context(join(Settings(via=["sim:lab,slots=20,cycle=20ms"])))
+        await session.settle()
+        assert names <= {view.name for view in session.module.network.modules()}
+        assert {module for module, node in session.module.network.nodes() if node == "leds"} == names
+    assert "there may be more" not in capsys.readouterr().err
+
+
+@pytest.mark.virtual_time
+async def test_who_tells_for_ever_is_not_heard_to_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+    async def busy(node: r2p.Node) -> None:
+        for number in itertools.count():
+            node.advertise(f"t{number}", Led)
+            await asyncio.sleep(0.2)
+
+    async with robot(busy), tool() as session:
+        await session.settle(of="nodes")
+    assert "there may be more nodes" in capsys.readouterr().err
 
 
 @pytest.mark.virtual_time

@@ -156,6 +156,19 @@ async def test_it_waits_for_a_topic_that_nobody_knows_and_says_so(capsys: pytest
 
 
 @pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("topic", "hint"), [("ledz", "r2p: nobody publishes ledz: is it one of leds?\n"), ("odometry", "")]
+)
+async def test_topics_with_names_much_like_it_are_named_once(
+    topic: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with robot(leds), tool() as session:
+        with pytest.raises(TimedOut):
+            await echo(session, [topic], timeout=20)
+    assert capsys.readouterr().err == f"r2p: waiting for a publisher of {topic} on memory:lab\n{hint}"
+
+
+@pytest.mark.virtual_time
 async def test_silence_is_a_time_out(capsys: pytest.CaptureFixture[str]) -> None:
     async def three(node: r2p.Node) -> None:
         publisher = node.advertise("leds", Led, latch=True)

@@ -325,6 +325,12 @@ def test_addresses_that_are_none(url: str) -> None:
         TcpTransport(parse(url))
 
 
+@pytest.mark.parametrize("transport", [TcpTransport, TcpListenTransport])
+def test_slashes_are_no_part_of_it(transport: type[TcpTransport] | type[TcpListenTransport]) -> None:
+    with pytest.raises(TransportError, match=r"leave out the //: tcp:127\.0\.0\.1:2323"):
+        transport(parse("tcp://127.0.0.1:2323"))
+
+
 @pytest.mark.parametrize("host", ["a..b", ".a", "a" * 64, "a\0b"])
 @pytest.mark.parametrize("transport", [TcpTransport, TcpListenTransport])
 def test_what_can_not_be_a_host_name_is_said_at_once(

@@ -47,6 +47,15 @@ def test_an_unknown_scheme_lists_the_known_ones() -> None:
         open_transport("tpc:host")
 
 
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [("can0", "rtcan:can0"), ("vcan1", "rtcan:vcan1"), ("can:can0", "rtcan:can0"), ("tpc:a", "tcp:a")],
+)
+def test_what_was_meant(text: str, meant: str) -> None:
+    with pytest.raises(TransportError, match=rf"did you mean {meant}\?$"):
+        open_transport(text)
+
+
 def test_a_scheme_of_another_package(monkeypatch: pytest.MonkeyPatch) -> None:
     """It names itself in the entry points of the group `r2p.transports`."""
     entry = metadata.EntryPoint("carrier-pigeon", "tests.transports.test_url:pigeon", urls.GROUP)

@@ -9,6 +9,17 @@ from r2p.transports.rtcan.transport import RtcanTransport
 from r2p.transports.rtcan.words import HOLDABLE
 from r2p.transports.url import Url
 
+# fmt: off
+INTERFACES = frozenset({
+    "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys",
+    "neovi", "nican", "nixnet", "pcan", "robotell", "seeedstudio", "serial", "slcan",
+    "socketcan", "socketcand", "systec", "udp_multicast", "usb2can", "vector", "virtual",
+})
+# fmt: on
+"""python-can's interfaces by name, here so that it need not be loaded; one of SocketCAN's with such a name is
+`rtcan:socketcan:NAME`.
+"""
+
 
 def from_url(url: Url) -> RtcanTransport:
     """`rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`; options as in `Options`, which see."""
@@ -31,6 +42,9 @@ def _taken_apart(url: Url) -> tuple[Callable[[], CanPort], Options]:
             "to a module (priority=0), or give the whole network longer ones, such as slots=20,cycle=10ms"
         )
     interface, colon, channel = url.address.partition(":")
+    if interface in INTERFACES and not channel:
+        example = {"socketcan": "can0", "slcan": "/dev/ttyACM0"}.get(interface, "CHANNEL")
+        raise TransportError(f"{url} lacks the channel: rtcan:{interface}:{example}")
     if not colon:
         interface, channel = "socketcan", url.address
     if not channel:

@@ -75,17 +75,24 @@ def checked(url: str, values: dict[str, Any], defaults: Options) -> Options:
 
 def _between(least: int, most: int) -> Callable[[str], int]:
     def parse(text: str) -> int:
-        value = int(text)
-        if not least <= value <= most:
-            raise ValueError(f"it lies between {least} and {most}")
+        value = _number(text)
+        if value is None or not least <= value <= most:
+            raise ValueError(f"give a number of {least} to {most}")
         return value
 
     return parse
 
 
+def _number(text: str) -> int | None:
+    try:
+        return int(text)
+    except ValueError:
+        return None
+
+
 def _bitrate(text: str) -> int:
-    value = int(text)
-    if value <= 0 or _SECOND % value:
+    value = _number(text)
+    if value is None or value <= 0 or _SECOND % value:
         raise ValueError("a bit must take whole nanoseconds, as with 1000000, 500000, 250000 or 125000")
     return value
 

@@ -19,7 +19,9 @@ from r2p.transports.url import Url
 MODES = ("peer", "client", "router")
 
 _NETWORK = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_ENDPOINT = re.compile(r"[a-z0-9_+-]+/.+")
+_AT_PORTS = ("tcp", "udp", "tls", "quic", "ws")
+_PROTOCOLS = (*_AT_PORTS, "unixsock-stream", "unixpipe", "serial", "vsock")
+_PORT = re.compile(r".+:[0-9]+(#.*)?")  # behind # are options of the endpoint: its network interface
 
 
 class Options(msgspec.Struct, frozen=True):
@@ -38,8 +40,11 @@ def options_of(url: Url) -> Options:
     """Check a URL. Raises TransportError."""
     given = url.parsed(_PARSERS)
     endpoint = url.address or None
-    if endpoint is not None and not _ENDPOINT.fullmatch(endpoint):
-        raise TransportError(f"{url}: {endpoint!r} is no zenoh endpoint: give it as tcp/HOST:PORT or tls/HOST:PORT")
+    if endpoint is not None:
+        try:
+            _endpoint_text(endpoint)
+        except ValueError as error:
+            raise TransportError(f"{url}: {error}") from None
     mode = given.get("mode") or (_default_mode(endpoint, given.get("config")))
     if mode == "client" and given.get("listen"):
         raise TransportError(f"{url}: a client listens nowhere: leave out listen=, or use mode=peer or mode=router")
@@ -96,8 +101,13 @@ def _network_name(text: str) -> str:
 
 
 def _endpoint_text(text: str) -> str:
-    if not _ENDPOINT.fullmatch(text):
-        raise ValueError("give an endpoint as tcp/ADDRESS:PORT")
+    protocol, _, address = text.partition("/")
+    if not address:
+        raise ValueError(f"{text!r} is no zenoh endpoint: give it as tcp/ADDRESS:PORT or tls/ADDRESS:PORT")
+    if protocol not in _PROTOCOLS:
+        raise ValueError(f"{protocol!r} is no protocol of zenoh: use one of {', '.join(_PROTOCOLS)}")
+    if protocol in _AT_PORTS and not _PORT.fullmatch(address):
+        raise ValueError(f"the port is missing: {protocol}/{address}:7447")
     return text
 
 

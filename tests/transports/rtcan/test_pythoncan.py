@@ -13,7 +13,7 @@ import pytest
 from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
-from r2p.transports.rtcan import pythoncan
+from r2p.transports.rtcan import INTERFACES, pythoncan
 from r2p.transports.rtcan.pythoncan import PythonCanPort
 from r2p.transports.url import open_transport
 from tests.can.rig import GUARD, User, now, using
@@ -226,6 +226,26 @@ async def test_what_waiting_does_not_mend(error: Exception, channel: str, monkey
 def test_an_unknown_interface() -> None:
     with pytest.raises(TransportError, match=r"no interface 'nosuch'; it knows: .*virtual"):
         PythonCanPort("nosuch", "x", BITRATE)
+
+
+@pytest.mark.parametrize(
+    ("url", "says"),
+    [
+        ("rtcan:slcan", "lacks the channel: rtcan:slcan:/dev/ttyACM0"),
+        ("rtcan:socketcan", "rtcan:socketcan:can0"),
+        ("rtcan:", "lacks the CAN interface"),
+        ("rtcan:can0,priority=abc", "give a number of 0 to 255"),
+        ("rtcan:can0,id=256", "give a number of 1 to 255"),
+        ("rtcan:can0,bitrate=fast", "whole nanoseconds"),
+    ],
+)
+def test_urls_that_can_not_be(url: str, says: str) -> None:
+    with pytest.raises(TransportError, match=says):
+        open_transport(url)
+
+
+def test_all_interfaces_of_python_can_are_known_by_name() -> None:
+    assert set(can.interfaces.BACKENDS) <= INTERFACES
 
 
 def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:

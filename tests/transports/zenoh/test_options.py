@@ -39,6 +39,10 @@ def test_a_file_decides_what_the_url_does_not() -> None:
     ("url", "says"),
     [
         ("zenoh:7447", "no zenoh endpoint"),
+        ("zenoh:tpc/HOST:2324", "'tpc' is no protocol of zenoh: use one of tcp, udp, tls"),
+        ("zenoh:tcp/HOST", "the port is missing: tcp/HOST:7447"),
+        ("zenoh:tcp/[::1]", "the port is missing"),
+        ("zenoh:?listen=tls/0.0.0.0", "the port is missing"),
         ("zenoh:?mode=server", "peer, client, router"),
         ("zenoh:?listen=7447", "tcp/ADDRESS:PORT"),
         ("zenoh:?network=a/b", "letters"),
