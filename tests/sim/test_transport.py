@@ -66,8 +66,8 @@ async def test_options_of_the_network() -> None:
     [
         ("sim:", "give the bus a name"),
         ("sim:lab,wheel=1", "it knows: .*drift"),
-        ("sim:lab,id=0", "between 1 and 255"),
-        ("sim:lab,priority=256", "between 0 and 255"),
+        ("sim:lab,id=0", "1 to 255"),
+        ("sim:lab,priority=256", "0 to 255"),
         ("sim:lab,slots=64,cycle=5ms", "too short"),
         ("sim:lab,bitrate=3000000", "whole nanoseconds"),
         ("sim:lab,profile=best", "auto, rtcan, firmware-2014"),
