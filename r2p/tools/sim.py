@@ -9,7 +9,8 @@ from r2p.tools.session import Quiet, Usage, Verbose, Via, execute, seconds
 
 DEBUG = "tcp-listen:0"
 """The debug line, on the loopback interface, at a port that is free."""
-ZENOH = "zenoh:?listen=tcp/127.0.0.1:0"
+ZENOH = "zenoh:?listen=tcp/127.0.0.1:0&scouting=off"
+"""On the loopback interface, too. It looks for nobody: two robots on one computer are two."""
 
 _FAST = 60.0  # seconds
 
