@@ -22,6 +22,7 @@ from r2p.logs import LogTopic
 from r2p.names import module_name, module_name_from, node_name, topic_name
 from r2p.network import NetworkView
 from r2p.node import Node
+from r2p.orders import Orders
 from r2p.protocols.events import Command
 from r2p.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.topic import TopicSpace
@@ -82,8 +83,7 @@ class Module:
         self._hub: ModuleHub | None = None
         self._transports: list[asyncio.Task[None]] = []
         self._tasks: asyncio.TaskGroup | None = None
-        self._order: Command | None = None
-        self._obeying: asyncio.Task[None] | None = None
+        self._orders = Orders(self.name, self.refused, self.stop, self.reboot)
         self._open = False
 
     # Life
@@ -99,7 +99,7 @@ class Module:
             self.links,
             random_of(loop),
             self._events,
-            self._obey,
+            self._orders.take,
             observer=self.observer,
             bridging=self._bridging,
         )
@@ -111,6 +111,7 @@ class Module:
         self._tasks = asyncio.TaskGroup()
         await self._tasks.__aenter__()
         self._open = True
+        self._orders.tasks = self._tasks
         try:
             for via in self._via:
                 await self._open_transport(self._tasks, via)
@@ -188,6 +189,7 @@ class Module:
         if not self._open:
             return
         self._open = False
+        self._orders.tasks = None
         try:
             await self._end_nodes()
         finally:
@@ -274,10 +276,9 @@ class Module:
     async def reboot(self) -> None:
         """End all nodes and start them from the beginning."""
         tasks = self._running()
-        await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))
+        await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))  # it ends who asks
 
     async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
-        """In a task of its own: a node that asks for it is ended by it."""
         async with self._switching:
             # Others notice each reboot by it, not only the first one.
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
@@ -324,24 +325,6 @@ class Module:
         Who reads too slowly loses the oldest of 256 events.
         """
         return self._events.listen()
-
-    def _obey(self, command: Command) -> None:
-        logger.warning("module %s: %s from the network", self.name, command.name)
-        if self._tasks is None or not self._open:
-            return
-        if command is not Command.BOOTLOAD:
-            self._order = command
-            if self._obeying is None or self._obeying.done():
-                self._obeying = self._tasks.create_task(self._obey_orders(self._tasks), name=f"{self.name} orders")
-        else:
-            self.refused[command.name] = self.refused.get(command.name, 0) + 1
-            logger.error("module %s is a program on a PC, it has no boot loader: BOOTLOAD refused", self.name)
-
-    async def _obey_orders(self, tasks: asyncio.TaskGroup) -> None:
-        """One order at a time; of those that come meanwhile the last one counts."""
-        while self._order is not None and self._open:
-            order, self._order = self._order, None
-            await (self.stop() if order is Command.STOP else self._reboot(tasks))
 
 
 def _urls(via: str | Transport | Iterable[str | Transport] | None) -> list[str | Transport]:

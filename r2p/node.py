@@ -131,7 +131,7 @@ class Node:
         shape = layout(type)
         name = self._resolve(topic)
         check_class(name, klass)
-        self._check_links(name, shape.size, klass, strict=strict)
+        _check_links(self._space, self.log, name, shape.size, klass, strict=strict)
         where = self._space.open(name, shape)
         publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
         try:
@@ -143,7 +143,7 @@ class Node:
                 case Periodic():
                     publisher = PeriodicPublisher(self._space, self, where, shape, klass, latch=latch)
                     publisher.start()
-        except BaseException:
+        except BaseException:  # whatever it was, the topic must not keep the type of a publisher that is not there
             self._space.release(where)
             raise
         where.publishers.append(publisher)
@@ -333,20 +333,6 @@ class Node:
             raise InvalidName(f"topic {name} is the management's: take another name")
         return name
 
-    def _check_links(
-        self, topic: str, size: int, klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool
-    ) -> None:
-        for link in self._space.links:
-            reason = link.refusal(size)
-            if reason and not strict:
-                self.log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
-            elif strict and link.best_effort(klass.publisher_class):
-                reason = link.guarantee(topic, klass.publisher_class)
-            elif strict and isinstance(klass, Periodic):
-                reason = link.inadmissible(size, klass.period)
-            if reason and strict:
-                raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
-
     async def _serve(self) -> bool:
         served = False
         for subscriber in self._listening():
@@ -369,3 +355,25 @@ class Node:
 
     def _listening(self) -> list[Subscriber[Any]]:
         return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
+
+
+def _check_links(
+    space: TopicSpace,
+    log: NodeLogger,
+    topic: str,
+    size: int,
+    klass: NonRealTime | Sporadic | Periodic[Any],
+    *,
+    strict: bool,
+) -> None:
+    """Tell of links that do not take the topic; `strict` raises TransportError where they give less than its class."""
+    for link in space.links:
+        reason = link.refusal(size)
+        if reason and not strict:
+            log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
+        elif strict and link.best_effort(klass.publisher_class):
+            reason = link.guarantee(topic, klass.publisher_class)
+        elif strict and isinstance(klass, Periodic):
+            reason = link.inadmissible(size, klass.period)
+        if reason and strict:
+            raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")

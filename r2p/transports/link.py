@@ -125,14 +125,7 @@ class Link(abc.ABC):
         self.gate: Gate | None = None
         """Set by a gateway."""
         self.stats = LinkStats(lost=Losses(name, hub.space.clock))
-        self.discovery: Door = discovery or Discovery(
-            hub.space.module,
-            hub.instance,
-            rate=management_rate,
-            burst=max(4, int(management_rate / 4)),
-            observer=hub.observer,
-            counts=Losses(name, hub.space.clock),
-        )
+        self.discovery: Door = discovery or _discovery(name, hub, management_rate)
         self._hub = hub
         self._space = hub.space
         self._clock = hub.space.clock
@@ -416,3 +409,11 @@ class Link(abc.ABC):
 def _unlike(name: str, taken: set[str]) -> str:
     """A name that tells two links apart that lead to the same place."""
     return next(each for each in (name, *(f"{name}#{n}" for n in range(2, len(taken) + 3))) if each not in taken)
+
+
+def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
+    """That of a line or a bus; `rate` is in messages/s."""
+    counts = Losses(link, hub.space.clock)
+    return Discovery(
+        hub.space.module, hub.instance, rate=rate, burst=max(4, int(rate / 4)), observer=hub.observer, counts=counts
+    )

@@ -1,13 +1,13 @@
 """The parts of an engine put together, and what passes between them: management messages, timers, changes of mode."""
 
 from collections import Counter
-from collections.abc import Callable, Hashable
-from typing import Any
+from collections.abc import Hashable
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import DecodeError
 from r2p.protocols.rtcan.alarms import Alarms
+from r2p.protocols.rtcan.answers import Answers
 from r2p.protocols.rtcan.cycle import Cycle, timing
 from r2p.protocols.rtcan.election import Election, Role
 from r2p.protocols.rtcan.events import Action, Done, Due, Fate, Profile, Ready, Received
@@ -90,7 +90,16 @@ class Core:
             self.say,
             settings.priority,
         )
-        self._handlers = self._table()
+        self.answers = Answers(
+            self.identity,
+            self.election,
+            self.grants,
+            self.wishes,
+            self.network,
+            self.periodics,
+            self.say,
+            self.tick,
+        )
 
     @property
     def profile(self) -> Profile:
@@ -190,9 +199,7 @@ class Core:
         except DecodeError:
             self.counts["undecodable"] += 1
             return
-        handler = self._handlers.get(type(message))
-        if handler is not None:
-            handler(now, message, received.source)
+        if self.answers.take(now, message, received.source):
             self.settle(now)
 
     # Timers
@@ -239,19 +246,6 @@ class Core:
 
     # What the parts need of each other
 
-    def _table(self) -> dict[type, Callable[[int, Any, int], None]]:
-        """Who handles which message of the bus."""
-        return {
-            management.Network: self._told,
-            management.Claim: self._claimed,
-            management.Reserve: self._wanted,
-            management.Grant: self._granted,
-            management.Refuse: self._refused,
-            management.Release: self._released,
-            management.Renew: self._renew,
-            management.Renewed: self._renewed,
-        }
-
     def _turn(self, now: int) -> None:
         self.network.turn(now)
         self.settle(now)
@@ -294,59 +288,4 @@ class Core:
             self.post.report(handle, Fate.FULL, missed=False, at=now)
 
     def _ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
-        if self.election.role is not Role.MASTER:
-            self.say(now, wanted)
-            return
-        id8 = self.identity.id8
-        answer = self._answer(now, wanted, id8)
-        if answer is not None:
-            self._handlers[type(answer)](now, answer, id8)
-
-    def _answer(
-        self, now: int, wanted: management.Reserve | management.Renew, id8: int
-    ) -> management.Grant | management.Refuse | management.Renewed | None:
-        if isinstance(wanted, management.Renew):
-            return self.grants.renew(now, wanted, id8)
-        return self.grants.answer(now, wanted, self.network.epoch or 0)
-
-    def _own(self, message: int) -> Periodic | None:
-        """Our periodic message with this id."""
-        periodic = self.periodics.get(rtcan.high_byte(message))
-        return periodic if periodic is not None and periodic.message == message else None
-
-    def _told(self, now: int, message: management.Network, source: int) -> None:
-        if message.id8 == source:
-            self.network.network(now, message)
-
-    def _claimed(self, now: int, message: management.Claim, source: int) -> None:
-        self.identity.claimed(now, message)
-        self.network.claim(now, message)
-
-    def _wanted(self, now: int, message: management.Reserve, source: int) -> None:
-        if self.election.role is Role.MASTER and rtcan.id8_of(message.message) == source:
-            answer = self._answer(now, message, source)
-            if answer is not None:
-                self.say(now, answer)
-
-    def _renew(self, now: int, message: management.Renew, source: int) -> None:
-        if self.election.role is Role.MASTER:
-            self.say(now, self.grants.renew(now, message, source))
-
-    def _renewed(self, now: int, message: management.Renewed, source: int) -> None:
-        if message.id8 == self.identity.id8 and source == self.network.master:
-            self.wishes.renewed(now, message)
-
-    def _granted(self, now: int, message: management.Grant, source: int) -> None:
-        periodic = self._own(message.message)
-        if periodic is not None and source == self.network.master and message.epoch == self.network.epoch:
-            self.wishes.granted(now, periodic, message)
-
-    def _refused(self, now: int, message: management.Refuse, source: int) -> None:
-        periodic = self._own(message.message)
-        if periodic is not None and source == self.network.master:
-            self.wishes.refused(now, periodic, message)
-            self.tick(now, periodic)
-
-    def _released(self, now: int, message: management.Release, source: int) -> None:
-        if self.election.role is Role.MASTER and rtcan.id8_of(message.message) == source:
-            self.grants.remove(message.message)
+        self.answers.ask(now, wanted)
