@@ -10,6 +10,7 @@ import pytest
 from r2p.codecs.rtcan import Frame, encode_identifier, wire_bits
 from r2p.sim.can import CanBus, CanController, CanNode, ErrorKind, Record, State
 from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
+from tests import can_watch
 
 BIT = 1000  # ns at 1 Mbit/s
 GAP = 3 * BIT
@@ -24,30 +25,15 @@ def bits(frame: Frame) -> int:
     return len(wire_bits(frame))
 
 
-class Watch:
-    """Writes down what its controllers hear, and what the bus did."""
+class Watch(can_watch.Watch):
+    """Writes down what its controllers hear, and what its bus did."""
 
     def __init__(self, **settings: Any) -> None:
         self.bus = CanBus(asyncio.get_running_loop(), **settings)
-        self.records: list[Record] = []
-        self.heard: list[tuple[Any, ...]] = []
-        self.bus.observers.append(self.records.append)
+        super().__init__(self.bus)
 
     def attach(self, name: str, **settings: Any) -> CanController:
-        controller = self.bus.attach(CanNode(name, **settings))
-
-        def write(what: str) -> Any:
-            return lambda *args: self.heard.append((what, name, *args))
-
-        controller.on_receive = write("received")
-        controller.on_sent = write("sent")
-        controller.on_lost = write("lost")
-        controller.on_error = write("error")
-        controller.on_state = write("state")
-        return controller
-
-    def of(self, what: str) -> list[tuple[Any, ...]]:
-        return [entry[1:] for entry in self.heard if entry[0] == what]
+        return self.add(self.bus.attach(CanNode(name, **settings)))
 
     @property
     def outcomes(self) -> list[tuple[Frame, ErrorKind | None]]:
