@@ -171,11 +171,12 @@ class QueueSink(Sink):
 class Outlet(Sink):
     """A remote subscriber: one topic on its way out by one link."""
 
-    __slots__ = ("carrier", "link")
+    __slots__ = ("carrier", "lines", "link")
 
-    def __init__(self, link: str, carrier: object) -> None:
+    def __init__(self, link: str, carrier: object, lines: Room) -> None:
         super().__init__()
         self.link = link
+        self.lines = lines
         self.carrier = carrier
         """The link itself; topics only tell one from another."""
 
@@ -183,6 +184,9 @@ class Outlet(Sink):
     def owner(self) -> str:
         """The name of its link."""
         return self.link
+
+    def room(self) -> Room:
+        return self.lines
 
 
 class Advertised(Protocol):
@@ -231,6 +235,8 @@ class Topic:
         self.inlets = 0
         """Remote publishers."""
         self.memories: list[Memory] = []
+        self.guard: Callable[[str], bool] | None = None
+        """Asked before each message, by the name of its link, whether it is to be dropped (`r2p.bridge.standby`)."""
         self._waker = waker
         self._heard: WeakValueDictionary[Hashable, Heard] = WeakValueDictionary()
 
@@ -249,16 +255,15 @@ class Topic:
 
         `own` is the publishing node: its own queues never make it wait. `driver` is a link that gets it another way.
         """
+        if self.guard is not None and self.guard(sample.source.link):
+            return None
         waker = self._waker
         blocked: list[Sink] | None = None
         for sink in self.queues:
             queue = sink.queue
             if len(queue) >= sink.limit:
                 if sink.patient and sink.node is not own:
-                    if blocked is None:
-                        blocked = [sink]
-                    else:
-                        blocked.append(sink)
+                    blocked = [sink] if blocked is None else [*blocked, sink]
                     continue
                 sink.lost += 1
                 if sink.keep_oldest:
@@ -277,8 +282,8 @@ class Topic:
 
     def _send(self, sample: Sample, blocked: list[Sink] | None, driver: object) -> list[Sink] | None:
         for outlet in self.outlets:
-            room = outlet.room()
-            queues = (room.events or room.claims) and room.line(sample)
+            lines = outlet.lines
+            queues = (lines.events or lines.claims) and lines.line(sample)
             if outlet.carrier is driver or (not queues and outlet.offer(sample)):
                 continue
             if not outlet.patient and sample.publisher_class == PublisherClass.NON_REAL_TIME:

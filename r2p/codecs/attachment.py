@@ -1,22 +1,26 @@
 """The header of a message on zenoh: what the payload, which is the packed message and nothing else, does not say.
 
 It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by what stays the same from message to
-message of one publisher, the origin; so a reader looks that up in a table, and decodes it once.
+message of one publisher, the origin; so a reader looks that up in a table, and decodes it once. What a publisher sends
+without a pause may travel together: the payload is then several messages of one size, one after the other, whose
+serials and sequences count on from those in the header.
 
 | bytes | what |
 | --- | --- |
 | 0 | version, 1 |
 | 1 | flags: bit 0 the stamp is not the publisher's, bit 1 there is a clock part |
 | 2 | hops: gateways that it has crossed |
-| 3 | reserved, 0 |
+| 3 | messages in the payload besides the first one: m |
 | 4..7 | serial: counts what the sender has sent on this topic in this class; a gap is what was lost on the way |
 | 8..15 | sequence: counts what the publisher has published, from 1; 0: not known |
 | 16..23 | stamp, UTC in ns |
 | 24..31 | deadline, UTC in ns; 0: none |
 | 16 more, if flagged | clock: `u32 epoch; i64 offset; u32 error` |
+| 8 m more | stamps of the other messages |
 | the rest | origin: `u8 class; u32 sender; u32 instance; u8 fingerprint[8]`, then `module/node` in ASCII |
 """
 
+import functools
 import re
 import struct
 from collections.abc import Callable
@@ -36,22 +40,18 @@ FLAG_CLOCK = 2
 
 SERIAL_WRAP = 0xFFFFFFFF
 
-_FIXED = struct.Struct("<BBBxIQqq")
+_FIXED = struct.Struct("<BBBBIQqq")
 _CLOCK = struct.Struct("<IqI")
 _ORIGIN = struct.Struct("<BII8s")
 _CREDIT = struct.Struct("<BBII")
 _unpack = _FIXED.unpack_from
+_pack_start = struct.Struct("<IIQqq").pack
 
 START = VERSION
-"""What almost all headers begin with, as a number: this version, no flags, no hops."""
+"""What almost all headers begin with, as a number: this version, no flags, no hops, one message."""
 
-START_MASK = 0xFFFF & ~(FLAG_RESTAMPED << 8)
-"""Where no other of these bits than those of START are set there is no clock part. Then the origin begins at
-`ORIGIN_AT`, and `unpack_start` gives the number, serial, sequence, stamp and deadline: for who has looked up the origin
-himself. `hops_of` and `is_stamped` say what else is in the number."""
-
-ORIGIN_AT = _FIXED.size
-unpack_start = struct.Struct("<IIQqq").unpack_from
+PACKET_MOST = 256
+"""Messages in one payload."""
 
 _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
 _NAMES = re.compile(rb"([A-Za-z0-9_]{0,7})/([A-Za-z0-9_]{0,8})")
@@ -90,7 +90,7 @@ class Origin(msgspec.Struct, frozen=True):
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
-    """The header of one message."""
+    """The header of one message, or of several."""
 
     origin: Origin
     serial: int
@@ -100,43 +100,43 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     hops: int = 0
     stamped: bool = True
     clock: Clock | None = None
+    more: tuple[int, ...] = ()
+    """The stamps of the messages that follow in the same payload."""
 
 
 class Packer:
-    """Headers without a clock part, of one origin: `pack(start, serial, sequence, stamp, deadline, tail)`.
+    """Headers without a clock part, of one origin; `start` is `START` or what `start_of` says."""
 
-    `start` is `START` or what `start_of` says; the serial has to be cut to its 32 bits. No function of our own around
-    it: this is called for each message.
-    """
-
-    __slots__ = ("pack", "tail")
+    __slots__ = ("_pack", "_tail", "origin")
 
     def __init__(self, origin: Origin) -> None:
-        self.tail = _encode_origin(origin)
-        self.pack = struct.Struct(f"<IIQqq{len(self.tail)}s").pack
+        self.origin = origin
+        self._tail = _encode_origin(origin)
+        self._pack = struct.Struct(f"<IIQqq{len(self._tail)}s").pack
+
+    def one(self, start: int, serial: int, sequence: int, stamp: int, deadline: int) -> bytes:
+        """The header of one message."""
+        return self._pack(start, serial & SERIAL_WRAP, sequence, stamp, deadline, self._tail)
+
+    def several(self, start: int, serial: int, sequence: int, deadline: int, stamps: list[int]) -> bytes:
+        """The header of so many messages, `PACKET_MOST` at most; serial and sequence are those of the first."""
+        first, *others = stamps
+        more = len(others)
+        fixed = _pack_start(start | more << 24, serial & SERIAL_WRAP, sequence, first, deadline)
+        return fixed + _stamps(more).pack(*others) + self._tail
 
 
 def start_of(hops: int, *, stamped: bool) -> int:
-    """The first four bytes of a header without a clock part."""
+    """The first four bytes of a header of one message without a clock part."""
     return VERSION | (0 if stamped else FLAG_RESTAMPED << 8) | min(hops, 255) << 16
-
-
-def hops_of(start: int) -> int:
-    """The gateways that a header begins with."""
-    return start >> 16 & 0xFF
-
-
-def is_stamped(start: int) -> bool:
-    """Whether the stamp is the publisher's."""
-    return not start & FLAG_RESTAMPED << 8
 
 
 def encode(header: Header) -> bytes:
     """The bytes of a header; serial and error are cut to their 32 bits, hops to 255."""
     flags = (0 if header.stamped else FLAG_RESTAMPED) | (0 if header.clock is None else FLAG_CLOCK)
-    serial = header.serial & SERIAL_WRAP
-    fixed = _FIXED.pack(VERSION, flags, min(header.hops, 255), serial, header.sequence, header.stamp, header.deadline)
-    return fixed + _encode_clock(header.clock) + _encode_origin(header.origin)
+    hops, more, serial = min(header.hops, 255), len(header.more), header.serial & SERIAL_WRAP
+    fixed = _FIXED.pack(VERSION, flags, hops, more, serial, header.sequence, header.stamp, header.deadline)
+    return fixed + _encode_clock(header.clock) + _stamps(more).pack(*header.more) + _encode_origin(header.origin)
 
 
 class Reader(Generic[T]):
@@ -147,28 +147,36 @@ class Reader(Generic[T]):
         self.known: dict[bytes, T] = {}
         """By the bytes of the origin."""
 
-    def read(self, data: bytes) -> tuple[T, int, int, int, int, int, int, Clock | None]:
-        """What is known of the origin; serial, sequence, stamp, deadline, hops, flags and clock.
+    def read(self, data: bytes) -> tuple[T, int, int, tuple[int, ...], int, int, bool, Clock | None]:
+        """What is known of the origin; serial and sequence of the first message, the stamps of all, then deadline,
+        hops, whether the stamps are the publisher's, and clock.
 
         Raises `UnknownType` for a version to ignore, else `DecodeError`.
         """
         try:
-            version, flags, hops, serial, sequence, stamp, deadline = _unpack(data)
+            version, flags, hops, more, serial, sequence, stamp, deadline = _unpack(data)
         except struct.error:
             version = data[0] if data else VERSION
         if version != VERSION:
             raise UnknownType(f"version {version} of the header")
         if len(data) < _FIXED.size:
             raise DecodeError(f"a header of {len(data)} bytes")
+        at = _FIXED.size
+        clock = None
         if flags & FLAG_CLOCK:
-            clock, tail = _decode_clock(data), data[_FIXED.size + _CLOCK.size :]
-        else:
-            clock, tail = None, data[_FIXED.size :]
-        try:
-            known = self.known[tail]
-        except KeyError:
+            clock = _decode_clock(data)
+            at += _CLOCK.size
+        stamps: tuple[int, ...] = (stamp,)
+        if more:
+            if len(data) < at + 8 * more:
+                raise DecodeError("the header ends in its stamps")
+            stamps += _stamps(more).unpack_from(data, at)
+            at += 8 * more
+        tail = data[at:]
+        known = self.known.get(tail)
+        if known is None:
             known = self._remember(tail)
-        return known, serial, sequence, stamp, deadline, hops, flags, clock
+        return known, serial, sequence, stamps, deadline, hops, not flags & FLAG_RESTAMPED, clock
 
     def _remember(self, tail: bytes) -> T:
         origin = _decode_origin(tail)
@@ -180,8 +188,8 @@ class Reader(Generic[T]):
 
 def decode(data: bytes) -> Header:
     """The header in these bytes. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
-    origin, serial, sequence, stamp, deadline, hops, flags, clock = Reader(_itself).read(data)
-    return Header(origin, serial, sequence, stamp, deadline, hops, not flags & FLAG_RESTAMPED, clock)
+    origin, serial, sequence, stamps, deadline, hops, stamped, clock = Reader(_itself).read(data)
+    return Header(origin, serial, sequence, stamps[0], deadline, hops, stamped, clock, stamps[1:])
 
 
 class Credit(msgspec.Struct, frozen=True, gc=False):
@@ -211,6 +219,11 @@ def decode_credit(data: bytes) -> Credit:
 
 def _itself(origin: Origin) -> Origin:
     return origin
+
+
+@functools.cache
+def _stamps(count: int) -> struct.Struct:
+    return struct.Struct(f"<{count}q")
 
 
 def _decode_clock(data: bytes) -> Clock:

@@ -106,5 +106,14 @@ def decode(key: str) -> Token:
     raise DecodeError(f"{key[:80]!r} is no token")
 
 
+def is_module(key: str) -> bool:
+    """Whether a key is the token of a module that is more than a tool."""
+    try:
+        token = decode(key)
+    except DecodeError:
+        return False
+    return isinstance(token, ModuleToken) and not token.observer
+
+
 def _instance(text: str) -> int | None:
     return None if text == _NONE else int(text, 16)

@@ -19,8 +19,9 @@ class LinkOutlet(Outlet):
 
     __slots__ = ("_link", "topic")
 
-    def __init__(self, link: "Link", topic: Topic) -> None:
-        super().__init__(link.name, link)
+    def __init__(self, link: "Link", topic: Topic, lines: Room | None = None) -> None:
+        """`lines`: its own, or else those of the link."""
+        super().__init__(link.name, link, link.room if lines is None else lines)
         self._link = link
         self.topic = topic
 
@@ -47,9 +48,6 @@ class LinkOutlet(Outlet):
         else:
             self.lost += 1
             link.stats.lost["send buffer full" if link.up else LINK_DOWN] += 1
-
-    def room(self) -> Room:
-        return self._link.room
 
     def refill(self) -> None:
         self._link.made_room()

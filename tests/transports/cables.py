@@ -292,70 +292,102 @@ class Pump:
             self._loop.add_reader(self._source, self._read)
 
 
+class Proxy:
+    """Takes connections on a port of its own, and carries them to another one while it is not cut.
+
+    `target` tells that port, None: there is nobody. `buffer` in bytes is what the sockets may hold.
+    """
+
+    def __init__(self, target: Callable[[], int | None], *, buffer: int | None = None) -> None:
+        self.pumps: list[Pump] = []
+        """Of the connections; the first one carries what comes back from the target of the first."""
+        self._target = target
+        self._buffer = buffer
+        self._loop = asyncio.get_running_loop()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._limit(self._listener)
+        self._listener.setblocking(False)
+        self._sockets: list[socket.socket] = []
+        self._connected = True
+        self._loop.add_reader(self._listener, self._accept)
+
+    @property
+    def port(self) -> int:
+        port: int = self._listener.getsockname()[1]
+        return port
+
+    def cut(self) -> None:
+        self._connected = False
+        self._hang_up()
+
+    def mend(self) -> None:
+        self._connected = True
+
+    def close(self) -> None:
+        self.cut()
+        self._loop.remove_reader(self._listener)
+        self._listener.close()
+
+    def _limit(self, each: socket.socket) -> None:
+        if self._buffer is not None:
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._buffer)
+
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        server = socket.socket()
+        self._limit(server)
+        port = self._target()
+        try:
+            if not self._connected or port is None:
+                raise ConnectionRefusedError
+            server.connect(("127.0.0.1", port))
+        except ConnectionRefusedError:
+            client.close()
+            server.close()
+            return
+        self._sockets += [server, client]
+        self.pumps += [
+            Pump(server.fileno(), client.fileno(), self._hang_up),
+            Pump(client.fileno(), server.fileno(), self._hang_up),
+        ]
+
+    def _hang_up(self) -> None:
+        for pump in self.pumps:
+            pump.close()
+        for each in self._sockets:
+            each.close()
+        self.pumps, self._sockets = [], []
+
+
 class TcpCable(Cable):
     """A TCP connection from B to A, through a proxy that can cut it."""
 
     async def __aenter__(self) -> Self:
-        self._loop = asyncio.get_running_loop()
         self._server = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
-        self._sockets: list[socket.socket] = []
-        self._pumps: list[Pump] = []
-        self._connected = True
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
-        self._listener.setblocking(False)
-        self._loop.add_reader(self._listener, self._accept)
+        self._proxy = Proxy(lambda: self._server.port, buffer=8192)
         return self
 
     async def __aexit__(self, *_reason: object) -> None:
-        await self.cut()
-        self._loop.remove_reader(self._listener)
-        self._listener.close()
+        self._proxy.close()
 
     def a(self) -> Transport:
         self._server = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
         return self._server
 
     def b(self) -> Transport:
-        return TcpTransport(parse(f"tcp:127.0.0.1:{self._listener.getsockname()[1]}"))
+        return TcpTransport(parse(f"tcp:127.0.0.1:{self._proxy.port}"))
 
     async def cut(self) -> None:
-        self._connected = False
-        self._hang_up()
+        self._proxy.cut()
 
     async def mend(self) -> None:
-        self._connected = True
+        self._proxy.mend()
 
     def freeze(self) -> None:
-        self._pumps[0].freeze()
+        self._proxy.pumps[0].freeze()
 
     def thaw(self) -> None:
-        self._pumps[0].thaw()
-
-    def _accept(self) -> None:
-        client, _ = self._listener.accept()
-        try:
-            if not self._connected or self._server.port is None:
-                raise ConnectionRefusedError
-            server = socket.socket()
-            server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
-            server.connect(("127.0.0.1", self._server.port))
-        except ConnectionRefusedError:
-            client.close()
-            return
-        self._hang_up()
-        self._sockets = [server, client]
-        self._pumps = [
-            Pump(server.fileno(), client.fileno(), self._hang_up),
-            Pump(client.fileno(), server.fileno(), self._hang_up),
-        ]
-
-    def _hang_up(self) -> None:
-        for pump in self._pumps:
-            pump.close()
-        for each in self._sockets:
-            each.close()
-        self._pumps, self._sockets = [], []
+        self._proxy.pumps[0].thaw()
 
 
 class SerialCable(Cable):

@@ -24,8 +24,7 @@ class Other(Outlet):
     """The way to another link; it takes as many as there is `space` for."""
 
     def __init__(self) -> None:
-        super().__init__("other", self)
-        self.place = Room()
+        super().__init__("other", self, Room())
         self.space = 0
         self.taken: list[bytes] = []
 
@@ -40,11 +39,8 @@ class Other(Outlet):
         if not self.offer(sample):
             self.lost += 1
 
-    def room(self) -> Room:
-        return self.place
-
     def refill(self) -> None:
-        self.place.serve()
+        self.lines.serve()
 
 
 class Passing(Topic):

@@ -22,8 +22,10 @@ def test_a_publisher_that_is_replaced_by_another() -> None:
     assert sources.of("leds") == Source("PC2", "wink", "lab")
     hear(discovery, S, publisher("blink"))
     assert sources.of("leds") == Source("PC2", "", "lab"), "one of two"
-    hear(discovery, 4 * S, PC2, publisher("blink"))
-    run(discovery, 4 * S, 7 * S)
+    for now in range(4 * S, 24 * S, 4 * S):
+        assert sources.of("leds") == Source("PC2", "", "lab")
+        hear(discovery, now, PC2, publisher("blink"))
+        run(discovery, now, now + 4 * S)
     assert sources.of("leds") == Source("PC2", "blink", "lab"), "the other one was not repeated"
 
 

@@ -3,7 +3,8 @@
     options   what the URL says               config    ... as zenoh wants it
     session   one zenoh session: everything that comes from zenoh's threads enters the event loop here
     link      discovery and topics over it; tokens: who is there
-    outlet    what goes out of a topic, with senders, in a burst, as far as there are credits; reach: whether it arrives
+    outlet    what goes out of a topic, with senders, as far as there are credits; reach: whether it arrives
+    burst     ... in which packets, and when; lane: of one topic and class
     streams   what comes in; stream: of one topic
     trouble   why there is no connection, in words
 
@@ -16,5 +17,5 @@ from r2p.transports.zenoh.transport import ZenohTransport
 
 
 def from_url(url: Url) -> ZenohTransport:
-    """`zenoh:[ENDPOINT]`; options `mode`, `listen`, `network`, `config`, `scouting`. Raises TransportError."""
+    """`zenoh:[ENDPOINT]`; options: see `_PARSERS` there. Raises TransportError."""
     return ZenohTransport(options_of(url))

@@ -1,74 +1,66 @@
-"""What goes out in one turn of the event loop: the first message at once, the others together when the turn is over.
+"""What goes out when: the first message at once, the others together when the turn of the event loop is over.
 
-Each message that zenoh is given wakes a thread of its own, which sends what is there by then. Given one after the other
-without a pause they go out in a few large packets; each for itself, waking costs both ends as much as all the rest.
+Each packet that zenoh is given wakes threads at both ends, which takes longer than a message. So while messages come
+turn after turn they go out every few turns, and as soon as a turn brings none.
 """
 
 import asyncio
-from collections.abc import Callable
 
-from r2p.room import LINK_DOWN
 from r2p.transports.intake import LinkStats
+from r2p.transports.zenoh.lane import MOST, Lane
 
-Put = Callable[..., None]
-"""zenoh's `Publisher.put(data, *, attachment)`."""
-
-MOST = 64
-"""Messages that wait for the end of a turn."""
-
-
-def nowhere(data: bytes, *, attachment: bytes) -> None:
-    """There is no session."""
+TURNS = 4
+"""Turns of the loop in which messages wait for more of them, at most."""
 
 
 class Burst:
     """The messages of all topics of one link."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, stats: LinkStats, error: type[Exception]) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, stats: LinkStats, error: type[Exception], *, batching: bool
+    ) -> None:
         self._loop = loop
+        self._batching = batching
         self._stats = stats
         self._error = error
-        self.begun = False
-        """Whether something was sent in this turn of the loop; what comes now may be put into `waiting`."""
-        self.waiting: list[tuple[Put, bytes, bytes]] = []
+        self._begun = False
+        self._turns = 0
+        self._count = 0
+        self._lanes: dict[Lane, None] = {}
 
-    def add(self, put: Put, data: bytes, header: bytes, *, urgent: bool) -> None:
-        """Send it, with the others of this turn unless it is `urgent`; zenoh drops it where the network is too slow."""
-        if self.begun and not urgent:
-            self.waiting.append((put, data, header))
-            if len(self.waiting) >= MOST:
-                self.flush()
-            return
-        if not self.begun:
-            self.begun = True
+    def add(self, lane: Lane) -> None:
+        """A message waits in a lane that was empty, or as many as may wait there: send them in good time."""
+        if not self._begun:
+            self._begun = True
             self._loop.call_soon(self._end)
-        self._send([(put, data, header)])
+        elif not lane.urgent and len(lane.waiting) < MOST:
+            self._lanes[lane] = None
+            return
+        lane.send(self._stats, self._error, batching=self._batching)
 
     def flush(self) -> None:
         """Send what waits."""
-        waiting, self.waiting = self.waiting, []
-        self._send(waiting)
+        lanes, self._lanes = self._lanes, {}
+        self._turns = self._count = 0
+        for lane in lanes:
+            lane.send(self._stats, self._error, batching=self._batching)
 
     def discard(self) -> int:
         """Forget what waits; says how much that was."""
-        waiting, self.waiting = self.waiting, []
-        return len(waiting)
+        lanes, self._lanes = self._lanes, {}
+        count = sum(len(lane.waiting) for lane in lanes)
+        for lane in lanes:
+            lane.waiting.clear()
+        return count
 
     def _end(self) -> None:
-        self.begun = False
-        if self.waiting:
+        """A turn is over: send what waits, unless it has become more."""
+        count = sum([len(lane.waiting) for lane in self._lanes])
+        self._begun = count > 0
+        if self._begun:
+            self._loop.call_soon(self._end)
+        self._turns += 1
+        if count > self._count and self._turns < TURNS:
+            self._count = count
+        else:
             self.flush()
-
-    def _send(self, messages: list[tuple[Put, bytes, bytes]]) -> None:
-        lost = size = 0
-        for put, data, header in messages:
-            try:
-                put(data, attachment=header)
-                size += len(data)
-            except self._error:
-                lost += 1
-        stats = self._stats
-        stats.sent += len(messages) - lost
-        stats.bytes_sent += size
-        if lost:
-            stats.lost[LINK_DOWN] += lost

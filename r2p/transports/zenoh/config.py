@@ -4,7 +4,6 @@ import json
 
 import zenoh
 
-from r2p.errors import TransportError
 from r2p.transports.zenoh.options import Options
 from r2p.transports.zenoh.trouble import Tls, Way
 
@@ -37,12 +36,12 @@ def config_of(options: Options) -> zenoh.Config:
         for key, value in _stated(options).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        raise TransportError(f"{options.name}: zenoh does not take this: {error}") from error
+        raise options.error(f"zenoh does not take this: {error}") from error
     return config
 
 
 def way_of(config: zenoh.Config) -> Way:
-    """What it connects to, and with what."""
+    """What it connects to, and with what; and where it listens."""
     tls = json.loads(config.get_json("transport/link/tls"))
     user = json.loads(config.get_json("transport/auth/usrpwd"))
     names = Tls(
@@ -51,7 +50,10 @@ def way_of(config: zenoh.Config) -> Way:
         tls["connect_private_key"],
         tls["verify_name_on_connect"] is not False,
     )
-    return Way(_texts(json.loads(config.get_json("connect/endpoints"))), names, user["user"])
+    connects, listens = (json.loads(config.get_json(f"{what}/endpoints")) for what in ("connect", "listen"))
+    if isinstance(listens, dict):
+        listens = listens.get(json.loads(config.get_json("mode")) or "peer", [])
+    return Way(_texts(connects), names, user["user"], _texts(listens))
 
 
 def _from_file(options: Options) -> zenoh.Config:
@@ -64,7 +66,7 @@ def _from_file(options: Options) -> zenoh.Config:
         theirs = zenoh.Config.from_file(options.config)
     except (zenoh.ZError, OSError) as error:
         reason = "there is no such file" if not options.config.exists() else str(error)
-        raise TransportError(f"{options.name}: can't read {options.config}: {reason}") from error
+        raise options.error(f"can't read {options.config}: {reason}") from error
     blank = zenoh.Config()
     for key, value in _OURS.items():
         if theirs.get_json(key) == blank.get_json(key):  # what the file says counts

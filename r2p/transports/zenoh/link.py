@@ -60,8 +60,11 @@ class ZenohLink(Link):
     longest_name: ClassVar[int] = NAMESPACED_MAX
     passes_probes: ClassVar[bool] = False
 
-    def __init__(self, name: str, hub: Hub, *, connects: bool) -> None:
-        """`connects`: it is up while it is connected; else it takes those who come, and is up even alone."""
+    def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool) -> None:
+        """`connects`: it is up while it is connected; else it takes those who come, and is up even alone.
+
+        `batching`: several messages may share a payload.
+        """
         self.prefix = ""
         """What all keys of the network begin with."""
         self._connects = connects
@@ -74,7 +77,7 @@ class ZenohLink(Link):
         self._transports: set[str] = set()
         self._tokens = Tokens(hub.space.loop, self._believed)
         self.senders = Senders()
-        self.burst = Burst(hub.space.loop, self.stats, self.send_error)
+        self.burst = Burst(hub.space.loop, self.stats, self.send_error, batching=batching)
         self.credits = Credits(hub.space.loop, self.stats, self.zenoh_outlets)
         self._reach = Reach(self, hub.space.loop)
         self._streams = Streams(

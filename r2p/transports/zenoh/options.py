@@ -21,7 +21,8 @@ MODES = ("peer", "client", "router")
 _NETWORK = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _AT_PORTS = ("tcp", "udp", "tls", "quic", "ws")
 _PROTOCOLS = (*_AT_PORTS, "unixsock-stream", "unixpipe", "serial", "vsock")
-_PORT = re.compile(r".+:[0-9]+(#.*)?")  # behind # are options of the endpoint: its network interface
+_PORT = re.compile(r".+:([0-9]+)(#.*)?")  # behind # are options of the endpoint: its network interface
+_PORT_MAX = 65_535
 
 
 class Options(msgspec.Struct, frozen=True):
@@ -33,7 +34,13 @@ class Options(msgspec.Struct, frozen=True):
     connect: str | None = None
     listen: str | None = None
     scouting: bool | None = None
+    batching: bool = True
+    """Whether several messages may share a payload."""
     config: Path | None = None
+
+    def error(self, text: str) -> TransportError:
+        """What is wrong with it, in words."""
+        return TransportError(f"{self.name.removesuffix(':')}: {text}")
 
 
 def options_of(url: Url) -> Options:
@@ -56,6 +63,7 @@ def options_of(url: Url) -> Options:
         connect=endpoint,
         listen=given.get("listen"),
         scouting=None if "scouting" not in given else given["scouting"] == "on",
+        batching=given.get("batching") != "off",
         config=None if config is None else Path(config),
     )
 
@@ -65,17 +73,17 @@ def default_network() -> str:
     return re.sub(r"[^A-Za-z0-9_.-]", "", socket.gethostname().partition(".")[0]) or "robot"
 
 
-def chosen(found: set[str], name: str) -> str:
+def chosen(found: set[str]) -> str:
     """The network that a tool joins which was not told one: the host's, or else the only one that there is.
 
-    Raises TransportError where there are several others.
+    Raises ValueError where there are several others.
     """
     own = default_network()
     others = sorted(found - {own})
     if own in found or not others:
         return own
     if len(others) > 1:
-        raise TransportError(f"{name}: there are the networks {', '.join(others)}: say which, as ?network={others[0]}")
+        raise ValueError(f"there are the networks {', '.join(others)}: say which, as ?network={others[0]}")
     return others[0]
 
 
@@ -106,8 +114,12 @@ def _endpoint_text(text: str) -> str:
         raise ValueError(f"{text!r} is no zenoh endpoint: give it as tcp/ADDRESS:PORT or tls/ADDRESS:PORT")
     if protocol not in _PROTOCOLS:
         raise ValueError(f"{protocol!r} is no protocol of zenoh: use one of {', '.join(_PROTOCOLS)}")
-    if protocol in _AT_PORTS and not _PORT.fullmatch(address):
-        raise ValueError(f"the port is missing: {protocol}/{address}:7447")
+    if protocol in _AT_PORTS:
+        found = _PORT.fullmatch(address)
+        if found is None:
+            raise ValueError(f"the port is missing: {protocol}/{address}:7447")
+        if int(found[1]) > _PORT_MAX:
+            raise ValueError(f"{found[1]} is no port: the last one is {_PORT_MAX}")
     return text
 
 
@@ -116,5 +128,6 @@ _PARSERS: dict[str, Callable[[str], str]] = {
     "listen": _endpoint_text,
     "network": _network_name,
     "scouting": _one_of("on", "off"),
+    "batching": _one_of("on", "off"),
     "config": str,
 }

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import zenoh
 from zenoh.handlers import FifoChannel, Handler, RingChannel
 
+from r2p.codecs import liveliness
 from r2p.errors import TransportError
 from r2p.transports.zenoh import threads
 
@@ -234,12 +235,18 @@ class Session:
 
         return await _in_thread(ask)
 
-    async def networks(self) -> set[str]:
-        """The names of the r2p networks on which there are modules."""
+    async def networks(self, *, tools: bool) -> set[str]:
+        """The names of the r2p networks on which there are modules, or else a publisher, or else `tools` that look."""
+
+        def tokens(kind: str) -> list[list[str]]:
+            found = self._session.liveliness().get(f"r2p/*/live/*/*/{kind}/**", timeout=1.0)
+            return [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
 
         def ask() -> set[str]:
-            found = self._session.liveliness().get("r2p/*/live/*/*/module/**", timeout=1.0)
-            return {str(reply.ok.key_expr).split("/")[1] for reply in found if reply.ok is not None}
+            everybody = tokens("module")
+            found = {network for _, network, _, token in everybody if liveliness.is_module(token)}
+            found = found or {network for _, network, *_ in tokens("pub")}
+            return found or {network for _, network, *_ in everybody if tools}
 
         return await _in_thread(ask)
 

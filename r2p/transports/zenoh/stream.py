@@ -13,17 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from r2p.codecs import UnknownType
-from r2p.codecs.attachment import (
-    FLAG_RESTAMPED,
-    ORIGIN_AT,
-    START,
-    START_MASK,
-    Origin,
-    Reader,
-    hops_of,
-    is_stamped,
-    unpack_start,
-)
+from r2p.codecs.attachment import SERIAL_WRAP, Origin, Reader
 from r2p.errors import DecodeError
 from r2p.protocols.events import Shape
 from r2p.protocols.flow import Inflow
@@ -138,58 +128,19 @@ class Stream:
         if blocked is not None and blocked.held is not None:
             blocked.held.withdraw()
 
-    def arrived(self, arrived: "zenoh.Sample | None") -> None:  # noqa: C901 - see below
-        """In the loop: hand out what is there, at most TURN messages in one turn."""
-        # One long function, because almost every message passes here: calls would take as long as the work.
+    def arrived(self, arrived: "zenoh.Sample | None") -> None:
+        """In the loop: hand out what is there, about TURN messages in one turn."""
         tap = self.tap
         if tap is None:
             return
-        take, known, deliver = tap.take, self._reader.known, self.topic.deliver
-        count = size = 0
-        for _ in range(TURN):
-            if arrived is None:
-                break
-            data = arrived.payload.to_bytes()
+        left = TURN
+        while arrived is not None and left > 0:
             attachment = arrived.attachment
-            header = b"" if attachment is None else attachment.to_bytes()
-            lane = known.get(header[ORIGIN_AT:])
-            if lane is None or self._blocked is not None:
-                self._accept(data, header)
-            else:
-                start, serial, sequence, stamp, deadline = unpack_start(header)
-                flow, heard = lane.flow, lane.heard
-                if (
-                    start & START_MASK != START
-                    or len(data) != lane.usual
-                    or serial != flow.next
-                    or (sequence and sequence <= heard.sequence)
-                ):
-                    self._accept(data, header)
-                else:
-                    flow.next = serial + 1
-                    lane.sequence = heard.sequence = sequence
-                    heard.stamp = stamp
-                    self.last = sample = Sample(data, lane.source, stamp, deadline, sequence, lane.publisher_class)
-                    if start != START:
-                        sample.hops = hops_of(start)
-                        sample.stamped = is_stamped(start)
-                    count += 1
-                    size += len(data)
-                    sinks = deliver(sample)
-                    if sinks is not None:
-                        self._block(lane, serial, sample, sinks)
-                    else:
-                        flow.until_credit -= 1
-                        if not flow.until_credit:
-                            self._give_credit(lane, serial)
+            left -= self._unpack(arrived.payload.to_bytes(), b"" if attachment is None else attachment.to_bytes())
             if self._blocked is not None and not self._queueing:
                 self._paused = True  # the rest stays where it is for now
-                break
-            arrived = take()
-        self._streams.stats.received += count
-        self._streams.stats.bytes_received += size
-        if self._paused:
-            return
+                return
+            arrived = tap.take()
         if arrived is None:
             self._loop.call_soon(self._look_again)  # after those who were woken: they may want to answer
         else:
@@ -204,31 +155,68 @@ class Stream:
             else:
                 self.arrived(sample)
 
-    def _accept(self, data: bytes, header: bytes) -> None:
-        """The first message of a publisher, one with something special about it, or none of ours."""
+    def _unpack(self, data: bytes, header: bytes) -> int:
+        """Hand out the messages of one packet; says how many that were."""
         try:
-            lane, serial, sequence, stamp, deadline, hops, flags, clock = self._reader.read(header)
+            lane, serial, sequence, stamps, deadline, hops, stamped, clock = self._reader.read(header)
+            parts = [data] if len(stamps) == 1 else _parts(data, len(stamps))
         except DecodeError as error:
             self._streams.stats.lost["unknown type" if isinstance(error, UnknownType) else "undecodable"] += 1
-            return
-        if self._is_good(lane, len(data), serial, sequence, stamp):
-            stamped = not flags & FLAG_RESTAMPED
-            sample = Sample(
-                data, lane.source, stamp, deadline, sequence, lane.publisher_class, None, stamped, True, hops, clock
+            return 1
+        source, publisher_class, step = lane.source, lane.publisher_class, 1 if sequence else 0
+        samples = []
+        for part, stamp in zip(parts, stamps, strict=True):
+            samples.append(
+                Sample(part, source, stamp, deadline, sequence, publisher_class, None, stamped, True, hops, clock)
             )
-            self._hand_out(lane, serial, sample)
+            sequence += step
+        first = samples[0]
+        if (
+            len(first.data) == lane.usual
+            and serial == lane.flow.next
+            and (first.sequence > lane.heard.sequence or not sequence)
+            and self._blocked is None
+        ):
+            self._take(lane, serial, samples)
+        else:
+            for number, sample in enumerate(samples, serial):
+                if self._is_good(lane, number, sample):
+                    self._hand_out(lane, number, sample)
+        return len(samples)
 
-    def _is_good(self, lane: _Lane, size: int, serial: int, sequence: int, stamp: int) -> bool:
+    def _take(self, lane: _Lane, serial: int, samples: list[Sample]) -> None:
+        """What was expected next, and nobody lacks room yet: as `_is_good` and `_hand_out`, at once for all."""
+        self.last = last = samples[-1]
+        flow, heard, count = lane.flow, lane.heard, len(samples)
+        flow.next = serial + count & SERIAL_WRAP
+        lane.sequence = heard.sequence = last.sequence
+        heard.stamp = last.stamp
+        stats = self._streams.stats
+        stats.received += count
+        stats.bytes_received += count * lane.usual
+        deliver = self.topic.deliver
+        for sample in samples:
+            if self._blocked is not None:
+                self._queue(lane, serial, sample)
+            elif (sinks := deliver(sample)) is not None:
+                self._block(lane, serial, sample, sinks)
+            else:
+                flow.until_credit -= 1
+                if not flow.until_credit:
+                    self._give_credit(lane, serial)
+            serial += 1
+
+    def _is_good(self, lane: _Lane, serial: int, sample: Sample) -> bool:
         """Whether it is a new message of the right type; what is wrong is counted."""
+        size, sequence, stamp = len(sample.data), sample.sequence, sample.stamp
         if size != lane.usual and not self._may_have(lane, size):
             return False
         lane.usual = size
-        flow = lane.flow
+        flow, heard = lane.flow, lane.heard
         if serial == flow.next:
             flow.next = serial + 1
         elif not self._is_new(lane, serial):
             return False
-        heard = lane.heard
         if sequence <= heard.sequence and sequence and stamp <= heard.stamp:
             self._came_again(lane, serial, sequence)
             return False
@@ -367,6 +355,14 @@ class Stream:
             fits,
             self.topic.heard((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
+
+
+def _parts(data: bytes, count: int) -> list[bytes]:
+    """The messages of a payload. Raises DecodeError if they can't be of one size."""
+    size, odd = divmod(len(data), count)
+    if odd or not size:
+        raise DecodeError(f"{len(data)} bytes for {count} messages")
+    return [data[at : at + size] for at in range(0, len(data), size)]
 
 
 def _shape(topic: Topic) -> Shape:

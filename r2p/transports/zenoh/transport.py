@@ -9,7 +9,7 @@ from r2p.backoff import Backoff
 from r2p.errors import TransportError
 from r2p.transports.link import Hub, Transport
 from r2p.transports.zenoh.options import Options, chosen, default_network
-from r2p.transports.zenoh.trouble import NOT_US, why
+from r2p.transports.zenoh.trouble import NOT_US, why, why_not_listening
 
 if TYPE_CHECKING:
     import zenoh
@@ -25,6 +25,12 @@ _LOOKS = 5
 _LOOK = 1.0
 """Seconds between two looks whether a link that is down should be explained."""
 
+_ALONE = 3.0
+"""Seconds without anybody else after which a module looks whether they are on other networks; then ever more rarely."""
+
+_TOOL_ALONE = 0.3
+_RARELY = 60.0
+
 
 class ZenohTransport(Transport):
     """`zenoh:[ENDPOINT]`."""
@@ -38,19 +44,24 @@ class ZenohTransport(Transport):
             from r2p.transports.zenoh.config import config_of, way_of
             from r2p.transports.zenoh.link import ZenohLink
         except ImportError as error:
-            raise TransportError(f"{self._options.name}: zenoh is missing: pip install 'r2p[zenoh]'") from error
+            if (error.name or "").partition(".")[0] != "zenoh":
+                raise
+            raise self._options.error("zenoh is missing: pip install 'r2p[zenoh]'") from error
         options = self._options
         config = config_of(options)
         connects = bool(way_of(config).endpoints)
-        link = ZenohLink(options.name, hub, connects=connects)
+        link = ZenohLink(options.name, hub, connects=connects, batching=options.batching)
         hub.attach(link)
         session = None
         try:
             session = await self._open(config, link, Backoff(hub.random, longest=0.5), opened)
-            link.use(session, f"r2p/{await self._network(session, hub)}")
+            network = await self._network(session, hub)
+            link.use(session, f"r2p/{network}")
             await self._tell_addresses(session, hub)
             opened()
-            await self._watch(config, link)
+            async with asyncio.TaskGroup() as tasks:  # neither ends but by being cancelled
+                tasks.create_task(self._watch(config, link))
+                tasks.create_task(self._look_around(session, link, hub, network))
         finally:
             link.close()
             hub.detach(link)
@@ -67,7 +78,8 @@ class ZenohTransport(Transport):
             try:
                 return await open_session(config)
             except TransportError as error:
-                raise TransportError(f"{self._options.name}: {error}") from error
+                reason = await asyncio.to_thread(why_not_listening, way_of(config))
+                raise self._options.error(reason or str(error)) from error
             except Unreachable:
                 opened()
                 link.unreachable(await why(way_of(config)))
@@ -79,11 +91,14 @@ class ZenohTransport(Transport):
             return self._options.network or default_network()
         found: set[str] = set()
         for _ in range(_LOOKS):
-            found = await session.networks()
+            found = await session.networks(tools=True)
             if found:
                 break
             await asyncio.sleep(_SCOUTING / _LOOKS)
-        return chosen(found, self._options.name)
+        try:
+            return chosen(found)
+        except ValueError as error:
+            raise self._options.error(str(error)) from error
 
     async def _tell_addresses(self, session: "Session", hub: Hub) -> None:
         if self._options.listen is not None:
@@ -103,3 +118,24 @@ class ZenohTransport(Transport):
                     continue  # zenoh may be about to try again
                 if not link.up:
                     link.unreachable(reason)
+
+    async def _look_around(self, session: "Session", link: "ZenohLink", hub: Hub, network: str) -> None:
+        """Until somebody else is on the network: say once on which networks there are others."""
+        pause = _TOOL_ALONE if hub.observer else _ALONE
+        while True:
+            await asyncio.sleep(pause)
+            others = sorted(await session.networks(tools=False) - {network}) if link.up else []
+            if _has_company(link):
+                return
+            if others:
+                text = f"nobody else is on the network {network}, but there are modules on {', '.join(others)}"
+                hub.link_notice(link, "elsewhere", f"{text}: is ?network={others[0]} meant?", trouble=False)
+                return
+            pause = min(2 * pause, _RARELY)
+
+
+def _has_company(link: "ZenohLink") -> bool:
+    """Whether anybody is there but tools that look."""
+    known = link.discovery
+    publish = any(topic.advertised_at is not None for topic in known.topics.values())
+    return publish or any(not module.observer for module in known.modules.values())

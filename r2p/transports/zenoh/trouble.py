@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import socket
 import ssl
 from collections.abc import AsyncIterator
@@ -21,6 +22,9 @@ _HANDSHAKE = 1.0
 NOT_US = "takes the connection, but not us"
 """What also seems so for a moment when a router comes back, until zenoh tries again."""
 
+_STREAMS = {"tcp", "tls", "ws"}
+_DATAGRAMS = {"udp", "quic"}
+
 _NO_TLS = "it does not speak TLS: connect to tcp/ instead of tls/, or mend the router's listen endpoint"
 
 
@@ -34,11 +38,37 @@ class Tls(msgspec.Struct, frozen=True):
 
 
 class Way(msgspec.Struct, frozen=True):
-    """What a session connects to, and with what."""
+    """What a session connects to, and with what; and where it listens."""
 
     endpoints: list[str]
     tls: Tls = Tls()
     user: str | None = None
+    listens: list[str] = []
+
+
+class _Place(msgspec.Struct, frozen=True):
+    """An endpoint `PROTOCOL/HOST:PORT#iface=NAME`, taken apart; the port is empty where a protocol has none."""
+
+    protocol: str
+    address: str
+    host: str
+    port: str
+    interface: str
+
+    def trouble(self) -> str:
+        """What is wrong with its interface; empty: nothing."""
+        there = [name for _, name in socket.if_nameindex()]
+        if not self.interface or self.interface in there:
+            return ""
+        return f"there is no network interface {self.interface} here: there are {', '.join(there)}"
+
+
+def why_not_listening(way: Way) -> str:
+    """What keeps a session from listening, and what to do; empty: it is none of what can be tried here.
+
+    Blocks as long as it takes to look names up.
+    """
+    return next(filter(None, map(_why_not_listening, way.listens)), "")
 
 
 async def why(way: Way) -> str:
@@ -47,19 +77,20 @@ async def why(way: Way) -> str:
 
 
 async def _why(endpoint: str, way: Way) -> str:
-    protocol, _, rest = endpoint.partition("/")
-    address = rest.partition("?")[0].partition("#")[0]
-    host, _, port = address.rpartition(":")
-    if protocol not in {"tcp", "tls"} or not port.isdecimal():
+    place = _place(endpoint)
+    protocol, address = place.protocol, place.address
+    if protocol not in {"tcp", "tls"} or not place.port:
         return f"{endpoint}: no answer; check the endpoint, and that a router listens there"
+    if trouble := place.trouble():
+        return trouble
     try:
-        async with asyncio.timeout(_PATIENCE), _connection(host.strip("[]"), int(port)) as (reader, writer):
+        async with asyncio.timeout(_PATIENCE), _connection(place.host, int(place.port)) as (reader, writer):
             if protocol == "tls":
-                await _shake_hands(reader, writer, host.strip("[]"), way.tls)
+                await _shake_hands(reader, writer, place.host, way.tls)
     except TimeoutError:
         return f"{address} does not answer: is the computer on, is there a firewall?"
     except socket.gaierror:
-        return f"{host} is the name of no computer that is known here"
+        return _no_such_host(place)
     except ssl.SSLError as error:
         return f"{address}: {_tls_words(error, way.tls)}"
     except ConnectionRefusedError:
@@ -67,6 +98,54 @@ async def _why(endpoint: str, way: Way) -> str:
     except (OSError, OverflowError) as error:
         return f"{address}: {error}"
     return f"{address} {NOT_US}: {_refusal_words(protocol, way)}"
+
+
+def _place(endpoint: str) -> _Place:
+    protocol, _, rest = endpoint.partition("/")
+    rest, _, options = rest.partition("#")
+    address = rest.partition("?")[0]
+    host, _, port = address.rpartition(":")
+    interface = next((each[len("iface=") :] for each in options.split(";") if each.startswith("iface=")), "")
+    return _Place(protocol, address, host.strip("[]"), port if port.isdecimal() else "", interface)
+
+
+def _no_such_host(place: _Place) -> str:
+    return f"{place.host} is the name of no computer that is known here"
+
+
+def _why_not_listening(endpoint: str) -> str:
+    place = _place(endpoint)
+    if not place.port or place.protocol not in _STREAMS | _DATAGRAMS:
+        return ""
+    try:
+        _try_to_listen(place)
+    except socket.gaierror:
+        return _no_such_host(place)
+    except OSError as error:
+        return _listening_words(error, place)
+    return place.trouble()
+
+
+def _try_to_listen(place: _Place) -> None:
+    kind = socket.SOCK_DGRAM if place.protocol in _DATAGRAMS else socket.SOCK_STREAM
+    family, _, _, _, address = socket.getaddrinfo(place.host, int(place.port), type=kind)[0]
+    with socket.socket(family, kind) as here:
+        if kind == socket.SOCK_STREAM:  # what has just been closed is free
+            here.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        here.bind(address)
+
+
+def _listening_words(error: OSError, place: _Place) -> str:
+    match error.errno:
+        case errno.EADDRINUSE:
+            other = "listen at another port, at 0 for any that is free, or end the other program"
+            return f"can't listen at {place.address}: the port is in use; {other} (ss -ltnp tells which)"
+        case errno.EADDRNOTAVAIL:
+            return f"can't listen at {place.address}: {place.host} is no address of this computer (ip address tells)"
+        case errno.EACCES:
+            return f"can't listen at {place.address}: ports below 1024 are for root; take another one"
+        case _:
+            return f"can't listen at {place.address}: {error.strerror}"
 
 
 @contextlib.asynccontextmanager

@@ -1,30 +1,62 @@
-"""What goes out at once, and what together with the others of a turn of the event loop."""
+"""What goes out at once, and what together with the others of a few turns of the event loop."""
 
 import asyncio
+from typing import Any
 
+import msgspec
 import pytest
 
+from r2p.codecs import attachment
+from r2p.codecs.attachment import Clock, Origin
+from r2p.protocols.flow import Outflow
+from r2p.sample import Sample, Source
 from r2p.transports.intake import LinkStats
-from r2p.transports.zenoh.burst import MOST, Burst
+from r2p.transports.zenoh.burst import TURNS, Burst
+from r2p.transports.zenoh.lane import MOST, Lane
 
 pytestmark = pytest.mark.virtual_time
 
+HERE = Source("PC1", "talk")
+ELSEWHERE = Source("IMU", "", "rtcan:can0")
+ORIGIN = Origin(1, 1, 1, bytes(8), "PC1", "talk")
+
 
 class Wire:
-    """Stands for zenoh."""
+    """Stands for zenoh: notes the payload of each packet, and the serials and sequences that its header stands for."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, batching: bool = True) -> None:
         self.sent: list[bytes] = []
+        self.headers: list[attachment.Header] = []
         self.stats = LinkStats()
-        self.burst = Burst(asyncio.get_running_loop(), self.stats, ConnectionError)
+        self.burst = Burst(asyncio.get_running_loop(), self.stats, ConnectionError, batching=batching)
+        self.lanes = {urgent: Lane(Outflow(), urgent=urgent) for urgent in (False, True)}
+        for lane in self.lanes.values():
+            lane.prepare(HERE, ORIGIN, self.put)
+        self.sequence = 0
 
     def put(self, data: bytes, *, attachment: bytes) -> None:
-        if data == b"x":
+        if data[:1] == b"x":
             raise ConnectionError
-        self.sent.append(data + attachment)
+        self.sent.append(data)
+        self.headers.append(_decode(attachment))
 
-    def add(self, data: bytes, *, urgent: bool = False) -> None:
-        self.burst.add(self.put, data, b"!", urgent=urgent)
+    def add(self, data: bytes, *, urgent: bool = False, **fields: Any) -> None:
+        """As an outlet does it."""
+        self.sequence += 1
+        lane = self.lanes[urgent]
+        lane.flow.serial += 1
+        sample = Sample(data, HERE, 1000 + self.sequence, sequence=self.sequence)
+        lane.waiting.append(msgspec.structs.replace(sample, **fields))
+        if urgent or len(lane.waiting) in (1, MOST):
+            self.burst.add(lane)
+
+
+_decode = attachment.decode
+
+
+async def turns(count: int) -> None:
+    for _ in range(count):
+        await asyncio.sleep(0)
 
 
 async def test_the_first_goes_at_once_the_others_together_and_the_urgent_never_wait() -> None:
@@ -32,20 +64,31 @@ async def test_the_first_goes_at_once_the_others_together_and_the_urgent_never_w
     for data in (b"1", b"2", b"3"):
         wire.add(data)
     wire.add(b"urgent", urgent=True)
-    assert wire.sent == [b"1!", b"urgent!"]
-    await asyncio.sleep(0)
-    assert wire.sent == [b"1!", b"urgent!", b"2!", b"3!"]
+    assert wire.sent == [b"1", b"urgent"]
+    await turns(2)  # the second one brings nothing more
+    assert wire.sent == [b"1", b"urgent", b"23"]
+    assert (wire.headers[2].serial, wire.headers[2].sequence, wire.headers[2].more) == (2, 2, (1003,))
+    assert (wire.stats.sent, wire.stats.bytes_sent) == (4, len("123urgent"))
+    await turns(2)
     wire.add(b"4")
-    assert wire.sent[-1] == b"4!"
-    assert (wire.stats.sent, wire.stats.bytes_sent) == (5, len("123urgent4"))
+    assert wire.sent[-1] == b"4"
+
+
+async def test_what_comes_turn_after_turn_goes_out_every_few_turns() -> None:
+    wire = Wire()
+    wire.add(b"0")
+    for _ in range(2 * TURNS):
+        wire.add(b"1")
+        await turns(1)
+    assert wire.sent == [b"0", TURNS * b"1", TURNS * b"1"]
 
 
 async def test_a_turn_that_does_not_end_is_no_reason_to_keep_all_of_it() -> None:
     wire = Wire()
     for _ in range(1 + MOST):
         wire.add(b"1")
-    assert len(wire.sent) == 1 + MOST
-    assert not wire.burst.waiting
+    assert wire.sent == [b"1", MOST * b"1"]
+    assert not wire.lanes[False].waiting
 
 
 async def test_a_link_that_goes_down_takes_along_what_waits() -> None:
@@ -53,14 +96,70 @@ async def test_a_link_that_goes_down_takes_along_what_waits() -> None:
     for data in (b"1", b"2", b"3"):
         wire.add(data)
     assert wire.burst.discard() == 2
-    await asyncio.sleep(0)
-    assert wire.sent == [b"1!"]
+    await turns(TURNS)
+    assert wire.sent == [b"1"]
 
 
 async def test_what_zenoh_does_not_take_is_counted() -> None:
     wire = Wire()
-    for data in (b"1", b"x", b"2"):
+    for data in (b"1", b"x", b"y", b"long", b"2"):
         wire.add(data)
     wire.burst.flush()
-    assert wire.sent == [b"1!", b"2!"]
-    assert (wire.stats.sent, dict(wire.stats.lost)) == (2, {"link down": 1})
+    assert wire.sent == [b"1", b"long", b"2"]
+    assert [each.serial for each in wire.headers] == [1, 4, 5]
+    assert (wire.stats.sent, dict(wire.stats.lost)) == (3, {"link down": 2})
+
+
+CLOCK = Clock(1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "packets"),
+    [
+        ([{}, {}, {}, {}], [b"abcd"]),
+        ([{}, {"sequence": 2}, {}, {}], [b"a", b"b", b"cd"]),  # a latched value, once more
+        ([{}, {"sequence": 9}, {"sequence": 10}, {"sequence": 11}], [b"a", b"bcd"]),  # others had no room
+        ([{"sequence": 0}, {"sequence": 0}, {}, {"sequence": 0}], [b"ab", b"c", b"d"]),
+        ([{}, {"deadline": 7}, {"deadline": 7}, {}], [b"a", b"bc", b"d"]),
+        ([{"hops": 1}, {"hops": 1}, {"hops": 2}, {}], [b"ab", b"c", b"d"]),
+        ([{}, {"stamped": False}, {"stamped": False}, {}], [b"a", b"bc", b"d"]),
+        ([{"clock": CLOCK}, {"clock": CLOCK}, {"clock": Clock(2, 2, 3)}, {}], [b"ab", b"c", b"d"]),
+        ([{"source": ELSEWHERE}] * 4, [b"abcd"]),
+    ],
+)
+async def test_what_shares_a_header(changes: list[dict[str, Any]], packets: list[bytes]) -> None:
+    """Read one by one, the headers say of each message what was to be said of it."""
+    wire = Wire()
+    wire.add(b"0")
+    expected = []
+    for serial, (data, fields) in enumerate(zip((b"a", b"b", b"c", b"d"), changes, strict=True), 2):
+        wire.add(data, **fields)
+        each = wire.lanes[False].waiting[-1]
+        hops = each.hops + bool(each.source.link)
+        expected.append((serial, each.sequence, each.stamp, each.deadline, hops, each.stamped, each.clock))
+    wire.burst.flush()
+    assert wire.sent[1:] == packets
+    told = []
+    for header in wire.headers[1:]:
+        for at, stamp in enumerate((header.stamp, *header.more)):
+            sequence = header.sequence + at if header.sequence else 0
+            rest = header.deadline, header.hops, header.stamped, header.clock
+            told.append((header.serial + at, sequence, stamp, *rest))
+    assert told == expected
+
+
+async def test_for_readers_that_know_nothing_of_r2p_each_message_is_a_payload() -> None:
+    wire = Wire(batching=False)
+    for data in (b"1", b"2", b"3"):
+        wire.add(data)
+    await turns(2)
+    assert wire.sent == [b"1", b"2", b"3"]
+    assert [each.serial for each in wire.headers] == [1, 2, 3]
+
+
+async def test_long_messages_go_alone() -> None:
+    wire = Wire()
+    for size in (1, 5000, 5000, 5000, 5000, 20_000, 20_000):
+        wire.add(bytes(size))
+    wire.burst.flush()
+    assert [len(each) for each in wire.sent] == [1, 15_000, 5000, 20_000, 20_000]

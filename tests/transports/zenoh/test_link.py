@@ -276,6 +276,7 @@ async def test_garbage_and_foreign_keys_are_counted_and_harm_nobody() -> None:
             live.declare_token(f"r2p/lab/live/{key}") for key in ("x", "1/zz/module/A/1/0/0", "9/1/module/A/1/0/0")
         ]
         good, huge = attachment.encode(HEADER), b"\xff" * 1_000_000
+        three = attachment.encode(msgspec.structs.replace(HEADER, more=(1, 2)))
         for key, payload, header, counted in (
             ("topic/leds", huge, None, "unknown type"),
             ("topic/leds", huge, good, "wrong size"),
@@ -283,6 +284,9 @@ async def test_garbage_and_foreign_keys_are_counted_and_harm_nobody() -> None:
             ("topic/leds", b"", good, "wrong size"),
             ("topic/leds", bytes(5), b"\x09" + good, "unknown type"),
             ("topic/leds", bytes(5), good[:-3] + b"///", "undecodable"),
+            ("topic/leds", bytes(16), three, "undecodable"),
+            ("topic/leds", b"", three, "undecodable"),
+            ("topic/leds", bytes(3), three, "wrong size"),
             ("control/zz", bytes(32), None, "foreign"),
             ("control/7", bytes(33), None, "undecodable"),
             ("control/7", huge, None, "undecodable"),
@@ -376,6 +380,46 @@ async def test_what_two_gateways_send_comes_once() -> None:
         for expected in (1, 2, 3, 1, 4):
             assert (await subscriber.fetch()).led == expected
         assert link_of(alice).losses == {"seen before": 2}
+
+
+@guarded
+async def test_packets_of_two_gateways_may_overlap() -> None:
+    net = Net()
+    async with nodes(net, "A") as (alice,), alien_on(net) as alien:
+        subscriber = alice.subscribe("leds", Led)
+
+        def put(sender: int, serial: int, *sequences: int) -> None:
+            origin = msgspec.structs.replace(HEADER.origin, sender=sender)
+            first, *others = sequences
+            header = Header(origin, serial, first, 10 * first, hops=1, more=tuple([10 * each for each in others]))
+            payload = b"".join([Led(each).encode() for each in sequences])
+            alien.put("r2p/lab/topic/leds", payload, attachment=attachment.encode(header))
+
+        put(1, 1, 1, 2, 3)
+        put(2, 1, 2, 3, 4, 5)
+        put(1, 4, 4)
+        put(1, 7, 7, 8)
+        samples = subscriber.samples()
+        came = [await anext(samples) for _ in range(7)]
+        assert [(Led.decode(each.data).led, each.sequence, each.stamp) for each in came] == [
+            (each, each, 10 * each) for each in (1, 2, 3, 4, 5, 7, 8)
+        ]
+        assert link_of(alice).losses == {"seen before": 3, "on the way": 2}
+        assert (link_of(alice).stats.received, link_of(alice).stats.bytes_received) == (7, 7 * len(Led(1).encode()))
+
+
+@guarded
+async def test_a_packet_that_has_no_room_in_the_middle_stays_whole_and_in_order() -> None:
+    net = Net()
+    async with nodes(net, "A", "B") as (alice, bob):
+        publisher = alice.advertise("leds", Led)
+        small, large = bob.subscribe("leds", Led, queue=3), bob.subscribe("leds", Led, queue=1000)
+        await publisher.wait_subscriber()
+        for number in range(500):
+            await publisher.publish(Led(number))
+        for subscriber in (small, large):
+            assert [(await subscriber.fetch()).led for _ in range(500)] == list(range(500))
+            assert not subscriber.lost
 
 
 @guarded
@@ -483,7 +527,7 @@ async def test_it_says_where_it_listens() -> None:
 async def test_an_address_that_is_taken_is_an_error() -> None:
     net = Net()
     async with module("A", net.listen):
-        with pytest.raises(r2p.TransportError, match="Address already in use"):
+        with pytest.raises(r2p.TransportError, match="the port is in use"):
             async with module("B", net.listen):
                 pass
 

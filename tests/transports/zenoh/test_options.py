@@ -28,6 +28,8 @@ def test_with_an_endpoint_it_is_a_client() -> None:
 def test_a_router() -> None:
     found = options("zenoh:?mode=router&listen=tcp/0.0.0.0:7447&scouting=off")
     assert (found.mode, found.listen, found.scouting) == ("router", "tcp/0.0.0.0:7447", False)
+    assert found.batching
+    assert not options("zenoh:?batching=off").batching
 
 
 def test_a_file_decides_what_the_url_does_not() -> None:
@@ -43,12 +45,13 @@ def test_a_file_decides_what_the_url_does_not() -> None:
         ("zenoh:tcp/HOST", "the port is missing: tcp/HOST:7447"),
         ("zenoh:tcp/[::1]", "the port is missing"),
         ("zenoh:?listen=tls/0.0.0.0", "the port is missing"),
+        ("zenoh:tcp/HOST:65536", "65536 is no port"),
         ("zenoh:?mode=server", "peer, client, router"),
         ("zenoh:?listen=7447", "tcp/ADDRESS:PORT"),
         ("zenoh:?network=a/b", "letters"),
         ("zenoh:?network=", "letters"),
         ("zenoh:tcp/localhost:7447?listen=tcp/0.0.0.0:7447", "listens nowhere"),
-        ("zenoh:?speed=9600", "config, listen, mode, network, scouting"),
+        ("zenoh:?speed=9600", "batching, config, listen, mode, network, scouting"),
     ],
 )
 def test_what_it_does_not_take(url: str, says: str) -> None:
@@ -58,11 +61,11 @@ def test_what_it_does_not_take(url: str, says: str) -> None:
 
 def test_the_network_of_a_tool_that_was_told_none() -> None:
     own = default_network()
-    assert chosen(set(), "zenoh:") == own
-    assert chosen({"robot1", own}, "zenoh:") == own
-    assert chosen({"robot1"}, "zenoh:") == "robot1"
-    with pytest.raises(r2p.TransportError, match="networks robot1, robot2: say which"):
-        chosen({"robot2", "robot1"}, "zenoh:")
+    assert chosen(set()) == own
+    assert chosen({"robot1", own}) == own
+    assert chosen({"robot1"}) == "robot1"
+    with pytest.raises(ValueError, match="networks robot1, robot2: say which"):
+        chosen({"robot2", "robot1"})
 
 
 @pytest.mark.anyio

@@ -10,9 +10,10 @@ import r2p
 from r2p.events import LinkNotice
 from r2p.msg import Led
 from r2p.testing.network import node_in
+from tests.ports import free_port
 from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.authority import Authority
-from tests.transports.zenoh.cable import free_port, guarded, module
+from tests.transports.zenoh.cable import guarded, module
 
 pytestmark = pytest.mark.anyio
 
