@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import itertools
-import multiprocessing
 import socket
 import statistics
 import struct
@@ -17,8 +16,9 @@ import zenoh
 import r2p
 from benchmarks.loops import run_on
 from benchmarks.network import Eight
+from benchmarks.processes import process
 from benchmarks.table import Row, p50_p99, rate
-from benchmarks.zenoh import config, free_port, url
+from benchmarks.zenoh import LISTEN, bare_client, bare_listener, connect, port_of
 from r2p.clock import Ticker
 from r2p.codecs import debug, management, rtcan
 from r2p.codecs.rtcan import Frame
@@ -63,7 +63,7 @@ def _gateway_process(pipe: Connection, out: str) -> None:
     run_on("uvloop", _gateway(pipe, out))
 
 
-def _robot(port: int, go: Connection) -> None:
+def _robot(go: Connection, port: int) -> None:
     """Firmware: offers a topic, answers who wants it, then sends lines as fast as they are taken."""
     line = debug.encode(b"eight", bytes(32), 0)
     with socket.create_connection(("127.0.0.1", port)) as connection:
@@ -112,24 +112,14 @@ async def _count(via: str, started: Connection) -> tuple[int, float]:
 
 def _through(out: str) -> tuple[float, int, float]:
     """Messages a second, how many were lost, and seconds of processor time that the gateway took for one."""
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    gateway = context.Process(target=_gateway_process, args=(there, out), daemon=True)
-    gateway.start()
-    robot_port, pc_port = here.recv()
-    go, gone = context.Pipe()
-    robot = context.Process(target=_robot, args=(robot_port, gone), daemon=True)
-    robot.start()
-    try:
-        here.send(None)
-        before = here.recv()
-        received, seconds = run_on("uvloop", _count(out if pc_port is None else f"tcp:127.0.0.1:{pc_port}", go))
-        here.send(None)
-        return received / max(seconds, 1e-9), MESSAGES - received, (here.recv() - before) / MESSAGES
-    finally:
-        for process in (robot, gateway):
-            process.terminate()
-            process.join()
+    with process(_gateway_process, out) as gateway:
+        robot_port, pc_port = gateway.recv()
+        with process(_robot, robot_port) as robot:
+            gateway.send(None)
+            before = gateway.recv()
+            received, seconds = run_on("uvloop", _count(out if pc_port is None else f"tcp:127.0.0.1:{pc_port}", robot))
+            gateway.send(None)
+            return received / max(seconds, 1e-9), MESSAGES - received, (gateway.recv() - before) / MESSAGES
 
 
 # How long it takes: each message carries the instant at which it was sent, by the monotonic clock of both processes
@@ -153,7 +143,7 @@ async def _tick(send: Callable[[bytes], object]) -> None:
     ticker.close()
 
 
-def _bare_links(pipe: Connection, port: int) -> None:
+def _bare_links(pipe: Connection) -> None:
     """The two links and nothing else: what a CAN controller receives is put into zenoh."""
 
     async def main() -> None:
@@ -165,15 +155,15 @@ def _bare_links(pipe: Connection, port: int) -> None:
         await _tick(lambda data: robot.request(Frame(identifier, data), next(mailboxes)))
         await asyncio.to_thread(pipe.recv)
 
-    pipe.recv()
-    with zenoh.open(config(port, listens=False)) as session:
+    with bare_client(pipe.recv()) as session:
+        pipe.recv()
         publisher = session.declare_publisher("bench/sent", express=True)
         while not publisher.matching_status:
             time.sleep(0.01)
         run_on("precise", main())
 
 
-def _robot_and_gateway(pipe: Connection, port: int) -> None:
+def _robot_and_gateway(pipe: Connection) -> None:
     """The same by r2p: a robot's module on a simulated bus, and a gateway."""
 
     async def publish(node: r2p.Node) -> None:
@@ -185,9 +175,8 @@ def _robot_and_gateway(pipe: Connection, port: int) -> None:
 
     async def main() -> None:
         bus = SimCan()
-        zenoh_url = url(port, listens=False)
         async with (
-            r2p.Module("GW", via=[bus.transport(), zenoh_url], bridge=True, watchdog=False),
+            r2p.Module("GW", via=[bus.transport(), connect(pipe.recv())], bridge=True, watchdog=False),
             r2p.Module("ROBOT", via=[bus.transport()], watchdog=False) as robot,
         ):
             robot.start(publish)
@@ -196,7 +185,7 @@ def _robot_and_gateway(pipe: Connection, port: int) -> None:
     run_on("precise", main())
 
 
-def _bare_pc(port: int, started: Connection) -> list[float]:
+def _bare_pc(robot: Connection) -> list[float]:
     delays: list[float] = []
     over = threading.Event()
 
@@ -205,28 +194,30 @@ def _bare_pc(port: int, started: Connection) -> list[float]:
         if len(delays) == PACED:
             over.set()
 
-    with zenoh.open(config(port, listens=True)) as session:
+    with bare_listener() as (session, port):
         session.declare_subscriber("bench/sent", arrived)
-        started.send(None)
+        robot.send(port)
+        robot.send(None)
         over.wait(2 * PACED * PERIOD / 1e9)
     return delays
 
 
-def _pc(port: int, started: Connection) -> list[float]:
+def _pc(robot: Connection) -> list[float]:
     delays: list[float] = []
 
     async def receive(node: r2p.Node) -> None:
         subscriber = node.subscribe("sent", Sent, queue=64)
         await subscriber.wait_publisher()
         await asyncio.sleep(2.5)  # the gateway has made sure that it is alone
-        started.send(None)
+        robot.send(None)
         with contextlib.suppress(TimeoutError):
             while len(delays) < PACED:
                 message = await subscriber.fetch(timeout=3.0)
                 delays.append((time.monotonic_ns() - message.at) / 1e9)
 
     async def main() -> None:
-        async with r2p.Module("PC", via=url(port, listens=True), watchdog=False) as module:
+        async with r2p.Module("PC", via=LISTEN, watchdog=False) as module:
+            robot.send(port_of(module))
             module.start(receive)
             await module.wait()
 
@@ -234,18 +225,10 @@ def _pc(port: int, started: Connection) -> list[float]:
     return delays
 
 
-def _delays(robot: Callable[[Connection, int], None], pc: Callable[[int, Connection], list[float]]) -> list[float]:
+def _delays(robot: Callable[[Connection], None], pc: Callable[[Connection], list[float]]) -> list[float]:
     """Seconds from the robot to the PC, of each message."""
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    port = free_port()
-    process = context.Process(target=robot, args=(there, port), daemon=True)
-    process.start()
-    try:
-        return pc(port, here)
-    finally:
-        process.terminate()
-        process.join()
+    with process(robot) as pipe:
+        return pc(pipe)
 
 
 def rows() -> Iterator[Row]:

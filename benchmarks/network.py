@@ -1,7 +1,6 @@
 """Two processes over TCP on loopback, against bare asyncio streams that exchange lines."""
 
 import asyncio
-import multiprocessing
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from multiprocessing.connection import Connection
@@ -11,6 +10,7 @@ import r2p
 from benchmarks import ends
 from benchmarks.ends import Result
 from benchmarks.loops import run_on
+from benchmarks.processes import process
 from benchmarks.table import Row, p50_p99, rate
 from r2p.transports.tcp import TcpListenTransport
 from r2p.transports.url import parse
@@ -76,20 +76,13 @@ Server = Callable[[Connection], Coroutine[Any, Any, None]]
 Driver = Callable[[int, Connection], Coroutine[Any, Any, Result]]
 
 
-def _process(serve: Server, pipe: Connection, loop: str) -> None:
+def _process(pipe: Connection, serve: Server, loop: str) -> None:
     run_on(loop, serve(pipe))
 
 
 def _both(serve: Server, drive: Driver, loop: str) -> Result:
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    server = context.Process(target=_process, args=(serve, there, loop), daemon=True)
-    server.start()
-    try:
-        return run_on(loop, drive(here.recv(), here))
-    finally:
-        server.terminate()
-        server.join()
+    with process(_process, serve, loop) as server:
+        return run_on(loop, drive(server.recv(), server))
 
 
 def rows() -> Iterator[Row]:

@@ -2,14 +2,12 @@
 
 import asyncio
 import json
-import multiprocessing
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, contextmanager
 from multiprocessing.connection import Connection
 
 import zenoh
@@ -18,6 +16,7 @@ import r2p
 from benchmarks import ends
 from benchmarks.ends import Result
 from benchmarks.loops import run_on
+from benchmarks.processes import process
 from benchmarks.table import Row, p50_p99, rate
 
 MESSAGES = 300_000
@@ -40,46 +39,66 @@ MESSAGE = Sixteen(values=tuple(map(float, range(16))))  # type: ignore[arg-type]
 LOAD = ends.Load(MESSAGE, MESSAGES, ROUNDS)
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port: int = probe.getsockname()[1]
-        return port
+LISTEN = "zenoh:?mode=peer&listen=tcp/127.0.0.1:0&scouting=off&network=bench"
 
 
-def url(port: int, *, listens: bool) -> str:
-    if listens:
-        return f"zenoh:?mode=peer&listen=tcp/127.0.0.1:{port}&scouting=off&network=bench"
+def connect(port: int) -> str:
+    """The URL of a client."""
     return f"zenoh:tcp/127.0.0.1:{port}?scouting=off&network=bench"
+
+
+def port_of(module: r2p.Module) -> int:
+    """The port where it takes connections."""
+    ((_, address),) = module.addresses
+    return int(address.rpartition(":")[2])
 
 
 # r2p at both ends
 
 
-def _serve_r2p(port: int, pipe: Connection) -> None:
-    module = r2p.Module("SERVER", via=url(port, listens=True), watchdog=False)
-    run_on("uvloop", ends.serve(module, LOAD, pipe, lambda: "ready"))
+def _serve_r2p(pipe: Connection) -> None:
+    module = r2p.Module("SERVER", via=LISTEN, watchdog=False)
+    run_on("uvloop", ends.serve(module, LOAD, pipe, lambda: port_of(module)))
 
 
 def _drive_r2p(port: int, pipe: Connection) -> Result:
-    module = r2p.Module("CLIENT", via=url(port, listens=False), watchdog=False)
+    module = r2p.Module("CLIENT", via=connect(port), watchdog=False)
     return run_on("uvloop", ends.drive(module, LOAD, pipe))
 
 
 # bare zenoh at both ends
 
 
-def config(port: int, *, listens: bool) -> zenoh.Config:
+@contextmanager
+def bare_listener() -> Iterator[tuple[zenoh.Session, int]]:
+    """A session, and the port where it takes connections."""
+    with zenoh.open(_config("peer", "listen", 0)) as session:
+        answers = [each.ok for each in session.get(f"@/{session.zid()}/*") if each.ok is not None]
+        (locator,) = [each for answer in answers for each in json.loads(answer.payload.to_bytes()).get("locators", [])]
+        yield session, int(locator.rpartition(":")[2])
+
+
+def bare_client(port: int) -> zenoh.Session:
+    """A session that connects to that port."""
+    return zenoh.open(_config("client", "connect", port))
+
+
+def _config(mode: str, way: str, port: int) -> zenoh.Config:
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("mode", '"peer"' if listens else '"client"')
-    key = "listen/endpoints" if listens else "connect/endpoints"
-    config.insert_json5(key, json.dumps([f"tcp/127.0.0.1:{port}"]))
+    config.insert_json5("adminspace/enabled", "true")  # it is asked where it listens
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5(f"{way}/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
     return config
 
 
-def _serve_bare(port: int, pipe: Connection) -> None:
+def _serve_bare(pipe: Connection) -> None:
     """Counts in a callback, and echoes in another one."""
-    session = zenoh.open(config(port, listens=True))
+    with bare_listener() as (session, port):
+        _count_and_echo(session, port, pipe)
+
+
+def _count_and_echo(session: zenoh.Session, port: int, pipe: Connection) -> None:
     done = threading.Event()
     count, started = 0, 0.0
     pong = session.declare_publisher("bench/pong")
@@ -95,14 +114,14 @@ def _serve_bare(port: int, pipe: Connection) -> None:
 
     numbers = session.declare_subscriber("bench/numbers", arrived)
     ping = session.declare_subscriber("bench/ping", lambda sample: pong.put(sample.payload))
-    pipe.send("ready")
+    pipe.send(port)
     done.wait()
     pipe.recv()
     del numbers, ping
 
 
 def _drive_bare(port: int, pipe: Connection) -> Result:
-    session = zenoh.open(config(port, listens=False))
+    session = bare_client(port)
     block = zenoh.CongestionControl.BLOCK
     numbers = session.declare_publisher("bench/numbers", congestion_control=block)
     ping = session.declare_publisher("bench/ping")
@@ -127,23 +146,15 @@ def _drive_bare(port: int, pipe: Connection) -> Result:
 
 
 def _both(*, bare: bool) -> Result:
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    port = free_port()
-    server = context.Process(target=_serve_bare if bare else _serve_r2p, args=(port, there), daemon=True)
-    server.start()
-    try:
-        here.recv()
-        return _drive_bare(port, here) if bare else _drive_r2p(port, here)
-    finally:
-        server.terminate()
-        server.join()
+    with process(_serve_bare if bare else _serve_r2p) as server:
+        drive = _drive_bare if bare else _drive_r2p
+        return drive(server.recv(), server)
 
 
 # A large network
 
 
-def _populate(port: int, pipe: Connection) -> None:
+def _populate(pipe: Connection) -> None:
     """50 modules that publish 10 topics each, and a router."""
 
     async def publish(node: r2p.Node, number: int) -> None:
@@ -152,15 +163,15 @@ def _populate(port: int, pipe: Connection) -> None:
         await asyncio.get_running_loop().create_future()
 
     async def main() -> None:
-        router = f"zenoh:?mode=router&listen=tcp/127.0.0.1:{port}&scouting=off&network=bench"
+        router = r2p.Module("ROUTER", via=LISTEN.replace("peer", "router"), watchdog=False)
         async with AsyncExitStack() as stack:
-            await stack.enter_async_context(r2p.Module("ROUTER", via=router, watchdog=False))
+            await stack.enter_async_context(router)
             for number in range(MODULES):
-                module = r2p.Module(f"M{number}", via=url(port, listens=False), watchdog=False)
+                module = r2p.Module(f"M{number}", via=connect(port_of(router)), watchdog=False)
                 await stack.enter_async_context(module)
                 module.start(publish, number, name="many")
             await asyncio.sleep(SETTLED)
-            pipe.send("ready")
+            pipe.send(port_of(router))
             await asyncio.to_thread(pipe.recv)
 
     run_on("uvloop", main())
@@ -168,20 +179,12 @@ def _populate(port: int, pipe: Connection) -> None:
 
 def _list_topics() -> tuple[float, int]:
     """Seconds that `r2p topic list` takes, and the topics that it finds."""
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    port = free_port()
-    network = context.Process(target=_populate, args=(port, there), daemon=True)
-    network.start()
-    try:
-        here.recv()
-        command = [sys.executable, "-c", "from r2p.tools.main import main; main()", "topic", "list"]
+    with process(_populate) as network:
+        via = connect(network.recv())
+        command = [sys.executable, "-c", "from r2p.tools.main import main; main()", "topic", "list", "--via", via]
         started = time.perf_counter()
-        listed = subprocess.run([*command, "--via", url(port, listens=False)], capture_output=True, check=True)
+        listed = subprocess.run(command, capture_output=True, check=True)
         return time.perf_counter() - started, sum(b'"m' in line for line in listed.stdout.splitlines())
-    finally:
-        network.terminate()
-        network.join()
 
 
 def rows() -> Iterator[Row]:

@@ -1,6 +1,7 @@
 """zenoh's configuration for a link: what r2p needs, then the user's file, then what the URL says."""
 
 import json
+import re
 
 import zenoh
 
@@ -36,7 +37,7 @@ def config_of(options: Options) -> zenoh.Config:
         for key, value in _stated(options).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        raise options.error(f"zenoh does not take this: {error}") from error
+        raise options.error(f"zenoh does not take this: {_words(error)}") from error
     return config
 
 
@@ -65,7 +66,7 @@ def _from_file(options: Options) -> zenoh.Config:
     try:
         theirs = zenoh.Config.from_file(options.config)
     except (zenoh.ZError, OSError) as error:
-        reason = "there is no such file" if not options.config.exists() else str(error)
+        reason = "there is no such file" if not options.config.exists() else _words(error)
         raise options.error(f"can't read {options.config}: {reason}") from error
     blank = zenoh.Config()
     for key, value in _OURS.items():
@@ -87,6 +88,13 @@ def _stated(options: Options) -> dict[str, object]:
     if options.scouting is not None:
         stated["scouting/multicast/enabled"] = options.scouting
     return stated
+
+
+def _words(error: Exception) -> str:
+    """zenoh's text without its own places, and with that in the file, if it tells it, in front."""
+    text = re.sub(r" at /\S+?\.rs:\d+\.?", "", str(error)).strip()
+    found = re.search(r'msg: "(.*)", location: Some\(Location \{ line: (\d+), column: (\d+)', text, re.DOTALL)
+    return f"line {found[2]}, column {found[3]}: {found[1]}" if found else text
 
 
 def _texts(value: object) -> list[str]:

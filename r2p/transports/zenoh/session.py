@@ -20,6 +20,7 @@ from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from r2p.codecs import liveliness
 from r2p.errors import TransportError
+from r2p.transports.intake import TURN
 from r2p.transports.zenoh import threads
 
 T = TypeVar("T")
@@ -63,8 +64,11 @@ class Funnel:
     def _empty(self) -> None:
         self._woken = False
         waiting = self._waiting
-        while waiting:
+        for _ in range(min(len(waiting), TURN)):
             self._take(waiting.popleft())
+        if waiting and not self._woken:  # a flood; others have their turn in between
+            self._woken = True
+            self._loop.call_soon(self._empty)
 
 
 class Tap:
@@ -230,7 +234,8 @@ class Session:
         """All answers to a query, within `timeout` seconds."""
 
         def ask() -> list[bytes]:
-            replies = self._session.get(key, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE)
+            channel: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
+            replies = self._session.get(key, channel, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE)
             return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
         return await _in_thread(ask)
@@ -239,7 +244,8 @@ class Session:
         """The names of the r2p networks on which there are modules, or else a publisher, or else `tools` that look."""
 
         def tokens(kind: str) -> list[list[str]]:
-            found = self._session.liveliness().get(f"r2p/*/live/*/*/{kind}/**", timeout=1.0)
+            replies: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
+            found = self._session.liveliness().get(f"r2p/*/live/*/*/{kind}/**", replies, timeout=1.0)
             return [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
 
         def ask() -> set[str]:
@@ -267,7 +273,10 @@ class Session:
 
 _MESSAGE_MAX = 4096
 _QUERIES = 1024
-_AT_ONCE = 256  # that wait in zenoh until their thread runs
+_AT_ONCE = 65_536
+"""What waits in zenoh until its thread runs, at most: more than there is, as zenoh may hand out all in the very call
+that asks for it, holding its locks, and would wait there for ever.
+"""
 
 
 async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] | None = None) -> T:

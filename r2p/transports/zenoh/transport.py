@@ -129,7 +129,9 @@ class ZenohTransport(Transport):
                 return
             if others:
                 text = f"nobody else is on the network {network}, but there are modules on {', '.join(others)}"
-                hub.link_notice(link, "elsewhere", f"{text}: is ?network={others[0]} meant?", trouble=False)
+                text += f": is ?network={others[0]} meant?"
+                # A program without a log handler shows warnings only; a tool shows both.
+                hub.link_notice(link, "elsewhere", text, trouble=not hub.observer)
                 return
             pause = min(2 * pause, _RARELY)
 

@@ -196,6 +196,7 @@ def _tls_words(error: ssl.SSLError, tls: Tls) -> str:
 
 def _refusal_words(protocol: str, way: Way) -> str:
     if way.user is not None:
-        return f"check the password of user {way.user} (transport/auth/usrpwd), and that it is a zenoh 1 router"
-    checks = "it may ask for a user and a password (transport/auth/usrpwd), or be no zenoh 1 router"
+        asks = f"check the password of user {way.user} (transport/auth/usrpwd), and that it"
+        return f"{asks} is a zenoh 1 router that does not hang"
+    checks = "it may ask for a user and a password (transport/auth/usrpwd), hang, or be no zenoh 1 router"
     return checks if protocol == "tls" else f"{checks}, or want TLS (tls/ instead of tcp/)"

@@ -253,6 +253,21 @@ async def test_networks_of_different_names_stay_apart() -> None:
 
 
 @guarded
+async def test_a_router_that_asks_who_is_there_is_not_stopped_by_many_answers() -> None:
+    """They come in the call that asks, which must not wait for somebody to take them."""
+    async with nodes(net := Net(), "A") as (alice,), alien_on(net) as alien:
+        live = alien.liveliness()
+        tokens = [live.declare_token(f"r2p/full/live/1/{n:x}/module/M{n}/{n:x}/0/0") for n in range(1, 1001)]
+        session = link_of(alice)._session
+        assert session is not None
+        found: set[str] = set()
+        while "full" not in found:
+            found = await session.networks(tools=False)
+        assert found == {"lab", "full"}
+        del tokens
+
+
+@guarded
 async def test_the_last_words_of_a_module_arrive() -> None:
     net = Net()
     async with module("A", net.listen) as a, node_in(a) as alice:
@@ -348,6 +363,8 @@ async def test_what_comes_by_two_links_comes_once() -> None:
             return sum(link.losses["seen before"] for link in b.links)
 
         await publisher.wait_subscriber()
+        links = [link for link in b.links if isinstance(link, ZenohLink)]
+        await until(lambda: all("leds" in link._streams._streams for link in links))  # the second one listened first
         while not dropped():  # until both links have it
             await publisher.publish(Led())
         for number in range(2 * WINDOW):  # further than it would get if what is dropped earned no credit

@@ -59,6 +59,24 @@ def test_what_it_does_not_take(url: str, says: str) -> None:
         open_transport(url)
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('{mode: "client", conect: {}}', "line 1, column 18: unknown field `conect`, expected one of "),
+        ('{mode: "client", ', "expected identifier or string"),
+    ],
+)
+def test_a_file_that_zenoh_does_not_take(tmp_path: Path, text: str, says: str) -> None:
+    from r2p.transports.zenoh.config import config_of
+
+    (tmp_path / "zenoh.json5").write_text(text)
+    with pytest.raises(r2p.TransportError) as caught:
+        config_of(options(f"zenoh:?config={tmp_path}/zenoh.json5"))
+    assert f"zenoh: can't read {tmp_path}/zenoh.json5: " in str(caught.value)
+    assert says in str(caught.value)
+    assert ".rs" not in str(caught.value)
+
+
 def test_the_network_of_a_tool_that_was_told_none() -> None:
     own = default_network()
     assert chosen(set()) == own

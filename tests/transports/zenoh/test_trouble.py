@@ -67,7 +67,10 @@ async def test_where_nobody_can_connect(endpoint: str, says: str) -> None:
 
 @guarded
 @pytest.mark.parametrize("observer", [True, False])
-async def test_alone_on_a_network_while_others_are_elsewhere(monkeypatch: pytest.MonkeyPatch, observer: bool) -> None:
+async def test_alone_on_a_network_while_others_are_elsewhere(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, observer: bool
+) -> None:
+    caplog.set_level("INFO")
     monkeypatch.setattr(transport, "_ALONE", 0.01)
     robot = Net("robot1")
     wrong = robot.join.replace(robot.name, "robot2")
@@ -77,6 +80,8 @@ async def test_alone_on_a_network_while_others_are_elsewhere(monkeypatch: pytest
         notice = await first(events, r2p.LinkNotice)
     expected = "nobody else is on the network robot2, but there are modules on robot1: is ?network=robot1 meant?"
     assert (notice.kind, notice.text) == ("elsewhere", expected)
+    levels = {each.levelname for each in caplog.records if expected in each.getMessage()}
+    assert ("WARNING" in levels) != observer, "a program without a handler shows warnings only"
 
 
 @guarded
