@@ -72,10 +72,8 @@ class Funnel:
 
 
 class Tap:
-    """A subscription, emptied by the loop itself, without a thread for each message.
-
-    A thread waits for the first sample, and hands it to the loop. That takes out all the others, and then says
-    `wait()`: only then does the thread look again.
+    """A subscription. A thread waits for samples, and hands them to the loop; when that falls behind, the thread rests,
+    and the loop takes what else there is by itself, without a switch of threads for each.
     """
 
     def __init__(
@@ -84,28 +82,58 @@ class Tap:
         loop: asyncio.AbstractEventLoop,
         arrived: Callable[[zenoh.Sample], None],
     ) -> None:
-        self.take = subscriber.handler.try_recv
-        """The next sample that waits, or None."""
         self._subscriber = subscriber
         self._loop = loop
         self._arrived = arrived
-        self._emptied = threading.Lock()
-        self._emptied.acquire()
-        self.wait = self._emptied.release
-        """Nothing waits any more. Once for each sample that the thread has handed over."""
+        self._receive = subscriber.handler.try_recv
+        self._handed: deque[zenoh.Sample] = deque()
+        self._taken = 0
+        self._idle = True
+        self._thread_rests = False
+        self._go_on = threading.Lock()
+        self._go_on.acquire()
         threads.start(self._watch)
+
+    def take(self) -> zenoh.Sample | None:
+        """The next sample that waits, or None."""
+        if self._handed:
+            self._taken += 1
+            return self._handed.popleft()
+        return self._receive() if self._thread_rests else None
+
+    def wait(self) -> None:
+        """Nothing waits any more: call `arrived` with the next sample."""
+        self._idle = True
+        if self._thread_rests:
+            self._thread_rests = False
+            self._go_on.release()
 
     def close(self) -> None:
         self._subscriber.undeclare()
         with contextlib.suppress(RuntimeError):  # the thread waits for a sample, not for us
-            self._emptied.release()
+            self._go_on.release()
 
     def _watch(self) -> None:
         receive = self._subscriber.handler.recv
+        count = 0
         with contextlib.suppress(zenoh.ZError, RuntimeError):  # it is undeclared; the loop is closed
             while True:
-                self._loop.call_soon_threadsafe(self._arrived, receive())
-                self._emptied.acquire()
+                sample = receive()
+                count += 1
+                rests = count - self._taken > 1
+                self._loop.call_soon_threadsafe(self._hand_over, sample, rests)
+                if rests:
+                    self._go_on.acquire()
+
+    def _hand_over(self, sample: zenoh.Sample, rests: bool) -> None:
+        """In the loop, one sample after the other; behind the last one the thread may rest."""
+        self._handed.append(sample)
+        self._thread_rests = rests
+        if self._idle:
+            self._idle = False
+            first = self.take()
+            assert first is not None
+            self._arrived(first)
 
 
 async def open_session(config: zenoh.Config) -> "Session":
