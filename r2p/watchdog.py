@@ -3,10 +3,15 @@
 A thread asks the loop for a sign of life, four times in each LIMIT. Where none comes for LIMIT seconds, it logs the
 stack that the loop is stuck in, once, and afterwards how long it took. One block of 100 ms is ten missed periods of a
 100 Hz node: worth a log line.
+
+It blames nobody for what the computer did: where the thread itself did not run either, and nothing in this process
+used the processor meanwhile, the process was stopped (Ctrl-Z, a debugger, a computer that slept), and that is said.
 """
 
 import asyncio
 import logging
+import os
+import selectors
 import sys
 import threading
 import traceback
@@ -17,9 +22,15 @@ from r2p.clock import clock_of
 
 logger = logging.getLogger("r2p.watchdog")
 
+_SECOND = 1_000_000_000
+
 LIMIT = 0.1
 """Seconds that the loop may be blocked."""
 
+_MOMENT = 1.0  # seconds that the process may be stopped without a word
+STOPPED = "this process did not run for %.1f s: it was stopped, or the computer slept or was busy"
+NOBODY = "the event loop did not come round for over %.0f ms, and none of its code runs: is the computer busy?"
+_IDLE = 0.5  # of a processor: whatever runs uses more than that, and what waits less
 _RUNS_IT = {each.__file__ for each in (asyncio.base_events, asyncio.events, asyncio.runners)} | {
     str(Path(__file__).with_name("supervisor.py"))
 }
@@ -35,11 +46,13 @@ class Watchdog:
         self._alive = threading.Event()
         self._ended = threading.Event()
         self._watched = 0
+        self._base: FrameType | None = None  # whatever runs a loop that is not written in Python
         self._thread = threading.Thread(target=self._watch, name="r2p-watchdog", daemon=True)
 
     def start(self) -> None:
         """Watch from now on."""
         self._watched = threading.get_ident()
+        self._base = _runner()
         self._thread.start()
 
     def close(self) -> None:
@@ -47,24 +60,50 @@ class Watchdog:
         self._ended.set()
         self._alive.set()
         self._thread.join()
+        self._base = None
 
     def _watch(self) -> None:
-        while not self._ended.wait(self._limit / 4):
+        while not self._pause():
             self._alive.clear()
-            asked = self._clock.monotonic()
+            asked, used = self._clock.monotonic(), _used()
             try:
                 self._loop.call_soon_threadsafe(self._alive.set)
             except RuntimeError:  # the loop is closed
                 return
-            if not self._ended.is_set() and not self._alive.wait(self._limit):
-                self._report()
-                self._wait_out(asked)
+            if self._ended.is_set() or self._alive.wait(self._limit):
+                continue
+            if self._was_stopped(asked, used, self._limit) and self._alive.wait(self._limit):
+                self._tell_stopped(asked)
+                continue
+            self._report()
+            self._wait_out(asked)
+
+    def _pause(self) -> bool:
+        """Until the next look; True: there is none."""
+        start, used = self._clock.monotonic(), _used()
+        if self._ended.wait(self._limit / 4):
+            return True
+        if self._was_stopped(start, used, _MOMENT):
+            self._tell_stopped(start)
+        return False
+
+    def _was_stopped(self, since: int, used: float, limit: float) -> bool:
+        """Whether this thread, which waited for a moment, was late by more than `limit` seconds, and nobody busy."""
+        passed = (self._clock.monotonic() - since) / _SECOND
+        return passed > 2 * limit and _used() - used < _IDLE * passed
+
+    def _tell_stopped(self, since: int) -> None:
+        passed = (self._clock.monotonic() - since) / _SECOND
+        logger.warning(STOPPED, passed)
 
     def _report(self) -> None:
+        frame = sys._current_frames().get(self._watched)  # noqa: SLF001 - documented, for exactly this use
+        stack = _own_part(frame) if frame is not None and frame is not self._base else ""
+        if not stack:
+            logger.warning(NOBODY, self._limit * 1e3)
+            return
         task = asyncio.current_task(self._loop)
         who = f"task {task.get_name()}" if task is not None else "a callback"
-        frame = sys._current_frames().get(self._watched)  # noqa: SLF001 - documented, for exactly this use
-        stack = _own_part(frame) if frame is not None else "(no stack)"
         logger.warning("%s has blocked the event loop for over %.0f ms:\n%s", who, self._limit * 1e3, stack)
 
     def _wait_out(self, asked: int) -> None:
@@ -73,8 +112,23 @@ class Watchdog:
             logger.warning("the event loop runs again after %.0f ms", (self._clock.monotonic() - asked) / 1e6)
 
 
+def _used() -> float:
+    """Seconds of a processor that this process has used so far."""
+    return sum(os.times()[:2])
+
+
+def _runner() -> FrameType | None:
+    """The frame below the task that is running."""
+    task = asyncio.current_task()
+    frame = getattr(task.get_coro(), "cr_frame", None) if task is not None else None
+    return frame.f_back if frame is not None else None
+
+
 def _own_part(frame: FrameType) -> str:
-    """The stack from where a node or a callback begins; what runs it is always the same."""
+    """The stack from where a node or a callback begins; what runs it is always the same. Empty: only that."""
     stack = traceback.extract_stack(frame)
     begin = max((at for at, each in enumerate(stack, 1) if each.filename in _RUNS_IT), default=0)
-    return "".join(traceback.format_list(stack[begin:] or stack)).rstrip()
+    own = stack[begin:]
+    if begin and stack[begin - 1].name == "_run_once" and all(each.filename == selectors.__file__ for each in own):
+        return ""  # it waits for events
+    return "".join(traceback.format_list(own)).rstrip()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from typing import TYPE_CHECKING
+import time
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
@@ -16,6 +17,8 @@ from tests.bench import local
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from r2p.clock import Clock
 
 PATIENCE = 30.0
 
@@ -92,6 +95,72 @@ async def test_a_callback_that_blocks_is_logged_too(reports: Reports) -> None:
     told = reports.texts[0].splitlines()
     assert told[0] == "a callback has blocked the event loop for over 10 ms:"
     assert "threading.py" in told[-2]
+
+
+@pytest.mark.anyio
+async def test_a_loop_that_only_waits_has_nobody_to_blame(reports: Reports) -> None:
+    watchdog = Watchdog(asyncio.get_running_loop())
+    watchdog.start()
+    watchdog._ended.set()
+
+    def look() -> None:
+        for _ in range(1000):  # once the loop has come to where it waits for this thread
+            watchdog._report()
+            if "none of its code runs" in reports.texts[-1]:
+                return
+
+    await asyncio.to_thread(look)
+    assert reports.texts[-1].startswith("the event loop did not come round for over 100 ms, and none")
+
+
+class Jumping:
+    """A clock that leaves out `seconds` at its second look."""
+
+    def __init__(self, seconds: float) -> None:
+        self._jump = round(seconds * 1e9)
+        self._looks = 0
+
+    def monotonic(self) -> int:
+        self._looks += 1
+        return time.monotonic_ns() + self._jump * (self._looks > 1)
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(("seconds", "busy"), [(8.0, 0.0), (8.0, 8.0), (0.5, 0.0)])
+async def test_a_process_that_was_stopped_says_so(
+    reports: Reports, monkeypatch: pytest.MonkeyPatch, seconds: float, busy: float
+) -> None:
+    watchdog = Watchdog(asyncio.get_running_loop(), limit=0.001)
+    clock = Jumping(seconds)
+    watchdog._clock = cast("Clock", clock)
+    monkeypatch.setattr("r2p.watchdog._used", lambda: busy * (clock._looks > 1))
+    assert not watchdog._pause()
+    expected = ["this process did not run for 8.0 s: it was stopped, or the computer slept or was busy"]
+    assert reports.texts == (expected if seconds > busy + 1 else [])
+
+
+@pytest.mark.anyio
+async def test_what_was_going_on_when_the_process_was_stopped_is_not_blamed(
+    reports: Reports, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watchdog = Watchdog(asyncio.get_running_loop(), limit=0.001)
+
+    class Sign(threading.Event):
+        """Of a loop that comes round at the second look, and then it is over."""
+
+        looks = 0
+
+        def wait(self, timeout: float | None = None) -> bool:
+            self.looks += 1
+            if self.looks > 1:
+                watchdog._ended.set()
+            return self.looks > 1
+
+    watchdog._alive = Sign()
+    monkeypatch.setattr(watchdog, "_was_stopped", lambda _since, _used, limit: limit == 0.001)
+    await asyncio.to_thread(watchdog._watch)
+    (told,) = reports.texts
+    assert told.startswith("this process did not run for")
 
 
 @pytest.mark.anyio

@@ -11,6 +11,7 @@ import msgspec
 
 from r2p.codecs import management
 from r2p.protocols.events import ModuleInfo, Shape, Source
+from r2p.protocols.schedule import SELDOM, Timers
 
 MOST = 4096
 """Entries in each table."""
@@ -74,14 +75,15 @@ class _Starts(msgspec.Struct):
 
 
 class Directory:
-    """The tables of one link."""
+    """The tables of one link. Each endpoint has a timer, ("endpoint", its key): it is believed for that long."""
 
-    def __init__(self, counts: Counter[str]) -> None:
+    def __init__(self, timers: Timers, counts: Counter[str]) -> None:
         self.modules: dict[str, ModuleInfo] = {}
         self.topics: dict[str, TopicInfo] = {}
         self.endpoints: dict[EndpointKey, EndpointInfo] = {}
         self.generation = 0
         """Another number means that modules or endpoints have changed."""
+        self._timers = timers
         self._counts = counts
         self._names: dict[int, str] = {}
         self._starts: dict[str, _Starts] = {}
@@ -171,25 +173,34 @@ class Directory:
             info.typed(role, known.joined(shape))
         return info
 
-    def endpoint(self, message: management.Endpoint) -> tuple[EndpointKey | None, EndpointKey | None]:
-        """An endpoint exists or is gone: the key that was entered, and the key that has left the table."""
+    def endpoint(self, now: int, message: management.Endpoint) -> None:
+        """A publisher or subscriber of a remote node is there, or gone."""
         role = message.role & ~management.ROLE_GONE
         key = (message.instance, message.node, message.topic, role)
         if message.role & management.ROLE_GONE:
             self.forget_endpoint(key)
-            return None, key
+            return
         module = self.name_of(message.instance)
         info = EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
         self.generation += self.endpoints.get(key) != info
         old = self._put(self.endpoints, key, info, "endpoints forgotten")
-        return key, None if old is None else (old.instance, old.node, old.topic, old.role)
+        if old is not None:
+            self._timers.clear(("endpoint", (old.instance, old.node, old.topic, old.role)))
+        known = self.modules.get(module)
+        if known is None:  # a stranger, who may never say hello
+            self._timers.set(("endpoint", key), now + LEASE)
+        elif known.lease < FOR_EVER:
+            self._timers.set(("endpoint", key), now + SELDOM * known.lease)
+        else:
+            self._timers.clear(("endpoint", key))
 
     def forget_endpoint(self, key: EndpointKey) -> None:
+        self._timers.clear(("endpoint", key))
         self.generation += self.endpoints.pop(key, None) is not None
 
     def forget_endpoints(self) -> None:
-        self.generation += 1
-        self.endpoints.clear()
+        for key in list(self.endpoints):
+            self.forget_endpoint(key)
 
     def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
         """Enter a value as the latest heard one; what had to go for it comes back."""

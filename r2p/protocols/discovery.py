@@ -16,6 +16,7 @@ from r2p.protocols.announcer import Announcer, Own, Relayed
 from r2p.protocols.demand import Demand, HeardDemand
 from r2p.protocols.directory import Directory, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.events import (
+    ORDERS,
     Command,
     Echoes,
     Event,
@@ -28,6 +29,7 @@ from r2p.protocols.events import (
     NameConflict,
     Obey,
     Opened,
+    OrderDenied,
     Send,
     Shape,
     Shut,
@@ -61,6 +63,10 @@ __all__ = [
 ]
 
 _SECOND = 1_000_000_000
+_SLEPT = _SECOND
+"""Ns by which nobody is late who runs at all."""
+_HEARD_AGAIN = 2 * _SECOND
+"""Ns in which whoever lives says so."""
 _ORDERS: dict[Command, Callable[[str], management.Management]] = {
     Command.STOP: management.Stop,
     Command.REBOOT: management.Reboot,
@@ -97,7 +103,7 @@ class Discovery:
         self._schedule = Schedule(rate, burst, round(quiet * _SECOND))
         self._announcer = Announcer(module, instance, self._schedule, self._outbox, observer=observer)
         self._timers = Timers()
-        self._directory = Directory(self.counts)
+        self._directory = Directory(self._timers, self.counts)
         self._exchange = Exchange(self._announcer, self._outbox, self._directory, self._timers, self.counts)
         self._neighbours = Neighbours(
             module,
@@ -124,6 +130,7 @@ class Discovery:
             management.Unsubscribe: self._exchange.unsubscribed,
             management.Endpoint: self._neighbours.endpoint,
             management.Conflict: self._neighbours.conflict,
+            management.Denied: self._denied,
         }
 
     # What was learnt
@@ -271,7 +278,13 @@ class Discovery:
         return turn if due is None else min(due, turn)
 
     def poll(self, now: int) -> list[Event]:
-        """What the time brings: leases run out, things are repeated."""
+        """What the time brings: leases run out, things are repeated.
+
+        Called far too late, it lets none run out: this program was stopped, and has yet to read what others said.
+        """
+        due = self._timers.next()
+        if due is not None and now - due > _SLEPT:
+            self._timers.put_off(now + _HEARD_AGAIN)
         for key in self._timers.pop(now):
             self._expired(now, key)
         return self._go_on(now)
@@ -314,6 +327,11 @@ class Discovery:
                 self._directory.forget_endpoint((instance, node, topic, role))
 
     # Orders
+
+    def _denied(self, now: int, message: management.Denied, source: Source) -> None:
+        if message.order in ORDERS:
+            denied = OrderDenied(message.gateway, ORDERS[message.order], message.module, message.reason)
+            self._outbox.tell(denied)
 
     def _stop(self, now: int, message: management.Stop, source: Source) -> None:
         self._obey(Command.STOP, message.module)

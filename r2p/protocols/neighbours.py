@@ -9,7 +9,7 @@ from collections.abc import Hashable
 
 from r2p.codecs import management
 from r2p.protocols.announcer import Announcer
-from r2p.protocols.directory import FOR_EVER, LEASE, Directory
+from r2p.protocols.directory import Directory
 from r2p.protocols.events import Echoes, ModuleChanged, ModuleGone, ModuleInfo, NameConflict, Source
 from r2p.protocols.exchange import Exchange
 from r2p.protocols.outbox import Outbox
@@ -86,14 +86,8 @@ class Neighbours:
 
     def endpoint(self, now: int, message: management.Endpoint, source: Source) -> None:
         """A publisher or subscriber of a remote node."""
-        if message.instance == self._instance:
-            return
-        key, left = self._directory.endpoint(message)
-        self._timers.clear(("endpoint", left))
-        info = self._directory.modules.get(self._directory.name_of(message.instance))
-        lease = info.lease if info is not None else LEASE
-        if key is not None and lease < FOR_EVER:
-            self._timers.set(("endpoint", key), now + lease)
+        if message.instance != self._instance:
+            self._directory.endpoint(now, message)
 
     def conflict(self, now: int, message: management.Conflict, source: Source) -> None:
         """Somebody who hears more than we do found a namesake of ours."""

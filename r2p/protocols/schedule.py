@@ -1,7 +1,8 @@
 """When to say what again: a ring of everything worth repeating, one step at a time, never faster than the link's rate.
 
 New things go first (`_fresh`), then join the ring. A wish to hear everything again only raises the number of ring
-places to visit without waiting (`_eager`) to a full round: fifty wishes at once cost one round.
+places to visit without waiting (`_eager`) to a full round: fifty wishes at once cost one round. What only describes
+leaves the ring after its first repetition for one that turns more slowly (`_seldom`), until somebody is new.
 """
 
 import heapq
@@ -14,6 +15,8 @@ import msgspec
 _SECOND = 1_000_000_000
 _STEP = _SECOND // 2
 _ROUND = 3 * _SECOND // 2
+SELDOM = 4
+"""Rounds in which what only describes is repeated once."""
 _PRESENCE_APART = _SECOND // 10
 _PRESENCE_SHARE = 8
 """Message times between two presences at least: on a slow line they would leave no room for anything else."""
@@ -68,10 +71,13 @@ class Schedule:
         self.pace(rate, burst, quiet)
         self._fresh: OrderedDict[Item, None] = OrderedDict()
         self._ring: OrderedDict[Item, None] = OrderedDict()
+        self._seldom: OrderedDict[Item, None] = OrderedDict()
         self._relayed: OrderedDict[Item, None] = OrderedDict()
         self._relay_next = True
         self._count = 0
         self._eager = 0
+        self._lap = 0  # turns in the ring until all has been said once more
+        self._owed = 0  # turns to the slow ring, in parts of one
         self._step_at = 0
         self._presence_at = 0
         self._presence_sent = -_SECOND
@@ -96,7 +102,7 @@ class Schedule:
 
     def drop(self, item: Item) -> None:
         """Announce it no more."""
-        for items in (self._fresh, self._ring):
+        for items in (self._fresh, self._ring, self._seldom):
             if item in items:
                 del items[item]
                 self._count -= not item.once
@@ -105,7 +111,7 @@ class Schedule:
         """The link is up: introduce yourself, then everything."""
         self.stop()
         self._fresh[Item(Kind.QUERY, once=True)] = None
-        self._eager = self._count
+        self._hurry()
         self._step_at = now + self._interval
         self._presence_at = now + self._presence_period
 
@@ -120,7 +126,7 @@ class Schedule:
         """Somebody is new: say everything once more, presence first."""
         apart = max(_PRESENCE_APART, _PRESENCE_SHARE * self._bucket.gap)
         self._presence_at = min(self._presence_at, max(now, self._presence_sent + apart))
-        self._eager = self._count
+        self._hurry()
 
     def traffic(self, now: int) -> None:
         """A management message passed by."""
@@ -138,19 +144,17 @@ class Schedule:
             item, _ = self._fresh.popitem(last=False)
             if not item.once:
                 self._ring[item] = None
+                self._lap = max(self._lap, len(self._ring))
             return item
         if self._relayed and (self._relay_next or self._turn_at() > now):
             self._relay_next = False
             return self._relayed.popitem(last=False)[0]
         self._relay_next = True
         self._step_at = now + self._interval
-        if self._presence_at <= now or not self._ring:
+        if self._presence_at <= now or not (self._ring or self._seldom):
             self._presence_sent, self._presence_at = now, now + self._presence_period
             return Item(Kind.PRESENCE, once=True)
-        self._eager -= self._eager > 0
-        item = next(iter(self._ring))
-        self._ring.move_to_end(item)
-        return item
+        return self._repetition()
 
     def sent(self, now: int, count: int) -> None:
         self._bucket.take(now, count)
@@ -160,7 +164,7 @@ class Schedule:
     def round_time(self) -> int:
         """How long it takes to repeat everything (ns)."""
         slot = max(self._interval, _MOST * self._bucket.gap, self._quiet)
-        return max(_ROUND, (self._count + 1) * slot)
+        return max(_ROUND, (self._places + 1) * slot)
 
     @property
     def relay_time(self) -> int:
@@ -168,17 +172,56 @@ class Schedule:
         return 2 * _MOST * self._bucket.gap * len(self._relayed)
 
     @property
+    def _places(self) -> int:
+        """Of what is repeated, how much has its turn in one round."""
+        return self._count - len(self._seldom) * (SELDOM - 1) // SELDOM
+
+    @property
     def _interval(self) -> int:
-        return min(_STEP, _ROUND // (self._count + 1))
+        return min(_STEP, _ROUND // (self._places + 1))
 
     @property
     def _presence_period(self) -> int:
-        return max(min(_ROUND, _STEP * (self._count + 1)), _PRESENCE_SHARE * self._bucket.gap)
+        return max(min(_ROUND, _STEP * (self._places + 1)), _PRESENCE_SHARE * self._bucket.gap)
+
+    def _hurry(self) -> None:
+        """Say everything without waiting, and once more in the next round: an answer may be lost."""
+        self._ring.update(self._seldom)
+        self._seldom.clear()
+        self._eager, self._lap = self._count, 2 * self._count
+
+    def _repetition(self) -> Item:
+        """What is next in the ring; so often that all have a turn in `SELDOM` rounds, what is next in the slow one."""
+        ring, seldom = self._ring, self._seldom
+        share = SELDOM * len(ring) + len(seldom)
+        self._owed += len(seldom)
+        if seldom and self._owed >= share:
+            self._owed %= share
+            return _turned(seldom)
+        item = _turned(ring)
+        self._eager -= self._eager > 0
+        self._lap -= 1
+        if self._lap == 0:
+            self._slow_down()
+        return item
+
+    def _slow_down(self) -> None:
+        """All has been said twice: what only describes may take its time."""
+        for item in [item for item in self._ring if item.kind is Kind.ENDPOINT]:
+            del self._ring[item]
+            self._seldom[item] = None
 
     def _turn_at(self) -> int:
         self._eager = min(self._eager, self._count)
         turn = 0 if self._eager else min(self._step_at, self._presence_at)
         return max(turn, min(self._traffic_at + self._quiet, self._step_at + _QUIET_MOST))
+
+
+def _turned(ring: OrderedDict[Item, None]) -> Item:
+    """What is next there; it comes last now."""
+    item = next(iter(ring))
+    ring.move_to_end(item)
+    return item
 
 
 class Timers:
@@ -213,6 +256,10 @@ class Timers:
             if due is not None and due > at:
                 self._push(key, due)
         return None
+
+    def put_off(self, until: int) -> None:
+        """Nothing runs out before then."""
+        self._due = {key: max(due, until) for key, due in self._due.items()}
 
     def pop(self, now: int) -> Iterator[Hashable]:
         """The keys that have run out; each is cleared."""

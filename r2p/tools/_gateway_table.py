@@ -2,6 +2,8 @@
 
 import logging
 import shutil
+from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -39,17 +41,18 @@ class Row(msgspec.Struct, frozen=True):
             rate=self.rate,
         )
 
-    def cells(self) -> dict[str, Any]:
-        """As it is shown."""
+    def cells(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """As it is shown; `names` are those of the links."""
         dropped = ", ".join(f"{count} {reason}" for reason, count in sorted(self.dropped.items()))
         if not self.topic:
             others = f" ({self.gateways} more here)" if self.gateways else ""
             clock = "" if self.error is None else f"+-{self.error / 1e3:.0f} us"
-            return {"link": self.source, "state": self.state + others, "clock": clock, "dropped": dropped}
+            state = "forwarding, alone" if self.state == "alone" else self.state + others
+            return {"link": self.source, "state": state, "clock": clock, "dropped": dropped}
         return {
             "topic": self.topic,
-            "from": self.source,
-            "to": self.target,
+            "from": names.get(self.source, self.source),
+            "to": names.get(self.target, self.target),
             "rate": f"{self.rate:.1f}/s",
             "forwarded": self.forwarded,
             "dropped": dropped,
@@ -124,15 +127,22 @@ def fitted(text: str, columns: int, lines: int) -> str:
     return "".join(f"{line[:columns]}\n" for line in shown)
 
 
+def _short(links: set[str]) -> dict[str, str]:
+    """Links by their kind alone where there is only one of it: rows of full names are wider than a terminal."""
+    kinds = Counter(link.partition(":")[0] for link in links)
+    return {link: kind for link in links if kinds[kind := link.partition(":")[0]] == 1}
+
+
 def table(rows: list[Row]) -> str:
     """The rows for people: links, and below them the busiest topics."""
-    links = [row.cells() for row in rows if not row.topic]
+    names = _short({row.source for row in rows if not row.topic})
+    links = [row.cells(names) for row in rows if not row.topic]
     ways = sorted((row for row in rows if row.topic), key=lambda row: (-row.rate, row.topic))
     clocks = ["clock"] if any(each["clock"] for each in links) else []
     text = aligned(links, ["link", "state", *clocks, "dropped"])
     if ways:
         columns = ["topic", "from", "to", "rate", "forwarded", "dropped"]
-        text += "\n" + aligned([row.cells() for row in ways[:_ROWS]], columns)
+        text += "\n" + aligned([row.cells(names) for row in ways[:_ROWS]], columns)
     if len(ways) > _ROWS:
         text += f"... and {len(ways) - _ROWS} more\n"
     return text

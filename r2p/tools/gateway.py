@@ -18,7 +18,7 @@ from r2p.names import module_name_from
 from r2p.tools._gateway_table import Rates, Row, Screen
 from r2p.tools.options import class_choice, hertz
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Quiet, Usage, Verbose, Via, execute, settings
+from r2p.tools.session import Format, Quiet, Usage, Verbose, Via, check_urls, execute, settings
 
 logger = logging.getLogger("r2p.gateway")
 
@@ -87,6 +87,9 @@ def command(
         chosen = settings(via)
         if len(chosen.via) < 2 and not any(url.startswith("tcp-listen:") for url in chosen.via):
             raise Usage("a gateway joins two links: --via rtcan:can0 --via zenoh:")
+        check_urls(chosen.via)
+        if len(set(chosen.via)) < len(chosen.via):
+            raise Usage("a link is given twice: it leads to the same network, so there is nothing to join")
         options = BridgeOptions(
             allow=_rules(allow, "--allow", chosen.via),
             deny=_rules(deny, "--deny", chosen.via),

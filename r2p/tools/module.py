@@ -29,6 +29,8 @@ _PROMPT = 0.2  # firmware says ALIVE 10 ms after an order to restart
 
 app = session.group("Modules: list, stop, reboot, bootload.")
 
+TOOLS_THERE = "; there are tools, which --all shows"
+
 Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
 All = Annotated[bool, typer.Option("--all", "-a", help="Also tools, whose names begin with _.")]
 
@@ -40,18 +42,20 @@ async def list_(session: Session, *, all: All = False, wait: Wait = None, format
     await session.settle(wait, of="modules")
     if wait is None:
         await _hear_firmware(session)
-    views = [view for view in session.module.network.modules() if view.link and (all or not view.name.startswith("_"))]
-    await output.table([_row(view) for view in views], ["module", "state", "rebooted", "kind", "link", "age"])
+    known = [view for view in session.module.network.modules() if view.link]
+    views = [view for view in known if all or not view.name.startswith("_")]
+    columns = ["module", "state", "rebooted", "kind", "link", "age"]
+    await output.table([_row(view) for view in views], columns, units={"age": "s"})
     if not views:
-        session.say(f"no module has been heard on {session.where}")
+        session.say(f"no module has been heard on {session.where}{TOOLS_THERE if known else ''}")
 
 
 async def _hear_firmware(session: Session) -> None:
-    """Firmware says its name once in a round of all its topics: give it time, if nobody else is at a link."""
+    """Firmware says its name once in a round of all its topics: give it time, if nobody else is at its link."""
 
     def named() -> bool:
         known = {view.link for view in session.module.network.modules()}
-        return all(link.name in known for link in session.module.links if link.up)
+        return all(link.name in known for link in session.module.links if link.up and link.passes_probes)
 
     with session.waiting("ALIVE of firmware"):
         await _until(named, _ROUND)
@@ -87,10 +91,14 @@ async def bootload(session: Session, module: Name, *, timeout: Timeout = None) -
 
 
 class _Watch(msgspec.Struct):
-    """What was heard of a module: its flags one after the other, and how long (s) after the order firmware spoke."""
+    """What was heard of a module: its flags one after the other, and how long (s) after the order firmware spoke.
+
+    `denied`: why a gateway does not let the order through, in words.
+    """
 
     flags: list[int]
     delay: float | None = None
+    denied: str = ""
 
 
 def _has_rebooted(watch: _Watch) -> bool:
@@ -117,24 +125,29 @@ async def _order(
     await session.settle(wait=0)
     loop = asyncio.get_running_loop()
     started = loop.time()
+    watch = _Watch([])
     with session.waiting(f"{name} to confirm {command.name}"):
         try:
             async with asyncio.timeout(timeout or TIMEOUT), asyncio.TaskGroup() as tasks:
-                flags = [_flags(view) for view in [_find(session, name)] if view is not None]
-                follower = tasks.create_task(_follow(session.module.events(), name, flags))
-                await _confirmed(session, command, name, _Watch(flags), done)
+                watch.flags += [_flags(view) for view in [_find(session, name)] if view is not None]
+                follower = tasks.create_task(_follow(session.module.events(), name, f"{command.name} denied", watch))
+                await _confirmed(session, command, name, watch, done)
                 follower.cancel()
         except TimeoutError:
             raise TimedOut(_what_was_seen(session, command, name, timeout or TIMEOUT)) from None
+    if watch.denied:
+        raise TimedOut(watch.denied)
     session.say(f"{name}: {_DONE[command]}, after {loop.time() - started:.1f} s")
 
 
-async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, flags: list[int]) -> None:
-    """Note each change of the module's flags."""
+async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str, watch: _Watch) -> None:
+    """Note each change of the module's flags, and that a gateway denies the order."""
     async for event in events:
         match event:
             case r2p.ModuleChanged(info=info) if info.name == name:
-                flags.append(info.flags)
+                watch.flags.append(info.flags)
+            case r2p.LinkNotice(kind=kind, text=text) if kind == denial:
+                watch.denied = text
 
 
 async def _confirmed(
@@ -148,9 +161,9 @@ async def _confirmed(
     def is_done() -> bool:
         view = _find(session, name)
         watch.delay = None if view is None or view.instance is not None else loop.time() - view.age - ordered
-        return bool(watch.flags) and done(watch)
+        return bool(watch.denied) or (bool(watch.flags) and done(watch))
 
-    while True:
+    while not watch.denied:
         session.module.command(command, name)
         ordered = loop.time()
         if await _until(is_done, _REPEAT):

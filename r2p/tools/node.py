@@ -9,6 +9,7 @@ import typer
 
 import r2p
 from r2p.tools import session
+from r2p.tools.module import TOOLS_THERE
 from r2p.tools.options import CLASS_NAMES
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, Wait
@@ -30,14 +31,15 @@ async def list_(
     """List the nodes, and the topics that they publish and subscribe."""
     output = Output(format)
     await session.settle(wait)
+    nodes = _nodes(session)
     rows = [
         {"node": f"{module}/{node}", "publishes": publishes, "subscribes": subscribes}
-        for (module, node), (publishes, subscribes) in _nodes(session).items()
+        for (module, node), (publishes, subscribes) in nodes.items()
         if all or not module.startswith("_")
     ]
     await output.table(rows, ["node", "publishes", "subscribes"])
     if not rows:
-        session.say(f"no node is known on {session.where}")
+        session.say(f"no node is known on {session.where}{TOOLS_THERE if nodes else ''}")
 
 
 @session.command(app, "info")
@@ -55,13 +57,16 @@ async def info(
     module, name = _find(node, nodes)
     publishes, subscribes = nodes[module, name]
     view = next((view for view in session.module.network.modules() if view.name == module), None)
+    types = Types(session.settings)
+    views = session.module.network.topics()
+    await types.learn_all(session, (views[topic] for topic in {*publishes, *subscribes}))
     await output.put(
         {
             "node": f"{module}/{name}",
             "module": None if view is None else view.state,
             "link": None if view is None else view.link,
-            "publishes": [_topic(session, topic) | {"class": _class(session, topic, node)} for topic in publishes],
-            "subscribes": [_topic(session, topic) for topic in subscribes],
+            "publishes": [_topic(types, views[topic]) | {"class": _class(views[topic], node)} for topic in publishes],
+            "subscribes": [_topic(types, views[topic]) for topic in subscribes],
         }
     )
 
@@ -91,15 +96,14 @@ def _find(wanted: str, nodes: Table) -> tuple[str, str]:
     raise r2p.Error(f"there is no node {wanted}; known: {paths or 'none'}")
 
 
-def _topic(session: Session, topic: str) -> dict[str, Any]:
-    view = session.module.network.topics()[topic]
-    cls = Types(session.settings).of(view)
-    return {"topic": topic, "type": None if cls is None else type_name(cls), "size": view.size or None}
+def _topic(types: Types, view: r2p.TopicView) -> dict[str, Any]:
+    cls = types.of(view)
+    return {"topic": view.name, "type": None if cls is None else type_name(cls), "size": view.size or None}
 
 
-def _class(session: Session, topic: str, node: str) -> str | None:
+def _class(view: r2p.TopicView, node: str) -> str | None:
     """The class of its publisher, where the node has told it."""
-    for endpoint in session.module.network.topics()[topic].publishers:
+    for endpoint in view.publishers:
         if endpoint.node == node.rpartition("/")[2] and endpoint.publisher_class is not None:
             return CLASS_NAMES[endpoint.publisher_class]
     return None

@@ -22,6 +22,8 @@ from typing import Any, Literal, TextIO
 
 Record = Mapping[str, Any]
 
+_NONE: Mapping[str, str] = {}
+
 _ATOMIC = 4096  # bytes that a pipe takes without blocking once it says that it takes some (POSIX: at least 512)
 
 
@@ -78,11 +80,15 @@ class Output:
         async with self._lock:
             await self._write(self._record(record, text))
 
-    async def table(self, rows: Iterable[Record], columns: list[str]) -> None:
-        """Write a list of records with the same keys; for people in aligned columns. Raises PipeClosed."""
+    async def table(self, rows: Iterable[Record], columns: list[str], *, units: Mapping[str, str] = _NONE) -> None:
+        """Write a list of records with the same keys; for people in aligned columns, numbers with the unit of theirs.
+
+        Raises PipeClosed.
+        """
         rows = list(rows)
         match self.format:
             case "text":
+                rows = [{**row, **{name: f"{row[name]} {unit}" for name, unit in units.items()}} for row in rows]
                 text = aligned(rows, columns, shutil.get_terminal_size().columns)
             case "csv":
                 text = _csv(columns) + "".join(_csv([_cell(row[name]) for name in columns]) for row in rows)

@@ -14,7 +14,7 @@ import typer
 import r2p
 from r2p.names import NODE_MAX, node_name, topic_name
 from r2p.tools.loading import load_module
-from r2p.tools.session import Quiet, Usage, Verbose, Via, execute, settings
+from r2p.tools.session import Quiet, Usage, Verbose, Via, check_urls, execute, settings
 
 logger = logging.getLogger("r2p.runner")
 
@@ -59,6 +59,7 @@ def command(
 
     async def main() -> None:
         chosen = settings(via)
+        check_urls(chosen.via)
         programs = load(functions)
         priorities = _priorities(priority or (), programs)
         names = chosen.remap | _renamed(remap or ())

@@ -33,7 +33,7 @@ import r2p
 from r2p.clock import random_of
 from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout
 from r2p.tools.stderr import log_to_stderr, say
-from r2p.transports.url import duration
+from r2p.transports.url import duration, open_transport
 
 B = TypeVar("B", bound=Callable[..., Awaitable[None]])
 
@@ -124,6 +124,17 @@ def settings(via: list[str] | None = None, directory: Path | None = None, *, too
     return Settings(via or [_beside(url) if tool else url for url in shared], file.types, file.remap, file.module)
 
 
+def check_urls(via: list[str]) -> None:
+    """Raises Usage for a URL that names no transport, or not as that takes it; it opens nothing."""
+    for url in via:
+        try:
+            open_transport(url)
+        except r2p.TransportError as error:
+            if isinstance(error.__cause__, ImportError):  # the URL is right, and this installation lacks something
+                raise
+            raise Usage(str(error)) from error
+
+
 def _beside(url: str) -> str:
     """The URL by which a tool on the same machine reaches a program with this one."""
     scheme, _, address = url.partition(":")
@@ -144,6 +155,16 @@ def _read(path: Path) -> _File:
         raise Usage(f"{path}: {error}; it knows {', '.join(_File.__struct_fields__)}") from error
     except (OSError, ValueError) as error:  # unreadable, or no TOML
         raise Usage(f"{path}: {error}") from error
+
+
+@contextlib.contextmanager
+def later(seconds: float, call: Callable[[], object]) -> Iterator[None]:
+    """Call it if the block takes so long."""
+    timer = asyncio.get_running_loop().call_later(seconds, call)
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class Session:
@@ -176,11 +197,8 @@ class Session:
         def tell() -> None:
             self.say(f"waiting for {what if isinstance(what, str) else what()} on {self.where}")
 
-        timer = asyncio.get_running_loop().call_later(PATIENCE, tell)
-        try:
+        with later(PATIENCE, tell):
             yield
-        finally:
-            timer.cancel()
 
     def only_module(self, link: str) -> str:
         """The name of the module at the other end of a link; "?" if there is not just one."""
@@ -270,6 +288,7 @@ async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> A
     if not settings.via:
         say("local only: this tool sees nothing but itself; give --via tcp:HOST:PORT, or set R2P_VIA")
     alphabet = string.ascii_lowercase + string.digits
+    check_urls(settings.via)
     module_name = "_" + "".join(random_of(asyncio.get_running_loop()).choices(alphabet, k=6))
     async with r2p.Module(module_name, via=settings.via, observer=True, watchdog=False) as module:
         yield Session(module, settings, name=name, verbose=verbose)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from r2p.tools.session import Quiet, Usage, Verbose, Via, execute, seconds
+from r2p.tools.session import Quiet, Usage, Verbose, Via, check_urls, execute, seconds
 
 DEBUG = "tcp-listen:0"
 """The debug line, on the loopback interface, at a port that is free."""
@@ -29,6 +29,9 @@ def command(
         bool, typer.Option("--square", help="Let a PC drive it along squares; --fast does so anyway.")
     ] = False,
     bus: Annotated[bool, typer.Option("--bus", help="Tell at the end who sent how much on the bus.")] = False,
+    allow_control: Annotated[
+        bool, typer.Option("--allow-control", help="Let the gateway take REBOOT and BOOTLOAD from IP links.")
+    ] = False,
     via: Via = None,
     verbose: Verbose = 0,
     quiet: Quiet = 0,
@@ -43,6 +46,7 @@ def command(
 
         if fast and via:
             raise Usage("--fast runs in virtual time, which nobody outside shares: leave out --via, or --fast")
+        check_urls(via or [])
         wish = Play(
             duration=duration or (_FAST if fast else None),
             seed=seed,
@@ -50,6 +54,7 @@ def command(
             laps=float("inf") if square or fast else 0,
             fast=fast,
             bus=bus,
+            allow_control=allow_control,
         )
         await play(wish)
 

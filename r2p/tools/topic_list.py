@@ -11,6 +11,7 @@ from r2p.tools.options import CLASS_NAMES, Topic
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, Wait
 from r2p.tools.types import Types, load_type, of_size, type_name
+from r2p.tools.watching import meant
 
 _COLUMNS = ["topic", "type", "size", "publishers", "subscribers"]
 
@@ -19,7 +20,9 @@ async def list_(session: Session, *, wait: Wait = None, format: Format = None) -
     """List topics, types, publishers and subscribers."""
     output = Output(format)
     await session.settle(wait)
-    rows = [_row(session, view, Types(session.settings)) for view in session.module.network.topics().values()]
+    views, types = session.module.network.topics().values(), Types(session.settings)
+    await types.learn_all(session, views)
+    rows = [_row(session, view, types) for view in views]
     await output.table(rows, _COLUMNS)
     if not rows:
         session.say(f"no topic is known on {session.where}")
@@ -36,10 +39,16 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
     views = session.module.network.topics()
     view = views.get(topic_name(topic))
     if view is None:
-        raise r2p.Error(f"nobody publishes or subscribes {topic}; known topics: {', '.join(views) or 'none'}")
+        question = meant(session, topic_name(topic), lambda view: True)
+        known = question or f"; known topics: {', '.join(views) or 'none'}"
+        raise r2p.Error(f"nobody publishes or subscribes {topic}{known}")
     if view.mismatch:
         session.say(f"{topic} has different types: some of those below can't hear each other")
-    await output.put(await _details(session, view))
+    details = await _details(session, view)
+    if session.verbose:
+        age = None if view.age is None else round(view.age, 3)
+        details["age"] = f"{age} s" if output.format == "text" else age
+    await output.put(details)
 
 
 async def find(
@@ -56,12 +65,11 @@ async def find(
     output = Output(format)
     size, fingerprint = _wanted(what)
     await session.settle(wait)
+    views = session.module.network.topics().values()
+    found = [(view, match) for view in views if (match := _match(view, size, fingerprint)) is not None]
     types = Types(session.settings)
-    rows = []
-    for view in session.module.network.topics().values():
-        match = _match(view, size, fingerprint)
-        if match is not None:
-            rows.append(_row(session, view, types) | {"match": match})
+    await types.learn_all(session, (view for view, _ in found))
+    rows = [_row(session, view, types) | {"match": match} for view, match in found]
     await output.table(rows, [*_COLUMNS, "match"])
     if not rows:
         raise r2p.Error(f"no topic of type {what} is known on {session.where}")
@@ -123,16 +131,16 @@ async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
         "guarantees": _guarantees(session, view),
     }
     if session.verbose:
-        details["fields"] = _fields(cls, view)
-        details["age"] = None if view.age is None else round(view.age, 3)
+        details |= _fields(cls, view)
     return details
 
 
-def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> list[str]:
-    """`name:kind` of each field; of an unknown type the names of the types that have its size."""
+def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> dict[str, Any]:
+    """The kind of each field by its path; of an unknown type the names of the types that have its size."""
     if cls is not None:
-        return r2p.layout(cls).schema.split()
-    return [f"maybe {name}" for name in of_size(view.size)]
+        pairs = (field.rpartition(":") for field in r2p.layout(cls).schema.split())
+        return {"fields": {path: kind for path, _, kind in pairs}}
+    return {"fields": None, "maybe": of_size(view.size)}
 
 
 def _guarantees(session: Session, view: r2p.TopicView) -> dict[str, str]:

@@ -11,6 +11,7 @@ from r2p.tools.options import ClassChoice, Count, Once, Rate, Topic, TypeName, c
 from r2p.tools.session import PATIENCE, Session, TimedOut, Timeout, Usage
 from r2p.tools.types import find
 from r2p.tools.values import parse, parse_line
+from r2p.tools.watching import hint, meant, subscribed
 
 STDIN = "-"
 DEFAULT_RATE = 1.0
@@ -142,7 +143,9 @@ class _Job:
         if not needed:
             asyncio.get_running_loop().call_later(PATIENCE, self._note_subscribers, publisher)
             return
-        with self._session.waiting(f"a subscriber of {self._topic}"):
+        nobody = f"nobody subscribes {self._topic}"
+        waiting = self._session.waiting(f"a subscriber of {self._topic}")
+        with waiting, hint(self._session, nobody, self._topic, subscribed):
             try:
                 async with asyncio.timeout(self._timeout):
                     await publisher.wait_subscriber()
@@ -151,4 +154,5 @@ class _Job:
 
     def _note_subscribers(self, publisher: _AnyPublisher) -> None:
         if not publisher.subscribers:
-            self._session.say(f"nobody subscribes {self._topic} yet; publishing all the same")
+            question = meant(self._session, self._topic, subscribed)
+            self._session.say(f"nobody subscribes {self._topic} yet; publishing all the same{question}")

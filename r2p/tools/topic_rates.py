@@ -96,6 +96,9 @@ class _Meter(Protocol):
     def report(self, lost: int) -> tuple[Report, str] | None:
         """The record, and its form for people; None: too little is known. `lost` counts what the tool itself lost."""
 
+    def begin_again(self) -> None:
+        """After a silence: what is averaged begins with the next message; what is counted goes on."""
+
 
 async def _measure(
     session: Session, topic: str, meter: _Meter, reports: int | None, timeout: float | None, output: Output
@@ -123,6 +126,7 @@ async def _measure(
                     break
             elif measured and not fresh:
                 session.say(f"no new messages of {topic}")
+                meter.begin_again()
             measured, fresh = report is not None, 0
         reading.cancel()
 
@@ -163,6 +167,7 @@ class _Rate:
         self._periods: deque[float] = deque(maxlen=window)
         self._sequences: dict[r2p.Source, _Sequences] = {}
         self._stamps: dict[r2p.Source, int] = {}
+        self._silent: set[r2p.Source] = set()
         self._numbered = False
         self._stamped = False
         self._gaps = 0
@@ -177,12 +182,20 @@ class _Rate:
             self._numbered = True
             follows = self._sequences.setdefault(source, _Sequences()).note(sample.sequence)
         if follows:
-            self._note_period((sample.stamp - self._stamps[source]) / _SECOND)
+            self._note_period((sample.stamp - self._stamps[source]) / _SECOND, source)
         self._stamps[source] = sample.stamp
 
-    def _note_period(self, period: float) -> None:
-        if self._stamped and self._periods and period > _GAP * self._usual:
+    def begin_again(self) -> None:
+        self._arrivals.clear()
+        self._periods.clear()
+        self._silent.update(self._stamps)
+
+    def _note_period(self, period: float, source: r2p.Source) -> None:
+        if self._stamped and self._usual and period > _GAP * self._usual:
             self._gaps += 1
+        if source in self._silent:
+            self._silent.remove(source)
+            return
         self._usual += (period - self._usual) * (_MEMORY if self._periods else 1.0)
         self._periods.append(period)
 
@@ -217,6 +230,10 @@ class _Bandwidth:
     def note(self, sample: r2p.Sample, now: int) -> None:
         self._arrivals.append(now if sample.stamped else sample.stamp)
         self._sizes.append(len(sample.data))
+
+    def begin_again(self) -> None:
+        self._arrivals.clear()
+        self._sizes.clear()
 
     def report(self, lost: int) -> tuple[Report, str] | None:
         total = sum(self._sizes) - self._sizes[0] if self._sizes else 0
@@ -259,6 +276,9 @@ class _Delay:
             self._starts[start] = None
         self._error = None if sample.clock is None else sample.clock.error
         self._delays.append((now - sample.stamp) / _SECOND)
+
+    def begin_again(self) -> None:
+        self._delays.clear()
 
     def report(self, lost: int) -> tuple[Report, str] | None:
         if not self._delays:

@@ -4,7 +4,10 @@ A peer tells the fingerprint of a layout. It is looked up among `r2p.msg` and th
 zenoh, whoever has such a type is asked for its fields.
 """
 
+import asyncio
+import contextlib
 import difflib
+from collections.abc import Iterable
 
 import r2p
 from r2p.tools.loading import load_module
@@ -13,6 +16,9 @@ from r2p.tools.session import Session, Settings, Usage
 STANDARD = "r2p.msg"
 LEARNT = "r2p.messages.schemas"
 """The module of classes that were made from what another module told."""
+
+_ANSWERS = 1.0  # seconds that the types of a list are waited for
+_AT_ONCE = 16  # that are asked for
 
 
 def load_type(text: str) -> type[r2p.Message]:
@@ -66,18 +72,31 @@ class Types:
         stated = self.stated(view.name, None)
         if stated is not None or view.fingerprint is None:
             return stated
-        return self.by_fingerprint(view.fingerprint)
+        return self.by_fingerprint(view.fingerprint) or self._learnt.get(view.fingerprint)
 
     async def learn(self, session: Session, view: r2p.TopicView) -> type[r2p.Message] | None:
         """As `of`; a type that is not known here is asked for on the network, where the transport can carry it."""
         known = self.of(view)
         if known is not None or view.fingerprint is None:
             return known
-        if view.fingerprint not in self._learnt:
-            found = await session.module.network.message_type(view.fingerprint)
-            if found is not None:
-                self._learnt[view.fingerprint] = found
-        return self._learnt.get(view.fingerprint)
+        found = await session.module.network.message_type(view.fingerprint)
+        if found is not None:
+            self._learnt[view.fingerprint] = found
+        return found
+
+    async def learn_all(self, session: Session, views: Iterable[r2p.TopicView]) -> None:
+        """As `learn` for all of them, at once; who does not answer within a second is left unknown."""
+        unknown = {view.fingerprint: view for view in views if view.fingerprint is not None and self.of(view) is None}
+        room = asyncio.Semaphore(_AT_ONCE)
+
+        async def learn(view: r2p.TopicView) -> None:
+            async with room:
+                await self.learn(session, view)
+
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_ANSWERS), asyncio.TaskGroup() as tasks:
+                for view in unknown.values():
+                    tasks.create_task(learn(view))
 
     def by_fingerprint(self, fingerprint: bytes) -> type[r2p.Message] | None:
         """The known class of that layout."""

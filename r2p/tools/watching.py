@@ -7,10 +7,12 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 import r2p
-from r2p.tools.session import Session, TimedOut
+from r2p.tools.session import Session, TimedOut, later
+
+_LOOK = 0.5  # seconds between two looks whether there is a publisher
 
 HINT_AFTER = 2.0
-"""Seconds without a publisher after which a tool names topics that the user may have meant."""
+"""Seconds without anybody at the other end after which a tool names topics that the user may have meant."""
 
 
 async def watched(session: Session, subscriber: r2p.Subscriber[Any]) -> AsyncIterator[r2p.Sample]:
@@ -20,30 +22,67 @@ async def watched(session: Session, subscriber: r2p.Subscriber[Any]) -> AsyncIte
         return ("the first message" if subscriber.publishers else "a publisher") + f" of {subscriber.topic}"
 
     samples = subscriber.samples()
-    with session.waiting(missing), _hint(session, subscriber):
+    nobody = f"nobody publishes {subscriber.topic}"
+    with session.waiting(missing), hint(session, nobody, subscriber.topic, published):
         first = await anext(samples, None)
     if first is not None:
         yield first
-    async for sample in samples:
-        yield sample
+    with _departures(session, subscriber):
+        async for sample in samples:
+            yield sample
+
+
+def meant(session: Session, topic: str, fits: Callable[[r2p.TopicView], bool]) -> str:
+    """Which topics that fit have names much like this one, for the end of a sentence; empty: none.
+
+    A name may also be right but for its namespace.
+    """
+    known = [name for name, view in session.module.network.topics().items() if fits(view) and name != topic]
+    close = difflib.get_close_matches(topic, known)
+    bare = topic.rpartition("/")[2]
+    close += [name for name in known if name.rpartition("/")[2] == bare and name not in close]
+    return f": is it one of {', '.join(close)}?" if close else ""
+
+
+def published(view: r2p.TopicView) -> bool:
+    return bool(view.publishers or view.published_on)
+
+
+def subscribed(view: r2p.TopicView) -> bool:
+    return bool(view.subscribers or view.subscribed_on)
 
 
 @contextlib.contextmanager
-def _hint(session: Session, subscriber: r2p.Subscriber[Any]) -> Iterator[None]:
-    """While the block waits: once, the published topics with names much like this one, if this one has no publisher."""
+def hint(session: Session, text: str, topic: str, fits: Callable[[r2p.TopicView], bool]) -> Iterator[None]:
+    """If the block waits long: say the text once, and which that fit may have been meant; not if this one fits."""
 
     def tell() -> None:
-        topics = session.module.network.topics().items()
-        published = [name for name, view in topics if view.publishers or view.published_on]
-        close = difflib.get_close_matches(subscriber.topic, published)
-        if close and not subscriber.publishers:
-            session.say(f"nobody publishes {subscriber.topic}: is it one of {', '.join(close)}?")
+        others = session.module.network.topics().get(topic)
+        question = meant(session, topic, fits)
+        if question and not (others and fits(others)):
+            session.say(f"{text}{question}")
 
-    timer = asyncio.get_running_loop().call_later(HINT_AFTER, tell)
+    with later(HINT_AFTER, tell):
+        yield
+
+
+@contextlib.contextmanager
+def _departures(session: Session, subscriber: r2p.Subscriber[Any]) -> Iterator[None]:
+    """While the block runs: say when the last publisher has left."""
+
+    async def watch() -> None:
+        there = True
+        while True:
+            await asyncio.sleep(_LOOK)
+            was_there, there = there, subscriber.publishers > 0
+            if was_there and not there:
+                session.say(f"nobody publishes {subscriber.topic} any more")
+
+    watching = asyncio.create_task(watch())
     try:
         yield
     finally:
-        timer.cancel()
+        watching.cancel()
 
 
 @contextlib.asynccontextmanager

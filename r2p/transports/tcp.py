@@ -247,7 +247,9 @@ def _explain(error: Exception) -> str:
     """What went wrong, and what to do where that is known."""
     if isinstance(error, TimeoutError) and not error.errno:
         return "no answer"
-    if not isinstance(error, OSError) or not error.errno or isinstance(error, socket.gaierror):
+    if isinstance(error, socket.gaierror):
+        return f"{error.strerror}: no computer of that name is known here"
+    if not isinstance(error, OSError) or not error.errno:
         return getattr(error, "strerror", None) or str(error)
     text = os.strerror(error.errno)
     hint = _HINTS.get(error.errno)
@@ -255,6 +257,9 @@ def _explain(error: Exception) -> str:
 
 
 _HINTS = {
+    errno.ECONNREFUSED: "nobody listens there; is the program running, is the port the right one?",
+    errno.EHOSTUNREACH: "is the computer on, is it on this network?",
+    errno.ENETUNREACH: "is this computer on that network?",
     errno.EADDRINUSE: "another program listens there; end it, or take another port",
     errno.EADDRNOTAVAIL: "this machine does not have that address",
     errno.EACCES: "ports below 1024 are for root; take another",

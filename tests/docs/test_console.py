@@ -7,7 +7,6 @@ and the serial port by those of an emulated module.
 import contextlib
 import json
 import os
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ import pytest
 
 from tests.docs.blocks import ROOT, Block, of_page, pages, pattern
 from tests.docs.shell import Command, Process, commands
+from tests.ports import free_port
 
 PORTS = ("2323", "2324")
 ROBOT = "192.168.0.10:23"
@@ -37,11 +37,6 @@ def emulated_board() -> Iterator[dict[str, str]]:
             yield {ROBOT: addresses["tcp"], DEVICE: addresses["pty"]}
         finally:
             board.stdin.close()
-
-
-def free_port() -> str:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return str(server.getsockname()[1])
 
 
 class Session:
@@ -125,7 +120,7 @@ _PAGES = [page for page in pages() if any(block.language == "console" for block 
 @pytest.mark.parametrize("page", _PAGES, ids=lambda page: page.stem)
 def test_the_commands_print_what_the_page_shows(page: Path, tmp_path: Path) -> None:
     todo = _blocks(page)
-    replacements = {port: free_port() for port in PORTS}
+    replacements = {port: str(free_port()) for port in PORTS}
     with contextlib.ExitStack() as stack:
         if any(known in block.text for block in todo for known in (ROBOT, DEVICE)):
             replacements |= stack.enter_context(emulated_board())

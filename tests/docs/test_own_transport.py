@@ -12,6 +12,7 @@ import r2p
 from r2p.msg import Led
 from r2p.transports.url import schemes
 from tests.docs.blocks import ROOT, of_page
+from tests.ports import free_port
 
 PAGE = ROOT / "docs" / "how-to" / "own-transport.md"
 
@@ -32,17 +33,10 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "r2p_udp", raising=False)
 
 
-def _free_ports() -> tuple[int, int]:
-    with socket.socket(type=socket.SOCK_DGRAM) as one, socket.socket(type=socket.SOCK_DGRAM) as other:
-        one.bind(("127.0.0.1", 0))
-        other.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], other.getsockname()[1]
-
-
 @pytest.mark.anyio
 @pytest.mark.usefixtures("installed")
 async def test_it_connects_two_modules() -> None:
-    here, there = _free_ports()
+    here, there = free_port(), free_port()
     assert "udp" in schemes()
     arrived: asyncio.Future[Led] = asyncio.get_running_loop().create_future()
 

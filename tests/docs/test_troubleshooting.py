@@ -7,6 +7,7 @@ from typing import Annotated
 import pytest
 
 import r2p
+from r2p import watchdog
 from r2p.msg import Led
 from r2p.sim.modules import FirmwareModule, Powered
 from r2p.testing.network import Network, node_in
@@ -61,6 +62,11 @@ async def test_a_module_is_stopped(r2p_network: Network, caplog: pytest.LogCaptu
         await asyncio.sleep(1)
     assert "module PC1: STOP from the network" in caplog.messages
     assert _told("module PC1: STOP from the network")
+
+
+def test_the_computer_is_busy_or_was_stopped() -> None:
+    assert watchdog.NOBODY % 100 in PAGE
+    assert watchdog.STOPPED % 8 in PAGE
 
 
 def test_the_event_loop_is_late() -> None:

@@ -11,11 +11,12 @@ from r2p.protocols.discovery import (
     Joined,
     Left,
     ModuleChanged,
+    ModuleGone,
     NameConflict,
     Obey,
     Send,
 )
-from tests.protocols.wire import ME, ONE, PC2, PEER, REQUEST, SOON, TWO, S, hear, joined, news, run, sent, started
+from tests.protocols.wire import ME, MS, ONE, PC2, PEER, REQUEST, SOON, TWO, S, hear, joined, news, run, sent, started
 
 
 class TestModules:
@@ -115,11 +116,22 @@ class TestModules:
         hear(discovery, S, m.Endpoint(129, PEER, "blink", "leds"))
         assert discovery.endpoints == {}
         hear(discovery, S, there)
-        hear(discovery, 5 * S, PC2)
-        run(discovery, 5 * S, 6 * S + 1)
+        for now in range(S, 26 * S, 5 * S):
+            hear(discovery, now, PC2)
+            run(discovery, now, min(now + 5 * S, 21 * S))
+        assert discovery.endpoints, "it is said seldom"
+        run(discovery, 21 * S, 21 * S + 1)
         assert discovery.endpoints == {}, "not repeated"
-        hear(discovery, 7 * S, there, m.Hello("PC2", PEER, m.HELLO_LEAVING))
+        hear(discovery, 27 * S, there, m.Hello("PC2", PEER, m.HELLO_LEAVING))
         assert discovery.endpoints == {}
+
+    def test_endpoints_of_a_stranger_are_forgotten_sooner(self) -> None:
+        discovery = started()
+        hear(discovery, S, m.Endpoint(1, PEER, "blink", "leds", m.CLASS_NRT))
+        run(discovery, S, 6 * S)
+        assert discovery.endpoints
+        run(discovery, 6 * S, 6 * S + 1)
+        assert not discovery.endpoints
 
     def test_topics_are_learnt(self) -> None:
         discovery = started()
@@ -216,3 +228,16 @@ def test_what_gateways_still_tell_of_a_last_start_is_no_namesake() -> None:
     assert news(hear(discovery, 2 * S, *last_starts)) == []
     assert discovery.modules["PC2"].instance == PEER
     assert not joined(discovery, 3 * S)
+
+
+def test_whoever_was_stopped_itself_takes_nobody_for_gone() -> None:
+    """What the others said meanwhile is still to be read; only who says nothing from then on is gone."""
+    a = Discovery("A", 1)
+    a.link_up(0)
+    for number, name in enumerate(("ALIVE", "DEAD"), 2):
+        hear(a, 0, m.Hello(name, number))
+    woken = 60 * S
+    assert not any(isinstance(each, ModuleGone) for each in a.poll(woken))
+    hear(a, woken + MS, m.Hello("ALIVE", 2))
+    gone = [(at, event.info.name) for at, event in run(a, woken, woken + 4 * S) if isinstance(event, ModuleGone)]
+    assert gone == [(woken + 2 * S, "DEAD")]

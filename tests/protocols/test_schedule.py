@@ -1,5 +1,8 @@
 """The parts of the schedule by themselves."""
 
+from itertools import pairwise
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -77,6 +80,74 @@ class TestSchedule:
         names = [key[0] for key in said if key]
         assert names[:6] == ["t0", "t2", "t3"] * 2
         assert set(names[-6:]) == {"t2", "t3"}
+
+    def said(self, schedule: Schedule, start: int, end: int) -> list[tuple[int, Item]]:
+        """What comes up, and when."""
+        times: list[tuple[int, Item]] = []
+        for now in range(start, end, MS):
+            while (each := schedule.pop(now)) is not None:
+                times.append((now, each))
+                schedule.sent(now, 1)
+        return times
+
+    def test_what_only_describes_is_repeated_once_soon_and_then_seldom(self) -> None:
+        schedule = Schedule(1000, 100, 0)
+        schedule.start(0)
+        endpoint, publisher = Item(Kind.ENDPOINT, ("n", "t", 1)), Item(Kind.PUBLISHER, ("t",))
+        schedule.add(publisher)
+        schedule.add(endpoint)
+        said = self.said(schedule, 0, 40 * S)
+        first, second, *rest = [now for now, item in said if item == endpoint]
+        assert first == 0
+        assert second <= 1.5 * S
+        gaps = [later - earlier for earlier, later in pairwise([second, *rest])]
+        assert min(gaps) >= 3 * S
+        assert max(gaps) <= 6.1 * S
+        published = [now for now, item in said if item == publisher]
+        assert max(later - earlier for earlier, later in pairwise(published)) <= 1.5 * S
+
+    def test_of_much_that_only_describes_each_has_its_turn_in_four_rounds(self) -> None:
+        schedule = Schedule(1000, 100, 0)
+        for n in range(40):
+            schedule.add(Item(Kind.ENDPOINT, ("n", f"t{n}", 1)))
+        for n in range(7):
+            schedule.add(Item(Kind.PUBLISHER, (f"t{n}",)))
+        schedule.start(0)
+        said = self.said(schedule, 0, 40 * S)
+        late = [(now, item) for now, item in said if now > 10 * S]
+        for item in {item for _, item in late}:
+            times = [now for now, each in late if each == item]
+            rounds = 4 if item.kind is Kind.ENDPOINT else 1
+            assert max(b - a for a, b in pairwise(times)) == pytest.approx(rounds * 1.5 * S, rel=0.1)
+
+    def test_for_a_newcomer_what_only_describes_is_said_at_once_and_once_more_soon(self) -> None:
+        schedule = Schedule(1000, 100, 0)
+        schedule.start(0)
+        endpoints = [Item(Kind.ENDPOINT, ("n", f"t{n}", 1)) for n in range(20)]
+        for each in endpoints:
+            schedule.add(each)
+        self.said(schedule, 0, 10 * S)
+        schedule.repeat(10 * S)
+        said = self.said(schedule, 10 * S, 20 * S)
+        for each in endpoints:
+            first, second, third, *_ = [now for now, item in said if item == each]
+            assert first == 10 * S
+            assert second <= first + 2 * S
+            assert 1.5 * S <= third - second <= 7.5 * S
+
+    def test_what_is_said_seldom_can_be_dropped_and_the_rest_goes_on(self) -> None:
+        schedule = Schedule(1000, 100, 0)
+        schedule.start(0)
+        items = [Item(Kind.ENDPOINT, ("n", f"t{n}", 1)) for n in range(3)]
+        for each in items:
+            schedule.add(each)
+        self.said(schedule, 0, 10 * S)
+        schedule.drop(items[1])
+        later = {item for _, item in self.said(schedule, 10 * S, 20 * S)}
+        assert later == {items[0], items[2], Item(Kind.PRESENCE, once=True)}
+        schedule.drop(items[0])
+        schedule.drop(items[2])
+        assert {item for _, item in self.said(schedule, 20 * S, 30 * S)} == {Item(Kind.PRESENCE, once=True)}
 
     def test_what_is_said_once_is_forgotten_when_the_link_goes_down(self) -> None:
         schedule = Schedule(1, 2, 0)

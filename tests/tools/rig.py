@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from r2p.supervisor import NodeFunction
 
 VIA = "memory:lab"
+PUBLISH = ("topic", "pub", "leds", "led=3", "--type", "Led", "--rate", "50", "--via", "tcp-listen:0")
+"""The arguments of a publisher that others can reach."""
 PATIENCE = 60.0  # seconds after which a process that should have ended is killed, so that its test fails
 
 

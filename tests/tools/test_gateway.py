@@ -47,11 +47,23 @@ def test_the_table() -> None:
     assert table(rows).splitlines() == [
         "LINK        STATE                     DROPPED",
         "rtcan:can0  forwarding (1 more here)",
-        "zenoh:      alone                     3 converging",
+        "zenoh:      forwarding, alone         3 converging",
         "",
-        "TOPIC    FROM        TO      RATE     FORWARDED  DROPPED",
-        "encoder  rtcan:can0  zenoh:  100.0/s  300        2 late",
+        "TOPIC    FROM   TO     RATE     FORWARDED  DROPPED",
+        "encoder  rtcan  zenoh  100.0/s  300        2 late",
     ]
+
+
+def test_two_links_of_a_kind_have_their_names_in_the_table() -> None:
+    ports = [PortStatistics(link, "forwarding", 0, {}) for link in ("tcp:a:23", "tcp:b:23", "zenoh:tcp/c:7447")]
+    there = [
+        WayStatistics("encoder", "tcp:a:23", "zenoh:tcp/c:7447", 5, {}),
+        WayStatistics("leds", "zenoh:tcp/c:7447", "tcp:b:23", 5, {}),
+        WayStatistics("leds", "zenoh:tcp/c:7447", "tcp:gone:23", 5, {}),
+    ]
+    text = table(Rates().rows(GatewayStatistics(ports, there), SECOND))
+    ways = [line.split()[:3] for line in text.partition("TOPIC")[2].splitlines()[1:]]
+    assert ways == [["encoder", "tcp:a:23", "zenoh"], ["leds", "zenoh", "tcp:b:23"], ["leds", "zenoh", "tcp:gone:23"]]
 
 
 def test_a_way_that_is_made_anew_counts_anew() -> None:
@@ -142,8 +154,8 @@ def test_loader_topics_come_in_from_ip_links_only_with_permission() -> None:
         assert not strict.allows("BOOT_IMU1", link, "rtcan:can0")
         assert strict.allows("BOOT_IMU1", "rtcan:can0", link)
         assert open_.allows("BOOT_IMU1", link, "rtcan:can0")
-        assert strict.allows_order(link, "rtcan:can0", harmless=True)
-        assert not strict.allows_order(link, "rtcan:can0", harmless=False)
+        assert not strict.order_denied(link, "rtcan:can0", harmless=True)
+        assert strict.order_denied(link, "rtcan:can0", harmless=False)
     assert strict.allows("BOOT_IMU1", "serial:/dev/ttyUSB0", "rtcan:can0")
 
 

@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.tools.rig import listening, process
+from tests.tools.rig import PUBLISH, listening, process
 
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Iterator
 
 pytestmark = pytest.mark.processes
-
-PUBLISH = ("topic", "pub", "leds", "led=3", "--type", "Led", "--rate", "50", "--via", "tcp-listen:0")
 
 
 @pytest.fixture
@@ -44,7 +42,8 @@ def test_mistakes() -> None:
         (("--via", "tcp:127.0.0.1:1"), 2, "a gateway joins two links"),
         (("--via", "memory:a", "--via", "memory:b", "--allow", "@x"), 2, "write TOPIC, TOPIC@FROM or TOPIC@FROM>TO"),
         (("--via", "memory:a", "--via", "memory:b", "--rate-limit", "leds"), 2, "write it as TOPIC=HZ"),
-        (("--via", "memory:a", "--via", "nonsense:b"), 1, "unknown transport"),
+        (("--via", "memory:a", "--via", "nonsense:b"), 2, "unknown transport"),
+        (("--via", "memory:a", "--via", "memory:a"), 2, "a link is given twice"),
     ):
         with process("gateway", *arguments) as child:
             _, err = child.communicate()

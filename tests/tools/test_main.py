@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from r2p.tools.main import COMMANDS, GROUPS, app
+from r2p.transports.url import BUILT_IN
 from tests.tools.rig import process
 
 
@@ -46,6 +47,39 @@ def test_mistakes_are_usage_errors(arguments: list[str], hint: str) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert hint in result.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["topic", "list"],
+        ["gateway", "--via", "memory:a"],
+        ["run", str(Path(__file__).parents[2] / "examples" / "blink.py:blink")],
+        ["sim"],
+    ],
+)
+def test_a_wrong_url_is_a_usage_error(arguments: list[str]) -> None:
+    result = CliRunner().invoke(app, [*arguments, "--via", "nonsense:b"])
+    assert result.exit_code == 2
+    assert "unknown transport 'nonsense'" in result.stderr
+
+
+def test_so_is_one_of_a_bus() -> None:
+    result = CliRunner().invoke(app, ["bus", "load", "--via", "rtcan:can0,nonsense=1"])
+    assert result.exit_code == 2
+    assert "has no option 'nonsense'" in result.stderr
+
+
+def test_a_wrong_url_in_the_environment_is_one_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("R2P_VIA", "tcp:")
+    assert CliRunner().invoke(app, ["node", "list"]).exit_code == 2
+
+
+def test_a_transport_that_this_installation_can_not_load_is_no_usage_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BUILT_IN, "serial", "r2p.no_such_module:Transport")
+    result = CliRunner().invoke(app, ["topic", "list", "--via", "serial:/dev/null"])
+    assert result.exit_code == 1
+    assert "can't be used here" in result.stderr
 
 
 @pytest.mark.processes

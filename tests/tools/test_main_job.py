@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import pytest
 
+from tests.ports import free_port
 from tests.tools.rig import PATIENCE, process
-from tests.transports.zenoh.cable import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -49,6 +50,15 @@ async def test_r2p_modules_are_listed(capsys: pytest.CaptureFixture[str]) -> Non
         ("ARM", "stopped", "r2p", "memory:lab"),
         ("BOT", "running", "r2p", "memory:lab"),
     ]
+
+
+async def test_ages_have_a_unit_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    async with robot(), tool() as session:
+        await list_(session)
+    header, row = capsys.readouterr().out.splitlines()
+    assert header.endswith("AGE")
+    assert re.search(r"  [0-9]\.[0-9] s$", row)
 
 
 async def test_tools_are_listed_on_demand(capsys: pytest.CaptureFixture[str]) -> None:
@@ -98,6 +108,17 @@ async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatc
             TimedOut, match=r"BOT did not confirm REBOOT in 4 s: it is running, heard .* rebooted before"
         ):
             await reboot(session, "BOT", timeout=4.0)
+
+
+async def test_a_gateway_that_refuses_an_order_says_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
+    gateway = r2p.Module("GW", via=["memory:lab", "memory:bus"], bridge=True)
+    async with gateway, r2p.Module("IMU1", via="memory:bus"), tool() as session:
+        await asyncio.sleep(3)
+        started = asyncio.get_running_loop().time()
+        with pytest.raises(TimedOut, match="gateway GW does not let REBOOT of IMU1 through: it lacks --allow-control"):
+            await reboot(session, "IMU1")
+        assert asyncio.get_running_loop().time() - started < 0.1
 
 
 async def test_an_order_that_a_gateway_may_have_refused_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 import r2p
 from r2p.msg import Encoder, Led, Velocity3
+from r2p.tools.module import list_ as modules
 from r2p.tools.node import info, list_
 from tests.tools.rig import Firmware, printed, robot, tool
 
@@ -78,6 +79,16 @@ async def test_names_that_are_not_one_node() -> None:
             await info(session, "drive")
         with pytest.raises(r2p.Error, match="no node ARM/show; known: ARM/drive, ARM/log, BOT/drive, BOT/log"):
             await info(session, "ARM/show")
+
+
+async def test_nobody_but_tools(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as other, tool() as session:
+        other.node.advertise("leds", Led)
+        await list_(session)
+        await modules(session)
+    no_node, *_, no_module = capsys.readouterr().err.splitlines()
+    assert no_node == "r2p: no node is known on memory:lab; there are tools, which --all shows"
+    assert no_module == "r2p: no module has been heard on memory:lab; there are tools, which --all shows"
 
 
 async def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 import r2p
 from r2p import sim
@@ -25,11 +26,14 @@ from r2p.sim.robots.square import square
 from r2p.tools._sim import screen
 from r2p.tools._sim.chart import Chart
 from r2p.tools._sim.play import Play, play, program
+from r2p.tools.main import app
 from r2p.tools.sim import outside
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from r2p.bridge import BridgeOptions
 
 VIA = "sim:gauge"
 
@@ -81,6 +85,16 @@ async def test_what_was_missed_before_does_not_count_and_what_is_off_says_so() -
     text = "\n".join(screen.state(figures))
     assert "MOTOR2    switched off" in text
     assert "a network in memory" in text
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_what_its_gateway_takes_from_outside(monkeypatch: pytest.MonkeyPatch, allowed: bool) -> None:
+    def robot(_via: str, *, options: BridgeOptions, **_others: object) -> Triskar2:
+        raise r2p.Error(f"control: {options.allow_control}")
+
+    monkeypatch.setattr("r2p.tools._sim.play.Triskar2", robot)
+    result = CliRunner().invoke(app, ["sim", "--via", "memory:lab", *(["--allow-control"] if allowed else [])])
+    assert (result.exit_code, result.stderr) == (1, f"r2p: control: {allowed}\n")
 
 
 def test_the_map_shows_walls_way_and_robot() -> None:

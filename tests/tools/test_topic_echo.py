@@ -157,7 +157,12 @@ async def test_it_waits_for_a_topic_that_nobody_knows_and_says_so(capsys: pytest
 
 @pytest.mark.virtual_time
 @pytest.mark.parametrize(
-    ("topic", "hint"), [("ledz", "r2p: nobody publishes ledz: is it one of leds?\n"), ("odometry", "")]
+    ("topic", "hint"),
+    [
+        ("ledz", "r2p: nobody publishes ledz: is it one of leds?\n"),
+        ("/robot1/leds", "r2p: nobody publishes robot1/leds: is it one of leds?\n"),
+        ("odometry", ""),
+    ],
 )
 async def test_topics_with_names_much_like_it_are_named_once(
     topic: str, hint: str, capsys: pytest.CaptureFixture[str]
@@ -165,7 +170,7 @@ async def test_topics_with_names_much_like_it_are_named_once(
     async with robot(leds), tool() as session:
         with pytest.raises(TimedOut):
             await echo(session, [topic], timeout=20)
-    assert capsys.readouterr().err == f"r2p: waiting for a publisher of {topic} on memory:lab\n{hint}"
+    assert capsys.readouterr().err == f"r2p: waiting for a publisher of {topic.lstrip('/')} on memory:lab\n{hint}"
 
 
 @pytest.mark.virtual_time

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from typing import Any
 
 import pytest
@@ -98,16 +99,28 @@ async def test_info_with_more(capsys: pytest.CaptureFixture[str]) -> None:
         Firmware().advertise("raw", 5)
         await info(session, "raw")
     leds, raw = printed(capsys)
-    assert leds["fields"] == ["led:u32", "value:u8"]
+    assert leds["fields"] == {"led": "u32", "value": "u8"}
     assert 0 <= leds["age"] < 5
     assert raw["type"] is None
-    assert raw["fields"] == ["maybe r2p.msg:Led"]
+    assert (raw["fields"], raw["maybe"]) == (None, ["r2p.msg:Led"])
+
+
+@pytest.mark.virtual_time
+async def test_info_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    async with robot(blink), tool(verbose=1) as session:
+        await info(session, "leds")
+    out = capsys.readouterr().out
+    assert "\nfields:\n  led: u32\n  value: u8\n" in out
+    assert re.search(r"\nage: [0-9.]+ s\n", out)
 
 
 @pytest.mark.virtual_time
 async def test_info_of_a_topic_that_nobody_knows() -> None:
     async with robot(blink), tool() as session:
-        with pytest.raises(r2p.Error, match="nobody publishes or subscribes led; known topics: leds, log, speed"):
+        with pytest.raises(r2p.Error, match="nobody publishes or subscribes power; known topics: leds, log, speed"):
+            await info(session, "power")
+        with pytest.raises(r2p.Error, match=r"nobody publishes or subscribes led: is it one of leds\?"):
             await info(session, "led")
 
 

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.tools.rig import listening, process
+from tests.tools.rig import PUBLISH, listening, process
 
 if TYPE_CHECKING:
     import subprocess
     from collections.abc import Iterator
 
 pytestmark = pytest.mark.processes
-
-PUBLISH = ("topic", "pub", "leds", "led=3", "--type", "Led", "--rate", "50", "--via", "tcp-listen:0")
 
 
 @pytest.fixture

@@ -66,6 +66,29 @@ async def test_once_waits_for_a_subscriber_and_says_so(capsys: pytest.CaptureFix
 
 
 @pytest.mark.virtual_time
+@pytest.mark.parametrize("once", [True, False])
+async def test_a_topic_with_a_name_much_like_it_is_named(once: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(Listener().listen), tool() as session:
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(5):
+                await pub(session, "cmdd", [], type="Led", once=once)
+    said = capsys.readouterr().err
+    assert said.startswith("r2p: waiting" if once else "r2p: nobody subscribes cmdd yet; publishing all the same:")
+    assert said.count("is it one of cmd?") == 1
+
+
+@pytest.mark.virtual_time
+async def test_a_topic_that_is_subscribed_is_not_guessed_at(capsys: pytest.CaptureFixture[str]) -> None:
+    async def listen(node: r2p.Node) -> None:
+        node.subscribe("cmdd", Led)
+        await Listener().listen(node)
+
+    async with robot(listen), tool() as session:
+        await pub(session, "cmdd", [], type="Led", once=True)
+    assert "is it one of" not in capsys.readouterr().err
+
+
+@pytest.mark.virtual_time
 async def test_nobody_subscribes_in_time() -> None:
     async with robot(), tool() as session:
         with pytest.raises(TimedOut, match="nobody subscribed cmd for 2 s"):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+import json
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -13,6 +14,9 @@ from r2p.tools.session import TimedOut
 from r2p.tools.topic_rates import QUEUE, bw, delay, hz
 from r2p.transports.memory import network
 from tests.tools.rig import Firmware, printed, robot, tool
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
 
 
 async def leds(node: r2p.Node) -> None:
@@ -176,7 +180,60 @@ async def test_silence(capsys: pytest.CaptureFixture[str]) -> None:
     async with robot(ends), tool() as session:
         with pytest.raises(TimedOut, match="nothing on leds for 3 s"):
             await hz(session, "leds", timeout=3)
-    assert "no new messages of leds" in capsys.readouterr().err
+    assert capsys.readouterr().err.endswith("r2p: no new messages of leds\n")
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("measure", [hz, bw, delay])
+async def test_after_a_silence_it_measures_anew(
+    measure: Callable[..., Awaitable[None]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What came before would make it look slow for as long as the window is."""
+
+    async def pauses(node: r2p.Node) -> None:
+        publisher = node.advertise("leds", Led)
+        await publisher.wait_subscriber()
+        for number in range(100):
+            await asyncio.sleep(30 if number == 40 else 0.1)
+            await publisher.publish(Led())
+
+    async with robot(pauses) as module, tool() as session:
+        await measure(session, "leds", count=8)
+        await module.wait()
+    captured = capsys.readouterr()
+    reports = [json.loads(line) for line in captured.out.splitlines()]
+    assert captured.err.count("no new messages of leds") == 1
+    assert [report["window"] < 41 for report in reports] == [True] * 8
+    for report in reports:
+        assert report.get("rate", report.get("messages_per_second", 10.0)) == pytest.approx(10.0, rel=0.01)
+    if measure is hz:
+        assert reports[-1]["max"] == pytest.approx(0.1)
+        assert (reports[0]["gaps"], reports[-1]["gaps"]) == (0, 1)
+
+
+@pytest.mark.virtual_time
+async def test_a_publisher_that_has_left_is_missed(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        measuring = asyncio.create_task(hz(session, "leds", timeout=20))
+        for _ in range(2):
+            async with robot(leds):
+                await asyncio.sleep(3)
+            await asyncio.sleep(3)
+        with pytest.raises(TimedOut):
+            await measuring
+    said = capsys.readouterr().err.splitlines()
+    assert said == 2 * ["r2p: nobody publishes leds any more", "r2p: no new messages of leds"]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("measure", [hz, bw, delay])
+async def test_a_topic_with_a_name_much_like_it_is_named(
+    measure: Callable[..., Awaitable[None]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with robot(leds), tool() as session:
+        with pytest.raises(TimedOut, match="nothing on ledz for 5 s"):
+            await measure(session, "ledz", timeout=5)
+    assert "nobody publishes ledz: is it one of leds?" in capsys.readouterr().err
 
 
 @pytest.mark.virtual_time

@@ -48,11 +48,17 @@ def test_echo_decodes(via: str) -> None:
     assert (err, echo.returncode) == ("", 0)
 
 
+def test_list_shows_it(via: str) -> None:
+    with process("topic", "list", "--via", via) as shown:
+        rows = [json.loads(line) for line in shown.communicate()[0].splitlines()]
+    assert [(row["topic"], row["type"], row["size"]) for row in rows] == [("wheel", "Wheel", 6)]
+
+
 def test_info_shows_its_fields(via: str) -> None:
     with process("topic", "info", "wheel", "-v", "--via", via) as info:
         found = json.loads(info.communicate()[0])
     assert (found["type"], found["size"]) == ("Wheel", 6)
-    assert found["fields"] == ["speed:f32", "currents:u8[2]"]
+    assert found["fields"] == {"speed": "f32", "currents": "u8[2]"}
     assert [each["class"] for each in found["publishers"]]
 
 

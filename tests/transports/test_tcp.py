@@ -207,7 +207,8 @@ async def test_why_there_is_no_connection_yet_is_told_once() -> None:
     module = r2p.Module("A", via=f"tcp:127.0.0.1:{port}", watchdog=False)
     events = module.events()
     async with asyncio.timeout(GUARD), module:
-        assert await anext(events) == r2p.LinkWaits(f"tcp:127.0.0.1:{port}", "Connection refused")
+        reason = "Connection refused: nobody listens there; is the program running, is the port the right one?"
+        assert await anext(events) == r2p.LinkWaits(f"tcp:127.0.0.1:{port}", reason)
         server = await asyncio.start_server(_ignore, "127.0.0.1", port)
         up = await anext(events)
         assert isinstance(up, r2p.LinkUp)
@@ -229,6 +230,15 @@ async def test_a_connection_to_itself_is_none() -> None:
         await asyncio.get_running_loop().create_connection(lambda: connection, *itself, local_addr=itself)
         await connection.ended.wait()
     assert connection.link is None
+
+
+async def test_a_name_that_nobody_has_is_told_as_that() -> None:
+    module = r2p.Module("A", via="tcp:nosuch.invalid:23", watchdog=False)
+    events = module.events()
+    async with asyncio.timeout(GUARD), module:
+        waits = await anext(events)
+    assert isinstance(waits, r2p.LinkWaits)
+    assert waits.reason.endswith(": no computer of that name is known here")
 
 
 async def test_an_address_in_use_is_an_error_that_says_so() -> None:

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import AsyncIterator
 
 from r2p.bus import BusMonitor
-from r2p.tools.session import Usage, settings
+from r2p.tools.session import Usage, check_urls, settings
 from r2p.tools.stderr import say
 
 SECOND = 1_000_000_000
@@ -17,5 +17,6 @@ async def listen(via: list[str] | None) -> AsyncIterator[BusMonitor]:
     urls = [url for url in given if url.startswith("rtcan:")]
     if len(urls) != 1:
         raise Usage(f"give one CAN bus, as in --via rtcan:can0 (not {' and '.join(urls or given) or 'none'})")
+    check_urls(urls)
     async with BusMonitor(urls[0], on_news=say) as bus:
         yield bus

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 import r2p
+from r2p.bridge import BridgeOptions
 from r2p.msg import Odometry
 from r2p.sim import SimCan, can_bus
 from r2p.sim.physics.world import World, box
@@ -34,7 +35,8 @@ _FAST_LINES = 10.0  # ... and under virtual time
 class Play(msgspec.Struct, frozen=True, kw_only=True):
     """What to play. `duration` in s, None: until it is ended. `outside`: where the gateway lets others in.
 
-    `laps` of a square that a PC drives. `fast`: under virtual time. `bus`: its statistics at the end.
+    `laps` of a square that a PC drives. `fast`: under virtual time. `bus`: its statistics at the end. `allow_control`:
+    the gateway lets REBOOT and BOOTLOAD in.
     """
 
     duration: float | None = None
@@ -43,6 +45,7 @@ class Play(msgspec.Struct, frozen=True, kw_only=True):
     laps: float = 0
     fast: bool = False
     bus: bool = False
+    allow_control: bool = False
 
 
 async def play(wish: Play) -> None:
@@ -50,7 +53,8 @@ async def play(wish: Play) -> None:
     world = World(box(SIDE / 2, SIDE / 2, 3.8, 3.8))
     screen = Screen(world, live=not wish.fast, duration=wish.duration)
     bus = can_bus(_NAME, seed=wish.seed)
-    robot = Triskar2(f"sim:{_NAME}", seed=wish.seed, world=world, outside=[*wish.outside, _INSIDE])
+    outside, options = [*wish.outside, _INSIDE], BridgeOptions(allow_control=wish.allow_control)
+    robot = Triskar2(f"sim:{_NAME}", seed=wish.seed, world=world, outside=outside, options=options)
     async with robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:
         screen.say(f"Triskar2 starts: {len(robot.modules)} modules on a simulated RTCAN bus")
         with contextlib.suppress(TimeoutError):  # a computer that is too slow for it: show what there is
