@@ -245,8 +245,11 @@ class Node:
         deadline = None if timeout is None else self._space.loop.time() + timeout
         while not await self._serve():
             try:
-                async with asyncio.timeout_at(deadline):
+                if deadline is None:  # a time-out costs more than a message
                     await self._arrival()
+                else:
+                    async with asyncio.timeout_at(deadline):
+                        await self._arrival()
             except TimeoutError:
                 return False
         await pause()

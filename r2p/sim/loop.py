@@ -19,7 +19,7 @@ import itertools
 import random
 import selectors
 from collections.abc import Callable, Coroutine
-from heapq import heappop, heappush
+from heapq import heappush
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
@@ -145,7 +145,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             self._jobs -= 1
 
     def run_ahead(self, events: list[Event]) -> None:
-        """Carry out events of this heap, each at its instant, for as long as nothing else is due in between.
+        """Carry out events of this sorted list, each at its instant, for as long as nothing else is due in between.
 
         For whoever has many events, and keeps them in order himself: a turn of the loop for each would cost more than
         the event. What is over is now. After some events, the loop has its turn all the same.
@@ -155,12 +155,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         for _ in range(_AHEAD):
             if not events:
                 return
-            when, _, callback, args = event = heappop(events)
+            when, _, callback, args = events[0]
             if when > clock.elapsed:
                 if when >= self._limit or ready:
-                    heappush(events, event)
                     return
                 clock.elapsed = when
+            del events[0]
             callback(*args)
 
     def _next_timer(self) -> int:

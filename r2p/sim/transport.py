@@ -169,10 +169,12 @@ class SimPort(CanPort):
         return self._clock.monotonic()
 
     def _sent(self, frame: Frame, stamp: int) -> None:
-        self._confirm(_MAILBOXES[frame.id >> 23], _SENT, stamp - self.receive_latency)
+        if self._user is not None and self._up:
+            self._user.confirmed(_MAILBOXES[frame.id >> 23], _SENT, stamp - self.receive_latency)
 
     def _lost(self, frame: Frame, stamp: int) -> None:
-        self._confirm(_MAILBOXES[frame.id >> 23], _LOST, stamp)
+        if self._user is not None and self._up:
+            self._user.confirmed(_MAILBOXES[frame.id >> 23], _LOST, stamp)
 
     def _late(self, frame: Frame, stamp: int) -> None:
         self._confirm(_MAILBOXES[frame.id >> 23], _LATE, stamp)

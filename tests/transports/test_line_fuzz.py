@@ -22,8 +22,13 @@ from tests.transports.conversation import Script, line, manage
 KINDS: tuple[type[msgspec.Struct], ...] = get_args(m.Management)
 MOST = 64
 """What takes the place of the bound of 4096, so that fewer messages reach it."""
-KNOWN = {"module": ["PC1", "IMU1"], "node": ["test"], "topic": ["leds", "text", "R2P", "R2P_PC1", "R2P_IMU1"]}
-LENGTHS = {"module": 7, "node": 8, "topic": 16}
+KNOWN = {
+    "module": ["PC1", "IMU1"],
+    "gateway": ["GW1"],
+    "node": ["test"],
+    "topic": ["leds", "text", "R2P", "R2P_PC1", "R2P_IMU1"],
+}
+LENGTHS = {"module": 7, "gateway": 7, "node": 8, "topic": 16}
 LETTERS = "abcdefghijklmnopqrstuvwxyzABC0123456789_"
 
 
@@ -40,12 +45,12 @@ def anything(chance: random.Random, kind: type[msgspec.Struct]) -> bytes:
 
 
 def _value(chance: random.Random, name: str, kind: object) -> Any:
-    if name in KNOWN:
+    if kind is str:
         if chance.random() < 0.3:
             return chance.choice(KNOWN[name])
         return "".join(chance.choices(LETTERS, k=chance.randint(0, LENGTHS[name])))
     if kind is bytes:
-        size = {"params": 10, "fingerprint": 8, "highs": 24}.get(name, 18)
+        size = {"params": 10, "fingerprint": 8, "highs": 24, "acks": chance.choice([12, 18])}.get(name, 18)
         return chance.choice([bytes(size), chance.randbytes(size)])
     return chance.getrandbits(chance.choice([0, 1, 2, 3, 8, 16, 32, 64]))
 

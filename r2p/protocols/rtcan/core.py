@@ -28,6 +28,9 @@ _URGENT = 1_000_000
 _DEPTH = 128  # management messages that wait
 _PAUSE = 500_000  # ns after a bus error, before the same topic is tried again
 _PAUSE_SPREAD = 8_000_000
+# Python 3.11 takes its time to find a member of an enum.
+_FIRMWARE, _ELECTING, _LISTENING = Profile.FIRMWARE, Role.ELECTING, Stage.LISTENING
+_SILENT, _FREE, _SLOTTED = Mode.SILENT, Mode.FREE, Mode.SLOTTED
 
 
 class Core:
@@ -110,14 +113,14 @@ class Core:
 
     def settle(self, now: int) -> None:
         """Use the bus as the state of things allows."""
-        electing, held = self.election.role is Role.ELECTING, self.queue.only is not None
+        electing, held = self.election.role is _ELECTING, self.queue.only is not None
         self.queue.only = self.message_id(rtcan.MANAGEMENT) if electing else None
-        if self.identity.stage is Stage.LISTENING or self.network.silenced is not None:
-            mode = Mode.SILENT
+        if self.identity.stage is _LISTENING or self.network.silenced is not None:
+            mode = _SILENT
         elif not self.cycle.running:
-            mode = Mode.FREE
+            mode = _FREE
         else:
-            mode = Mode.SLOTTED if self.network.verified else Mode.SILENT
+            mode = _SLOTTED if self.network.verified else _SILENT
         self.sender.enter(now, mode)
         if not self.joined and self.identity.stage is Stage.OWNING and self.network.settled:
             self._join(now)
@@ -137,14 +140,14 @@ class Core:
     def say(self, now: int, message: management.Management) -> None:
         """Send a management message of our own."""
         data = management.encode(message)
-        if self.profile is Profile.FIRMWARE:
+        if self.profile is _FIRMWARE:
             self.manage(now, data)
         else:
             self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, None, _CONTROL)
 
     def manage(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> None:
         """Send a management message; before the others, if it is urgent."""
-        if self.profile is not Profile.FIRMWARE:
+        if self.profile is not _FIRMWARE:
             within = _URGENT if urgent else _DEADLINE
             self._queue_management(now, self.message_id(rtcan.MANAGEMENT), data, handle, within)
             return
@@ -174,8 +177,8 @@ class Core:
     def low(self, now: int, frame: Frame, stamp: int) -> None:
         """A frame of management, or in a network of firmware one of a topic whose high byte is as low as that."""
         message = frame.id >> 7 & 0xFFFF
-        high = rtcan.high_byte(message)
-        firmware = self.profile is Profile.FIRMWARE
+        high = message >> 8
+        firmware = self.detector.profile is _FIRMWARE
         if high <= rtcan.MANAGEMENT:
             self.pacer.traffic(now)
         if high == rtcan.SYNC and not firmware:
@@ -259,7 +262,7 @@ class Core:
 
     def _stage_changed(self, now: int) -> None:
         stage = self.identity.stage
-        if stage is Stage.LISTENING:
+        if stage is _LISTENING:
             self.joined = False
             self.detector.start()
             self.discard(now)
@@ -267,7 +270,7 @@ class Core:
         elif stage is Stage.OWNING:
             for periodic in self.periodics.values():
                 periodic.message = self.message_id(periodic.high)
-            if self.profile is not Profile.FIRMWARE:
+            if self.profile is not _FIRMWARE:
                 self.network.owned(now)
         self.settle(now)
 

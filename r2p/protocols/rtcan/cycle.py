@@ -54,6 +54,9 @@ class State(enum.Enum):
     LEADING = "leading"  # the node is the master
 
 
+_NONE = State.NONE  # Python 3.11 takes its time to find a member of an enum
+
+
 class Alignment(enum.Enum):
     """What a sync frame was good for."""
 
@@ -90,7 +93,7 @@ class Cycle:
 
     @property
     def running(self) -> bool:
-        return self.state is not State.NONE
+        return self.state is not _NONE
 
     def slot_at(self, now: int) -> int:
         """The slot at this instant, counted from the start of this cycle; not limited to it."""
@@ -116,7 +119,7 @@ class Cycle:
         """A sync frame was received; `stamp` is the instant of the reception interrupt."""
         sync = rtcan.decode_sync(frame)
         start = stamp - self._latency - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
-        if self.state is State.NONE:
+        if self.state is _NONE:
             return self._start(start, sync.cycle, sync.mask)
         cycles, off = self._distance(start)
         if abs(off) > self.timing.slot or cycles < 0 or (self.counter + cycles) & 0xFF != sync.cycle:

@@ -198,12 +198,12 @@ class Engine:
                 self._out.append(received)
         elif self._running:
             core.low(now, frame, stamp - self._latency)
-        return self._take()
+        return self._take() if self._out else _NOTHING
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> Sequence[Action]:
         """What became of a frame that was to be transmitted, and when it was over (for SENT: its end)."""
         self._sender.confirm(now, mailbox, outcome, at)
-        return self._take()
+        return self._take() if self._out else _NOTHING
 
     def next_deadline(self) -> int | None:
         """When to call `poll`; an instant in the past means at once."""
@@ -212,10 +212,10 @@ class Engine:
         due = self._sender.due
         if self._timers.due < due:
             due = self._timers.due
-        if self._reassembly.open:
-            due = min(due, self._reassembly.due)
-        if self._pacer.waiting:
-            due = min(due, self._pacer.due)
+        if self._reassembly.open and (given_up := self._reassembly.due) < due:
+            due = given_up
+        if self._pacer.waiting and (quiet := self._pacer.due) < due:
+            due = quiet
         return due if due < NEVER else None
 
     def poll(self, now: int) -> Sequence[Action]:

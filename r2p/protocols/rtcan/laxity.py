@@ -171,7 +171,8 @@ class LaxityQueue:
         lane = self._lanes[message.message]
         lane.busy = False
         lane.held = hold
-        self._expiry = min(self._expiry, lane.expiry)
+        if lane.expiry < self._expiry:
+            self._expiry = lane.expiry
 
     def sent(self, message: Outgoing) -> bool:
         """The frame was sent. Says whether it was the last one: then the message is out of the queue."""

@@ -31,6 +31,11 @@ REPEAT = 1_000_000_000
 _LONGEST = (1 << 63) - 1  # ns, 292 years: what no network has lasted, and no field of ours could tell
 _PAUSE = 20_000_000  # ns before the first sync is tried again, at most
 
+_SLEPT = (
+    "this node was the master, and its computer was busy or stopped: "
+    "give r2p a real-time priority (r2p doctor tells how), or let another node be the master (priority=)"
+)
+
 
 class Network:
     """The network as this node sees it. `say(now, message)` sends management; `priority` is that to be the master."""
@@ -90,16 +95,16 @@ class Network:
         self._sender.poll(now)
         held = self._cycle.state is State.HOLDING
         match self._cycle.heard(frame, stamp):
-            case Alignment.FOREIGN:
-                self._counts["foreign syncs"] += 1
-                self._allegiance.foreign()
-            case Alignment.STARTED | Alignment.RESUMED as alignment:
-                self._join(now, resumed=alignment is Alignment.RESUMED)
             case Alignment.ALIGNED:
                 if held:
                     self._counts["missed syncs"] += 1
                 self._sender.turned(now)
                 self._follow(now, self._allegiance.goes_on(now))
+            case Alignment.FOREIGN:
+                self._counts["foreign syncs"] += 1
+                self._allegiance.foreign()
+            case Alignment.STARTED | Alignment.RESUMED as alignment:
+                self._join(now, resumed=alignment is Alignment.RESUMED)
             case _:
                 self._sender.kick(now)
         if not self.verified:
@@ -150,7 +155,7 @@ class Network:
         """A cycle is over."""
         if self._cycle.state is State.LEADING:
             if not self._reign.turn(now):
-                self._abdicate(now, "this node was the master, and slept")
+                self._abdicate(now, _SLEPT)
                 self._elect(now, forget=True)
             return
         if self._cycle.state is State.HOLDING:  # only now it is sure: a sync may be read late

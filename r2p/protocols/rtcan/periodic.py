@@ -4,6 +4,7 @@ Where a message owns slots, they are its clock: `lead` before the first one of e
 then each fragment has its slot. Everything lies on slot boundaries, so to wake up in time is to know the next slot.
 """
 
+import math
 from collections.abc import Hashable, Iterable
 
 import msgspec
@@ -47,18 +48,27 @@ class Periodic(msgspec.Struct, eq=False):
         return unfinished
 
 
+_Sends = dict[int, tuple[Periodic, int, bool]]
+_Fills = dict[int, list[tuple[Periodic, int]]]
+
+
 class Agenda:
     """What to do in the slots of one cycle. `fills`: messages whose data are wanted now, and how many slots ahead of
     theirs. `sends`: a message, its fragment, and whether its data are wanted only now. `next` has for each slot the
     first one behind it with something to do. Slot 0 of the next cycle counts as the last one of this.
+
+    After the least common multiple of all periods, which is the longest of them, all comes again: each cycle up to
+    there is worked out once.
     """
 
     def __init__(self, timing: Timing) -> None:
         self.next = following((), timing.slots)
-        self.sends: dict[int, tuple[Periodic, int, bool]] = {}
-        self.fills: dict[int, list[tuple[Periodic, int]]] = {}
+        self.sends: _Sends = {}
+        self.fills: _Fills = {}
         self._timing = timing
         self._stale = True
+        self._cycles: dict[int, tuple[_Sends, _Fills, list[int]]] = {}
+        self._span = 1  # cycles after which all comes again
 
     def changed(self) -> None:
         """A message got or lost its slots."""
@@ -66,30 +76,40 @@ class Agenda:
 
     def turn(self, cycle: int, periodics: Iterable[Periodic]) -> None:
         """A cycle begins."""
-        if not self._stale:
-            return
-        self._stale = False
-        self.sends.clear()
-        self.fills.clear()
+        if self._stale:
+            self._begin(cycle, periodics)
+        known = self._cycles.get(cycle % self._span)
+        if known is None:
+            known = self._cycles[cycle % self._span] = self._work_out(cycle, periodics)
+        self.sends, self.fills, self.next = known
+
+    def _begin(self, cycle: int, periodics: Iterable[Periodic]) -> None:
+        """Other messages than before have slots, some perhaps only from a later cycle on."""
+        owners = [(each.from_cycle, each.reservation.period) for each in periodics if each.active and each.reservation]
+        self._stale = any(begins > cycle for begins, _ in owners)
+        self._span = math.lcm(self._timing.slots, *[period for _, period in owners]) // self._timing.slots
+        self._cycles.clear()
+
+    def _work_out(self, cycle: int, periodics: Iterable[Periodic]) -> tuple[_Sends, _Fills, list[int]]:
+        sends: _Sends = {}
+        fills: _Fills = {}
         for each in periodics:
             if each.active and each.reservation is not None:
-                self._enter(cycle, each, each.reservation)
-                longer = each.reservation.period > self._timing.slots
-                self._stale = self._stale or longer or each.from_cycle > cycle
-        self.next = following(self.sends.keys() | self.fills.keys(), self._timing.slots)
+                self._enter(sends, fills, cycle, each, each.reservation)
+        return sends, fills, following(sends.keys() | fills.keys(), self._timing.slots)
 
-    def _enter(self, cycle: int, each: Periodic, reservation: Reservation) -> None:
+    def _enter(self, sends: _Sends, fills: _Fills, cycle: int, each: Periodic, reservation: Reservation) -> None:
         slots = self._timing.slots
         lead = min(-(-each.lead // self._timing.slot), reservation.period - each.fragments)
         start = cycle * slots
         if cycle >= each.from_cycle:
             for slot in _set_bits(occupied(reservation, start, slots)):
                 fragment = (start + slot - reservation.phase) % reservation.period
-                self.sends[slot] = each, fragment, not lead and not fragment
+                sends[slot] = each, fragment, not lead and not fragment
         if lead:
             first = reservation.first_from(max(start + 1 + lead, each.from_cycle * slots))
             for number in range(first, start + slots + lead + 1, reservation.period):
-                self.fills.setdefault(number - lead - start, []).append((each, lead))
+                fills.setdefault(number - lead - start, []).append((each, lead))
 
 
 def _set_bits(bits: int) -> Iterable[int]:

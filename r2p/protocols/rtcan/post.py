@@ -33,7 +33,8 @@ class Gone(msgspec.Struct, frozen=True):
 
 
 _HRT, _SRT, _NRT = Mailbox  # Python 3.11 takes its time to find a member of an enum
-_SENT, _UNKNOWN, _LOST = Outcome.SENT, Outcome.UNKNOWN, Outcome.LOST
+_SENT, _UNKNOWN, _LOST, _ERROR = Outcome.SENT, Outcome.UNKNOWN, Outcome.LOST, Outcome.ERROR
+_ALL_SENT = Fate.SENT
 SYNC = Sync()
 GONE = Gone()
 Item = Outgoing | Periodic | Sync | FirstSync | Gone
@@ -123,9 +124,9 @@ class Post:
         if outcome is _SENT or outcome is _UNKNOWN:
             message.unknown = message.unknown or outcome is _UNKNOWN
             if self._queue.sent(message):
-                fate = Fate.UNKNOWN if message.unknown else Fate.SENT
+                fate = Fate.UNKNOWN if message.unknown else _ALL_SENT
                 self.report(message.handle, fate, missed=at > message.deadline, at=at)
-        elif outcome is Outcome.ERROR:
+        elif outcome is _ERROR:
             self._failed(now, message, at)
         else:
             if outcome is _LOST:

@@ -47,7 +47,7 @@ class Pacer:
         self.waiting: deque[tuple[bytes, Hashable]] = deque()
         """Messages and their handles, the next one first."""
         self._quiet_from = LONG_AGO
-        self._delay = 0
+        self._delay: int | None = None  # drawn when it is needed: most networks are not of firmware
 
     def put(self, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Hashable:
         """Send it when it is quiet; the oldest is dropped when there are too many: its handle comes back."""
@@ -64,12 +64,16 @@ class Pacer:
     def traffic(self, now: int) -> None:
         """Somebody, or this node, sent a management frame."""
         self._quiet_from = now
-        self._delay = self._draw(_SPREAD)
+        self._delay = None
 
     @property
     def due(self) -> int:
         """When the next one may go."""
-        return self._quiet_from + QUIET + self._delay if self.waiting else NEVER
+        if not self.waiting:
+            return NEVER
+        if self._delay is None:
+            self._delay = self._draw(_SPREAD)
+        return self._quiet_from + QUIET + self._delay
 
     def pop(self, now: int) -> tuple[bytes, Hashable] | None:
         """What may go now, and its handle."""

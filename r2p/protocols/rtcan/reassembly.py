@@ -47,11 +47,10 @@ class Reassembly:
 
     def subscribe(self, message: int, size: int) -> None:
         """Take messages with this id, of `size` bytes. Raises `MessageError` beyond 1..1024."""
-        first = rtcan.fragment_count(size) - 1
         before = self._inlets.get(message)
         if before is None or before.size != size:
+            self._inlets[message] = Inlet(rtcan.fragment_count(size) - 1, size)
             self.open.pop(message, None)
-            self._inlets[message] = Inlet(first, size)
 
     def unsubscribe(self, message: int) -> None:
         self.open.pop(message, None)
@@ -81,7 +80,9 @@ class Reassembly:
     @property
     def due(self) -> int:
         """When to call `poll`: that is when the oldest unfinished message is given up."""
-        return next(iter(self.open.values())).last + TIMEOUT if self.open else NEVER
+        for oldest in self.open.values():
+            return oldest.last + TIMEOUT
+        return NEVER
 
     def poll(self, now: int) -> None:
         """Give up messages whose next frame stays away."""

@@ -30,6 +30,7 @@ class Mode(enum.Enum):
 _FREE, _SLOTTED = Mode.FREE, Mode.SLOTTED  # Python 3.11 takes its time to find a member of an enum
 _HRT = Mailbox.HRT
 _SENT, _UNKNOWN = Outcome.SENT, Outcome.UNKNOWN
+_ALL_SENT = Fate.SENT
 
 
 class Sender:
@@ -55,7 +56,7 @@ class Sender:
         self.mode = Mode.SILENT
         self.due = NEVER
         self._cycle = cycle
-        self._timing = cycle.timing
+        self._slots, self._slot, self._bit = cycle.timing.slots, cycle.timing.slot, cycle.timing.bit
         self._queue = queue
         self._agenda = agenda
         self._post = post
@@ -68,9 +69,9 @@ class Sender:
         self._done = 0
         self._tried = 0  # the last slot in which nothing more can be tried
         self._last = 0
-        bit = self._timing.bit
+        bit = self._bit
         # A try now would come too late for the slots before `now + ahead`; a coarse port may still try in that one.
-        self._ahead = latency - (self._timing.slot if coarse else bit)
+        self._ahead = latency - (self._slot if coarse else bit)
         self._close = _CLOSE * bit
         self._longest = [(rtcan.frame_bits_max(size) + INTERMISSION) * bit for size in range(FRAME_MAX + 1)]  # ns
 
@@ -100,7 +101,7 @@ class Sender:
         """A cycle has begun, at `Cycle.reference`; nothing of it is done yet."""
         self._done = self._tried = 0
         self._agenda.turn(self._cycle.counter, self._periodics)
-        self._last = self._timing.slots + (self._cycle.state is not State.LEADING)
+        self._last = self._slots + (self._cycle.state is not State.LEADING)
         self._plan(now)
 
     def kick(self, now: int) -> None:
@@ -116,7 +117,7 @@ class Sender:
     def sync(self, now: int, frame: Frame) -> None:
         """The cycle begins with this sync frame."""
         start = self._cycle.reference
-        last = start + self._timing.slot - self._longest[FRAME_MAX]
+        last = start + self._slot - self._longest[FRAME_MAX]
         if now + self._latency > last or self._post.boxes[_HRT] is not None:
             self._counts["syncs not sent"] += 1
             return
@@ -134,9 +135,8 @@ class Sender:
         slot = periodic.waiting
         periodic.restart(payload)
         if slot is not None and payload is not None:
-            current = self._cycle.slot_at(now + self._latency)
-            first = slot - self._cycle.number_of(0)
-            self._send_periodic(now, periodic, 0, first, current)
+            current = (now + self._latency - self._cycle.reference) // self._slot
+            self._send_periodic(now, periodic, 0, slot - self._cycle.number_of(0), current)
 
     def reset(self) -> None:
         """The bus is gone, and all frames with it."""
@@ -149,9 +149,9 @@ class Sender:
             if self.mode is _FREE:
                 self.kick(now)
                 return
-            current = self._cycle.slot_at(now + self._latency)
+            current = (now + self._latency - self._cycle.reference) // self._slot
             if current >= self._last:
-                self._run(now, self._timing.slots, current)
+                self._run(now, self._slots, current)
                 self._turn(now)
                 if not self._cycle.running:  # a node that is silent stays so: nothing else has moved `due`
                     self.kick(now)
@@ -184,28 +184,32 @@ class Sender:
 
     def _plan(self, now: int) -> None:
         """Wake up for the next slot where there is something to do, or to send something, or for the next cycle."""
-        cycle, slot_length = self._cycle, self._timing.slot
+        cycle = self._cycle
         slot = self._agenda.next[self._done]
         if self._queue.size and self._post.idle and self.mode is _SLOTTED:
-            over = max((now + self._ahead - cycle.reference) // slot_length, self._tried)
-            if over < self._timing.slots and cycle.next_free[over] < slot:
+            over = (now + self._ahead - cycle.reference) // self._slot
+            if over < self._tried:
+                over = self._tried
+            if over < self._slots and cycle.next_free[over] < slot:
                 slot = cycle.next_free[over]
         if slot > self._last:
             slot = self._last
-        self.due = cycle.reference + slot * slot_length - self._latency
+        self.due = cycle.reference + slot * self._slot - self._latency
 
     def _run(self, now: int, upto: int, current: int) -> None:
         """Do what is to be done in the slots up to one; it is slot `current` now."""
-        slot = self._agenda.next[self._done] if self.mode is _SLOTTED else NO_SLOT
+        agenda = self._agenda
+        slot = agenda.next[self._done] if self.mode is _SLOTTED else NO_SLOT
         self._done = upto
         while slot <= upto:
-            for periodic, lead in self._agenda.fills.get(slot, ()):
+            for periodic, lead in agenda.fills.get(slot, ()):
                 if periodic.active:
                     self._ask(now, periodic, slot + lead)
-            send = self._agenda.sends.get(slot)
-            if send is not None and send[0].active:
-                self._periodic_slot(now, *send, slot, current)
-            slot = self._agenda.next[slot]
+            if slot in agenda.sends:
+                periodic, fragment, asks = agenda.sends[slot]
+                if periodic.active:
+                    self._periodic_slot(now, periodic, fragment, asks, slot, current)
+            slot = agenda.next[slot]
         if not self._coarse:
             self._tried = upto
         if self._queue.size and current == upto and self.mode is _SLOTTED:
@@ -224,8 +228,8 @@ class Sender:
         end = slot + 1
         while self._coarse and end in self._cycle.free:
             end += 1
-        start = self._cycle.start_of(slot)
-        last = self._latest_start(now, frame, start + (end - slot) * self._timing.slot)
+        start = self._cycle.reference + slot * self._slot
+        last = self._latest_start(now, frame, start + (end - slot) * self._slot)
         if now + self._latency > last:
             self._counts["late_to_slot"] += 1
             self._queue.put_back(message)
@@ -242,7 +246,7 @@ class Sender:
     def _exact_latest_start(self, frame: Frame, end: int) -> int:
         """As above, to the stuff bit. That is not cheap, unless the same frame is seen again."""
         bits = rtcan.frame_bits(frame.id, frame.data) + INTERMISSION
-        return end - bits * self._timing.bit
+        return end - bits * self._bit
 
     # Periodic messages
 
@@ -271,8 +275,8 @@ class Sender:
         assert payload is not None
         at = fragment * FRAME_MAX
         frame = Frame(periodic.message << 7 | periodic.fragments - 1 - fragment, payload[at : at + FRAME_MAX])
-        start = self._cycle.start_of(slot)
-        last = self._exact_latest_start(frame, start + self._timing.slot) if slot == current else LONG_AGO
+        start = self._cycle.reference + slot * self._slot
+        last = self._exact_latest_start(frame, start + self._slot) if slot == current else LONG_AGO
         if mask is not None and not mask >> slot & 1:
             self._abandon(now, periodic, "not in the mask")
         elif self._post.boxes[_HRT] is not None:
@@ -297,6 +301,6 @@ class Sender:
         periodic.unknown = periodic.unknown or outcome is _UNKNOWN
         periodic.sent += 1
         if periodic.sent == periodic.fragments:
-            fate = Fate.UNKNOWN if periodic.unknown else Fate.SENT
+            fate = Fate.UNKNOWN if periodic.unknown else _ALL_SENT
             periodic.restart()
             self._post.report(periodic.handle, fate, missed=False, at=at)

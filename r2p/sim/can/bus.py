@@ -239,7 +239,7 @@ class CanBus:
     def _transfer_of(self, requests: list[Request], start: int, deaf: Sequence[CanController]) -> _Transfer:
         frame, owner = requests[0].frame, requests[0].owner
         if len(requests) == 1 and not deaf:
-            names, heard_by = self._listeners.audience(owner)
+            names, heard_by = self._listeners.audience[owner]
         else:
             owners = [request.owner for request in requests]
             names = tuple([owner.name for owner in owners])
@@ -252,7 +252,7 @@ class CanBus:
         frame = transfer.frame
         for request in transfer.requests:
             request.owner.sent(request, end)
-        for node in self._listeners.concerned(frame.id):
+        for node in self._listeners.concerned[frame.id]:
             if node in transfer.heard_by:
                 node.arrived(frame, end)
         self._over(transfer, transfer.bits, None, end)

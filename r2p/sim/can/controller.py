@@ -75,9 +75,11 @@ class CanController:
         self.mailboxes = Mailboxes(self._guard)  # for the bus, as is the next one
         self.confinement = Confinement(self._changed)
         self._transmit_delay = node.transmit.drawer(self.numbers)
+        self._ahead = node.transmit.nominal
         self._interrupts = Interrupts(bus.timeline, self.clock, node.receive.drawer(self.numbers))
         self._bus = bus
         self._timeline = bus.timeline
+        self._source = bus.timeline.source
         self._filters: Sequence[tuple[int, int]] = ()
         self._lose_next = 0
         self._mad: Frame | None = None
@@ -109,13 +111,13 @@ class CanController:
             raise IndexError(f"{self.name} has {self.node.mailboxes} mailboxes: there is no mailbox {mailbox}")
         if mailbox in self.mailboxes.requests or not self.confinement.live:
             return False
-        given = self._timeline.now()
+        given, clock = self._source.elapsed, self.clock
         if not_before is not None:
-            ahead = self.clock.true(not_before) - self.node.transmit.nominal
+            ahead = clock.true(not_before) - self._ahead
             if ahead > given:
                 given = ahead
-        last = NEVER if not_after is None else self.clock.true(not_after + 1) - 1
-        self._put(frame, mailbox, given + self._transmit_delay(), last)
+        last = NEVER if not_after is None else clock.true(not_after + 1) - 1
+        self._put(Request(self, frame, mailbox, given + self._transmit_delay(), last))
         return True
 
     def abort(self, mailbox: int = 0) -> bool:
@@ -238,11 +240,12 @@ class CanController:
 
     # Inside
 
-    def _put(self, frame: Frame, mailbox: int, ready: int, last: int = NEVER) -> None:
+    def _put(self, request: Request) -> None:
+        frame = request.frame
         if frame.id >> 29 or len(frame.data) > FRAME_MAX:
             raise MessageError(f"identifier {frame.id:#x} with {len(frame.data)} bytes: no frame has room")
-        self.mailboxes.requests[mailbox] = request = Request(self, frame, mailbox, ready, last)
-        if not self._bus.contend(request) and last < NEVER:
+        self.mailboxes.requests[request.mailbox] = request
+        if not self._bus.contend(request) and request.last < NEVER:
             self._guard(request)
 
     def _wants(self, identifier: int) -> bool:
@@ -285,4 +288,4 @@ class CanController:
 
     def _babble(self) -> None:
         if self._mad and self.live:
-            self._put(self._mad, BABBLE, self._timeline.now())
+            self._put(Request(self, self._mad, BABBLE, self._timeline.now(), NEVER))

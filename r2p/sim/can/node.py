@@ -101,24 +101,29 @@ class LocalClock:
     def __init__(self, timeline: Timeline, offset: int, drift_ppm: float) -> None:
         self.virtual = timeline.clock.virtual
         self._timeline = timeline
+        self._source = timeline.source
         self._offset = offset
         self._drift = round(drift_ppm * 1000)  # ns a second
         self._second = _BILLION + self._drift  # what it shows of a true one
+        self._true = self._local = -1  # the latest conversion: what happens at one instant asks again and again
 
     def monotonic(self) -> int:
         """What this clock shows now, in ns."""
-        true = self._timeline.now()
-        return true + self._offset + true * self._drift // _BILLION
+        true = self._source.elapsed
+        return self._local if true == self._true else self.local(true)
 
     def now(self) -> int:
         """UTC in ns, as this node has it."""
-        true = self._timeline.now()
+        true = self._source.elapsed
         ahead = self.local(true) - true
         return self._timeline.clock.now() + ahead
 
     def local(self, true: int) -> int:
         """What this clock shows at that true instant."""
-        return true + self._offset + true * self._drift // _BILLION
+        if true != self._true:
+            self._true = true
+            self._local = true + self._offset + true * self._drift // _BILLION
+        return self._local
 
     def true(self, local: int) -> int:
         """The first true instant at which this clock shows `local`, or more."""

@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from types import TracebackType
 from typing import Self
 
+from r2p.bridge import BridgeOptions
 from r2p.msg import Speed3
 from r2p.publishers import AnyPublisher
 from r2p.sim.modules.board import Board
@@ -100,7 +101,7 @@ class Triskar2:
     """The robot, on the network `via`, for the time of an `async with` block.
 
     `traffic` is the class of all hops of the command chain; None: those that the nodes choose. `modules`: those that
-    are here, where the others are somewhere else. `outside`: where the gateway lets computers in.
+    are here, where the others are somewhere else. `outside`: where the gateway lets computers in, with these `options`.
     Raises TransportError for a `via` that can't work.
     """
 
@@ -113,9 +114,11 @@ class Triskar2:
         traffic: Traffic | None = None,
         modules: Iterable[str] | None = None,
         outside: Iterable[str | Transport] = (),
+        options: BridgeOptions | None = None,
     ) -> None:
         self.via = via
         self.outside = list(outside)
+        self._options = options
         self.hardware = Hardware(seed, world)
         self.modules: dict[str, Board] = {}
         """Those that are switched on, by name."""
@@ -186,7 +189,7 @@ class Triskar2:
         if name in PROXIMITY:
             return self._proximity(name, PROXIMITY[name])
         if name == "GW":
-            return GatewayModule(name, via=self.via, outside=self.outside)
+            return GatewayModule(name, via=self.via, outside=self.outside, options=self._options)
         return PowerModule(name, battery=self.hardware.battery, topic="power", via=self.via)
 
     def _motor(self, name: str, wheel: int) -> MotorModule:

@@ -13,6 +13,7 @@ from r2p.protocols.rtcan.events import (
     Action,
     Done,
     Fate,
+    LostSync,
     Profile,
     Received,
 )
@@ -208,7 +209,10 @@ def test_a_node_that_slept_finds_its_place_again() -> None:
         bus.run(10 * SECOND)
         bus.nodes.insert(asleep, node)
         node.boxes.clear()
+        before = len(node.of(LostSync))
         bus.run(3 * SECOND)
+        if sleeper == 0:
+            assert "its computer was busy or stopped: give r2p a real-time priority" in node.of(LostSync)[before].reason
         assert sorted(each.engine.role.value for each in nodes) == ["master", "slave", "slave"]
         assert len({each.engine.cycle for each in nodes}) == 1
         assert len({each.engine.master for each in nodes}) == 1

@@ -1,8 +1,12 @@
 """Hard real-time messages: slots of their own, and what becomes of them."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from r2p.codecs import rtcan
+from r2p.protocols.rtcan.calendar import Reservation
+from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.events import (
     Degraded,
     Done,
@@ -11,6 +15,7 @@ from r2p.protocols.rtcan.events import (
     Granted,
     Refused,
 )
+from r2p.protocols.rtcan.periodic import Agenda, Periodic
 from tests.protocols.rtcan.bus import MS, SECOND, Bus
 from tests.protocols.rtcan.networks import CYCLE, SLOT, TOPIC, counted, is_sync, network, starts, syncs
 
@@ -167,3 +172,41 @@ def test_the_owner_stops_when_the_master_does_not_answer() -> None:
     bus.run(SECOND)
     assert len(owner.of(Granted)) == 2  # it has asked all the time
     assert starts(bus, TOPIC, 0)[-1] > bus.now - 2 * CYCLE
+
+
+SLOTS = CYCLE // SLOT
+periodics = st.lists(
+    st.builds(
+        lambda cycles, phase, fragments, lead, begins: Periodic(
+            TOPIC,
+            0x2105,
+            8 * fragments,
+            fragments,
+            cycles * CYCLE,
+            lead * SLOT,
+            None,
+            reservation=Reservation(0x2105, cycles * SLOTS, 1 + phase, fragments),
+            active=True,
+            from_cycle=begins,
+        ),
+        st.sampled_from([1, 2, 4, 12]),
+        st.integers(0, 50),
+        st.integers(1, 3),
+        st.integers(0, 100),
+        st.integers(0, 5),
+    ),
+    max_size=4,
+)
+
+
+@given(periodics, st.integers(0, 3))
+def test_an_agenda_that_knows_its_cycles_says_what_a_new_one_says(messages: list[Periodic], gone: int) -> None:
+    agenda = Agenda(timing())
+    for cycle in range(40):
+        if cycle == 30:  # a message loses its slots
+            del messages[gone : gone + 1]
+            agenda.changed()
+        fresh = Agenda(timing())
+        agenda.turn(cycle, messages)
+        fresh.turn(cycle, messages)
+        assert (agenda.sends, agenda.fills, agenda.next) == (fresh.sends, fresh.fills, fresh.next)

@@ -130,7 +130,7 @@ def test_load_does_not_move_hard_real_time_by_a_nanosecond_and_does_move_the_res
     assert without.error >= 5 * loaded.error
 
 
-MANAGEMENT = 450
+MANAGEMENT = 390
 """Frames a second at most of what the robot and a PC say to stay known to each other, the start included."""
 
 
