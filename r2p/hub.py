@@ -8,7 +8,8 @@ import logging
 import random
 from collections.abc import Callable
 
-from r2p.bridge import Bridge, BridgeOptions
+from r2p.bridge import Bridge, BridgeOptions, Standby
+from r2p.codecs.management import DENIED_READ_ONLY
 from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.network import describe_mismatch
 from r2p.protocols.events import (
@@ -21,6 +22,7 @@ from r2p.protocols.events import (
     ModuleInfo,
     NameConflict,
     Obey,
+    OrderDenied,
 )
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.link import Link
@@ -29,6 +31,7 @@ logger = logging.getLogger("r2p.module")
 
 _CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
+_ANSWERED = 5_000_000_000  # ns after an order in which gateways may say that it does not pass
 _APART = 1_000_000_000  # ns between two lines about one topic whose types differ
 
 
@@ -55,22 +58,32 @@ class ModuleHub:
         self.flags = 0
         """Those of ALIVE."""
         self.bridge: Bridge | None = None
+        self._joints: Bridge | Standby
         self.addresses: list[tuple[str, str]] = []
         """Where it takes connections: the URL that was opened, and the address."""
         self._events = events
         self._obey = obey
         self._suspected: set[str] = set()
+        self._ordered: dict[tuple[Command, str], int] = {}
         self._mismatches: dict[tuple[str, str], int] = {}
         space.changed = self._topic_changed
         if bridging is not None:
-            self.bridge = Bridge(space, self.instance, bridging, self._port_changed)
+            self._joints = self.bridge = Bridge(space, self.instance, bridging, self._port_changed)
             space.make_topic = self.bridge.make_topic
+        else:
+            self._joints = Standby(space, self.instance, self._link_chosen)
 
     def set_flags(self, flags: int) -> None:
         """The module's state changed: tell the others."""
         self.flags = flags
         for link in self.links:
             link.set_flags(flags)
+
+    def order(self, command: Command, module: str) -> None:
+        """Send an order to another module, by all links."""
+        self._ordered[command, module] = self.space.clock.monotonic()
+        for link in self.links:
+            link.command(command, module)
 
     def _topic_changed(self, topic: Topic) -> None:
         for link in self.links:
@@ -82,8 +95,7 @@ class ModuleHub:
         """A transport has a link, up or not yet."""
         self.links.append(link)
         self.space.links.append(link)
-        if self.bridge is not None:
-            self.bridge.attach(link)
+        self._joints.attach(link)
         for topic in list(self.space.topics.values()):
             link.topic_changed(topic)
         link.set_flags(self.flags)
@@ -92,8 +104,7 @@ class ModuleHub:
         """It does not have it any more."""
         self.links.remove(link)
         self.space.links.remove(link)
-        if self.bridge is not None:
-            self.bridge.detach(link)
+        self._joints.detach(link)
 
     def link_waits(self, link: Link, reason: str) -> None:
         """The link can't be had yet."""
@@ -104,6 +115,13 @@ class ModuleHub:
         """Something on the link is worth telling."""
         logger.log(logging.WARNING if trouble else logging.INFO, "link %s: %s", link.name, text)
         self._events.tell(LinkNotice(link.name, kind, text))
+
+    def close(self) -> None:
+        """Nothing is to be done any more."""
+        self._joints.close()
+
+    def _link_chosen(self, link: Link, kind: str, text: str, trouble: bool) -> None:
+        self.link_notice(link, kind, text, trouble=trouble)
 
     def _port_changed(self, link: Link, kind: str, text: str, trouble: bool) -> None:
         self.link_notice(link, f"gateway: {kind}", text, trouble=trouble)
@@ -128,8 +146,7 @@ class ModuleHub:
             abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
             logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.name, reason)
             self._events.tell(LinkDown(link.name, reason))
-        if self.bridge is not None:
-            self.bridge.link_changed(link)
+        self._joints.link_changed(link)
 
     def discovered(self, link: Link, event: Event) -> None:
         """The discovery of a link found something that concerns the module."""
@@ -139,6 +156,8 @@ class ModuleHub:
             case Mismatched():
                 self._log_mismatch(link, event)
                 self._events.tell(event)
+            case OrderDenied():
+                self._tell_denied(link, event)
             case NameConflict():
                 logger.error("link %s: two modules carry the name %s: rename one (--module)", link.name, event.module)
                 self._events.tell(event)
@@ -149,6 +168,14 @@ class ModuleHub:
                 self._events.tell(event)
             case ModuleGone():
                 self._tell_gone(link, event)
+
+    def _tell_denied(self, link: Link, event: OrderDenied) -> None:
+        """To whoever ordered it."""
+        if self.space.clock.monotonic() - self._ordered.get((event.command, event.module), -_ANSWERED) < _ANSWERED:
+            what = f"{event.command.name} of {event.module}"
+            missing = "it is read-only there" if event.reason == DENIED_READ_ONLY else "it lacks --allow-control"
+            text = f"gateway {event.gateway} does not let {what} through: {missing}"
+            self.link_notice(link, f"{event.command.name} denied", text, trouble=True)
 
     def _log_mismatch(self, link: Link, event: Mismatched) -> None:
         """At most once a second: another type in each message would fill the log."""

@@ -202,8 +202,7 @@ class Module:
             except BaseExceptionGroup as group:  # of transports: what a node raises, its supervisor keeps
                 raise group.exceptions[0] if len(group.exceptions) == 1 else group from None
             finally:
-                if self._opened.bridge is not None:
-                    self._opened.bridge.close()
+                self._opened.close()
                 if self._watchdog is not None:
                     self._watchdog.close()
                 self._changed.set()
@@ -310,8 +309,7 @@ class Module:
         Raises NameTooLong or InvalidName, and Closed if this module is not open.
         """
         self._running()
-        for link in self.links:
-            link.command(command, module_name(module))
+        self._opened.order(command, module_name(module))
 
     def query(self) -> None:
         """Ask all others to repeat what they publish and subscribe. Raises Closed if this module is not open."""

@@ -11,6 +11,7 @@ It never decodes a message. Where it forwards at all is agreed with the other ga
 
 from r2p.bridge.bridge import Bridge
 from r2p.bridge.options import BridgeOptions, ClassOf
+from r2p.bridge.standby import Standby
 from r2p.bridge.statistics import GatewayStatistics, PortStatistics, WayStatistics
 
-__all__ = ["Bridge", "BridgeOptions", "ClassOf", "GatewayStatistics", "PortStatistics", "WayStatistics"]
+__all__ = ["Bridge", "BridgeOptions", "ClassOf", "GatewayStatistics", "PortStatistics", "Standby", "WayStatistics"]

@@ -15,14 +15,18 @@ from r2p.codecs import UnknownType, management
 from r2p.errors import DecodeError
 from r2p.protocols.bridging.tree import MOST_PORTS, Changed, Port, Probe, Say, State, Tree
 from r2p.topic import Topic, TopicSpace, Waker
+from r2p.transports.announce import Told
 from r2p.transports.link import Link
 
 logger = logging.getLogger("r2p.bridge")
 
 _ORDERS = (0x12, 0x13, 0x14)
+_DENIED = 0x55
+_DENIED_APART = 200_000_000  # ns between two answers on one link to orders that do not pass
 _ALIVE = 0x11
 _HELLO = 0x50
-_TREE = (0x60, 0x61)
+_HELLO_FLAGS = 12  # its place
+_TREE = (0x60, 0x61, 0x62)
 _WORDS = {
     State.ALONE: "forwards",
     State.FORWARDING: "forwards, in agreement with {gateways}",
@@ -45,8 +49,8 @@ class Bridge:
         """By the name of the link."""
         self.tree = Tree(instance)
         self._policy = Policy(options)
-        self.relays = Relays(self, space, self._policy)
-        self.presences = Presences(self, space.loop, space.clock, self._policy)
+        self.relays = Relays(self.ports, space, self._policy)
+        self.presences = Presences(self.name, instance, self.ports, space, self._policy, self.relays.retyped)
         self._space = space
         self._clock = space.clock
         self._told = told
@@ -98,6 +102,20 @@ class Bridge:
         self._alarm.close()
         self.presences.close()
 
+    @property
+    def gateway(self) -> int:
+        return self.tree.gateway
+
+    def wish(self, port: BridgePort, topic: Topic, own: Told) -> Told:
+        """What a link is to be told of a topic."""
+        return self.relays.wish(port, topic, own)
+
+    def demand_changed(self, port: BridgePort, topics: set[str]) -> None:
+        self.relays.changed(topics, port)
+
+    def modules_changed(self) -> None:
+        self.presences.changed()
+
     # What comes in
 
     def heard(self, port: BridgePort, data: bytes) -> bool:
@@ -108,8 +126,12 @@ class Bridge:
             return True
         if kind in _ORDERS:
             self._pass_order(port, data)
+        if kind == _DENIED:
+            self._pass_on(port, data)
         if kind in (_ALIVE, _HELLO) and self._is_our_own(port, data):
             return True
+        if kind == _HELLO and data[_HELLO_FLAGS] & management.HELLO_QUERY:
+            self.presences.asked(port)
         if kind == _ALIVE and (probe := probes.decode(data)) is not None:
             self.tree.probed(self._clock.monotonic(), port.number, *probe)
             self._act()
@@ -139,7 +161,22 @@ class Bridge:
             self.tree.bridge(now, port.number, message)
         elif isinstance(message, management.Mesh):
             self.tree.mesh(now, port.number, message)
+        elif isinstance(message, management.Leaf):
+            self.tree.leaf(now, port.number, message)
         self._act()
+
+    def _open_from(self, port: BridgePort) -> list[BridgePort]:
+        """Where what came in here may go on to now."""
+        now = self._clock.monotonic()
+        if now >= port.place.until:
+            port.dropped["converging"] += 1
+            return []
+        others = [each for each in self.ports.values() if each is not port and each.link.up]
+        return [each for each in others if now < each.place.until]
+
+    def _pass_on(self, port: BridgePort, data: bytes) -> None:
+        for other in self._open_from(port):
+            other.link.write_management(data)
 
     def _pass_order(self, port: BridgePort, data: bytes) -> None:
         """STOP, REBOOT or BOOTLOAD for a module that may be anywhere."""
@@ -147,19 +184,26 @@ class Bridge:
             order = management.decode(data)
         except (DecodeError, UnknownType):
             return
-        now = self._clock.monotonic()
-        if now >= port.place.until:
-            port.dropped["converging"] += 1
+        if not isinstance(order, management.Stop | management.Reboot | management.Bootload):
             return
         harmless = isinstance(order, management.Stop)
-        for other in self.ports.values():
-            if other is port or not other.link.up or now >= other.place.until:
-                continue
-            if self._policy.allows_order(port.name, other.name, harmless=harmless):
+        for other in self._open_from(port):
+            reason = self._policy.order_denied(port.name, other.name, harmless=harmless)
+            if not reason:
                 other.link.write_management(data, urgent=True)
-            else:
-                port.dropped["order refused"] += 1
-                logger.warning("%s from %s is refused: see --allow-control", type(order).__name__.upper(), port.name)
+                continue
+            port.dropped["order refused"] += 1
+            option = "--read-only" if reason == management.DENIED_READ_ONLY else "--allow-control"
+            logger.warning("%s from %s is refused: see %s", type(order).__name__.upper(), port.name, option)
+            if order.module in other.link.discovery.modules:
+                self._deny(port, management.Denied(self.name, order.module, data[-1], reason))
+
+    def _deny(self, port: BridgePort, message: management.Denied) -> None:
+        """Tell who gave the order, if not just done."""
+        now = self._clock.monotonic()
+        if now >= port.denied_at + _DENIED_APART:
+            port.denied_at = now
+            port.link.write_management(management.encode(message))
 
     # The tree
 
@@ -196,7 +240,7 @@ class Bridge:
         if forwarded:
             port.link.stats.lost["converging"] += port.link.discard()
         count = len(port.place.gateways)
-        gateways = "another gateway" if count == 1 else f"{count} other gateways"
+        gateways = "another gateway" if count == 1 else f"{count} other gateways" if count else "modules there"
         self._told(port.link, state.value, _WORDS[state].format(gateways=gateways), state is State.LOOP)
         if state in (State.ALONE, State.FORWARDING):
             port.link.query()

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import msgspec
 
+from r2p.codecs.management import DENIED_CONTROL, DENIED_READ_ONLY
 from r2p.errors import Error
 from r2p.names import LOADER_PREFIX
 from r2p.sample import PublisherClass
@@ -99,11 +100,11 @@ class Policy:
             return False
         return not self._allow or any(each.matches(topic, source, target) for each in self._allow)
 
-    def allows_order(self, source: str, target: str, *, harmless: bool) -> bool:
-        """Whether an order for a module may go this way; STOP is harmless."""
+    def order_denied(self, source: str, target: str, *, harmless: bool) -> int:
+        """Why an order for a module may not go this way (DENIED_..., 0: it may); STOP is harmless."""
         if any(is_link(target, each) for each in self._options.read_only):
-            return False
-        return harmless or self._may_control(source)
+            return DENIED_READ_ONLY
+        return 0 if harmless or self._may_control(source) else DENIED_CONTROL
 
     def rate_limit(self, topic: str) -> float | None:
         """Messages a second; None: as many as come."""

@@ -2,21 +2,38 @@
 
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from r2p.protocols.bridging.tree import Port, State
 from r2p.topic import Topic
 from r2p.transports.announce import Told
 from r2p.transports.link import Link
 
-if TYPE_CHECKING:
-    from r2p.bridge.bridge import Bridge
+
+class Owner(Protocol):
+    """The gateway, as its ports see it."""
+
+    @property
+    def gateway(self) -> int:
+        """Its number in the tree."""
+
+    def heard(self, port: "BridgePort", data: bytes) -> bool:
+        """A management message; True if discovery need not see it."""
+
+    def wish(self, port: "BridgePort", topic: Topic, own: Told) -> Told:
+        """What the link is to be told of a topic that this module itself has as `own`."""
+
+    def demand_changed(self, port: "BridgePort", topics: set[str]) -> None:
+        """Others offer or want these topics there, or don't any more."""
+
+    def modules_changed(self) -> None:
+        """Modules or nodes came or went."""
 
 
 class BridgePort:
     """A link and its place in the tree (one that forwards nothing while the link is down)."""
 
-    def __init__(self, bridge: "Bridge", link: Link, number: int, now: Callable[[], int]) -> None:
+    def __init__(self, owner: Owner, link: Link, number: int, now: Callable[[], int]) -> None:
         self.link = link
         self.number = number
         self.place = Port(number, 0)
@@ -27,7 +44,9 @@ class BridgePort:
         self.dropped: Counter[str] = Counter()
         """What came in, or was published here, while nothing was forwarded."""
         self.demand = link.discovery.demand()
-        self._bridge = bridge
+        self.denied_at = -(1 << 62)
+        """When it was told last that an order does not pass (monotonic ns)."""
+        self._owner = owner
         self._generation = -1
 
     @property
@@ -41,14 +60,14 @@ class BridgePort:
     # Gate
 
     def heard(self, data: bytes) -> bool:
-        return self._bridge.heard(self, data)
+        return self._owner.heard(self, data)
 
     def wish(self, topic: Topic, own: Told) -> Told:
-        return self._bridge.relays.wish(self, topic, own)
+        return self._owner.wish(self, topic, own)
 
     @property
     def speaks(self) -> bool:
-        return self.place.in_tree or self._bridge.tree.gateway not in self.place.gateways
+        return self.place.in_tree or self._owner.gateway not in self.place.gateways
 
     @property
     def shares(self) -> bool:
@@ -57,7 +76,7 @@ class BridgePort:
     def looked(self) -> None:
         changed = self.demand.changed()
         if changed:
-            self._bridge.relays.changed(changed, self)
+            self._owner.demand_changed(self, changed)
         if self.link.discovery.generation != self._generation:
             self._generation = self.link.discovery.generation
-            self._bridge.presences.changed()
+            self._owner.modules_changed()

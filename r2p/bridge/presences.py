@@ -1,29 +1,28 @@
 """Modules and nodes of one side, told on the other: what has changed at once, the rest again and again.
 
-r2p modules are passed on with one hop more, and taken back when they are gone. Of firmware only what it says itself is
-passed on, so that its age can be seen everywhere.
+Whoever is new on a link, or asks, gets all of it at once. r2p modules are passed on with one hop more, and taken back
+when they are gone. Of firmware only what it says itself is passed on, so that its age can be seen everywhere; it does
+not answer, so whoever asks is told of what was heard lately.
 """
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import msgspec
 
 from r2p.bridge.options import Policy
 from r2p.bridge.port import BridgePort
 from r2p.bridge.relay import MOST_HOPS
-from r2p.clock import Alarm, Clock
+from r2p.clock import Alarm
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_GONE, ROLE_PUBLISHES
 from r2p.protocols.announcer import Relayed
 from r2p.protocols.events import ModuleInfo
-
-if TYPE_CHECKING:
-    import asyncio
-
-    from r2p.bridge.bridge import Bridge
+from r2p.topic import TopicSpace
 
 _REFRESH = 1_500_000_000
 _SOON = 2_000_000  # ns; so that what comes together is looked at together
+_APART = 200_000_000  # ns between two answers on one link
+_LATELY = 2_000_000_000  # ns; of firmware that was heard since
 _Key = tuple[object, ...]
 
 
@@ -36,15 +35,37 @@ class _Told(msgspec.Struct, frozen=True):
 
 
 class Presences:
-    """What each link has been told of the modules on the others."""
+    """What each link has been told of the modules on the others; `name` and `instance` are the gateway's own.
 
-    def __init__(self, bridge: "Bridge", loop: "asyncio.AbstractEventLoop", clock: Clock, policy: Policy) -> None:
-        self._bridge = bridge
-        self._clock = clock
+    `repeating` is called whenever everything is told again.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        instance: int,
+        ports: dict[str, BridgePort],
+        space: TopicSpace,
+        policy: Policy,
+        repeating: Callable[[], object],
+    ) -> None:
+        self._name = name
+        self._instance = instance
+        self._ports = ports
+        self._clock = space.clock
         self._policy = policy
+        self._repeating = repeating
         self._told: dict[int, dict[_Key, _Told]] = {}
-        self._alarm = Alarm(loop, self._due)
+        self._alarm = Alarm(space.loop, self._due)
         self._refresh_at = 0
+        self._met: dict[int, set[int]] = {}
+        self._asked: set[int] = set()
+        self._answered_at: dict[int, int] = {}
+
+    def asked(self, port: BridgePort) -> None:
+        """Somebody on the link wants to know everything."""
+        self._asked.add(port.number)
+        self.changed()
 
     def changed(self) -> None:
         """A module or a node came or went, or a link."""
@@ -52,7 +73,9 @@ class Presences:
 
     def forget(self, port: BridgePort) -> None:
         """The link is gone."""
-        self._told.pop(port.number, None)
+        for known in (self._told, self._met, self._answered_at):
+            known.pop(port.number, None)
+        self._asked.discard(port.number)
         self.changed()
 
     def close(self) -> None:
@@ -63,21 +86,35 @@ class Presences:
         refresh = now >= self._refresh_at
         if refresh:
             self._refresh_at = now + _REFRESH
-        ports = [port for port in self._bridge.ports.values() if port.link.up]
+            self._repeating()
+        ports = [port for port in self._ports.values() if port.link.up]
         for port in ports:
             self._tell(port, ports, now, refresh=refresh)
-        if refresh:
-            self._bridge.relays.retyped()
-        self._alarm.set(self._refresh_at)
+        waits = any(port.number in self._asked for port in ports)
+        self._alarm.set(min(self._refresh_at, now + _APART) if waits else self._refresh_at)
+
+    def _answers(self, port: BridgePort, now: int) -> bool:
+        """Whether the link is to be told everything, for it was asked for or somebody is new there."""
+        here = {info.instance for info in port.link.discovery.modules.values() if info.instance and not info.hops}
+        if not here <= self._met.get(port.number, set()):
+            self._asked.add(port.number)
+        self._met[port.number] = here
+        if port.number not in self._asked or now < self._answered_at.get(port.number, -_APART) + _APART:
+            return False
+        self._asked.discard(port.number)
+        self._answered_at[port.number] = now
+        return True
 
     def _tell(self, port: BridgePort, ports: list[BridgePort], now: int, *, refresh: bool) -> None:
         told = self._told.setdefault(port.number, {})
         if port.in_tree and now >= port.place.until:
             return  # it has to wait until the gateways agree
+        answers = self._answers(port, now)
         news = self._news(port, ports, now) if port.in_tree else {}
         for key, new in news.items():
             before = told.get(key)
             again = refresh and before is not None and (new.heard > before.heard or not _is_alive(new.message))
+            again |= answers and (now < new.heard + _LATELY or not _is_alive(new.message))
             if before is None or before.message != new.message or again:
                 port.link.relay(new.message)
                 told[key] = new
@@ -89,7 +126,6 @@ class Presences:
     def _news(self, port: BridgePort, ports: list[BridgePort], now: int) -> dict[_Key, _Told]:
         """What this link should know."""
         news: dict[_Key, _Told] = {}
-        instances = {info.instance for info in port.link.discovery.modules.values() if info.r2p}
         for other in ports:
             if other is port or not other.in_tree:
                 continue
@@ -99,7 +135,10 @@ class Presences:
                 self._add_module(news, info, port)
             for key, endpoint in list(other.link.discovery.endpoints.items()):
                 topic = self._passing(endpoint.topic, endpoint.role, other, port)
-                if topic is not None and endpoint.instance not in instances | {self._bridge.instance}:
+                if topic is None or endpoint.instance == self._instance:
+                    continue
+                there = (endpoint.instance, endpoint.node, topic, endpoint.role)
+                if there not in port.link.discovery.endpoints:  # else it is on both links, and uses both
                     message = management.Endpoint(
                         endpoint.role, endpoint.instance, endpoint.node, topic, endpoint.publisher_class
                     )
@@ -109,7 +148,7 @@ class Presences:
     def _add_module(self, news: dict[_Key, _Told], info: ModuleInfo, port: BridgePort) -> None:
         known = port.link.discovery.modules.get(info.name)
         hops = info.hops + 1
-        if hops > MOST_HOPS or info.name == self._bridge.name:
+        if hops > MOST_HOPS or info.name == self._name:
             return  # of our name: our last start, of which others still tell
         if known is not None and known.instance == info.instance:
             return  # it is on both links

@@ -7,7 +7,6 @@ that only on links that are in the tree; so demand travels along the tree, and c
 import logging
 import re
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -21,9 +20,6 @@ from r2p.protocols.events import Shape
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told
 
-if TYPE_CHECKING:
-    from r2p.bridge.bridge import Bridge
-
 logger = logging.getLogger("r2p.bridge")
 
 QUEUE = 16
@@ -36,9 +32,9 @@ _BUSES = frozenset({"rtcan", "sim"})
 class Relays:
     """The relayed topics by their name on the robot."""
 
-    def __init__(self, bridge: "Bridge", space: TopicSpace, policy: Policy) -> None:
+    def __init__(self, ports: dict[str, BridgePort], space: TopicSpace, policy: Policy) -> None:
         self.by_name: dict[str, Relay] = {}
-        self._bridge = bridge
+        self._ports = ports
         self._space = space
         self._policy = policy
         self._dirty: dict[str, None] = {}
@@ -54,14 +50,14 @@ class Relays:
 
     def all_changed(self) -> None:
         """The tree, or the links, have changed."""
-        ports = self._bridge.ports.values()
+        ports = self._ports.values()
         heard = {topic for port in ports for name in port.demand.topics() if (topic := self._meant(name, port))}
         self._mark(heard | self.by_name.keys())
 
     def retyped(self) -> None:
         """See whether other types, or sizes, are told than before."""
         for (topic, link), shape in list(self._shapes.items()):
-            port = self._bridge.ports.get(link)
+            port = self._ports.get(link)
             if port is not None and self._types(topic, port) != shape:
                 self._mark((topic,))
 
@@ -80,7 +76,7 @@ class Relays:
             self._reviewing = False
 
     def _review(self, topic: str) -> None:
-        ports = [port for port in self._bridge.ports.values() if port.in_tree and self._carries(topic, port)]
+        ports = [port for port in self._ports.values() if port.in_tree and self._carries(topic, port)]
         if any(self._uses(topic, source, target) for source, target in _pairs(ports)):
             self._relay(topic, ports)
         else:
@@ -128,7 +124,7 @@ class Relays:
                 self._space.topics.pop(here.name, None)
 
     def _tell(self, topic: str, topics: dict[str, BridgedTopic] | None = None) -> None:
-        for port in list(self._bridge.ports.values()):
+        for port in list(self._ports.values()):
             name = self._policy.called(topic, port.name)
             here = (topics or self._space.topics).get(name)
             if here is not None:
@@ -144,7 +140,7 @@ class Relays:
         name = self._policy.meant(topic.name, port.name)
         if name is None or name not in self.by_name:
             return own
-        others = [each for each in self._bridge.ports.values() if each is not port and each.in_tree]
+        others = [each for each in self._ports.values() if each is not port and each.in_tree]
         allows = self._policy.allows
         publishes = any(self._offers(name, each) and allows(name, each.name, port.name) for each in others)
         subscribes = any(self._wants(name, each) and allows(name, port.name, each.name) for each in others)
@@ -166,7 +162,7 @@ class Relays:
 
         Those that it has itself are asked for what they have, so that one of another type elsewhere does not end it.
         """
-        others = [each for each in self._bridge.ports.values() if each is not port and each.in_tree]
+        others = [each for each in self._ports.values() if each is not port and each.in_tree]
         here = self._told(topic, [port], ROLE_PUBLISHES)
         published = self._told(topic, others, ROLE_PUBLISHES)
         asked = self._told(topic, others, ROLE_SUBSCRIBES)

@@ -16,12 +16,13 @@ modules that are directly on it. After the version, without gaps (`slot` and `ut
 | 0x46 | RENEW | `u8 serial; u8 highs[24]` (of the messages, 0: none) |
 | 0x47 | RENEWED | `u8 id8; u8 serial; u16 lease_ms; u8 highs[24]` |
 
-Gateways agree on their tree (`r2p.protocols.bridging`) with two more, which stay on their network as well:
+Gateways agree on their tree (`r2p.protocols.bridging`) with three more, which stay on their network as well:
 
 | type | name | body |
 | --- | --- | --- |
-| 0x60 | BRIDGE | `u32 gateway; u8 port; u16 count; u32 agreement; 3 x {u32 gateway; u16 count} acks` (0: none) |
+| 0x60 | BRIDGE | `u32 gateway; u8 port; u16 count; u32 agreement, root; 2 x {u32 from; u16 count} acks` (0: none) |
 | 0x61 | MESH | `u32 gateway; u16 serial; u8 part; 3 x {u8 port; u32 gateway; u8 its_port} heard` (0: none) |
+| 0x62 | LEAF | `u32 module; u8 port; u16 count; 3 x {u32 gateway; u16 count} acks` (0: none) |
 """
 
 import msgspec
@@ -57,6 +58,10 @@ NO_PARAMS = bytes(10)
 UNANSWERED = bytes(9) + b"\1"
 """Params of a SUBSCRIBE_REQUEST between r2p modules: no SUBSCRIBE_RESPONSE has been heard yet."""
 ANY_TYPE = bytes(8)
+
+# Denied.reason
+DENIED_CONTROL = 1  # the gateway takes it from nobody on this link
+DENIED_READ_ONLY = 2  # nothing goes onto the link of the module
 
 # Claim.flags
 CLAIM_FIXED = 1  # the module can't take another id8
@@ -177,16 +182,27 @@ class Conflict(msgspec.Struct, frozen=True, gc=False):
     instance_b: int
 
 
+class Denied(msgspec.Struct, frozen=True, gc=False):
+    """A gateway does not let an order through to this module: `order` is the order's type byte, `reason` DENIED_..."""
+
+    gateway: str
+    module: str
+    order: int
+    reason: int
+
+
 class Bridge(msgspec.Struct, frozen=True, gc=False):
     """A gateway is there: `count` numbers what it sends, `agreement` is the hash of what it takes the network for.
 
-    `acks` are 3 times the gateway (u32) and `count` (u16) of the last BRIDGE that it got on this network.
+    `root` is the lowest gateway of its mesh. `acks` are 2 times the sender (u32) and `count` (u16) of the last BRIDGE
+    or LEAF that it got on this network.
     """
 
     gateway: int
     port: int
     count: int
     agreement: int
+    root: int
     acks: bytes
 
 
@@ -201,6 +217,19 @@ class Mesh(msgspec.Struct, frozen=True, gc=False):
     serial: int
     part: int
     heard: bytes
+
+
+class Leaf(msgspec.Struct, frozen=True, gc=False):
+    """A module that is no gateway has links to several networks with gateways: `module` is the instance of its start.
+
+    `count` numbers what it sends; `acks` are 3 times the gateway (u32) and `count` (u16) of the last BRIDGE that it got
+    on this network.
+    """
+
+    module: int
+    port: int
+    count: int
+    acks: bytes
 
 
 class Network(msgspec.Struct, frozen=True, gc=False):
@@ -312,8 +341,10 @@ Management = (
     | Unsubscribe
     | Endpoint
     | Conflict
+    | Denied
     | Bridge
     | Mesh
+    | Leaf
 )
 
 RTCAN_TYPES = range(0x40, 0x50)
@@ -343,8 +374,10 @@ _CODEC = Codec[Management](
     Record(Unsubscribe, 0x52, "16s I", version=_VERSION),
     Record(Endpoint, 0x53, "B I 8s 16s B", version=_VERSION, may_be_empty=("node",)),
     Record(Conflict, 0x54, "7s I I", version=_VERSION),
-    Record(Bridge, 0x60, "I B H I 18s", version=_VERSION),
+    Record(Denied, 0x55, "7s 7s B B", version=_VERSION),
+    Record(Bridge, 0x60, "I B H I I 12s", version=_VERSION),
     Record(Mesh, 0x61, "I H B 18s", version=_VERSION),
+    Record(Leaf, 0x62, "I B H 18s", version=_VERSION),
 )
 
 

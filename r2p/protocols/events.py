@@ -21,6 +21,10 @@ class Command(enum.Enum):
     BOOTLOAD = "bootload"
 
 
+ORDERS = {0x12: Command.STOP, 0x13: Command.REBOOT, 0x14: Command.BOOTLOAD}
+"""By the type byte of the message."""
+
+
 class Shape(msgspec.Struct, frozen=True):
     """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (all zero: unknown)."""
 
@@ -126,6 +130,15 @@ class NameConflict(msgspec.Struct, frozen=True):
     instance_b: int | None
 
 
+class OrderDenied(msgspec.Struct, frozen=True):
+    """A gateway does not let an order through; `reason` is DENIED_... of management."""
+
+    gateway: str
+    command: Command
+    module: str
+    reason: int
+
+
 class Echoes(msgspec.Struct, frozen=True):
     """The line gives back what we send."""
 
@@ -171,6 +184,7 @@ Event = (
     | Obey
     | Mismatched
     | NameConflict
+    | OrderDenied
     | Echoes
     | ModuleChanged
     | ModuleGone

@@ -21,11 +21,13 @@ from r2p.protocols.declarations import Declarations, Own
 from r2p.protocols.demand import Demand
 from r2p.protocols.directory import MOST, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.events import (
+    ORDERS,
     Command,
     Event,
     ModuleInfo,
     NameConflict,
     Obey,
+    OrderDenied,
     Send,
     Shape,
     Source,
@@ -294,6 +296,8 @@ class Presence:
                 self._events.append(Obey(Command.BOOTLOAD))
             case management.Conflict(self._module, a, b) if self._instance in (a, b):
                 self._events.append(NameConflict(self._module, a, b))
+            case management.Denied(gateway, module, order, reason) if order in ORDERS:
+                self._events.append(OrderDenied(gateway, ORDERS[order], module, reason))
             case management.Alive(name, flags):
                 self._census.firmware(ModuleInfo(name, flags, now, hops=1, source=source))
 

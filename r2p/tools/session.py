@@ -43,7 +43,7 @@ PATIENCE = 1.0
 
 _SETTLED = 0.3  # seconds without news, after which an r2p peer has told everything
 _FIRMWARE = 1.5  # seconds in which a module that repeats itself each half second should have said something
-_PASSED_ON = 1.7  # seconds; a gateway tells a bus what is behind it each 1.5 s, and whoever is new there not sooner
+_SETTLED_ON_BUS = 0.6  # ... on a bus, where all speak in turn
 _MOST = 8.0  # seconds that a tool listens while there is news: a bus of 1 Mbit/s bears 100 messages a second
 _BUSES = ("rtcan", "sim")
 _LOOK = 0.05  # seconds between two looks for news
@@ -209,8 +209,8 @@ class Session:
     async def settle(self, wait: float | None = None, *, of: str = "topics") -> None:
         """Listen to the network until the others have told what they have, or for `wait` seconds.
 
-        `of` is what it listens for, in words. r2p modules are asked and answer at once, but those behind a gateway on
-        a bus; firmware repeats itself step by step. Where there may be more to come, that is said. Raises
+        `of` is what it listens for, in words. r2p modules are asked and answer at once, gateways for those behind them;
+        firmware repeats itself step by step. Where there may be more to come, that is said. Raises
         r2p.TransportError if no link comes up.
         """
         if not self.settings.via:
@@ -229,7 +229,7 @@ class Session:
     async def _told(self) -> bool:
         """Wait until nobody has news any more; False if that was given up."""
         on_bus = any(url.partition(":")[0] in _BUSES for url in self.settings.via)
-        quiet = _PASSED_ON if on_bus else _SETTLED
+        quiet = _SETTLED_ON_BUS if on_bus else _SETTLED
         loop = asyncio.get_running_loop()
         start = news_at = loop.time()
         known = 0

@@ -97,6 +97,7 @@ class LineLink(Link):
     """
 
     longest: ClassVar[int] = debug.PAYLOAD_MAX
+    lone: ClassVar[bool] = True
 
     def __init__(
         self, name: str, hub: Hub, *, management_rate: float = 250.0, buffer: int = BUFFER, piecemeal: bool = False

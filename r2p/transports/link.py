@@ -77,7 +77,7 @@ class Hub(Protocol):
 
 
 class Gate(Protocol):
-    """What a gateway has to say about one of its links."""
+    """What a gateway has to say about one of its links, and a module with several links about what gateways join."""
 
     def heard(self, data: bytes) -> bool:
         """A management message, before discovery gets it; True if it concerns gateways only."""
@@ -118,12 +118,16 @@ class Link(abc.ABC):
     """Characters of the longest topic's name."""
     passes_probes: ClassVar[bool] = True
     """Whether there may be gateways of firmware on it."""
+    lone: ClassVar[bool] = False
+    """Whether it has only one other end."""
 
     def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: Door | None = None) -> None:
         self.name = _unlike(name, {each.name for each in hub.space.links})
         self.up = False
         self.gate: Gate | None = None
-        """Set by a gateway."""
+        """Set by the module: what gateways, and it beside gateways, do with the link."""
+        self.stands_by = ""
+        """Why another link is used in place of this one, where gateways join their networks; empty while it is used."""
         self.stats = LinkStats(lost=Losses(name, hub.space.clock))
         self.discovery: Door = discovery or _discovery(name, hub, management_rate)
         self._hub = hub

@@ -12,7 +12,9 @@ import pytest
 import r2p
 from r2p.bridge import BridgeOptions
 from r2p.codecs import management
+from r2p.events import LinkNotice
 from r2p.msg import Float32, Led, Text
+from r2p.protocols.events import Command
 from r2p.testing.network import node_in
 from r2p.transports.memory import Frame, Port, network
 from tests.transports.conversation import Script, manage
@@ -304,6 +306,41 @@ async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.Monkey
             assert bool(ways(gw, "BOOT_IMU1")) is allowed
 
 
+@pytest.mark.parametrize(
+    ("options", "command", "missing"),
+    [
+        (BridgeOptions(), Command.REBOOT, "it lacks --allow-control"),
+        (BridgeOptions(read_only=("memory:a",)), Command.STOP, "it is read-only there"),
+    ],
+)
+async def test_who_gives_an_order_that_does_not_pass_is_told(
+    options: BridgeOptions, command: Command, missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through another gateway, too; and nobody else is."""
+    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
+    async with (
+        gateway(options),
+        gateway(BridgeOptions(allow_control=True), name="G2", networks="bc"),
+        node("A", "a"),
+        r2p.Module("C", via="memory:c") as asks,
+        r2p.Module("D", via="memory:c") as other,
+    ):
+        events, others = asks.events(), other.events()
+        await asyncio.sleep(3)
+        asks.command(command, "A")
+        asks.command(command, "NOBODY")
+        await asyncio.sleep(0.1)
+    denied = [event async for event in events if isinstance(event, LinkNotice) and "denied" in event.kind]
+    assert denied == [
+        LinkNotice(
+            "memory:c",
+            f"{command.name} denied",
+            f"gateway GW does not let {command.name} of A through: {missing}",
+        )
+    ]
+    assert not [event async for event in others if isinstance(event, LinkNotice) and "denied" in event.kind]
+
+
 async def test_who_leaves_or_hangs_is_gone_on_the_other_side_too(caplog: pytest.LogCaptureFixture) -> None:
     loop = asyncio.get_running_loop()
     async with gateway(), r2p.Module("PC", via="memory:b") as pc:
@@ -356,7 +393,7 @@ async def test_a_line_with_a_gateway_at_its_other_end_is_read_whoever_has_no_roo
         await asyncio.sleep(CONVERGED)
         assert line.link.waits
         for count in range(5):
-            line.hear(manage(management.Bridge(7, 0, count, 0, bytes(18))))
+            line.hear(manage(management.Bridge(7, 0, count, 0, 7, bytes(12))))
             await asyncio.sleep(0.08)
             assert not line.link.waits
         await asyncio.sleep(CONVERGED)  # it is gone

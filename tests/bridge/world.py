@@ -76,14 +76,24 @@ class Gateway:
 
 
 class Speaker:
-    """A module with one node that publishes one topic and subscribes another."""
+    """A module with one node that publishes one topic and subscribes another; it is on one network or more.
 
-    def __init__(self, network: str, publishes: str, subscribes: str) -> None:
-        self.network = network
+    `pulled` is the number of the link that is unplugged.
+    """
+
+    def __init__(self, networks: str, publishes: str, subscribes: str) -> None:
+        self.networks = networks
+        self.module: r2p.Module | None = None
+        self.pulled: int | None = None
         self.publishes = publishes
         self.subscribes = subscribes
         self.publisher: r2p.Publisher[Numbered] | None = None
         self.got: Counter[int] = Counter()
+
+    @property
+    def here(self) -> str:
+        """The networks that it can reach now."""
+        return "".join(each for number, each in enumerate(self.networks) if number != self.pulled)
 
 
 class World:
@@ -131,13 +141,14 @@ class World:
         module, gateway.module = gateway.module, None
         await module.__aexit__(None, None, None)
 
-    async def speak(self, network: str, publishes: str, subscribes: str) -> Speaker:
+    async def speak(self, networks: str, publishes: str, subscribes: str) -> Speaker:
         """A module starts."""
-        speaker = Speaker(network, publishes, subscribes)
+        speaker = Speaker(networks, publishes, subscribes)
         name = f"M{len(self.speakers)}"
         self.speakers.append(speaker)
-        via = self.networks[network].transport(network)
+        via = [self.networks[network].transport(network) for network in networks]
         module = await self._stack.enter_async_context(r2p.Module(name, via=via, watchdog=False))
+        speaker.module = module
         node = await self._stack.enter_async_context(node_in(module))
         speaker.publisher = node.advertise(publishes, Numbered)
         subscriber = node.subscribe(subscribes, Numbered, queue=4096)
@@ -148,6 +159,19 @@ class World:
 
         module.start(listen)
         return speaker
+
+    def pull_or_plug(self, speaker: Speaker) -> None:
+        """A link of a module goes down, or comes back."""
+        assert speaker.module is not None
+        number = self.chance.randrange(len(speaker.networks)) if speaker.pulled is None else speaker.pulled
+        link = speaker.module.links[number]
+        assert isinstance(link, MemoryLink)
+        if link.up:
+            link.disconnect()
+            speaker.pulled = number
+        else:
+            link.connect()
+            speaker.pulled = None
 
     def say(self) -> int:
         """Somebody publishes something."""
@@ -170,26 +194,44 @@ class World:
 
     # What should be
 
-    def twice(self) -> dict[int, int]:
-        """Messages that somebody got more than once."""
-        return {number: count for each in self.speakers for number, count in each.got.items() if count > 1}
+    def twice(self, lately: Iterable[int] = ()) -> list[tuple[int, str, str]]:
+        """Messages that somebody got more than once: number, from, to.
+
+        Modules on several networks each hear each other by all that both are on, while no gateway joins these; so what
+        such a pair says counts only `lately`, while nothing has changed.
+        """
+        return [
+            (number, self.said[number].networks, each.networks)
+            for each in self.speakers
+            for number, count in each.got.items()
+            if count > 1 and (number in lately or not self._both_have_several(number, each))
+            if not (self._both_have_several(number, each) and self._are_parted(number, each))
+        ]
+
+    def _both_have_several(self, number: int, listener: Speaker) -> bool:
+        return len(set(self.said[number].networks)) > 1 and len(set(listener.networks)) > 1
+
+    def _are_parted(self, number: int, listener: Speaker) -> bool:
+        """Whether there are networks of theirs that no gateway joins."""
+        networks = self.said[number].here + listener.here
+        return not self.connected(networks[0]).issuperset(networks)
 
     def missing(self, numbers: Iterable[int]) -> list[tuple[int, str, str]]:
         """Messages that did not reach everybody, though no network lost them: number, from, to."""
         hurt = set().union(*(network.hurt for network in self.networks.values()))
         return [
-            (number, self.said[number].network, listener.network)
+            (number, self.said[number].networks, listener.networks)
             for number in numbers
             if number not in hurt
             for listener in self.speakers
             if listener.subscribes == self.said[number].publishes
-            and listener.network in self.connected(self.said[number].network)
+            and not self.connected(self.said[number].here).isdisjoint(listener.here)
             and not listener.got[number]
         ]
 
-    def connected(self, network: str) -> set[str]:
-        """The networks that can be reached from this one."""
-        reached = {network}
+    def connected(self, networks: str) -> set[str]:
+        """The networks that can be reached from these."""
+        reached = set(networks)
         while True:
             joined = [set(each.networks) for each in self.gateways if each.module is not None]
             more = reached.union(*(networks for networks in joined if networks & reached))

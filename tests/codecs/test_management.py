@@ -76,6 +76,7 @@ LAYOUTS = [
         b"\x01\x81\x07\0\0\0ledpub\0\0leds567890123456\x03\x53",
     ),
     (m.Conflict("IMU1", 1, 2), padded(b"\x01IMU1\0\0\0\x01\0\0\0\x02\0\0\0", 0x54)),
+    (m.Denied("GW", "IMU1", 0x13, m.DENIED_CONTROL), padded(b"\x01GW\0\0\0\0\0IMU1\0\0\0\x13\x01", 0x55)),
 ]
 
 

@@ -11,6 +11,9 @@ A gateway that was stopped for a while finds it in the past before it does anyth
 
 The timings fit together: a gateway counts as dead (`DEAD`) only after what it was granted has run out (`LEASE`); a new
 one listens (`LISTEN`) for longer than an old one can be stuck and still forward.
+
+Modules that are no gateways may have several links, too (`homes`). Those that use links of several meshes say so, by
+LEAF; and before a gateway forwards in another mesh than before (its root is another one), they know of it.
 """
 
 import enum
@@ -19,7 +22,7 @@ from collections import deque
 
 import msgspec
 
-from r2p.codecs.management import Bridge, Mesh
+from r2p.codecs.management import Bridge, Leaf, Mesh
 from r2p.protocols.bridging.mesh import Assembly, Edge, Hearing, Place, digest, edges_from, parts, tree
 
 _MS = 1_000_000
@@ -44,10 +47,12 @@ PROBE_PROVEN = 300 * _MS
 
 MOST_PORTS = 250
 
-_APART = 10 * _MS  # hellos out of turn
+APART = 10 * _MS
+"""Between two hellos at least, for those out of turn."""
 _FOR_EVER = 1 << 62
-_ACK = struct.Struct("<IH")
-_ACKS = 3
+ACK = struct.Struct("<IH")
+_ACKS = 2
+_LEAVES = 32  # on one network; more than these use one link only
 _RECORDS_KEPT = 5_000 * _MS
 _RECORDS_A_TICK = 16
 
@@ -94,11 +99,31 @@ class Neighbour(msgspec.Struct):
     acked_at: int
 
 
+def is_late(count: int, last: int) -> bool:
+    """Whether a message was overtaken by one with the number `last`."""
+    return (count - last) & 0xFFFF >= 0x8000
+
+
+def acknowledged(acks: bytes, sender: int, sent: deque[tuple[int, int]]) -> int:
+    """When `sender` sent what these acks name; 0: nothing of its that still counts. `sent`: count, instant."""
+    for name, count in ACK.iter_unpack(acks):
+        if name == sender:
+            return next((at for each, at in reversed(sent) if each == count), 0)
+    return 0
+
+
+def packed_acks(acks: list[tuple[int, int]], each: int) -> list[bytes]:
+    """Senders and counts, `each` of them in a message."""
+    starts = range(0, max(len(acks), 1), each)
+    return [b"".join(ACK.pack(*ack) for ack in acks[at : at + each]).ljust(each * ACK.size, b"\0") for at in starts]
+
+
 class Port(msgspec.Struct, eq=False):
     """A port of this gateway.
 
     `until`: data may pass before this instant (monotonic ns). `in_tree`: whether it does, has done, or will soon do so;
     what others want is known by that. `gateways` are those heard on its network. `echoes`: it gives back what we say.
+    `heeded_since`: since when all `leaves` there know our root.
     """
 
     number: int
@@ -107,6 +132,8 @@ class Port(msgspec.Struct, eq=False):
     state: State = State.LISTENING
     in_tree: bool = False
     neighbours: dict[Place, Neighbour] = {}
+    leaves: dict[Place, Neighbour] = {}
+    heeded_since: int | None = 0
     probes: dict[Place, tuple[int, int]] = {}
     view: object = None
     agreement: int = 0
@@ -140,6 +167,9 @@ class Tree:
         self.ports: dict[int, Port] = {}
         self.edges: frozenset[Edge] = frozenset()
         """The mesh of gateways that this one is part of."""
+        self.root = self.gateway
+        """The lowest gateway of the mesh."""
+        self._rooted_at = 0
         self._chosen: frozenset[Place] = frozenset()
         self._mesh_hash = digest(self.edges)
         self._members: set[int] = set()
@@ -188,14 +218,15 @@ class Tree:
         for port in self.ports.values():
             port.opened_at = port.say_at = now
             port.neighbours = {}
+            port.leaves = {}
             port.agreed_since = None
 
     def _due(self, port: Port) -> int:
         due = min(port.say_at, port.probe_at)
         if port.state is State.LISTENING:
             due = min(due, port.opened_at + LISTEN)
-        if port.agreed_since is not None and port.state is State.CONVERGING:
-            due = min(due, port.agreed_since + SETTLE)
+        if port.state is State.CONVERGING and port.agreed_since is not None and port.heeded_since is not None:
+            due = min(due, max(port.agreed_since, port.heeded_since) + SETTLE)
         return due
 
     # What comes in
@@ -214,13 +245,34 @@ class Tree:
             neighbour = Neighbour(now, message.count, message.agreement, 0)
             port.probes = {each: at for each, at in port.probes.items() if each[0] != message.gateway}
             port.neighbours = port.neighbours | {place: neighbour}
-        elif (message.count - neighbour.count) & 0xFFFF >= 0x8000:
-            return  # late
+        elif is_late(message.count, neighbour.count):
+            return
         if neighbour.agreement != message.agreement:
             neighbour.acked_at = 0
-            port.say_at = min(port.say_at, max(now, port.said_at + _APART))
+            port.say_at = min(port.say_at, max(now, port.said_at + APART))
         neighbour.heard_at, neighbour.count, neighbour.agreement = now, message.count, message.agreement
-        neighbour.acked_at = max(neighbour.acked_at, self._acknowledged(message))
+        neighbour.acked_at = max(neighbour.acked_at, acknowledged(message.acks, self.gateway, self._sent))
+        self._look(now, port)
+
+    def leaf(self, now: int, number: int, message: Leaf) -> None:
+        """A LEAF was heard: it counts from when it knows our root, and has an answer at once."""
+        port = self.ports.get(number)
+        if port is None or not message.module:
+            return
+        place = (message.module, message.port)
+        acked_at = acknowledged(message.acks, self.gateway, self._sent)
+        leaf = port.leaves.get(place)
+        if leaf is None:
+            port.say_at = min(port.say_at, max(now, port.said_at + APART))
+            if not acked_at or acked_at < self._rooted_at or len(port.leaves) >= _LEAVES:
+                return
+            port.leaves = port.leaves | {place: Neighbour(now, message.count, 0, acked_at)}
+        elif is_late(message.count, leaf.count):
+            return
+        elif not self._is_heard_by(message):
+            port.leaves = {each: known for each, known in port.leaves.items() if each != place}
+        else:
+            leaf.heard_at, leaf.count, leaf.acked_at = now, message.count, max(leaf.acked_at, acked_at)
         self._look(now, port)
 
     def mesh(self, now: int, number: int, message: Mesh) -> None:
@@ -235,7 +287,7 @@ class Tree:
         if heard is None:
             return
         self._records[message.gateway] = _Record(message.serial, heard, now)
-        self._map()
+        self._map(now)
         for port in self.ports.values():
             if port.neighbours and port.number != number:
                 self._say_record(port, message.gateway)
@@ -249,12 +301,10 @@ class Tree:
             port.probes = port.probes | {place: (port.probes.get(place, (now, now))[0], now)}
             self._look(now)
 
-    def _acknowledged(self, message: Bridge) -> int:
-        """When we sent what it acknowledges; 0: nothing of ours that still counts."""
-        for gateway, count in _ACK.iter_unpack(message.acks):
-            if gateway == self.gateway:
-                return next((at for each, at in reversed(self._sent) if each == count), 0)
-        return 0
+    def _is_heard_by(self, message: Leaf) -> bool:
+        """Whether it may hear us: who does not has no consent of ours any more."""
+        names = [name for name, _ in ACK.iter_unpack(message.acks)]
+        return self.gateway in names or 0 not in names
 
     # What follows from it
 
@@ -272,7 +322,7 @@ class Tree:
         if heard != self._heard:
             self._heard = heard
             self._serial = (self._serial + 1) & 0xFFFF
-            self._map()
+            self._map(now)
             for port in self.ports.values():
                 if port.neighbours:
                     self._say_record(port, self.gateway)
@@ -284,13 +334,15 @@ class Tree:
         for port in self.ports.values():
             if any(now - each.heard_at >= DEAD for each in port.neighbours.values()):
                 port.neighbours = {place: each for place, each in port.neighbours.items() if now - each.heard_at < DEAD}
+            if any(now - each.heard_at >= DEAD for each in port.leaves.values()):
+                port.leaves = {place: each for place, each in port.leaves.items() if now - each.heard_at < DEAD}
             if any(now - last >= PROBE_MEMORY for _, last in port.probes.values()):
                 port.probes = {place: at for place, at in port.probes.items() if now - at[1] < PROBE_MEMORY}
         for gateway in [gateway for gateway, record in self._records.items() if now - record.at >= _RECORDS_KEPT]:
             if gateway not in self._members:
                 del self._records[gateway]
 
-    def _map(self) -> None:
+    def _map(self, now: int) -> None:
         heard = {gateway: record.heard for gateway, record in self._records.items()}
         edges = edges_from(self.gateway, heard | {self.gateway: self._heard})
         if edges != self.edges:
@@ -298,6 +350,18 @@ class Tree:
             self._chosen = tree(edges)
             self._members = {place[0] for edge in edges for place in edge}
             self._mesh_hash = digest(sorted(edges))
+            root = min(self._members, default=self.gateway)
+            if root != self.root:
+                self.root = root
+                self._tell_leaves(now + 1)  # what was said in this very instant is older
+
+    def _tell_leaves(self, at: int) -> None:
+        """What they know of us is wrong: nothing passes before they know better, or are gone."""
+        self._rooted_at = at
+        for port in self.ports.values():
+            if port.leaves:
+                port.heeded_since = None
+                port.say_at = at
 
     def _judge(self, now: int, port: Port) -> None:
         view = (self._mesh_hash, frozenset(port.neighbours))
@@ -306,11 +370,13 @@ class Tree:
             agreement = digest(self._mesh_hash, sorted([(self.gateway, port.number), *port.neighbours]))
             port.agreement = agreement
             port.agreed_since = None
-            port.say_at = min(port.say_at, max(now, port.said_at + _APART))
+            port.say_at = min(port.say_at, max(now, port.said_at + APART))
         if not self._agreed(now, port):
             port.agreed_since = None
         elif port.agreed_since is None:
             port.agreed_since = now
+        if port.heeded_since is None and all(each.acked_at >= self._rooted_at for each in port.leaves.values()):
+            port.heeded_since = now
         state = self._state(now, port)
         in_tree = self._in_tree(port, state)
         port.until = self._until(port, state)
@@ -330,6 +396,8 @@ class Tree:
             return State.LOOP
         if now < port.opened_at + LISTEN:
             return State.LISTENING
+        if port.heeded_since is None or now < port.heeded_since + SETTLE:
+            return State.CONVERGING
         if not port.neighbours:
             return State.ALONE
         if port.agreed_since is None:
@@ -375,11 +443,10 @@ class Tree:
     def _say(self, now: int, port: Port) -> None:
         self._count = (self._count + 1) & 0xFFFF
         self._sent.append((self._count, now))
-        latest = sorted(port.neighbours.items(), key=lambda item: item[1].heard_at)
-        acks = list({gateway: each.count for (gateway, _), each in latest}.items())
-        for at in range(0, max(len(acks), 1), _ACKS):
-            packed = b"".join(_ACK.pack(*each) for each in acks[at : at + _ACKS]).ljust(18, b"\0")
-            bridge = Bridge(self.gateway, port.number, self._count, port.agreement, packed)
+        latest = sorted([*port.neighbours.items(), *port.leaves.items()], key=lambda item: item[1].heard_at)
+        acks = list({sender: each.count for (sender, _), each in latest}.items())
+        for packed in packed_acks(acks, _ACKS):
+            bridge = Bridge(self.gateway, port.number, self._count, port.agreement, self.root, packed)
             self._actions.append(Say(port.number, bridge))
         while now - self._sent[0][1] > LEASE:
             self._sent.popleft()
@@ -393,7 +460,7 @@ class Tree:
     def _tick(self, port: Port) -> int:
         if port.state is State.LISTENING:
             return TICK_LISTENING
-        return TICK if port.neighbours else TICK_ALONE
+        return TICK if port.neighbours or port.leaves else TICK_ALONE
 
     def _say_record(self, port: Port, gateway: int) -> None:
         if gateway == self.gateway:

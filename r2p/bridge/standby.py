@@ -1,0 +1,254 @@
+"""A module that is no gateway, with several links: it uses each topic on one of those that gateways join.
+
+What a link is told of a topic is NOTHING where another one is used (`r2p.protocols.bridging.homes`), and others see
+the module's nodes there as gateways tell of them. A topic that a link can't carry, as its name or its messages are too
+long, takes the next link that can.
+"""
+
+from collections.abc import Callable
+
+from r2p.bridge import probes
+from r2p.clock import Alarm
+from r2p.codecs import UnknownType, management
+from r2p.errors import DecodeError
+from r2p.protocols.bridging.homes import Homes
+from r2p.topic import Topic, TopicSpace
+from r2p.transports.announce import NOTHING, Told
+from r2p.transports.link import Link
+
+_KINDS = (0x11, 0x50, 0x60, 0x61, 0x62)  # ALIVE, HELLO, and what gateways say
+_ALL: frozenset[int] = frozenset()
+
+
+class HomePort:
+    """One link: where hellos of gateways come in, and where it is decided what the link is told."""
+
+    def __init__(self, standby: "Standby", link: Link, number: int) -> None:
+        self.link = link
+        self.number = number
+        self.generation = -1
+        """Of what was known of the modules there when it was looked at last."""
+        self._standby = standby
+
+    def heard(self, data: bytes) -> bool:
+        return self._standby.heard(self, data)
+
+    def wish(self, topic: Topic, own: Told) -> Told:
+        return own if self._standby.uses(topic, self) else NOTHING
+
+    @property
+    def speaks(self) -> bool:
+        return not self._standby.homes.is_twin(self.number)
+
+    @property
+    def shares(self) -> bool:
+        return self._standby.homes.speaks
+
+    def looked(self) -> None:
+        self._standby.looked(self)
+
+
+class Standby:
+    """The links of one module. `told(link, kind, text, trouble)` is called with news for the user."""
+
+    def __init__(self, space: TopicSpace, instance: int, told: Callable[[Link, str, str, bool], None]) -> None:
+        self.homes = Homes(instance)
+        self._space = space
+        self._instance = instance
+        self._told = told
+        self._ports: dict[str, HomePort] = {}  # by the name of the link
+        self._by_number: dict[int, HomePort] = {}
+        self._attached = 0
+        self._changes = 0
+        self._used = self.homes.used(0, _ALL)
+        self._without: dict[str, frozenset[int]] = {}
+        self._unable: dict[tuple[int, int], frozenset[int]] = {}
+        self._guarding = False
+        self._alarm = Alarm(space.loop, self._poll)
+
+    # Links
+
+    def attach(self, link: Link) -> None:
+        """The module has a link, up or not yet; those that come first are preferred."""
+        self._attached += 1
+        port = HomePort(self, link, self._attached)
+        self._ports[link.name] = self._by_number[port.number] = port
+        self._unable.clear()
+        link.gate = port
+
+    def detach(self, link: Link) -> None:
+        """It does not have it any more."""
+        port = self._ports.pop(link.name)
+        del self._by_number[port.number]
+        self._unable.clear()
+        self.homes.shut(self._now(), port.number)
+        self.homes.forget(port.number)
+        self._act()
+
+    def link_changed(self, link: Link) -> None:
+        """It went up or down."""
+        port = self._ports.get(link.name)
+        if port is None:
+            return
+        if link.up:
+            self.homes.open(self._now(), port.number, lone=link.lone)
+        else:
+            self.homes.shut(self._now(), port.number)
+            link.stands_by = ""
+        self._act()
+        if link.up and port.number not in self._used:
+            self._retell([link])
+
+    def close(self) -> None:
+        self._alarm.close()
+
+    # What comes in
+
+    def heard(self, port: HomePort, data: bytes) -> bool:
+        """A management message; True if discovery need not see it."""
+        kind = data[-1] if len(data) == management.SIZE else 0
+        if kind not in _KINDS:
+            return False
+        try:
+            message = management.decode(data)
+        except (DecodeError, UnknownType):
+            return False
+        ours = self._heard(self._now(), port, message, data)
+        if ours:
+            self._act()
+        return ours
+
+    def _heard(self, now: int, port: HomePort, message: management.Management, data: bytes) -> bool:
+        match message:
+            case management.Bridge():
+                self.homes.bridge(now, port.number, message)
+            case management.Leaf(self._instance):
+                self.homes.leaf(now, port.number, message)
+            case management.Hello(_, self._instance, hops=0) | management.Alive(self._space.module):
+                return self.homes.heard_ourselves(now, port.number)
+            case management.Alive() if (probe := probes.decode(data)) is not None and probe[0] == self._instance:
+                self.homes.probed(now, port.number, probe[1])
+            case management.Leaf() | management.Mesh():
+                pass
+            case _:
+                return False
+        return True
+
+    def looked(self, port: HomePort) -> None:
+        """Discovery may have learnt who is at the other end, or how long messages are of which we did not know it."""
+        if port.link.lone and port.link.discovery.generation != port.generation:
+            port.generation = port.link.discovery.generation
+            ends = [info.instance for info in port.link.discovery.modules.values() if info.r2p and not info.hops]
+            self.homes.ended(self._now(), port.number, ends[0] if len(ends) == 1 else None)
+            self._act()
+        if len(self._used) == len(self.homes.by_number):
+            return
+        for topic in list(self._space.topics.values()):
+            if topic.layout is None and self._without.get(topic.name, _ALL) != self._unable_for(topic):
+                self._retell_topic(topic)
+
+    # Topics
+
+    def uses(self, topic: Topic, port: HomePort) -> bool:
+        """Whether the topic takes this link; one that is down keeps what it had, until it is up again."""
+        if port.number not in self.homes.by_number:
+            return True
+        without = self._without[topic.name] = self._unable_for(topic)
+        topic.guard = self._guard_of(topic) if self._guarding else None
+        return port.number in without or port.number in self.homes.used(self._now(), without)
+
+    def _unable_for(self, topic: Topic) -> frozenset[int]:
+        """The links that can't carry it."""
+        size = topic.layout.size if topic.layout is not None else 0
+        if not size:
+            infos = (port.link.discovery.topics.get(topic.name) for port in self._by_number.values())
+            size = max((info.size for info in infos if info is not None), default=0)
+        key = len(topic.name), size
+        if key not in self._unable:
+            self._unable[key] = frozenset(
+                number
+                for number, port in self._by_number.items()
+                if key[0] > port.link.longest_name or (size and port.link.refusal(size))
+            )
+        return self._unable[key]
+
+    def _guard_of(self, topic: Topic) -> Callable[[str], bool]:
+        """Asked before each message while gateways consent to the use of several links for a while only: a module that
+        was stopped must not go on with them. Says whether the message came in by a link that is not used any more.
+        """
+
+        def guard(link: str) -> bool:
+            if self._now() >= self.homes.until:
+                self._poll()
+            port = self._ports.get(link)
+            return port is not None and not self.uses(topic, port)
+
+        return guard
+
+    # What follows
+
+    def _now(self) -> int:
+        return self._space.clock.monotonic()
+
+    def _poll(self) -> None:
+        self.homes.poll(self._now())
+        self._act()
+
+    def _act(self) -> None:
+        for number, message in self.homes.take():
+            link = self._by_number[number].link
+            if link.up and message is not None:
+                link.write_management(management.encode(message), urgent=True)
+            elif link.up and link.passes_probes:
+                link.write_management(probes.encode(self._instance, number))
+        guarding = self.homes.guards
+        if self.homes.changes != self._changes or guarding != self._guarding:
+            self._changes = self.homes.changes
+            self._guarding = guarding
+            self._choose()
+        for number, port in self._by_number.items():
+            if port.link.up:
+                self._tell_user(number, port.link)
+        self._alarm.set(self.homes.next_deadline())
+
+    def _choose(self) -> None:
+        """Other links are used than before."""
+        before, self._used = self._used, self.homes.used(self._now(), _ALL)
+        for number in before - self._used:
+            port = self._by_number.get(number)
+            if port is not None and port.link.up:
+                port.link.stats.lost["standing by"] += port.link.discard()
+        links = [port.link for port in self._by_number.values() if port.link.up]
+        self._retell(links)
+
+    def _retell(self, links: list[Link]) -> None:
+        for topic in list(self._space.topics.values()):
+            for link in links:
+                link.topic_changed(topic)
+
+    def _retell_topic(self, topic: Topic) -> None:
+        for port in list(self._by_number.values()):
+            if port.link.up:
+                port.link.topic_changed(topic)
+
+    def _tell_user(self, number: int, link: Link) -> None:
+        if number in self._used:
+            if link.stands_by:
+                link.stands_by = ""
+                self._told(link, "used", "is used again", False)
+            return
+        other = self.homes.stands_by_for(number)
+        if other is not None and not link.stands_by:
+            link.stands_by = self._reason(number, self._by_number[other])
+            self._told(link, "stands by", link.stands_by, False)
+
+    def _reason(self, number: int, other: HomePort) -> str:
+        if self.homes.is_twin(number):
+            return f"stands by: it leads to the same network as {other.link.name}"
+        if self.homes.by_number[number].end is not None:
+            return f"stands by: it leads to the same module as {other.link.name}"
+        link = self._by_number[number].link
+        gateways = {gateway for gateway, _ in self.homes.by_number[number].gateways}
+        names = [info.name for info in link.discovery.modules.values() if info.instance in gateways]
+        joins = f"gateway {names[0]} joins" if len(names) == 1 else "gateways join"
+        return f"stands by: {joins} its network to that of {other.link.name}"

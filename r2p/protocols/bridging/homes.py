@@ -1,0 +1,240 @@
+"""The links of a module that is no gateway: which of them it uses, so that it gives and gets nothing twice.
+
+Where gateways join two of its networks, a message that it sent by both links would arrive twice, and so would one that
+it took from both. So of links that lead into one mesh of gateways it uses the first one, and the others stand by. It
+knows by BRIDGE, in which each gateway tells the root of its mesh. Where the roots differ it uses both; but gateways
+might join those meshes at any time. So it says LEAF there, and uses more than one only while every gateway there has
+acknowledged that within a lease: for before a gateway forwards in another mesh, all who said LEAF know of it (`tree`).
+
+A link without gateways is used without more ado; whether there are any is known after LISTEN, or at once where the link
+has only one other end. What was unused until now waits for SETTLE, for what is on its way. One link is always used.
+"""
+
+from collections import deque
+
+from r2p.codecs.management import Bridge, Leaf
+from r2p.protocols.bridging.choice import FOR_EVER, Choice, Heard, Home
+from r2p.protocols.bridging.tree import (
+    APART,
+    DEAD,
+    LEASE,
+    LISTEN,
+    TICK,
+    TICK_LISTENING,
+    acknowledged,
+    is_late,
+    packed_acks,
+)
+
+TWIN_MEMORY = 7_000_000_000
+"""Ns after which two links that led to one network are not believed to do so any more, unless it shows again."""
+
+_ACKS = 3
+_SUSPICION = 1_000_000_000  # ns in which an answer comes when we ask whose voice we hear
+_LINGER = 1_000_000_000  # ns in which LEAF goes on after its use has ended: there may be some who wait for an answer
+
+
+class Homes:
+    """The links of one module; links have numbers, in the order in which they are preferred.
+
+    Every method takes `now` (monotonic ns). `take` gives what to say, as number and LEAF (None: a probe, which gateways
+    of firmware pass on); `changes` counts how often other links were chosen.
+    """
+
+    def __init__(self, instance: int) -> None:
+        self.by_number: dict[int, Home] = {}
+        self.changes = 0
+        self.until = FOR_EVER
+        """The instant (monotonic ns) at which a choice ends by itself: nobody must go on with it after that."""
+        self._instance = instance or 1
+        self._choices: dict[frozenset[int], Choice] = {}
+        self._needed_at = -FOR_EVER
+        self._count = 0
+        self._sent: deque[tuple[int, int]] = deque()  # count, instant
+        self._looked_at = 0
+        self._says: list[tuple[int, Leaf | None]] = []
+
+    @property
+    def guards(self) -> bool:
+        """Whether more links are used than without the consent of gateways, until `until`."""
+        return self.until < FOR_EVER
+
+    @property
+    def speaks(self) -> bool:
+        """Whether gateways are to know of this module."""
+        return self._looked_at < self._needed_at + _LINGER
+
+    def open(self, now: int, number: int, *, lone: bool) -> None:
+        """A link is up; `lone`: it has only one other end."""
+        self.by_number[number] = Home(number, now if lone else now + LISTEN)
+        self._look(now)
+
+    def shut(self, now: int, number: int) -> None:
+        """It is down."""
+        if self.by_number.pop(number, None) is not None:
+            for choice in self._choices.values():
+                choice.forget(number)
+            self._look(now)
+
+    def forget(self, number: int) -> None:
+        """There is no such link any more."""
+        self._choices = {key: choice for key, choice in self._choices.items() if number not in key}
+
+    def used(self, now: int, without: frozenset[int]) -> frozenset[int]:
+        """The links to use for what all can carry but those."""
+        choice = self._choices.get(without)
+        if choice is None:
+            choice = self._choices[without] = Choice(without)
+            self._look(now)
+        return choice.used
+
+    def bridge(self, now: int, number: int, message: Bridge) -> None:
+        """A BRIDGE was heard."""
+        home = self.by_number.get(number)
+        if home is None or not message.gateway:
+            return
+        place = (message.gateway, message.port)
+        known = home.gateways.get(place)
+        if known is not None and is_late(message.count, known.count):
+            return
+        home.eager |= known is None or known.root != message.root
+        acked_at = acknowledged(message.acks, self._instance, self._sent)
+        if known is not None:
+            acked_at = max(acked_at, known.acked_at)
+        home.gateways = home.gateways | {place: Heard(now, message.count, message.root, acked_at)}
+        self._look(now)
+
+    def heard_ourselves(self, now: int, number: int) -> bool:
+        """What this module said came in by this link. True if it may come from another one: LEAF or a probe will tell.
+
+        False: it is an echo, or there is somebody else of our name.
+        """
+        home = self.by_number.get(number)
+        if home is None or len(self.by_number) < 2 or home.echoes:
+            return False
+        if home.twins or home.loops or home.contested(now):
+            home.suspected_at = FOR_EVER
+        else:
+            home.suspected_at = min(home.suspected_at, now)
+        for each in self.by_number.values():
+            each.asks = True
+        self._look(now)
+        return now < home.suspected_at + _SUSPICION
+
+    def ended(self, now: int, number: int, instance: int | None) -> None:
+        """Who is at the other end of a line. Where two lines lead to one module, the one of the two that has the lower
+        instance gives up one of them; the other just notices that nothing is wanted there any more.
+        """
+        home = self.by_number.get(number)
+        if instance is not None and instance < self._instance:
+            instance = None
+        if home is not None and home.end != instance:
+            home.end = instance
+            self._look(now)
+
+    def probed(self, now: int, number: int, low: int) -> None:
+        """Our own probe came in, that was sent by a link whose number modulo 13 is `low`."""
+        home = self.by_number.get(number)
+        if home is not None:
+            others = [other for other in self.by_number if other != number and other % 13 == low]
+            home.loops = home.loops | dict.fromkeys(others, now)
+            self._look(now)
+
+    def leaf(self, now: int, number: int, message: Leaf) -> None:
+        """Our own LEAF was heard."""
+        home = self.by_number.get(number)
+        if home is None:
+            return
+        home.echoes = message.port == number & 0xFF
+        for other in self.by_number:
+            if other != number and other & 0xFF == message.port:
+                home.twins = home.twins | {other: now}
+        self._look(now)
+
+    def is_twin(self, number: int) -> bool:
+        """Whether it leads to the network of a link that is preferred."""
+        home = self.by_number.get(number)
+        return home is not None and any(other < number for other in home.twins)
+
+    def stands_by_for(self, number: int) -> int | None:
+        """The link that leads to the same modules and is preferred."""
+        home = self.by_number.get(number)
+        if home is None:
+            return None
+        others = [each for each in self.by_number.values() if not each.leads_to.isdisjoint(home.leads_to)]
+        return min((each.number for each in others if each.number < number), default=None)
+
+    def take(self) -> list[tuple[int, Leaf | None]]:
+        says, self._says = self._says, []
+        return says
+
+    def poll(self, now: int) -> None:
+        """See who has fallen silent, and say what is due."""
+        self._look(now)
+        for home in self.by_number.values():
+            if self._due(home) <= now:
+                self._say(now, home)
+
+    def next_deadline(self) -> int | None:
+        """When to call `poll`."""
+        now = self._looked_at
+        dues = [choice.next_deadline(now) for choice in self._choices.values()]
+        if len(self.by_number) > 1:
+            for home in self.by_number.values():
+                dues.append(self._due(home))
+                dues += [each.at + DEAD for each in home.gateways.values()]
+                dues += [at + TWIN_MEMORY for at in (*home.twins.values(), *home.loops.values())]
+                dues += [home.known_at] if now < home.known_at else []
+        due = min(dues, default=FOR_EVER)
+        return due if due < FOR_EVER // 2 else None
+
+    def _look(self, now: int) -> None:
+        self._looked_at = now
+        for home in self.by_number.values():
+            self._bury(now, home)
+        homes = [home for _, home in sorted(self.by_number.items())]
+        for choice in self._choices.values():
+            before = choice.used
+            if choice.choose(now, homes):
+                self._needed_at = now
+            self.changes += choice.used != before
+        self.until = min((choice.until for choice in self._choices.values()), default=FOR_EVER)
+
+    def _bury(self, now: int, home: Home) -> None:
+        """Gateways that were silent for so long are gone, or not heard: listen again before that is believed."""
+        if any(now - each.at >= DEAD for each in home.gateways.values()):
+            home.gateways = {place: each for place, each in home.gateways.items() if now - each.at < DEAD}
+            if not home.gateways:
+                home.known_at = now + LISTEN
+        if home.twins or home.loops:
+            home.twins, home.loops = self._fresh(now, home.twins), self._fresh(now, home.loops)
+
+    def _fresh(self, now: int, others: dict[int, int]) -> dict[int, int]:
+        return {other: at for other, at in others.items() if other in self.by_number and now - at < TWIN_MEMORY}
+
+    def _due(self, home: Home) -> int:
+        """When to say LEAF."""
+        now = self._looked_at
+        if now < home.known_at and sum(each.contested(now) for each in self.by_number.values()) > 1:
+            tick = TICK_LISTENING
+        elif home.gateways and self.speaks:
+            tick = TICK
+        elif home.asks:
+            return now
+        else:
+            return FOR_EVER
+        return home.said_at + (APART if home.eager else tick)
+
+    def _say(self, now: int, home: Home) -> None:
+        self._count = (self._count + 1) & 0xFFFF
+        self._sent.append((self._count, now))
+        while now - self._sent[0][1] > LEASE:
+            self._sent.popleft()
+        latest = sorted(home.gateways.items(), key=lambda item: item[1].at)
+        acks = list({gateway: each.count for (gateway, _), each in latest}.items())
+        for packed in packed_acks(acks, _ACKS):
+            self._says.append((home.number, Leaf(self._instance, home.number & 0xFF, self._count, packed)))
+        if home.asks:
+            self._says.append((home.number, None))
+        home.said_at = now
+        home.eager = home.asks = False

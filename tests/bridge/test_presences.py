@@ -1,0 +1,62 @@
+"""What a gateway tells of the modules behind it, and when."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+import r2p
+from r2p.codecs import management
+from r2p.msg import Led
+from tests.bridge.test_bridge import Tap, gateway, node
+
+pytestmark = pytest.mark.virtual_time
+
+AT_ONCE = 0.05
+
+
+async def test_whoever_is_new_gets_everything_at_once() -> None:
+    async with gateway(), node("A", "a") as a:
+        a.advertise("leds", Led)
+        await asyncio.sleep(3.2)
+        async with r2p.Module("B", via="memory:b") as b:
+            await asyncio.sleep(AT_ONCE)
+            assert [str(each.module) for each in b.network.topics()["leds"].publishers] == ["A"]
+
+
+async def test_whoever_asks_gets_everything_at_once() -> None:
+    async with gateway(), node("A", "a") as a, r2p.Module("B", via="memory:b") as b:
+        a.advertise("leds", Led)
+        await asyncio.sleep(3.2)
+        (link,) = b.links
+        before = link.discovery.modules["A"]
+        b.query()
+        await asyncio.sleep(AT_ONCE)
+        assert link.discovery.modules["A"].last_heard > before.last_heard
+
+
+async def test_who_asks_often_is_answered_now_and_then() -> None:
+    async with gateway(), node("A", "a") as a, r2p.Module("B", via="memory:b") as b:
+        a.advertise("leds", Led)
+        await asyncio.sleep(3.2)
+        tap = Tap("b")
+        for _ in range(100):
+            b.query()
+            await asyncio.sleep(0.01)
+        told = [message for message in tap.heard if isinstance(message, management.Hello) and message.module == "A"]
+        assert 4 <= len(told) <= 8
+
+
+async def test_firmware_that_was_heard_lately_is_told_and_not_one_that_is_silent() -> None:
+    async with gateway():
+        firmware = Tap("a")
+        firmware.say(management.Alive("OLD"))
+        await asyncio.sleep(3.0)
+        firmware.say(management.Alive("IMU1"))
+        await asyncio.sleep(1.0)
+        async with r2p.Module("B", via="memory:b") as b:
+            await asyncio.sleep(AT_ONCE)
+            names = {view.name for view in b.network.modules()}
+            assert "IMU1" in names
+            assert "OLD" not in names
