@@ -63,7 +63,7 @@ class Lane:
         """Send what waits; zenoh drops it where the network is too slow. `error`: the session is closed."""
         waiting, self.waiting = self.waiting, []
         serial = self.flow.serial - len(waiting) + 1
-        for samples in _packets(waiting) if batching else [[each] for each in waiting]:
+        for samples in _packets(waiting) if batching and len(waiting) > 1 else [[each] for each in waiting]:
             try:
                 size = self._send(samples, serial)
             except error:
@@ -97,9 +97,6 @@ class Lane:
 
 def _packets(samples: list[Sample]) -> Iterator[list[Sample]]:
     """What goes out together: messages of one size that count on, and that one header is true for."""
-    if len(samples) == 1:
-        yield samples
-        return
     for _, alike in groupby(enumerate(samples), _kind):
         run = [sample for _, sample in alike]
         most = max(1, _LONGEST // max(1, len(run[0].data)))
