@@ -209,9 +209,9 @@ class Session:
     async def settle(self, wait: float | None = None, *, of: str = "topics") -> None:
         """Listen to the network until the others have told what they have, or for `wait` seconds.
 
-        `of` is what it listens for, in words. r2p modules are asked and answer at once, gateways for those behind them;
-        firmware repeats itself step by step. Where there may be more to come, that is said. Raises r2p.TransportError if
-        no link comes up.
+        `of` is what it listens for, in words. r2p modules are asked and answer at once, gateways for those behind
+        them; firmware repeats itself step by step. Where there may be more to come, that is said. Raises
+        r2p.TransportError if no link comes up.
         """
         if not self.settings.via:
             return
