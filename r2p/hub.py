@@ -108,12 +108,12 @@ class ModuleHub:
 
     def link_waits(self, link: Link, reason: str) -> None:
         """The link can't be had yet."""
-        logger.warning("link %s: %s; trying again", link.name, reason)
+        logger.warning("link %s: %s; trying again", link.title, reason)
         self._events.tell(LinkWaits(link.name, reason))
 
     def link_notice(self, link: Link, kind: str, text: str, *, trouble: bool) -> None:
         """Something on the link is worth telling."""
-        logger.log(logging.WARNING if trouble else logging.INFO, "link %s: %s", link.name, text)
+        logger.log(logging.WARNING if trouble else logging.INFO, "link %s: %s", link.title, text)
         self._events.tell(LinkNotice(link.name, kind, text))
 
     def close(self) -> None:
@@ -140,11 +140,11 @@ class ModuleHub:
             if lost:
                 meanwhile += f"; {lost} messages lost meanwhile"
             expected = self.observer and first and outage < _PROMPT
-            logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.name, meanwhile)
+            logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.title, meanwhile)
             self._events.tell(LinkUp(link.name, outage, lost))
         else:
             abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
-            logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.name, reason)
+            logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.title, reason)
             self._events.tell(LinkDown(link.name, reason))
         self._joints.link_changed(link)
 
@@ -159,10 +159,10 @@ class ModuleHub:
             case OrderDenied():
                 self._tell_denied(link, event)
             case NameConflict():
-                logger.error("link %s: two modules carry the name %s: rename one (--module)", link.name, event.module)
+                logger.error("link %s: two modules carry the name %s: rename one (--module)", link.title, event.module)
                 self._events.tell(event)
             case Echoes():
-                logger.error("link %s gives back what we send: switch off local echo at the other end", link.name)
+                logger.error("link %s gives back what we send: switch off local echo at the other end", link.title)
             case ModuleChanged():
                 self._suspect_namesakes(link, event.info)
                 self._events.tell(event)
@@ -182,7 +182,7 @@ class ModuleHub:
         now = self.space.clock.monotonic()
         if now - self._mismatches.get((link.name, event.topic), -_APART) >= _APART:
             self._mismatches[link.name, event.topic] = now
-            logger.error("link %s: topic %s is refused: %s", link.name, event.topic, describe_mismatch(event))
+            logger.error("link %s: topic %s is refused: %s", link.title, event.topic, describe_mismatch(event))
 
     def _tell_gone(self, link: Link, event: ModuleGone) -> None:
         """A module on the link itself is gone. While the link is up that is news; without a good-bye it is trouble."""
@@ -190,7 +190,7 @@ class ModuleHub:
         if link.up and not info.observer and not info.hops:
             silence = f": nothing heard of it for {info.lease / 1e9:.0f} s; does it hang?" if event.silent else ""
             level = logging.WARNING if event.silent else logging.INFO
-            logger.log(level, "link %s: module %s is gone%s", link.name, info.name, silence)
+            logger.log(level, "link %s: module %s is gone%s", link.title, info.name, silence)
         self._events.tell(event)
 
     # Names

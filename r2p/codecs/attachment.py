@@ -1,4 +1,4 @@
-"""The header of a message on zenoh: what the payload, which is the packed message and nothing else, does not say.
+"""The header of messages on zenoh: what the payload, which is one packed message or several, does not say.
 
 It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by what stays the same from message to
 message of one publisher, the origin; so a reader looks that up in a table, and decodes it once. What a publisher sends
@@ -39,6 +39,7 @@ FLAG_RESTAMPED = 1
 FLAG_CLOCK = 2
 
 SERIAL_WRAP = 0xFFFFFFFF
+_SEQUENCE_MOST = 0xFFFFFFFFFFFFFFFF
 
 _FIXED = struct.Struct("<BBBBIQqq")
 _CLOCK = struct.Struct("<IqI")
@@ -46,9 +47,6 @@ _ORIGIN = struct.Struct("<BII8s")
 _CREDIT = struct.Struct("<BBII")
 _unpack = _FIXED.unpack_from
 _pack_start = struct.Struct("<IIQqq").pack
-
-START = VERSION
-"""What almost all headers begin with, as a number: this version, no flags, no hops, one message."""
 
 PACKET_MOST = 256
 """Messages in one payload."""
@@ -105,7 +103,7 @@ class Header(msgspec.Struct, frozen=True, gc=False):
 
 
 class Packer:
-    """Headers without a clock part, of one origin; `start` is `START` or what `start_of` says."""
+    """Headers without a clock part, of one origin; `start` is what `start_of` says."""
 
     __slots__ = ("_pack", "_tail", "origin")
 
@@ -172,6 +170,8 @@ class Reader(Generic[T]):
                 raise DecodeError("the header ends in its stamps")
             stamps += _stamps(more).unpack_from(data, at)
             at += 8 * more
+        if sequence + more > _SEQUENCE_MOST:
+            raise DecodeError("the sequence ends in this packet")
         tail = data[at:]
         known = self.known.get(tail)
         if known is None:

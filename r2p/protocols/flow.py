@@ -110,6 +110,10 @@ class Inflow:
         """The sender is gone: should it come back, it knows nothing of us, so its first message is answered."""
         self.until_credit = 1
 
+    def skipped(self, count: int) -> None:
+        """So many were lost: the next one that the queues take is told of in good time."""
+        self.until_credit = max(1, self.until_credit - count)
+
     def credited(self) -> None:
         """The sender is told now: so when next?"""
         self.until_credit = self._share

@@ -146,6 +146,11 @@ class Link(abc.ABC):
         self._unreachable = ""
         self._closed = False
 
+    @property
+    def title(self) -> str:
+        """Its name as it stands in texts."""
+        return self.name.removesuffix(":")
+
     # For the transport that owns the link
 
     def went_up(self) -> None:
@@ -174,7 +179,8 @@ class Link(abc.ABC):
         self.up = False
         self._down_at = self._clock.monotonic()
         self._lost_at_down = self.stats.lost["link down"]
-        self.stats.lost["link down"] += self.discard()
+        lost = self.discard()  # which counts, too, what waited for room
+        self.stats.lost["link down"] += lost
         self._hub.link_changed(self, reason, 0.0, 0)
         carried = [publisher for outlet in self._outlets.values() for publisher in outlet.topic.publishers]
         self._apply(self.discovery.link_down(self._down_at))

@@ -91,7 +91,7 @@ async def test_a_link_comes_back(r2p_network: Network, caplog: pytest.LogCapture
             await asyncio.sleep(0.1)
         link.went_up()
     logged = next(text for text in caplog.messages if "messages lost meanwhile" in text)
-    assert _told(logged.removeprefix(f"link {link.name} "))
+    assert _told(logged.removeprefix(f"link {link.title} "))
 
 
 @pytest.mark.virtual_time

@@ -38,6 +38,11 @@ class Burst:
             return
         lane.send(self._stats, self._error, batching=self._batching)
 
+    def send(self, lane: Lane) -> None:
+        """Send what waits in this one."""
+        if self._lanes.pop(lane, lane) is None:
+            lane.send(self._stats, self._error, batching=self._batching)
+
     def flush(self) -> None:
         """Send what waits."""
         lanes, self._lanes = self._lanes, {}
@@ -60,7 +65,7 @@ class Burst:
         if self._begun:
             self._loop.call_soon(self._end)
         self._turns += 1
-        if count > self._count and self._turns < TURNS:
+        if self._batching and count > self._count and self._turns < TURNS:
             self._count = count
         else:
             self.flush()

@@ -1,7 +1,7 @@
-"""One class of one topic on its way out: what waits for the end of the turn, and how it is sent.
+"""One class of one topic on its way out: what waits for others to go with it, and how it is sent.
 
-What a publisher sends in one turn of the event loop goes out in one packet of zenoh: a payload of messages one after
-the other, each as it is, and one header for all (r2p.codecs.attachment). Giving zenoh each for itself would take both
+What a publisher sends without a pause goes out in few packets of zenoh, each a payload of messages one after
+the other, each as it is, with one header for all (r2p.codecs.attachment). Giving zenoh each for itself would take both
 ends longer than all the rest of what they do.
 """
 
@@ -39,7 +39,7 @@ def nowhere(data: bytes, *, attachment: bytes) -> None:
 class Lane:
     """The way of one class, for one publisher at a time."""
 
-    __slots__ = ("_origin", "_packer", "_put", "flow", "source", "urgent", "waiting")
+    __slots__ = ("_packer", "_put", "flow", "source", "urgent", "waiting")
 
     def __init__(self, flow: "Outflow", *, urgent: bool) -> None:
         self.flow = flow
@@ -48,14 +48,12 @@ class Lane:
         self.source: Source | None = None
         self.waiting: list[Sample] = []
         """Each has been given its serial in the flow already: the last one is the flow's last."""
-        self._origin = _NOBODY.origin
         self._packer = _NOBODY
         self._put: Put = nowhere
 
     def prepare(self, source: Source, origin: Origin, put: Put) -> None:
         """Another publisher is next; nothing of the one before waits any more."""
         self.source = source
-        self._origin = origin
         self._packer = Packer(origin)
         self._put = put
 
@@ -90,7 +88,7 @@ class Lane:
             stamps = [each.stamp for each in samples]
             return self._packer.several(start, serial, first.sequence, first.deadline, stamps)
         more = tuple([each.stamp for each in samples[1:]])
-        origin, clock = self._origin, first.clock
+        origin, clock = self._packer.origin, first.clock
         header = Header(origin, serial, first.sequence, first.stamp, first.deadline, hops, first.stamped, clock, more)
         return encode(header)
 

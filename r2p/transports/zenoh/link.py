@@ -3,7 +3,7 @@
 Keys, all under `r2p/NETWORK/`:
 
     live/...                what each module has, as liveliness tokens (r2p.codecs.liveliness)
-    topic/TOPIC             messages: the packed bytes, the rest in the attachment (r2p.codecs.attachment)
+    topic/TOPIC             messages: one or several, packed; the rest is in the attachment (r2p.codecs.attachment)
     credit/SESSION          to a publisher's module: how far a subscriber has come
     control/SESSION         management messages, from a module to all
     schema/SESSION/TYPE     asks a module for the fields of a type, by fingerprint
@@ -31,7 +31,7 @@ from r2p.transports.zenoh.outlet import ZenohOutlet
 from r2p.transports.zenoh.reach import Reach
 from r2p.transports.zenoh.senders import Senders
 from r2p.transports.zenoh.session import ErrorOfZenoh, Funnel, Session, Tap
-from r2p.transports.zenoh.stream import MOST
+from r2p.transports.zenoh.stream import RING
 from r2p.transports.zenoh.streams import Streams
 from r2p.transports.zenoh.tokens import Tokens
 
@@ -233,6 +233,7 @@ class ZenohLink(Link):
             outlet.joined(session, window)
             outlet.welcome()
         else:
+            self.burst.flush()  # of an outlet before it, with whose numbers it goes on
             outlet = self._outlets[name] = ZenohOutlet(self, topic)
             outlet.joined(session, window)
             topic.join(outlet)
@@ -268,7 +269,7 @@ class ZenohLink(Link):
     def _subscribe(self, topic: str, arrived: Callable[["zenoh.Sample"], None]) -> "Tap | None":
         if self._session is None:
             return None
-        return self._session.subscribe(f"{self.prefix}/topic/{topic}", MOST, arrived)
+        return self._session.subscribe(f"{self.prefix}/topic/{topic}", RING, arrived)
 
     def _credit(self, topic: str, origin: Origin, serial: int) -> None:
         if self._session is not None:

@@ -128,7 +128,7 @@ class ZenohOutlet(LinkOutlet):
 
     def _prepare(self, lane: Lane, sample: Sample) -> None:
         """Another publisher than before."""
-        self._burst.flush()
+        self._burst.send(lane)
         sender = self._zenoh.senders.publisher(self.topic.name, sample.publisher_class)
         layout, instance, source = self.topic.layout, self._zenoh.instance, sample.source
         origin = Origin(

@@ -1,8 +1,8 @@
-"""One zenoh session. Everything that comes from zenoh's threads enters the event loop here, in batches.
+"""One zenoh session. Everything that comes from zenoh's threads enters the event loop here.
 
-A thread waits at zenoh's channel of each subscriber. There nothing is done but to put what came into a deque, and to
-wake the loop once for a batch: no code of the user, and none of the protocols, runs outside of the loop. What blocks
-(opening, closing) runs in a thread, so the loop never waits for a network.
+A thread waits at zenoh's channel of each subscriber. There nothing is done but to hand what came to the loop: no code
+of the user, and none of the protocols, runs outside of it. What blocks (opening, closing) runs in a thread, so the loop
+never waits for a network.
 """
 
 import asyncio
@@ -90,6 +90,7 @@ class Tap:
         self._taken = 0
         self._idle = True
         self._thread_rests = False
+        self._closed = False
         self._go_on = threading.Lock()
         self._go_on.acquire()
         threads.start(self._watch)
@@ -109,6 +110,8 @@ class Tap:
             self._go_on.release()
 
     def close(self) -> None:
+        self._closed = True
+        self._thread_rests = False
         self._subscriber.undeclare()
         with contextlib.suppress(RuntimeError):  # the thread waits for a sample, not for us
             self._go_on.release()
@@ -117,7 +120,7 @@ class Tap:
         receive = self._subscriber.handler.recv
         count = 0
         with contextlib.suppress(zenoh.ZError, RuntimeError):  # it is undeclared; the loop is closed
-            while True:
+            while not self._closed:
                 sample = receive()
                 count += 1
                 rests = count - self._taken > 1

@@ -1,6 +1,6 @@
 """What comes in of one topic by zenoh, on its way to the queues.
 
-    zenoh's ring -> Tap (one wake-up of the loop for a batch) -> Stream.arrived -> Topic.deliver -> credit
+    zenoh's ring -> Tap -> Stream.arrived (packets) -> Topic.deliver (messages) -> credit
 
 A non real-time message waits for as long as its subscribers have no room: its publisher waits with it, or goes on
 without them, as its class says; that is decided there (r2p.protocols.flow). Others wait a few turns of the loop.
@@ -28,8 +28,11 @@ if TYPE_CHECKING:
     from r2p.transports.zenoh.session import Tap
     from r2p.transports.zenoh.streams import Streams
 
-MOST = 4096
-"""Messages that wait for one topic at most."""
+RING = 1024
+"""Packets of one topic that wait in zenoh at most; more would be old before they are read."""
+
+_MOST = 4096
+"""Messages of one topic that wait behind one for which there is no room."""
 
 SENDERS = 4096
 """Senders of which a stream, or the link, keeps count."""
@@ -101,7 +104,8 @@ class Stream:
         shape = _shape(self.topic)
         if shape != self._shape:
             self._shape = shape
-            self._reader = Reader(self._lane)
+            for lane in self._reader.known.values():
+                self._fit(lane)
         window = self._streams.window(self.topic)
         for (_, publisher_class), flow in self._flows.items():
             if publisher_class == _NRT and flow.window != window:
@@ -209,10 +213,12 @@ class Stream:
     def _is_good(self, lane: _Lane, serial: int, sample: Sample) -> bool:
         """Whether it is a new message of the right type; what is wrong is counted."""
         size, sequence, stamp = len(sample.data), sample.sequence, sample.stamp
+        flow, heard = lane.flow, lane.heard
         if size != lane.usual and not self._may_have(lane, size):
+            if serial == flow.next:  # it is no gap: it came, and was counted
+                flow.next = serial + 1
             return False
         lane.usual = size
-        flow, heard = lane.flow, lane.heard
         if serial == flow.next:
             flow.next = serial + 1
         elif not self._is_new(lane, serial):
@@ -260,17 +266,20 @@ class Stream:
             self._streams.stats.lost["repeated"] += 1
         elif gap:
             self._streams.count_gap(self.topic.name, lane.source, gap)
+            lane.flow.skipped(gap)
         return gap >= 0
 
     def _queue(self, lane: _Lane, serial: int, sample: Sample) -> None:
         """Another one waits for room: events and periods don't wait behind a message that does not expire."""
-        if lane.publisher_class != _NRT:
+        if lane.publisher_class != _NRT and self._queueing:
             for sink in self.topic.deliver(sample) or ():
                 sink.force(sample)
-        elif len(self._waiting) < MOST:
+            self._taken(lane, serial)
+        elif len(self._waiting) < _MOST:
             self._waiting.append((lane, serial, sample))
         else:
             self._streams.stats.lost["receive queue full"] += 1
+            lane.flow.skipped(1)
 
     def _deliver(self, lane: _Lane, serial: int, sample: Sample) -> None:
         sinks = self.topic.deliver(sample)
@@ -345,16 +354,22 @@ class Stream:
                 self._flows.clear()
             window = self._streams.window(self.topic) if origin.publisher_class == _NRT else 0
             self._flows[key] = Inflow(window)
-        fits = self._shape.fits(Shape(0, origin.fingerprint))
-        return _Lane(
+        lane = _Lane(
             origin,
             Source(origin.module, origin.node, self._streams.link),
             PublisherClass(origin.publisher_class),
             self._flows[key],
-            (self._shape.size or -1) if fits else -1,
-            fits,
+            -1,
+            False,
             self.topic.heard((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
+        self._fit(lane)
+        return lane
+
+    def _fit(self, lane: _Lane) -> None:
+        lane.fits = self._shape.fits(Shape(0, lane.origin.fingerprint))
+        lane.size = (self._shape.size or -1) if lane.fits else -1
+        lane.usual = -1
 
 
 def _parts(data: bytes, count: int) -> list[bytes]:

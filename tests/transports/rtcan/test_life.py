@@ -280,5 +280,5 @@ async def test_a_fixed_id_that_is_taken_is_waited_for_and_that_is_told_once(capl
             assert made.link("B").engine.id8 == 5
     conflicts = [line for line in caplog.messages if "another node uses" in line]
     assert conflicts == [
-        "link sim:: another node uses the id 5 of this one: it is the other's, this module waits till it is free"
+        "link sim: another node uses the id 5 of this one: it is the other's, this module waits till it is free"
     ]

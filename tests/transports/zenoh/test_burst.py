@@ -83,6 +83,19 @@ async def test_what_comes_turn_after_turn_goes_out_every_few_turns() -> None:
     assert wire.sent == [b"0", TURNS * b"1", TURNS * b"1"]
 
 
+async def test_one_topic_can_be_sent_before_the_others() -> None:
+    wire = Wire()
+    other = Lane(Outflow(), urgent=False)
+    other.prepare(HERE, ORIGIN, wire.put)
+    for data in (b"0", b"1", b"2"):
+        wire.add(data)
+    wire.burst.send(other)
+    assert wire.sent == [b"0"]
+    wire.burst.send(wire.lanes[False])
+    wire.burst.send(wire.lanes[False])
+    assert wire.sent == [b"0", b"12"]
+
+
 async def test_a_turn_that_does_not_end_is_no_reason_to_keep_all_of_it() -> None:
     wire = Wire()
     for _ in range(1 + MOST):

@@ -24,7 +24,7 @@ from r2p.transports.zenoh.link import ZenohLink
 from r2p.transports.zenoh.outlet import ZenohOutlet
 from r2p.transports.zenoh.streams import WINDOW
 from tests.transports.test_conformance import first, other, until
-from tests.transports.zenoh.cable import Net, guarded, module, plain_session
+from tests.transports.zenoh.cable import Net, ZenohCable, guarded, module, plain_session
 
 pytestmark = pytest.mark.anyio
 
@@ -85,6 +85,33 @@ async def test_a_slow_subscriber_slows_its_publisher_and_loses_nothing() -> None
         await sending
         assert (publisher.missed, subscriber.lost) == (0, 0)
         assert not link_of(alice).losses + link_of(bob).losses
+
+
+@guarded
+async def test_what_waits_for_credit_when_the_link_goes_down_is_counted() -> None:
+    async with (
+        ZenohCable() as cable,
+        r2p.Module("A", via=cable.a(), watchdog=False) as a,
+        r2p.Module("B", via=cable.b(), watchdog=False) as b,
+        node_in(a) as alice,
+        node_in(b) as bob,
+    ):
+        publisher, link = bob.advertise("leds", Led, r2p.NonRealTime(stall=30.0)), link_of(bob)
+        subscriber = alice.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+
+        async def send() -> None:
+            while link.up:
+                await publisher.publish(Led())
+
+        sending = asyncio.create_task(send())
+        await until(lambda: bool(publisher._topic.outlets[0].lines.claims))  # as its subscriber does not read
+        await cable.cut()
+        await sending
+        assert link.losses["link down"] > 0
+        assert link.stats.sent + link.losses["link down"] == publisher.sent
+        assert subscriber.queue
+        await cable.mend()
 
 
 @guarded

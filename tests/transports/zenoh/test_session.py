@@ -1,11 +1,16 @@
 """The ways from zenoh's threads into the loop."""
 
 import asyncio
+import queue
+import threading
+from collections.abc import Iterable
+from typing import Any
 
 import pytest
+import zenoh
 
 from r2p.transports.intake import TURN
-from r2p.transports.zenoh.session import Funnel
+from r2p.transports.zenoh.session import Funnel, Tap
 
 pytestmark = pytest.mark.anyio
 
@@ -26,3 +31,99 @@ async def test_a_flood_lets_others_have_their_turn() -> None:
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert taken[-1] == -1
+
+
+class Channel:
+    """Stands for zenoh's, and for the subscriber that has it."""
+
+    def __init__(self) -> None:
+        self.handler = self
+        self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def put(self, item: Any) -> None:
+        self._items.put(item)
+
+    def put_all(self, items: Iterable[Any]) -> None:
+        for item in items:
+            self.put(item)
+
+    def recv(self) -> Any:
+        item = self._items.get()
+        if item is None:
+            raise zenoh.ZError("undeclared")
+        return item
+
+    def try_recv(self) -> Any:
+        try:
+            return self._items.get_nowait()
+        except queue.Empty:
+            return None
+
+    def undeclare(self) -> None:
+        self._items.put(None)
+
+
+class Reader:
+    """Takes as a stream does: a few at a time, then it looks once more before it waits."""
+
+    def __init__(self, channel: Channel) -> None:
+        self.taken: list[Any] = []
+        self.more = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        subscriber: Any = channel
+        self.tap = Tap(subscriber, self._loop, self._arrived)
+
+    def _arrived(self, item: Any) -> None:
+        for _ in range(3):
+            self.taken.append(item)
+            self.more.set()
+            item = self.tap.take()
+            if item is None:
+                self._loop.call_soon(self._look_again)
+                return
+        self._loop.call_soon(self._arrived, item)
+
+    def _look_again(self) -> None:
+        item = self.tap.take()
+        if item is None:
+            self.tap.wait()
+        else:
+            self._arrived(item)
+
+    async def until(self, count: int) -> None:
+        while len(self.taken) < count:
+            self.more.clear()
+            await self.more.wait()
+
+
+async def test_a_tap_gives_everything_once_and_in_order_fast_or_slow() -> None:
+    channel = Channel()
+    reader = Reader(channel)
+    for number in range(1, 101):  # each for itself: the thread hands it over
+        channel.put(number)
+        await reader.until(number)
+    feeding = threading.Thread(target=channel.put_all, args=(range(101, 5001),))
+    feeding.start()  # a flood: the loop takes them itself
+    await reader.until(5000)
+    channel.put(5001)
+    await reader.until(5001)
+    assert reader.taken == list(range(1, 5002))
+    feeding.join()
+    reader.tap.close()
+
+
+@pytest.mark.parametrize("waiting", [0, 1, 5])
+async def test_the_thread_of_a_tap_ends_with_it(waiting: int) -> None:
+    before = set(threading.enumerate())
+    channel = Channel()
+    subscriber: Any = channel
+    arrived: asyncio.Queue[Any] = asyncio.Queue()
+    tap = Tap(subscriber, asyncio.get_running_loop(), arrived.put_nowait)  # never ready for a second one
+    for number in range(waiting):
+        channel.put(number)
+    if waiting:
+        assert await arrived.get() == 0
+    (thread,) = set(threading.enumerate()) - before
+    tap.close()
+    await asyncio.to_thread(thread.join)
+    assert arrived.empty()

@@ -1,0 +1,159 @@
+"""What comes in of one topic, packet by packet; a stand-in takes zenoh's place."""
+
+import asyncio
+from collections import Counter, deque
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from r2p.codecs import attachment
+from r2p.codecs.attachment import Header, Origin
+from r2p.messages import layout
+from r2p.msg import Led
+from r2p.topic import QueueSink, Topic, Waker
+from r2p.transports.intake import LinkStats
+from r2p.transports.zenoh.stream import RING
+from r2p.transports.zenoh.streams import WINDOW, Streams
+
+pytestmark = pytest.mark.virtual_time
+
+SIZE = layout(Led).size
+
+
+class Ring:
+    """A topic `leds` with a subscriber, and what waits for it in zenoh."""
+
+    def __init__(self, queue: int, *, typed: bool = True) -> None:
+        loop = asyncio.get_running_loop()
+        self.credits: list[tuple[int, int]] = []
+        self.stats = LinkStats()
+        self.waker = Waker(loop)
+        self.topic = Topic("leds", self.waker)
+        self.topic.layout = layout(Led) if typed else None
+        self._ring: deque[Any] = deque()
+        self._idle = True
+        self.streams = Streams(
+            "zenoh:",
+            loop,
+            self.stats,
+            longest=1024,
+            latched=lambda _: False,
+            credit=lambda _, origin, serial: self.credits.append((origin.publisher_class, serial)),
+            subscribe=self._subscribe,
+        )
+        self.sink = self.subscribe(queue)
+        self.streams.begin(self.topic)
+
+    def subscribe(self, queue: int) -> QueueSink:
+        owner: Any = SimpleNamespace(name="node", priority=0)
+        sink = QueueSink(self.waker, owner, queue, 0, lossy=False, keep_oldest=False)
+        self.topic.join(sink)
+        return sink
+
+    def _subscribe(self, _topic: str, arrived: Any) -> Any:
+        self._arrived = arrived
+        return SimpleNamespace(take=self._take, wait=self._wait, close=lambda: None)
+
+    def _take(self) -> Any:
+        return self._ring.popleft() if self._ring else None
+
+    def _wait(self) -> None:
+        self._idle = True
+
+    def put(self, serial: int, count: int = 1, *, publisher_class: int = 1, size: int = SIZE) -> None:
+        """So many messages in one packet; sequences are as the serials, stamps ten times as much."""
+        origin = Origin(publisher_class, 7, 7, bytes(8), "A", "node")
+        stamps = [10 * (serial + at) for at in range(count)]
+        header = attachment.encode(Header(origin, serial, serial, stamps[0], more=tuple(stamps[1:])))
+        data = b"".join([(serial + at).to_bytes(size, "little") for at in range(count)])
+        sample = SimpleNamespace(
+            payload=SimpleNamespace(to_bytes=lambda: data), attachment=SimpleNamespace(to_bytes=lambda: header)
+        )
+        if self._idle:
+            self._idle = False
+            self._arrived(sample)
+        else:
+            self._ring.append(sample)
+
+
+async def turns(count: int = 20) -> None:
+    for _ in range(count):
+        await asyncio.sleep(0)
+
+
+def numbers(sink: QueueSink) -> list[int]:
+    return [each.sequence for each in sink.queue]
+
+
+async def test_events_of_one_packet_stay_in_order_where_there_is_no_room() -> None:
+    """Our own senders send each for itself; others need not."""
+    ring = Ring(queue=2)
+    ring.put(1, 4, publisher_class=2)
+    await turns()
+    assert numbers(ring.sink) == [3, 4]
+    assert ring.sink.lost == 2
+
+
+async def test_the_rest_of_a_packet_waits_with_the_message_that_has_no_room() -> None:
+    ring = Ring(queue=2)
+    ring.put(1, 5)
+    ring.put(6)
+    taken = []
+    for _ in range(6):
+        await turns()
+        taken.append(ring.sink.queue.popleft().sequence)
+        ring.sink.refill()
+    assert taken == [1, 2, 3, 4, 5, 6]
+    assert (ring.stats.received, ring.stats.lost) == (6, Counter())
+
+
+async def test_what_is_lost_on_the_way_earns_credit() -> None:
+    """Else a publisher would wait for what never came, if that is more than half of a window."""
+    ring = Ring(queue=4 * WINDOW)
+    ring.put(1)
+    ring.put(WINDOW - 100, 10)
+    await turns()
+    assert ring.credits == [(1, 1), (1, WINDOW - 100)]
+    assert ring.stats.lost == {"on the way": WINDOW - 102}
+
+
+async def test_an_event_that_passes_a_message_that_waits_is_told_of() -> None:
+    ring = Ring(queue=1)
+    ring.put(1, 2)
+    await turns()
+    ring.put(1, publisher_class=2)
+    await turns()
+    assert (2, 1) in ring.credits
+    assert ring.sink.lost == 1
+
+
+async def test_a_message_of_the_wrong_size_is_counted_once() -> None:
+    ring = Ring(queue=10)
+    ring.put(1)
+    ring.put(2, 3, size=SIZE + 1)
+    ring.put(5)
+    await turns()
+    assert ring.stats.lost == {"wrong size": 3}
+    assert numbers(ring.sink) == [1, 5]
+
+
+async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
+    ring = Ring(queue=10, typed=False)
+    ring.put(1, 2)
+    await turns()
+    ring.topic.layout = layout(Led)
+    ring.streams.begin(ring.topic)
+    ring.put(3, size=SIZE + 1)
+    ring.put(4)
+    await turns()
+    assert ring.stats.lost == {"wrong size": 1}
+    again = attachment.encode(Header(Origin(1, 8, 7, bytes(8), "A", "node"), 1, 4, 40))
+    ring.streams._streams["leds"]._unpack(bytes(SIZE), again)  # by another gateway
+    assert numbers(ring.sink) == [1, 2, 4]
+    assert ring.stats.lost["seen before"] == 1
+
+
+async def test_a_reader_that_falls_behind_does_not_read_old_packets() -> None:
+    """The ring holds no more than a publisher may have on its way."""
+    assert RING <= WINDOW
