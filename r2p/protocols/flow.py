@@ -121,4 +121,4 @@ class Inflow:
     @property
     def _share(self) -> int:
         """Messages from one credit to the next: so many that the sender need not stop for it."""
-        return max(1, self.window // 2) if self.window else NO_LIMIT
+        return max(1, self.window // 4) if self.window else NO_LIMIT

@@ -157,7 +157,6 @@ class Session:
         self._session = session
         self._kept: list[Any] = []
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
-        self._listener: Any = None
 
     def watch(self, funnel: Funnel) -> None:
         """Tell of each transport, those that are there included: (id, whether it opened)."""

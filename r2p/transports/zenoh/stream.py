@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from r2p.transports.zenoh.session import Tap
     from r2p.transports.zenoh.streams import Streams
 
-RING = 1024
-"""Packets of one topic that wait in zenoh at most; more would be old before they are read."""
+RING = 4096
+"""Packets of one topic that wait in zenoh at most."""
 
-_MOST = 4096
-"""Messages of one topic that wait behind one for which there is no room."""
+_MOST = 16_384
+"""Messages of one topic that wait behind one for which there is no room: what eight publishers may send meanwhile."""
 
 SENDERS = 4096
 """Senders of which a stream, or the link, keeps count."""

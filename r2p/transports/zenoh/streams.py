@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
     from r2p.transports.zenoh.session import Tap
 
-WINDOW = 1024
+WINDOW = 2048
 """Messages of one publisher that may be on the way to one subscriber's module, at most."""
 
-_WINDOW_BYTES = 96 * 1024
-"""... and their bytes: ten topics at full speed fit into zenoh's own queue of 1 MB."""
+_WINDOW_BYTES = 192 * 1024
+"""... and their bytes: five topics at full speed fit into zenoh's own queue of 1 MB."""
 
 _OVERHEAD = 32  # bytes of stamp, and share in header and framing, in a packet of several
 

@@ -13,7 +13,6 @@ from r2p.messages import layout
 from r2p.msg import Led
 from r2p.topic import QueueSink, Topic, Waker
 from r2p.transports.intake import LinkStats
-from r2p.transports.zenoh.stream import RING
 from r2p.transports.zenoh.streams import WINDOW, Streams
 
 pytestmark = pytest.mark.virtual_time
@@ -61,9 +60,9 @@ class Ring:
     def _wait(self) -> None:
         self._idle = True
 
-    def put(self, serial: int, count: int = 1, *, publisher_class: int = 1, size: int = SIZE) -> None:
+    def put(self, serial: int, count: int = 1, *, publisher_class: int = 1, size: int = SIZE, sender: int = 7) -> None:
         """So many messages in one packet; sequences are as the serials, stamps ten times as much."""
-        origin = Origin(publisher_class, 7, 7, bytes(8), "A", "node")
+        origin = Origin(publisher_class, sender, sender, bytes(8), "A", "node")
         stamps = [10 * (serial + at) for at in range(count)]
         header = attachment.encode(Header(origin, serial, serial, stamps[0], more=tuple(stamps[1:])))
         data = b"".join([(serial + at).to_bytes(size, "little") for at in range(count)])
@@ -154,6 +153,11 @@ async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
     assert ring.stats.lost["seen before"] == 1
 
 
-async def test_a_reader_that_falls_behind_does_not_read_old_packets() -> None:
-    """The ring holds no more than a publisher may have on its way."""
-    assert RING <= WINDOW
+async def test_what_eight_publishers_may_send_is_kept_where_nobody_reads() -> None:
+    ring = Ring(queue=1)
+    for sender in range(1, 9):
+        for serial in range(1, WINDOW, 64):
+            ring.put(serial, 64, sender=sender)
+        await turns(2 * WINDOW // 64)
+    assert not ring.stats.lost
+    assert ring.stats.received == 8 * WINDOW
