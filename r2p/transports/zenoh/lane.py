@@ -62,20 +62,15 @@ class Lane:
         waiting, self.waiting = self.waiting, []
         serial = self.flow.serial - len(waiting) + 1
         for samples in _packets(waiting) if batching and len(waiting) > 1 else [[each] for each in waiting]:
+            data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
             try:
-                size = self._send(samples, serial)
+                self._put(data, attachment=self._header(samples, serial))
             except error:
                 stats.lost[LINK_DOWN] += len(samples)
             else:
                 stats.sent += len(samples)
-                stats.bytes_sent += size
+                stats.bytes_sent += len(data)
             serial += len(samples)
-
-    def _send(self, samples: list[Sample], serial: int) -> int:
-        """Send one packet; says how many bytes its messages have."""
-        data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
-        self._put(data, attachment=self._header(samples, serial))
-        return len(data)
 
     def _header(self, samples: list[Sample], serial: int) -> bytes:
         """What comes from another link has crossed a gateway more."""

@@ -130,13 +130,13 @@ class Tap:
 
     def _hand_over(self, sample: zenoh.Sample, rests: bool) -> None:
         """In the loop, one sample after the other; behind the last one the thread may rest."""
-        self._handed.append(sample)
         self._thread_rests = rests
         if self._idle:
             self._idle = False
-            first = self.take()
-            assert first is not None
-            self._arrived(first)
+            self._taken += 1
+            self._arrived(sample)
+        else:
+            self._handed.append(sample)
 
 
 async def open_session(config: zenoh.Config) -> "Session":

@@ -163,7 +163,7 @@ class Stream:
         """Hand out the messages of one packet; says how many that were."""
         try:
             lane, serial, sequence, stamps, deadline, hops, stamped, clock = self._reader.read(header)
-            parts = [data] if len(stamps) == 1 else _parts(data, len(stamps))
+            parts = (data,) if len(stamps) == 1 else _parts(data, len(stamps))
         except DecodeError as error:
             self._streams.stats.lost["unknown type" if isinstance(error, UnknownType) else "undecodable"] += 1
             return 1
