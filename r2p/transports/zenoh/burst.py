@@ -1,7 +1,7 @@
 """What goes out when: the first message at once, the others together when the turn of the event loop is over.
 
-Each packet that zenoh is given wakes threads at both ends, which takes longer than a message. So while messages come
-turn after turn they go out every few turns, and as soon as a turn brings none.
+Each packet that zenoh is given wakes threads at both ends, which takes longer than a message. So a flood goes out every
+few turns, and as soon as it ends.
 """
 
 import asyncio
@@ -9,8 +9,11 @@ import asyncio
 from r2p.transports.intake import LinkStats
 from r2p.transports.zenoh.lane import MOST, Lane
 
-TURNS = 4
-"""Turns of the loop in which messages wait for more of them, at most."""
+TURNS = 12
+"""Turns of the loop in which messages of a flood wait for more of them, at most."""
+
+FLOOD = 8
+"""Messages in one turn that make a flood; what comes more slowly goes out when its turn is over."""
 
 
 class Burst:
@@ -59,13 +62,13 @@ class Burst:
         return count
 
     def _end(self) -> None:
-        """A turn is over: send what waits, unless it has become more."""
+        """A turn is over: send what waits, unless it becomes more and more."""
         count = sum([len(lane.waiting) for lane in self._lanes])
         self._begun = count > 0
         if self._begun:
             self._loop.call_soon(self._end)
         self._turns += 1
-        if self._batching and count > self._count and self._turns < TURNS:
+        if self._batching and count >= self._count + FLOOD and self._turns < TURNS:
             self._count = count
         else:
             self.flush()

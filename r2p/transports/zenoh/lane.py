@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 Put = Callable[..., None]
 """zenoh's `Publisher.put(data, *, attachment)`."""
 
-MOST = 128
+MOST = PACKET_MOST
 """Messages that wait in a lane."""
-
-assert MOST <= PACKET_MOST
 
 _LONGEST = 16 * 1024
 """Bytes of a packet of several messages."""

@@ -11,7 +11,7 @@ from r2p.codecs.attachment import Clock, Origin
 from r2p.protocols.flow import Outflow
 from r2p.sample import Sample, Source
 from r2p.transports.intake import LinkStats
-from r2p.transports.zenoh.burst import TURNS, Burst
+from r2p.transports.zenoh.burst import FLOOD, TURNS, Burst
 from r2p.transports.zenoh.lane import MOST, Lane
 
 pytestmark = pytest.mark.virtual_time
@@ -74,13 +74,26 @@ async def test_the_first_goes_at_once_the_others_together_and_the_urgent_never_w
     assert wire.sent[-1] == b"4"
 
 
-async def test_what_comes_turn_after_turn_goes_out_every_few_turns() -> None:
+async def test_a_flood_goes_out_every_few_turns_and_when_it_ends() -> None:
     wire = Wire()
     wire.add(b"0")
-    for _ in range(2 * TURNS):
-        wire.add(b"1")
+    for _ in range(TURNS + 2):
+        for _ in range(FLOOD):
+            wire.add(b"1")
         await turns(1)
-    assert wire.sent == [b"0", TURNS * b"1", TURNS * b"1"]
+    assert wire.sent == [b"0", TURNS * FLOOD * b"1"]
+    await turns(1)
+    assert wire.sent[2:] == [2 * FLOOD * b"1"]
+
+
+async def test_what_comes_slowly_does_not_wait_for_more() -> None:
+    wire = Wire()
+    wire.add(b"0")
+    for _ in range(3):
+        for _ in range(FLOOD - 1):
+            wire.add(b"1")
+        await turns(1)
+    assert wire.sent == [b"0", *3 * [(FLOOD - 1) * b"1"]]
 
 
 async def test_one_topic_can_be_sent_before_the_others() -> None:
