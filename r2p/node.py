@@ -307,7 +307,8 @@ class Node:
 
     def forget(self, user: object) -> None:
         """A publisher or subscriber of the node was closed."""
-        self.publishers.pop(user, None)  # type: ignore[call-overload]  # a dict looks up anything
+        # The type checker wants a key that may be there; it is in one of the two at most.
+        self.publishers.pop(user, None)  # type: ignore[call-overload]
         self.subscribers.pop(user, None)  # type: ignore[call-overload]
 
     def enter(self) -> None:

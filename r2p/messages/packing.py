@@ -10,6 +10,8 @@ from typing import Any
 from r2p.errors import DecodeError, MessageError
 from r2p.messages.shapes import Array, Chars, Field, Nested, Scalar, Shape, show
 
+# `encode` catches everything: users put objects of any kind into messages, and what these raise when they are checked
+# or packed (OverflowError, AttributeError, something of their own) means that they do not fit.
 _SOURCE = """
 def encode(message):
     try:

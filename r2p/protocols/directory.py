@@ -62,6 +62,11 @@ class EndpointInfo(msgspec.Struct, frozen=True):
     role: int
     publisher_class: int
 
+    def latches(self, topic: str) -> bool:
+        """Whether it publishes the topic, and latches it."""
+        latches = self.publisher_class & management.CLASS_LATCHES
+        return self.topic == topic and self.role == management.ROLE_PUBLISHES and latches > 0
+
 
 EndpointKey = tuple[int, str, str, int]
 

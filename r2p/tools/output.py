@@ -190,18 +190,18 @@ def _yaml_dumper() -> Callable[[Any], str]:
 
     base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
-    class Dumper(base):  # type: ignore[misc]
-        """Lists of plain values on one line."""
+    dumper: Any = type("Dumper", (base,), {})  # of our own: what is added to it stays with us
 
-    def represent(dumper: Any, items: Iterable[Any]) -> Any:
+    def represent(to: Any, items: Iterable[Any]) -> Any:
+        """Lists of plain values on one line."""
         items = list(items)
         nested = any(isinstance(each, Mapping | list | tuple) for each in items)
-        return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=not nested)
+        return to.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=not nested)
 
-    Dumper.add_representer(list, represent)
-    Dumper.add_representer(tuple, represent)
+    dumper.add_representer(list, represent)
+    dumper.add_representer(tuple, represent)
     return lambda record: str(
-        yaml.dump(record, Dumper=Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=1 << 20)
+        yaml.dump(record, Dumper=dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=1 << 20)
     )
 
 

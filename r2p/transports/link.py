@@ -17,7 +17,7 @@ import msgspec
 
 from r2p.clock import Alarm
 from r2p.codecs.attachment import Clock
-from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, ROLE_PUBLISHES
+from r2p.codecs.management import NO_PARAMS
 from r2p.messages import Message
 from r2p.names import MANAGEMENT, TOPIC_MAX
 from r2p.protocols.announcer import Relayed
@@ -123,6 +123,8 @@ class Link(abc.ABC):
 
     def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: Door | None = None) -> None:
         self.name = _unlike(name, {each.name for each in hub.space.links})
+        self.title = self.name.removesuffix(":")
+        """The name as it stands in texts."""
         self.up = False
         self.gate: Gate | None = None
         """Set by the module: what gateways, and it beside gateways, do with the link."""
@@ -145,11 +147,6 @@ class Link(abc.ABC):
         self._lost_at_down = 0
         self._unreachable = ""
         self._closed = False
-
-    @property
-    def title(self) -> str:
-        """Its name as it stands in texts."""
-        return self.name.removesuffix(":")
 
     # For the transport that owns the link
 
@@ -207,10 +204,7 @@ class Link(abc.ABC):
 
     def latched(self, topic: str) -> bool:
         """Whether a publisher at the other end latches the topic; only r2p modules tell."""
-        return any(
-            each.topic == topic and each.role == ROLE_PUBLISHES and each.publisher_class & CLASS_LATCHES
-            for each in self.discovery.endpoints.values()
-        )
+        return any(each.latches(topic) for each in self.discovery.endpoints.values())
 
     def take_other(self, arrival: Arrival) -> None:
         if arrival.topic == _MANAGEMENT:

@@ -81,6 +81,16 @@ class TestSchedule:
         assert names[:6] == ["t0", "t2", "t3"] * 2
         assert set(names[-6:]) == {"t2", "t3"}
 
+    def with_endpoints(self, count: int) -> tuple[Schedule, list[Item]]:
+        """They have been said for 10 s: seldom by now."""
+        schedule = Schedule(1000, 100, 0)
+        schedule.start(0)
+        items = [Item(Kind.ENDPOINT, ("n", f"t{n}", 1)) for n in range(count)]
+        for each in items:
+            schedule.add(each)
+        self.said(schedule, 0, 10 * S)
+        return schedule, items
+
     def said(self, schedule: Schedule, start: int, end: int) -> list[tuple[int, Item]]:
         """What comes up, and when."""
         times: list[tuple[int, Item]] = []
@@ -121,12 +131,7 @@ class TestSchedule:
             assert max(b - a for a, b in pairwise(times)) == pytest.approx(rounds * 1.5 * S, rel=0.1)
 
     def test_for_a_newcomer_what_only_describes_is_said_at_once_and_once_more_soon(self) -> None:
-        schedule = Schedule(1000, 100, 0)
-        schedule.start(0)
-        endpoints = [Item(Kind.ENDPOINT, ("n", f"t{n}", 1)) for n in range(20)]
-        for each in endpoints:
-            schedule.add(each)
-        self.said(schedule, 0, 10 * S)
+        schedule, endpoints = self.with_endpoints(20)
         schedule.repeat(10 * S)
         said = self.said(schedule, 10 * S, 20 * S)
         for each in endpoints:
@@ -136,12 +141,7 @@ class TestSchedule:
             assert 1.5 * S <= third - second <= 7.5 * S
 
     def test_what_is_said_seldom_can_be_dropped_and_the_rest_goes_on(self) -> None:
-        schedule = Schedule(1000, 100, 0)
-        schedule.start(0)
-        items = [Item(Kind.ENDPOINT, ("n", f"t{n}", 1)) for n in range(3)]
-        for each in items:
-            schedule.add(each)
-        self.said(schedule, 0, 10 * S)
+        schedule, items = self.with_endpoints(3)
         schedule.drop(items[1])
         later = {item for _, item in self.said(schedule, 10 * S, 20 * S)}
         assert later == {items[0], items[2], Item(Kind.PRESENCE, once=True)}

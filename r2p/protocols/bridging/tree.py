@@ -23,7 +23,8 @@ from collections import deque
 import msgspec
 
 from r2p.codecs.management import Bridge, Leaf, Mesh
-from r2p.protocols.bridging.mesh import Assembly, Edge, Hearing, Place, digest, edges_from, parts, tree
+from r2p.protocols.bridging.atlas import Atlas
+from r2p.protocols.bridging.mesh import Edge, Place, digest
 
 _MS = 1_000_000
 
@@ -53,7 +54,6 @@ _FOR_EVER = 1 << 62
 ACK = struct.Struct("<IH")
 _ACKS = 2
 _LEAVES = 32  # on one network; more than these use one link only
-_RECORDS_KEPT = 5_000 * _MS
 _RECORDS_A_TICK = 16
 
 
@@ -148,14 +148,6 @@ class Port(msgspec.Struct, eq=False):
         return {gateway for gateway, _ in self.neighbours}
 
 
-class _Record(msgspec.Struct):
-    """Whom another gateway hears."""
-
-    serial: int
-    heard: frozenset[Hearing]
-    at: int
-
-
 class Tree:
     """The tree as one gateway knows it. Every method takes `now` (monotonic ns); `take` gives what to do about it.
 
@@ -165,22 +157,19 @@ class Tree:
     def __init__(self, gateway: int) -> None:
         self.gateway = gateway or 1
         self.ports: dict[int, Port] = {}
-        self.edges: frozenset[Edge] = frozenset()
-        """The mesh of gateways that this one is part of."""
         self.root = self.gateway
-        """The lowest gateway of the mesh."""
+        """The lowest gateway of the mesh, as this one tells it."""
         self._rooted_at = 0
-        self._chosen: frozenset[Place] = frozenset()
-        self._mesh_hash = digest(self.edges)
-        self._members: set[int] = set()
-        self._records: dict[int, _Record] = {}
-        self._assembly = Assembly()
-        self._heard: frozenset[Hearing] = frozenset()
-        self._serial = 0
+        self._atlas = Atlas(self.gateway)
         self._count = 0
         self._sent: deque[tuple[int, int]] = deque()  # count, instant
         self._looked_at = 0
         self._actions: list[Action] = []
+
+    @property
+    def edges(self) -> frozenset[Edge]:
+        """The mesh of gateways that this one is part of."""
+        return self._atlas.edges
 
     # Ports
 
@@ -279,15 +268,9 @@ class Tree:
         """A MESH was heard: new things are passed on at once."""
         if message.gateway in (0, self.gateway) or number not in self.ports:
             return
-        known = self._records.get(message.gateway)
-        if known is not None and not 0 < (message.serial - known.serial) & 0xFFFF < 0x8000:
-            known.at = now
+        if not self._atlas.learn(now, message):
             return
-        heard = self._assembly.add(message)
-        if heard is None:
-            return
-        self._records[message.gateway] = _Record(message.serial, heard, now)
-        self._map(now)
+        self._take_root(now)
         for port in self.ports.values():
             if port.neighbours and port.number != number:
                 self._say_record(port, message.gateway)
@@ -315,18 +298,16 @@ class Tree:
         if now - self._looked_at > LEASE:
             self._begin_anew(now)
         self._looked_at = now
-        mesh_hash = self._mesh_hash
+        mesh = self._atlas.fingerprint
         if changed is None:
             self._bury(now)
         heard = frozenset((port.number, *place) for port in self.ports.values() for place in port.neighbours)
-        if heard != self._heard:
-            self._heard = heard
-            self._serial = (self._serial + 1) & 0xFFFF
-            self._map(now)
+        if self._atlas.hear(heard):
+            self._take_root(now)
             for port in self.ports.values():
                 if port.neighbours:
                     self._say_record(port, self.gateway)
-        everywhere = changed is None or mesh_hash != self._mesh_hash
+        everywhere = changed is None or mesh != self._atlas.fingerprint
         for port in list(self.ports.values()) if everywhere or changed is None else [changed]:
             self._judge(now, port)
 
@@ -338,22 +319,13 @@ class Tree:
                 port.leaves = {place: each for place, each in port.leaves.items() if now - each.heard_at < DEAD}
             if any(now - last >= PROBE_MEMORY for _, last in port.probes.values()):
                 port.probes = {place: at for place, at in port.probes.items() if now - at[1] < PROBE_MEMORY}
-        for gateway in [gateway for gateway, record in self._records.items() if now - record.at >= _RECORDS_KEPT]:
-            if gateway not in self._members:
-                del self._records[gateway]
+        self._atlas.forget(now)
 
-    def _map(self, now: int) -> None:
-        heard = {gateway: record.heard for gateway, record in self._records.items()}
-        edges = edges_from(self.gateway, heard | {self.gateway: self._heard})
-        if edges != self.edges:
-            self.edges = edges
-            self._chosen = tree(edges)
-            self._members = {place[0] for edge in edges for place in edge}
-            self._mesh_hash = digest(sorted(edges))
-            root = min(self._members, default=self.gateway)
-            if root != self.root:
-                self.root = root
-                self._tell_leaves(now + 1)  # what was said in this very instant is older
+    def _take_root(self, now: int) -> None:
+        """The mesh may have another root now."""
+        if self._atlas.root != self.root:
+            self.root = self._atlas.root
+            self._tell_leaves(now + 1)  # what was said in this very instant is older
 
     def _tell_leaves(self, at: int) -> None:
         """What they know of us is wrong: nothing passes before they know better, or are gone."""
@@ -364,10 +336,10 @@ class Tree:
                 port.say_at = at
 
     def _judge(self, now: int, port: Port) -> None:
-        view = (self._mesh_hash, frozenset(port.neighbours))
+        view = (self._atlas.fingerprint, frozenset(port.neighbours))
         if view != port.view:
             port.view = view
-            agreement = digest(self._mesh_hash, sorted([(self.gateway, port.number), *port.neighbours]))
+            agreement = digest(self._atlas.fingerprint, sorted([(self.gateway, port.number), *port.neighbours]))
             port.agreement = agreement
             port.agreed_since = None
             port.say_at = min(port.say_at, max(now, port.said_at + APART))
@@ -425,7 +397,7 @@ class Tree:
         return min([port.said_at, *acked]) + LEASE
 
     def _is_chosen(self, port: Port) -> bool:
-        return (self.gateway, port.number) in self._chosen
+        return self._atlas.chosen((self.gateway, port.number))
 
     def _loops(self, now: int, port: Port) -> bool:
         """Whether a gateway that says no BRIDGE joins this network to another one of ours, and we are to keep off."""
@@ -434,7 +406,7 @@ class Tree:
                 continue
             if gateway == self.gateway and its_port < port.number % 13:
                 return True
-            if gateway in self._members and gateway < self.gateway:
+            if gateway in self._atlas.members and gateway < self.gateway:
                 return True
         return False
 
@@ -451,7 +423,7 @@ class Tree:
         while now - self._sent[0][1] > LEASE:
             self._sent.popleft()
         if port.neighbours and not self._agreed(now, port):
-            for gateway in [self.gateway, *list(self._records)[:_RECORDS_A_TICK]]:
+            for gateway in [self.gateway, *self._atlas.others[:_RECORDS_A_TICK]]:
                 self._say_record(port, gateway)
         port.said_at = now
         port.say_at = now + self._tick(port)
@@ -463,12 +435,7 @@ class Tree:
         return TICK if port.neighbours or port.leaves else TICK_ALONE
 
     def _say_record(self, port: Port, gateway: int) -> None:
-        if gateway == self.gateway:
-            messages = parts(gateway, self._serial, self._heard)
-        else:
-            record = self._records[gateway]
-            messages = parts(gateway, record.serial, record.heard)
-        self._actions.extend(Say(port.number, each) for each in messages)
+        self._actions.extend(Say(port.number, each) for each in self._atlas.told(gateway))
 
     def _probe(self, now: int, port: Port) -> None:
         listening = port.state is State.LISTENING

@@ -51,58 +51,27 @@ class Core:
         self.detector = Detector(settings.profile)
         self.queue = LaxityQueue(settings.capacity, _DEPTH)
         self.cycle = Cycle(self.timing, settings.receive_latency)
-        self.identity = Identity(
-            settings.id8,
-            settings.number,
-            settings.listen,
-            self.timers,
-            self.out,
-            self.counts,
-            self._announce,
-            self._stage_changed,
-        )
-        self.pacer = Pacer(self.identity.draw, self.counts)
         self.agenda = Agenda(self.timing)
-        self.post = Post(self.queue, self.out, self.counts, self._pause)
-        self.sender = Sender(
-            self.cycle,
-            self.queue,
-            self.agenda,
-            self.post,
-            self.out,
-            self.counts,
-            self._turn,
-            latency=settings.transmit_latency,
-            coarse=settings.coarse,
-        )
         self.election = Election(settings.priority, 3 * self.timing.cycle, self.timers)
         self.grants = Grants(self.cycle, self.timers)
-        self.wishes = Wishes(
-            self.cycle, self.agenda, self.timers, self.periodics, self.out, self._ask, enabled=settings.reserves
+        self._assemble(settings)
+
+    def _assemble(self, settings: Settings) -> None:
+        """The parts that work with others."""
+        counts, out, timers, cycle = self.counts, self.out, self.timers, self.cycle
+        self.identity = Identity(
+            settings.id8, settings.number, settings.listen, timers, out, counts, self._announce, self._stage_changed
         )
-        self.network = Network(
-            self.cycle,
-            self.sender,
-            self.identity,
-            self.election,
-            self.grants,
-            self.wishes,
-            self.timers,
-            self.out,
-            self.counts,
-            self.say,
-            settings.priority,
+        self.pacer = Pacer(self.identity.draw, counts)
+        self.post = Post(self.queue, out, counts, self._pause)
+        latency, coarse = settings.transmit_latency, settings.coarse
+        self.sender = Sender(
+            cycle, self.queue, self.agenda, self.post, out, counts, self._turn, latency=latency, coarse=coarse
         )
-        self.answers = Answers(
-            self.identity,
-            self.election,
-            self.grants,
-            self.wishes,
-            self.network,
-            self.periodics,
-            self.say,
-            self.tick,
-        )
+        self.wishes = Wishes(cycle, self.agenda, timers, self.periodics, out, self._ask, enabled=settings.reserves)
+        parts = self.identity, self.election, self.grants, self.wishes
+        self.network = Network(cycle, self.sender, *parts, timers, out, counts, self.say, settings.priority)
+        self.answers = Answers(*parts, self.network, self.periodics, self.say, self.tick)
 
     @property
     def profile(self) -> Profile:

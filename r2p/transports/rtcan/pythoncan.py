@@ -114,7 +114,8 @@ class PythonCanPort(InterfacePort["_Bus"]):
 
 
 _NEVER = (NotImplementedError, ValueError, TypeError)
-"""Waiting mends none of these: a driver that is not installed, a channel or bit rate that can't be."""
+"""What drivers of python-can raise for what waiting does not mend: they are not installed, or there can't be such a
+channel or bit rate. Other errors may pass, such as those of an adapter that is not plugged in."""
 
 
 class _Bus:
