@@ -213,7 +213,8 @@ class Relays:
 
         def reserve(size: int, period: float) -> None:
             here = self._topic(topic, target)
-            here.reserved = here.reserved or RelayedPeriodic(here.name, size, period)
+            if here.reserved is None or here.reserved.size != size:
+                here.reserved = RelayedPeriodic(here.name, size, period)
             if shaper is not None:
                 shaper.reserved = here.reserved
             target.link.topic_changed(here)

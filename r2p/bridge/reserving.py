@@ -31,8 +31,11 @@ class RelayedPeriodic(PeriodicPublisher[Any]):
         return self._size
 
     def take(self, sample: Sample) -> bool:
-        """A message came; False if the bus does not send it in slots now, and it has to go another way."""
-        if self._by is None:
+        """A message came; False if the bus does not send it in slots now, and it has to go another way.
+
+        So it has to if it has another size: the slots are for messages of one size.
+        """
+        if self._by is None or len(sample.data) != self._size:
             return False
         self.missed += self._latest is not None
         self._latest = sample

@@ -23,7 +23,8 @@ class Shaper:
 
     `rate`: messages a second at most, in bursts of two. `klass`: what a debug line can't say. `soften`: periodic
     messages become sporadic ones that are due within their period, as the next link has no slots for them. `learnt` is
-    called once with size (bytes) and period (s) when those are known, and may set `reserved`, which takes them then.
+    called with size (bytes) and period (s) when those of a publisher are known, and again when it comes back with
+    another size; it may set `reserved`, which takes the messages then.
     """
 
     def __init__(
@@ -65,23 +66,25 @@ class Shaper:
         source = sample.source
         known = self._periods.get((source.module, source.node))
         if known is None:
-            self._periods[source.module, source.node] = _Period(sample.stamp)
+            self._periods[source.module, source.node] = _Period(sample.stamp, len(sample.data))
             return _UNKNOWN_PERIOD
         since = sample.stamp - known.stamp
         known.stamp = sample.stamp
-        if 0 < since < _LONGEST_PERIOD:
+        if since >= _LONGEST_PERIOD or len(sample.data) != known.size:
+            known.size, known.period, known.count = len(sample.data), 0, 0
+        elif since > 0:
             known.count += 1
             known.period = since if not known.period else min(since, known.period + known.period // 8)
-        if known.count == _SURE and self._learnt is not None:
-            learnt, self._learnt = self._learnt, None
-            learnt(len(sample.data), known.period / _SECOND)
+            if known.count == _SURE and self._learnt is not None:
+                self._learnt(known.size, known.period / _SECOND)
         return known.period or _UNKNOWN_PERIOD
 
 
 class _Period(msgspec.Struct):
-    """The last stamp of a publisher, and its period as far as known (ns)."""
+    """The last stamp of a publisher, the size of its messages, and its period as far as known (ns)."""
 
     stamp: int
+    size: int
     period: int = 0
     count: int = 0
 

@@ -29,6 +29,8 @@ FIRST_TOPIC = 0x02
 FIRMWARE_MANAGEMENT = 0x0000  # the message id of management of every module of 2014
 MESSAGE_MASK = 0xFFFF << 7  # a filter for one message id looks at these bits of the identifier
 
+LEFT_MASK = 0x7F  # the bits of the identifier that say how many fragments come after this one
+
 INTERMISSION = 3  # bits between two frames
 TAIL = 10  # bits after the CRC, never stuffed: CRC delimiter, ACK slot, ACK delimiter, end of frame
 

@@ -17,10 +17,11 @@ from r2p.msg import Float32, Led, Text
 from r2p.protocols.events import Command
 from r2p.testing.network import node_in
 from r2p.transports.memory import Frame, Port, network
+from r2p.transports.rtcan.link import RtcanLink
 from tests.transports.conversation import Script, manage
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
 pytestmark = pytest.mark.virtual_time
 
@@ -481,3 +482,30 @@ async def test_periodic_messages_towards_a_bus(reserve: bool) -> None:
         assert got == sorted(set(got))
         assert len(got) > 300
         assert ways(gw)["memory:a", "sim:bus"][1] == {}
+
+
+def always(message: r2p.Message) -> Callable[[], r2p.Message]:
+    return lambda: message
+
+
+async def test_a_publisher_with_slots_comes_back_with_another_size() -> None:
+    """A new version of a module has a new version of its type: the slots are reserved anew, for the new size."""
+    versions = (Led(led=1), Float32(data=1.0), Led(led=2))
+    async with (
+        r2p.Module("GW", via=["memory:a", "sim:bus"], bridge=BridgeOptions(reserve=("data",))) as gw,
+        r2p.Module("IMU1", via="sim:bus") as imu,
+        node_in(imu) as there,
+    ):
+        far = there.subscribe("data", None, queue=10**4)
+        for message in versions:
+            far.queue.clear()
+            async with node("A", "a") as a:
+                a.advertise("data", type(message), r2p.Periodic(0.05, always(message)))
+                async with asyncio.timeout(30):
+                    async for sample in far.samples():
+                        if sample.publisher_class is r2p.PublisherClass.PERIODIC:
+                            break
+                assert sample.data == message.encode()
+                bus = gw.links[1]
+                assert isinstance(bus, RtcanLink)
+                assert [each.publisher.size for each in bus.slots.values()] == [len(sample.data)]

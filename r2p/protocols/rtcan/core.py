@@ -45,6 +45,7 @@ class Core:
         self.periodics: dict[int, Periodic] = {}
         self.joined = False
         """Whether messages may be sent: the node has an id8, and knows how the network works."""
+        self._management_ends = False  # the next frame of firmware's management is the last one of a message
         self.timing = timing(settings.slots, settings.cycle, settings.bit_rate)
         self.timers = Alarms()
         self.reassembly = Reassembly()
@@ -129,6 +130,17 @@ class Core:
         if due is not None:
             self._queue_management(now, rtcan.FIRMWARE_MANAGEMENT, *due, _DEADLINE)
 
+    def is_sync(self, identifier: int) -> bool:
+        """Whether a frame is a sync that has the identifier of one.
+
+        When firmware has no time left it sends laxity 0: then the last frame of its management has the identifier of
+        the sync of cycle 0, and in a network of firmware a topic may have that of another one.
+        """
+        message = identifier >> 7
+        if self.detector.profile is _FIRMWARE:
+            return message != rtcan.FIRMWARE_MANAGEMENT and not self.reassembly.subscribed(message)
+        return not (self._management_ends and message == rtcan.FIRMWARE_MANAGEMENT)
+
     def listen(self, identifier: int) -> None:
         """What any frame tells while we only listen."""
         message = identifier >> 7 & 0xFFFF
@@ -152,6 +164,7 @@ class Core:
             self.pacer.traffic(now)
         if high == rtcan.SYNC and not firmware:
             self.counts["management of firmware"] += 1
+            self._management_ends = message == rtcan.FIRMWARE_MANAGEMENT and frame.id & rtcan.LEFT_MASK == 1
         ours = message == rtcan.FIRMWARE_MANAGEMENT if firmware else high == rtcan.MANAGEMENT
         if ours:
             self.reassembly.subscribe(message, management.SIZE)

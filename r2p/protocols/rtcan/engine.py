@@ -178,7 +178,7 @@ class Engine:
     def receive(self, now: int, frame: Frame, stamp: int) -> Sequence[Action]:
         """A frame of another node came in; `stamp` is the instant of its reception interrupt."""
         core, identifier = self._core, frame.id
-        if not identifier & _NOT_SYNC:
+        if not identifier & _NOT_SYNC and core.is_sync(identifier):
             if len(frame.data) != rtcan.FRAME_MAX:
                 self.counts["undecodable"] += 1
             elif self._running and core.profile is not Profile.FIRMWARE:

@@ -260,9 +260,13 @@ class Monitor:
         return text
 
     def _kind(self, frame: Frame, message: int) -> FrameKind:
-        if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX:
+        if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX and not self._ends_management(message):
             return FrameKind.SYNC
         if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.census.topics:
             return FrameKind.MANAGEMENT  # firmware of 2014 may have topics there
         laxity = frame.id >> 23
         return FrameKind.HRT if laxity == rtcan.HRT else FrameKind.NRT if laxity == rtcan.NRT else FrameKind.SRT
+
+    def _ends_management(self, message: int) -> bool:
+        """Firmware without any time left ends its management with the identifier of the sync of cycle 0."""
+        return message == rtcan.FIRMWARE_MANAGEMENT and self._reassembly.ends_with_next(message)

@@ -59,6 +59,11 @@ class Reassembly:
     def subscribed(self, message: int) -> bool:
         return message in self._inlets
 
+    def ends_with_next(self, message: int) -> bool:
+        """Whether a message with this id is being received, and only its last frame is missing."""
+        inlet = self.open.get(message)
+        return inlet is not None and inlet.expected == 0
+
     @property
     def messages(self) -> list[int]:
         """The ids that are taken."""

@@ -217,3 +217,13 @@ def test_nothing_on_the_bus_upsets_it(frames: list[tuple[int, bytes, int]]) -> N
         monitor.frame(Frame(identifier, data), now)
     assert sum(tally.frames for tally in monitor.load(now).tallies.values()) == len(frames)
     assert len(monitor.slots) <= 64
+
+
+def test_management_of_firmware_that_has_no_time_left_is_not_shown_as_a_sync() -> None:
+    monitor = Monitor(timing())
+    stop = management.encode(management.Stop("PC1"))
+    frames = [Frame(left, data) for left, data in rtcan.fragments(stop)]
+    seen = [monitor.frame(frame, number * MS) for number, frame in enumerate(frames, 1)]
+    assert [each.kind for each in seen] == [FrameKind.MANAGEMENT] * 4
+    assert seen[-1].text == "Stop module=PC1"
+    assert monitor.frame(Frame(0, bytes(8)), 9 * MS).kind is FrameKind.SYNC

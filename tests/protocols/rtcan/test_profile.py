@@ -4,10 +4,15 @@ from collections import Counter
 
 import pytest
 
-from r2p.protocols.rtcan.events import NEVER, Profile
+from r2p.codecs import management, rtcan
+from r2p.codecs.rtcan import Frame
+from r2p.protocols.rtcan.engine import Engine
+from r2p.protocols.rtcan.events import NEVER, Profile, Received
 from r2p.protocols.rtcan.profile import QUIET, Detector, Pacer
+from r2p.protocols.rtcan.settings import Settings
 
 MS = 1_000_000
+STOP = management.encode(management.Stop("PC1"))
 
 
 @pytest.mark.parametrize(
@@ -66,3 +71,53 @@ def test_it_is_bounded() -> None:
         pacer.put(bytes([n]))
     assert counts == {"management dropped": 6}
     assert pacer.pop(QUIET) == (bytes([6]), None)
+
+
+def hear(engine: Engine, now: int, laxities: list[int], payload: bytes = STOP, message: int = 0) -> list[bytes]:
+    """A message of firmware, each of its frames with the laxity of that moment. Comes back: what was received."""
+    received = []
+    for laxity, (left, data) in zip(laxities, rtcan.fragments(payload), strict=True):
+        now += 150_000
+        actions = engine.receive(now, Frame(rtcan.encode_identifier(laxity, message, left), data), now)
+        received += [each.payload for each in actions if isinstance(each, Received)]
+    return received
+
+
+def engine_of(profile: Profile) -> Engine:
+    engine = Engine(Settings(number=1 << 40, id8=10, profile=profile))
+    engine.start(0)
+    return engine
+
+
+@pytest.mark.parametrize("laxities", [[50] * 4, [0] * 4, [2, 1, 1, 0], [0, 1, 1, 1], [63, 63, 63, 0], [1, 1, 0, 63]])
+def test_management_that_ends_with_laxity_0_is_no_sync_among_firmware(laxities: list[int]) -> None:
+    engine = engine_of(Profile.FIRMWARE)
+    assert hear(engine, MS, laxities) == [STOP]
+    assert hear(engine, 5 * MS, laxities) == [STOP]
+    assert engine.losses == {}
+
+
+def test_a_topic_of_firmware_with_laxity_0_and_a_low_id_is_no_sync_either() -> None:
+    engine = engine_of(Profile.FIRMWARE)
+    engine.subscribe(0x0010, 5)
+    assert hear(engine, MS, [0], b"12345", 0x0010) == [b"12345"]
+    assert hear(engine, 2 * MS, [0], b"12345678", 0x0011) == []
+    assert not engine.counts
+
+
+def test_firmware_without_time_left_is_found_by_its_management() -> None:
+    engine = engine_of(Profile.AUTO)
+    at = 0
+    while engine.profile is Profile.AUTO:
+        hear(engine, at, [0] * 4)  # the last one ends just before it is decided
+        at = engine.next_deadline() or 0
+        engine.poll(at)
+    assert engine.profile is Profile.FIRMWARE
+
+
+def test_a_master_does_not_take_the_end_of_management_for_a_foreign_sync() -> None:
+    engine = engine_of(Profile.RTCAN)
+    hear(engine, MS, [0] * 4)
+    assert engine.cycle is None
+    engine.receive(6 * MS, rtcan.encode_sync(256, 1), 6 * MS)
+    assert engine.cycle == 0
