@@ -32,6 +32,7 @@ OPENING = b"\r\n\r\n"
 """Ends whatever the reader at the other end has begun to read."""
 
 _MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
+_URGENT_MOST = 96  # urgent messages that wait, whatever else does: another 8 KiB
 _CLOSING = 0.5  # seconds for the other end to take what is still buffered
 _SECOND = 1_000_000_000
 _NO_DEADLINE = 0x7FFFFFFF
@@ -107,6 +108,7 @@ class LineLink(Link):
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
         self._sources = Sources(self.discovery, name)
         self._carrier: Carrier | None = None
+        self._urgent: deque[bytes] = deque()
         self._management: deque[bytes] = deque()
         self._samples: deque[bytes] = deque()
         self._waiting = 0
@@ -183,7 +185,7 @@ class LineLink(Link):
             self._hold(topic, sample)
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        if self._waiting >= self._limit + _MANAGEMENT_BUFFER and not urgent:
+        if len(self._urgent) >= _URGENT_MOST if urgent else self._waiting >= self._limit + _MANAGEMENT_BUFFER:
             self.stats.lost["management, send buffer full"] += 1
             return
         deadline = self._clock.now() // 1000 + _NO_DEADLINE
@@ -192,10 +194,7 @@ class LineLink(Link):
             self._send_at_once(line)
             return
         self._waiting += len(line)
-        if urgent:
-            self._management.appendleft(line)
-        else:
-            self._management.append(line)
+        (self._urgent if urgent else self._management).append(line)
 
     def sample(self, topic: str, arrival: debug.Line) -> Sample:
         return Sample(arrival.data, self._sources.of(topic), self._stamp, stamped=False)
@@ -203,6 +202,7 @@ class LineLink(Link):
     def discard(self) -> int:
         discarded = len(self._samples)
         self.stats.sent -= discarded
+        self._urgent.clear()
         self._management.clear()
         self._samples.clear()
         self._waiting = 0
@@ -248,10 +248,11 @@ class LineLink(Link):
 
     def _next_piece(self) -> bytes:
         if self._piecemeal:
-            piece = (self._management or self._samples).popleft()
+            piece = (self._urgent or self._management or self._samples).popleft()
             self._waiting -= len(piece)
             return piece
-        piece = b"".join([*self._management, *self._samples])
+        piece = b"".join([*self._urgent, *self._management, *self._samples])
+        self._urgent.clear()
         self._management.clear()
         self._samples.clear()
         self._waiting = 0

@@ -18,6 +18,7 @@ from tests.transports.conversation import Script, line, manage
 pytestmark = pytest.mark.virtual_time
 
 SUBSCRIBE = m.SubscribeRequest("leds", 5, 1)
+ORDERS = (m.Stop, m.Reboot, m.Bootload)
 
 
 @asynccontextmanager
@@ -62,6 +63,38 @@ async def test_a_stop_overtakes_all_that_waits() -> None:
         assert "SubscribeResponse" in order[1:]
         assert set(order[order.index("leds") :]) == {"leds"}
         assert len(script.topics("leds")) >= 3
+
+
+async def test_orders_keep_their_order() -> None:
+    """In one turn of the loop, and while the line takes no more."""
+    orders = [("STOP", "A"), ("STOP", "B"), ("REBOOT", "B"), ("STOP", "C"), ("REBOOT", "C")]
+    async with scripted() as (script, module, _):
+        await asyncio.sleep(1)
+        for blocked in False, True:
+            script.said.clear()
+            script.link._blocked = blocked
+            for command, name in orders:
+                module.command(r2p.Command[command], name)
+            script.unblock()
+            await asyncio.sleep(0)
+            given = [each.management for each in script.said]
+            assert [(type(each).__name__.upper(), each.module) for each in given if isinstance(each, ORDERS)] == orders
+
+
+async def test_orders_that_wait_for_a_blocked_line_are_bounded() -> None:
+    """They have a buffer of their own, so that announcements can't fill it."""
+    async with scripted() as (script, module, _):
+        await asyncio.sleep(1)
+        script.blocked = True
+        for _ in range(2000):
+            script.hear(manage(m.SubscribeRequest("leds", 5, 1)))
+            module.command(r2p.Command.STOP, "A")
+        assert script.link._waiting < 20_000
+        assert script.link.losses["management, send buffer full"] > 1800
+        script.said.clear()
+        script.unblock()
+        await asyncio.sleep(0)
+        assert 90 < sum(isinstance(each.management, m.Stop) for each in script.said) < 100
 
 
 async def test_what_waits_for_a_blocked_line_is_bounded() -> None:

@@ -46,17 +46,25 @@ class Pacer:
         self._counts = counts
         self.waiting: deque[tuple[bytes, Hashable]] = deque()
         """Messages and their handles, the next one first."""
+        self._urgent = 0  # so many of them are urgent: the first ones
         self._quiet_from = LONG_AGO
         self._delay: int | None = None  # drawn when it is needed: most networks are not of firmware
 
     def put(self, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Hashable:
-        """Send it when it is quiet; the oldest is dropped when there are too many: its handle comes back."""
+        """Send it when it is quiet, `urgent` ones first, in order.
+
+        The oldest that is not urgent is dropped when there are too many: its handle comes back.
+        """
         dropped: Hashable = None
         if len(self.waiting) >= _MOST:
-            _, dropped = self.waiting.popleft()
             self._counts["management dropped"] += 1
+            if self._urgent == len(self.waiting):
+                return handle
+            _, dropped = self.waiting[self._urgent]
+            del self.waiting[self._urgent]
         if urgent:
-            self.waiting.appendleft((data, handle))
+            self.waiting.insert(self._urgent, (data, handle))
+            self._urgent += 1
         else:
             self.waiting.append((data, handle))
         return dropped
@@ -80,6 +88,7 @@ class Pacer:
         if self.due > now:
             return None
         self.traffic(now)
+        self._urgent = max(0, self._urgent - 1)
         return self.waiting.popleft()
 
     def __len__(self) -> int:
@@ -89,4 +98,5 @@ class Pacer:
         """Forget all; their handles come back."""
         handles = [handle for _, handle in self.waiting]
         self.waiting.clear()
+        self._urgent = 0
         return handles

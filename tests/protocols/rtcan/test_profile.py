@@ -121,3 +121,19 @@ def test_a_master_does_not_take_the_end_of_management_for_a_foreign_sync() -> No
     assert engine.cycle is None
     engine.receive(6 * MS, rtcan.encode_sync(256, 1), 6 * MS)
     assert engine.cycle == 0
+
+
+def test_urgent_ones_keep_their_order_and_are_the_last_to_be_dropped() -> None:
+    counts: Counter[str] = Counter()
+    pacer = Pacer(lambda below: 0, counts)
+    pacer.put(b"later", handle="later")
+    orders = [bytes([n]) for n in range(64)]
+    assert [pacer.put(order, urgent=True, handle=order) for order in orders] == [*[None] * 63, "later"]
+    assert pacer.put(b"late", handle="late") == "late"
+    assert pacer.put(b"stop", urgent=True, handle="stop") == "stop"
+    assert counts == {"management dropped": 3}
+    sent = [pacer.pop(n * QUIET) for n in range(1, 65)]
+    assert [each[0] for each in sent if each is not None] == orders
+    pacer.put(b"later")
+    pacer.put(b"stop", urgent=True)
+    assert pacer.pop(100 * QUIET) == (b"stop", None)
