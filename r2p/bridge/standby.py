@@ -60,7 +60,7 @@ class Standby:
         self._by_number: dict[int, HomePort] = {}
         self._attached = 0
         self._changes = 0
-        self._used = self.homes.used(0, _ALL)
+        self._used = {_ALL: self.homes.used(0, _ALL)}  # by the links that can't carry a topic
         self._without: dict[str, frozenset[int]] = {}
         self._unable: dict[tuple[int, int], frozenset[int]] = {}
         self._guarding = False
@@ -73,14 +73,18 @@ class Standby:
         self._attached += 1
         port = HomePort(self, link, self._attached)
         self._ports[link.name] = self._by_number[port.number] = port
-        self._unable.clear()
+        for key, unable in self._unable.items():
+            if _cannot_carry(link, *key):
+                self._unable[key] = unable | {port.number}
         link.gate = port
 
     def detach(self, link: Link) -> None:
         """It does not have it any more."""
         port = self._ports.pop(link.name)
         del self._by_number[port.number]
-        self._unable.clear()
+        for key, unable in self._unable.items():
+            if port.number in unable:
+                self._unable[key] = unable - {port.number}
         self.homes.shut(self._now(), port.number)
         self.homes.forget(port.number)
         self._act()
@@ -96,7 +100,7 @@ class Standby:
             self.homes.shut(self._now(), port.number)
             link.stands_by = ""
         self._act()
-        if link.up and port.number not in self._used:
+        if link.up and port.number not in self._used[_ALL]:
             self._retell([link])
 
     def close(self) -> None:
@@ -141,7 +145,7 @@ class Standby:
             ends = [info.instance for info in port.link.discovery.modules.values() if info.r2p and not info.hops]
             self.homes.ended(self._now(), port.number, ends[0] if len(ends) == 1 else None)
             self._act()
-        if len(self._used) == len(self.homes.by_number):
+        if len(self._used[_ALL]) == len(self.homes.by_number):
             return
         for topic in list(self._space.topics.values()):
             if topic.layout is None and self._without.get(topic.name, _ALL) != self._unable_for(topic):
@@ -165,11 +169,8 @@ class Standby:
             size = max((info.size for info in infos if info is not None), default=0)
         key = len(topic.name), size
         if key not in self._unable:
-            self._unable[key] = frozenset(
-                number
-                for number, port in self._by_number.items()
-                if key[0] > port.link.longest_name or (size and port.link.refusal(size))
-            )
+            ports = self._by_number.items()
+            self._unable[key] = frozenset(number for number, port in ports if _cannot_carry(port.link, *key))
         return self._unable[key]
 
     def _guard_of(self, topic: Topic) -> Callable[[str], bool]:
@@ -206,20 +207,25 @@ class Standby:
             self._changes = self.homes.changes
             self._guarding = guarding
             self._choose()
-        for number, port in self._by_number.items():
-            if port.link.up:
-                self._tell_user(number, port.link)
+        for number in self._by_number.keys() - self._used[_ALL]:
+            self._tell_user(number, self._by_number[number].link)
         self._alarm.set(self.homes.next_deadline())
 
     def _choose(self) -> None:
         """Other links are used than before."""
-        before, self._used = self._used, self.homes.used(self._now(), _ALL)
-        for number in before - self._used:
-            port = self._by_number.get(number)
-            if port is not None and port.link.up:
+        before = self._used
+        withouts = {_ALL, *self._without.values()}
+        self._used = {without: self.homes.used(self._now(), without) for without in withouts}
+        changed = set().union(*(used ^ before.get(without, _ALL) for without, used in self._used.items()))
+        ports = [port for number in sorted(changed) if (port := self._by_number.get(number)) and port.link.up]
+        for port in ports:
+            if port.number in self._used[_ALL]:
+                self._tell_used(port.link)
+            elif port.number in before[_ALL]:
                 port.link.stats.lost["standing by"] += port.link.discard()
-        links = [port.link for port in self._by_number.values() if port.link.up]
-        self._retell(links)
+        for topic in self._space.topics.values():
+            topic.guard = self._guard_of(topic) if self._guarding else None
+        self._retell([port.link for port in ports])
 
     def _retell(self, links: list[Link]) -> None:
         for topic in list(self._space.topics.values()):
@@ -231,14 +237,15 @@ class Standby:
             if port.link.up:
                 port.link.topic_changed(topic)
 
+    def _tell_used(self, link: Link) -> None:
+        if link.stands_by:
+            link.stands_by = ""
+            self._told(link, "used", "is used again", False)
+
     def _tell_user(self, number: int, link: Link) -> None:
-        if number in self._used:
-            if link.stands_by:
-                link.stands_by = ""
-                self._told(link, "used", "is used again", False)
-            return
-        other = self.homes.stands_by_for(number)
-        if other is not None and not link.stands_by:
+        """Of a link that is not used."""
+        other = self.homes.stands_by_for(number) if link.up and not link.stands_by else None
+        if other is not None:
             link.stands_by = self._reason(number, self._by_number[other])
             self._told(link, "stands by", link.stands_by, False)
 
@@ -252,3 +259,8 @@ class Standby:
         names = [info.name for info in link.discovery.modules.values() if info.instance in gateways]
         joins = f"gateway {names[0]} joins" if len(names) == 1 else "gateways join"
         return f"stands by: {joins} its network to that of {other.link.name}"
+
+
+def _cannot_carry(link: Link, name_length: int, size: int) -> bool:
+    """Whether a topic's name, or its messages of `size` bytes (0: not known), are too long for the link."""
+    return name_length > link.longest_name or (size > 0 and link.refusal(size) is not None)

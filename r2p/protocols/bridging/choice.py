@@ -54,6 +54,10 @@ class Home(msgspec.Struct, eq=False):
         """Whether gateways may join its network to others."""
         return bool(self.gateways) or now < self.known_at
 
+    def is_busy(self, now: int) -> bool:
+        """Whether anything was heard of its network that time may change, or there is something to say."""
+        return bool(self.gateways or self.twins or self.loops) or self.asks or now < self.known_at
+
 
 class Choice:
     """Which links are used for topics that all links can carry but those in `without`."""
@@ -69,6 +73,20 @@ class Choice:
 
     def forget(self, number: int) -> None:
         self._barred.pop(number, None)
+
+    def add(self, number: int) -> bool:
+        """A link that is new and leads where no other one does: used at once. Says whether that changes anything."""
+        if number in self.without or number in self.used:
+            return False
+        self.used |= {number}
+        return True
+
+    def remove(self, number: int) -> bool:
+        """Such a link is gone."""
+        if number not in self.used:
+            return False
+        self.used -= {number}
+        return True
 
     def choose(self, now: int, homes: list[Home]) -> bool:
         """Look at the links (those that are up, in order) anew; says whether more than one is contested."""

@@ -10,7 +10,7 @@ A link without gateways is used without more ado; whether there are any is known
 has only one other end. What was unused until now waits for SETTLE, for what is on its way. One link is always used.
 """
 
-from collections import deque
+from collections import Counter, deque
 
 from r2p.codecs.management import Bridge, Leaf
 from r2p.protocols.bridging.choice import FOR_EVER, Choice, Heard, Home
@@ -53,6 +53,8 @@ class Homes:
         self._sent: deque[tuple[int, int]] = deque()  # count, instant
         self._looked_at = 0
         self._says: list[tuple[int, Leaf | None]] = []
+        self._busy: list[Home] = []  # those of which something was heard, or may yet be: the others need no time
+        self._ends: Counter[int] = Counter()  # how many links lead to each module
 
     @property
     def guards(self) -> bool:
@@ -66,14 +68,28 @@ class Homes:
 
     def open(self, now: int, number: int, *, lone: bool) -> None:
         """A link is up; `lone`: it has only one other end."""
-        self.by_number[number] = Home(number, now if lone else now + LISTEN)
-        self._look(now)
+        self.shut(now, number)
+        home = self.by_number[number] = Home(number, now if lone else now + LISTEN)
+        if not (lone and self._stands_alone(home)):
+            self._look(now)
+            return
+        for choice in self._choices.values():
+            self.changes += choice.add(number)
 
     def shut(self, now: int, number: int) -> None:
         """It is down."""
-        if self.by_number.pop(number, None) is not None:
-            for choice in self._choices.values():
-                choice.forget(number)
+        home = self.by_number.get(number)
+        if home is None:
+            return
+        stands_alone = self._stands_alone(home)
+        del self.by_number[number]
+        if home.end is not None:
+            self._forget_end(home.end)
+        for choice in self._choices.values():
+            choice.forget(number)
+            if stands_alone:
+                self.changes += choice.remove(number)
+        if not stands_alone:
             self._look(now)
 
     def forget(self, number: int) -> None:
@@ -128,8 +144,15 @@ class Homes:
         home = self.by_number.get(number)
         if instance is not None and instance < self._instance:
             instance = None
-        if home is not None and home.end != instance:
-            home.end = instance
+        if home is None or home.end == instance:
+            return
+        stood_alone = self._stands_alone(home)
+        if home.end is not None:
+            self._forget_end(home.end)
+        home.end = instance
+        if instance is not None:
+            self._ends[instance] += 1
+        if not (stood_alone and self._stands_alone(home)):
             self._look(now)
 
     def probed(self, now: int, number: int, low: int) -> None:
@@ -171,7 +194,7 @@ class Homes:
     def poll(self, now: int) -> None:
         """See who has fallen silent, and say what is due."""
         self._look(now)
-        for home in self.by_number.values():
+        for home in self._busy:
             if self._due(home) <= now:
                 self._say(now, home)
 
@@ -180,7 +203,7 @@ class Homes:
         now = self._looked_at
         dues = [choice.next_deadline(now) for choice in self._choices.values()]
         if len(self.by_number) > 1:
-            for home in self.by_number.values():
+            for home in self._busy:
                 dues.append(self._due(home))
                 dues += [each.at + DEAD for each in home.gateways.values()]
                 dues += [at + TWIN_MEMORY for at in (*home.twins.values(), *home.loops.values())]
@@ -193,12 +216,23 @@ class Homes:
         for home in self.by_number.values():
             self._bury(now, home)
         homes = [home for _, home in sorted(self.by_number.items())]
+        self._busy = [home for home in homes if home.is_busy(now)]
         for choice in self._choices.values():
             before = choice.used
             if choice.choose(now, homes):
                 self._needed_at = now
             self.changes += choice.used != before
         self.until = min((choice.until for choice in self._choices.values()), default=FOR_EVER)
+
+    def _forget_end(self, instance: int) -> None:
+        self._ends[instance] -= 1
+        if not self._ends[instance]:
+            del self._ends[instance]
+
+    def _stands_alone(self, home: Home) -> bool:
+        """Whether what becomes of the link makes no difference to others: one of a thousand clients costs no more."""
+        alone = home.end is None or self._ends[home.end] == 1
+        return alone and home not in self._busy and not any(each.twins or each.loops for each in self._busy)
 
     def _bury(self, now: int, home: Home) -> None:
         """Gateways that were silent for so long are gone, or not heard: listen again before that is believed."""
@@ -215,7 +249,7 @@ class Homes:
     def _due(self, home: Home) -> int:
         """When to say LEAF."""
         now = self._looked_at
-        if now < home.known_at and sum(each.contested(now) for each in self.by_number.values()) > 1:
+        if now < home.known_at and sum(each.contested(now) for each in self._busy) > 1:
             tick = TICK_LISTENING
         elif home.gateways and self.speaks:
             tick = TICK
