@@ -8,6 +8,7 @@ nothing is sent for which nobody asked, nothing is taken that nobody opened.
 """
 
 import abc
+import itertools
 import random
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable
@@ -412,7 +413,8 @@ class Link(abc.ABC):
 
 def _unlike(name: str, taken: set[str]) -> str:
     """A name that tells two links apart that lead to the same place."""
-    return next(each for each in (name, *(f"{name}#{n}" for n in range(2, len(taken) + 3))) if each not in taken)
+    names = itertools.chain((name,), (f"{name}#{n}" for n in itertools.count(2)))
+    return next(each for each in names if each not in taken)
 
 
 def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
