@@ -129,7 +129,7 @@ class RtcanLink(Link):
 
     def _ready(self, news: Ready) -> None:
         """The node has an id8, perhaps another one than before: announce everything under it."""
-        pace(self._paced, news.profile, self.engine.timing.bit)
+        self._high_bytes.pace(pace(self._paced, news.profile, self.engine.timing.bit))
         self.shell.refilter()
         self._announce()
 
@@ -154,12 +154,19 @@ class RtcanLink(Link):
             source = origins.address(data, self.discovery.modules)
             data = origins.unmark(data)
         told = origins.publisher_in(data, source)
-        ours = None if told is None else self._high_bytes.heard(*told, self.engine.id8 or 0)
-        topic = None if ours is None else self._space.topics.get(ours)
-        if topic is not None:
-            self.topic_changed(topic)  # its high byte is another's
+        if told is not None:
+            firmware = source == origins.FIRMWARE and message == rtcan.FIRMWARE_MANAGEMENT
+            now, id8 = self._clock.monotonic(), self.engine.id8 or 0
+            self._renumber(self._high_bytes.heard(now, *told, id8, firmware=firmware))
         if self.up:  # before, we only listen
             self.manage(data, source)
+
+    def _renumber(self, names: Sequence[str]) -> None:
+        """These topics of ours have to take another high byte, or may find one now."""
+        for name in names:
+            topic = self._space.topics.get(name)
+            if topic is not None:
+                self.topic_changed(topic)
 
     # Out
 
@@ -208,12 +215,17 @@ class RtcanLink(Link):
             return NO_PARAMS
         high = self._high_bytes.pick(topic)
         if high is None:
-            self._hub.link_notice(self, "no id", f"topic {topic}: all message ids are taken", trouble=True)
             return None
         return origins.params_of(rtcan.message_id(high, self.engine.id8 or 0))
 
     def topic_changed(self, topic: Topic) -> None:
+        refused = self._high_bytes.refused
+        known = topic.name in refused
+        refused.discard(topic.name)
         super().topic_changed(topic)
+        if topic.name in refused and not known:
+            text = f"topic {topic.name}: all message ids are taken; it is published as soon as one comes free"
+            self._hub.link_notice(self, "no id", text, trouble=True)
         told = self._told.get(topic.name)
         if told is None or not told.publishes:
             self._high_bytes.drop(topic.name)
@@ -286,6 +298,7 @@ class RtcanLink(Link):
 
     def _poll(self) -> None:
         self._tell_utc()
+        self._renumber(self._high_bytes.freed(self._clock.monotonic()))
         super()._poll()
 
     # Life

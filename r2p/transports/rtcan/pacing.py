@@ -17,9 +17,11 @@ def discovery_on(hub: Hub, link: str) -> Discovery:
     return Discovery(hub.space.module, hub.instance, rate=_RATE, burst=_BURST, observer=hub.observer, counts=counts)
 
 
-def pace(discovery: Discovery, profile: Profile, bit: int) -> None:
-    """Now it is known what the bus bears; `bit` in ns."""
+def pace(discovery: Discovery, profile: Profile, bit: int) -> float:
+    """Now it is known what the bus bears; `bit` in ns. Returns the announcements a second."""
     if profile is Profile.FIRMWARE:
         discovery.pace(_FIRMWARE_RATE, _LEAST, _QUIET)
-    else:
-        discovery.pace(_RATE * _BIT / bit, max(_LEAST, _BURST * _BIT // bit), 0.0)
+        return _FIRMWARE_RATE
+    rate = _RATE * _BIT / bit
+    discovery.pace(rate, max(_LEAST, _BURST * _BIT // bit), 0.0)
+    return rate

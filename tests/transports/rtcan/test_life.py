@@ -8,12 +8,14 @@ from contextlib import AsyncExitStack
 import pytest
 
 import r2p
-from r2p.codecs import rtcan
+from r2p.codecs import management, rtcan
+from r2p.codecs.management import Advertise
 from r2p.events import ModuleEvent
 from r2p.msg import PWM2, Led
 from r2p.protocols.rtcan.election import Role
 from r2p.protocols.rtcan.topics import HighBytes
 from r2p.sim.can import State
+from r2p.transports.rtcan import origins
 from r2p.transports.rtcan.options import Options
 from tests.transports.rtcan.networks import GUARD, Lab, lab, until
 
@@ -245,6 +247,43 @@ def _colliding() -> tuple[str, str]:
             return seen[high], name
         seen[high] = name
     raise AssertionError("256 bytes for 1000 names")
+
+
+async def test_message_ids_that_a_broken_node_has_taken_come_free() -> None:
+    async with lab("A", "B") as (made, (alice, bob)):
+        link = made.link("A")
+        publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        for high in range(rtcan.FIRST_TOPIC, 256):
+            advertise = Advertise(f"broken{high}", 8, 0, origins.params_of(rtcan.message_id(high, 1)))
+            for left, data in rtcan.fragments(management.encode(advertise)):
+                frame = rtcan.Frame(rtcan.encode_identifier(50, 0x0101, left), data)
+                link.shell.received(frame, link.shell.now())
+        assert publisher.subscribers == 0
+        async with asyncio.timeout(25.0):
+            await publisher.wait_subscriber()
+        await publisher.publish(Led(led=1))
+        assert await subscriber.fetch(timeout=1.0) == Led(led=1)
+
+
+async def test_publishers_of_a_topic_share_a_high_byte() -> None:
+    first, second = _colliding()
+    async with lab("A", "B", "C") as (made, (alice, bob, carol)):
+        subscriber = carol.subscribe(second, Led)
+        blocker = alice.advertise(first, Led)
+        await asyncio.sleep(3.0)
+        bobs = bob.advertise(second, Led)  # the byte that the name decides is taken
+        await bobs.wait_subscriber()
+        blocker.close()
+        alices = alice.advertise(second, Led)
+        await alices.wait_subscriber()
+        made.clear()
+        for publisher, led in (alices, 1), (bobs, 2):
+            await publisher.publish(Led(led=led))
+            assert await subscriber.fetch(timeout=1.0) == Led(led=led)
+        data = made.sent(lambda found: found.laxity == rtcan.NRT)
+        assert len({each.frame.id >> 7 & 0xFFFF for each in data}) == 2
+        assert len({each.frame.id >> 15 & 0xFF for each in data}) == 1
 
 
 async def test_stop_is_urgent() -> None:
