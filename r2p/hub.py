@@ -12,6 +12,7 @@ from r2p.bridge import Bridge, BridgeOptions, Standby
 from r2p.codecs.management import DENIED_READ_ONLY
 from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.network import describe_mismatch
+from r2p.printable import get_logger
 from r2p.protocols.events import (
     Command,
     Echoes,
@@ -27,7 +28,7 @@ from r2p.protocols.events import (
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.link import Link
 
-logger = logging.getLogger("r2p.module")
+logger = get_logger("r2p.module")
 
 _CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word

@@ -5,7 +5,6 @@ when its `async with` block has.
 """
 
 import asyncio
-import logging
 import os
 import socket
 from collections.abc import AsyncIterator, Iterable
@@ -23,6 +22,7 @@ from r2p.names import module_name, module_name_from, node_name, topic_name
 from r2p.network import NetworkView
 from r2p.node import Node
 from r2p.orders import Orders
+from r2p.printable import get_logger
 from r2p.protocols.events import Command
 from r2p.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.topic import TopicSpace
@@ -30,7 +30,7 @@ from r2p.transports.link import Link, Transport
 from r2p.transports.url import open_transport
 from r2p.watchdog import Watchdog
 
-logger = logging.getLogger("r2p.module")
+logger = get_logger("r2p.module")
 
 PATIENCE = 1.0
 """Seconds after which the log names the nodes whose clean-up is being waited for."""

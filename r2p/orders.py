@@ -1,15 +1,15 @@
 """Orders from the network to a module: STOP, REBOOT, and BOOTLOAD, which a program on a PC refuses."""
 
-import logging
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING
 
+from r2p.printable import get_logger
 from r2p.protocols.events import Command
 
 if TYPE_CHECKING:
     import asyncio
 
-logger = logging.getLogger("r2p.module")
+logger = get_logger("r2p.module")
 
 
 class Orders:

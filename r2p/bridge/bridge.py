@@ -1,6 +1,5 @@
 """The gateway of a module: its ports, the tree that they are part of, and what passes between them besides topics."""
 
-import logging
 from collections.abc import Callable
 
 from r2p.bridge import probes
@@ -13,12 +12,13 @@ from r2p.bridge.statistics import GatewayStatistics, PortStatistics, WayStatisti
 from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management
 from r2p.errors import DecodeError
+from r2p.printable import get_logger
 from r2p.protocols.bridging.tree import MOST_PORTS, Changed, Port, Probe, Say, State, Tree
 from r2p.topic import Topic, TopicSpace, Waker
 from r2p.transports.announce import Told
 from r2p.transports.link import Link
 
-logger = logging.getLogger("r2p.bridge")
+logger = get_logger("r2p.bridge")
 
 _ORDERS = (0x12, 0x13, 0x14)
 _DENIED = 0x55

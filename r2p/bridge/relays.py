@@ -4,7 +4,6 @@ On a link we publish what is offered, and subscribe what is wanted, on another o
 that only on links that are in the tree; so demand travels along the tree, and can't feed itself.
 """
 
-import logging
 import re
 from collections.abc import Iterable, Iterator
 
@@ -16,11 +15,12 @@ from r2p.bridge.relay import BridgedTopic, Relay, Way
 from r2p.bridge.reserving import RelayedPeriodic
 from r2p.bridge.shaping import Shaper
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.printable import get_logger
 from r2p.protocols.events import Shape
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told
 
-logger = logging.getLogger("r2p.bridge")
+logger = get_logger("r2p.bridge")
 
 QUEUE = 16
 """Messages that a gateway asks firmware to keep for it."""

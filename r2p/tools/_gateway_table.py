@@ -112,10 +112,10 @@ class Screen:
     async def draw(self, rows: list[Row]) -> None:
         """Write the table over the last one."""
         text = fitted(table(rows), *shutil.get_terminal_size())
-        up = f"\x1b[{self._height}F\x1b[J" if self._height and self._noticed.count == self._seen else ""
+        over = self._height if self._noticed.count == self._seen else 0
         self._seen = self._noticed.count
         self._height = text.count("\n") + 1
-        await self._output.remark(up + text)
+        await self._output.remark(text, over=over)
 
 
 def fitted(text: str, columns: int, lines: int) -> str:

@@ -1,5 +1,8 @@
 """What tools print: text for people at a terminal, JSON lines in a pipe, or the --format that was asked for.
 
+Texts from other modules are escaped here, for each format in its way: what is printed never moves a terminal's cursor,
+and a record stays on its lines.
+
 Output never stops the event loop: a tool that did would not read its links, and so make a robot wait for somebody's
 pager. Where the reader of a pipe is slow, `put` waits, the tool's lossy queues overflow, and that is counted.
 """
@@ -19,6 +22,8 @@ import sys
 import textwrap
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, TextIO
+
+from r2p.printable import printable
 
 Record = Mapping[str, Any]
 
@@ -97,20 +102,21 @@ class Output:
         async with self._lock:
             await self._write(text)
 
-    async def remark(self, text: str) -> None:
-        """Write a line for people; other formats are without. Raises PipeClosed."""
+    async def remark(self, text: str, *, over: int = 0) -> None:
+        """Write a line for people, over the last `over` lines; other formats are without. Raises PipeClosed."""
         if self.format == "text":
+            up = f"\x1b[{over}F\x1b[J" if over else ""
             async with self._lock:
-                await self._write(text + "\n")
+                await self._write(up + printable(text, "\n") + "\n")
 
     def _record(self, record: Record, text: str | None) -> str:
         match self.format:
             case "json":
-                return json.dumps(record, allow_nan=False) + "\n"
+                return json.dumps(record, allow_nan=False).replace("\x7f", "\\u007f") + "\n"
             case "csv":
                 return self._row(record)
             case "text" if text is not None:
-                return text + "\n"
+                return printable(text, "\n") + "\n"
             case _:
                 return to_yaml(record) + "---\n"
 
@@ -180,12 +186,13 @@ def flatten(record: Record) -> dict[str, Any]:
 
 
 def to_yaml(record: Any) -> str:
-    """A record as YAML: one line a field, and for a list of plain values."""
-    return _yaml_dumper()(record)
+    """A record as YAML: one line a field, and for a list of plain values. Only what is printable is not escaped."""
+    text = _yaml_dumper()(record, True)
+    return text if printable(text, "\n") == text else _yaml_dumper()(record, False)
 
 
 @functools.cache
-def _yaml_dumper() -> Callable[[Any], str]:
+def _yaml_dumper() -> Callable[[Any, bool], str]:
     import yaml
 
     base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -200,18 +207,17 @@ def _yaml_dumper() -> Callable[[Any], str]:
 
     dumper.add_representer(list, represent)
     dumper.add_representer(tuple, represent)
-    return lambda record: str(
-        yaml.dump(record, Dumper=dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=1 << 20)
-    )
+    style: dict[str, Any] = {"Dumper": dumper, "sort_keys": False, "default_flow_style": False, "width": 1 << 20}
+    return lambda record, allow_unicode: str(yaml.dump(record, allow_unicode=allow_unicode, **style))
 
 
 def aligned(rows: Iterable[Record], columns: list[str], width: int | None = None) -> str:
-    """A table for people: columns aligned, lists joined by blanks, nothing for None.
+    """A table for people: columns aligned, lists joined by blanks, nothing for None, each cell printable.
 
     Where it is wider than `width` characters, lists are folded between their items, onto lines of their own.
     """
     rows = list(rows)
-    lines = [[name.upper() for name in columns], *([_cell(row[name]) for name in columns] for row in rows)]
+    lines = [[printable(name.upper()) for name in columns], *([_cell(row[name]) for name in columns] for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
     if width is not None and sum(widths) + 2 * (len(widths) - 1) > width:
         lists = [i for i, name in enumerate(columns) if any(isinstance(row[name], list | tuple) for row in rows)]
@@ -247,12 +253,12 @@ def _wrapped(text: str, width: int) -> list[str]:
 def _cell(value: Any) -> str:
     if value is None:
         return ""
-    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+    return printable(" ".join(map(str, value)) if isinstance(value, list | tuple) else str(value))
 
 
 def _csv(cells: Iterable[Any]) -> str:
     line = io.StringIO()
-    csv.writer(line, lineterminator="\n").writerow(cells)
+    csv.writer(line, lineterminator="\n").writerow(printable(each) if isinstance(each, str) else each for each in cells)
     return line.getvalue()
 
 

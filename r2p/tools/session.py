@@ -31,6 +31,7 @@ import typer
 
 import r2p
 from r2p.clock import random_of
+from r2p.printable import printable
 from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout
 from r2p.tools.stderr import log_to_stderr, say
 from r2p.transports.url import duration, open_transport
@@ -371,7 +372,7 @@ def _explain(error: BaseException) -> None:
             abandon_stdout()
             return
         if isinstance(leaf, Usage | r2p.InvalidName):  # names that did not come from a person raise nothing
-            raise typer.BadParameter(str(leaf)) from leaf
+            raise typer.BadParameter(printable(str(leaf), "\n")) from leaf
         if isinstance(leaf, TimedOut):
             say(str(leaf))
             raise typer.Exit(3) from leaf

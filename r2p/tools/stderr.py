@@ -6,11 +6,13 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from r2p.printable import printable
+
 
 def say(text: str) -> None:
     """Tell the user, on stderr."""
     with contextlib.suppress(OSError):  # nobody reads it
-        print(f"r2p: {text}", file=sys.stderr, flush=True)  # noqa: T201 - the one place
+        print(printable(f"r2p: {text}", "\n\t"), file=sys.stderr, flush=True)  # noqa: T201 - the one place
 
 
 class _Short(logging.Formatter):
@@ -24,7 +26,7 @@ class _Short(logging.Formatter):
         text = where + level + record.getMessage()
         if record.exc_info:
             text += "\n" + self.formatException(record.exc_info)
-        return text
+        return printable(text, "\n\t")
 
 
 class _Stderr(logging.StreamHandler[Any]):

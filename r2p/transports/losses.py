@@ -4,8 +4,9 @@ import logging
 from collections import Counter
 
 from r2p.clock import Clock
+from r2p.printable import get_logger
 
-logger = logging.getLogger("r2p.link")
+logger = get_logger("r2p.link")
 
 _APART = 1_000_000_000
 """Ns between two lines about one reason."""

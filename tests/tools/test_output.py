@@ -69,6 +69,46 @@ async def test_csv_has_a_header_and_flat_columns() -> None:
     )
 
 
+HOSTILE = "\x1b]0;title\x07\x9b2J\r\nforged,line\x7f\u202e\u2028\\"
+
+
+def _is_harmless(text: str) -> bool:
+    return all(line.isprintable() for line in text.split("\n"))
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("format", ["json", "yaml", "csv", None])
+async def test_texts_from_outside_do_nothing_to_a_terminal(format: Any) -> None:
+    stream = Terminal()
+    output = Output(format, stream)
+    record = {"text": HOSTILE, "key\x1b": [HOSTILE]}
+    await output.put(record, f"shown {HOSTILE}")
+    await output.put(record)
+    await output.table([record], list(record))
+    await output.remark(HOSTILE)
+    assert _is_harmless(stream.getvalue())
+
+
+@pytest.mark.virtual_time
+async def test_json_and_yaml_hold_the_exact_text_and_csv_one_line() -> None:
+    lines, documents, cells = io.StringIO(), io.StringIO(), io.StringIO()
+    for stream, form in ((lines, "json"), (documents, "yaml"), (cells, "csv")):
+        await Output(form, stream).put({"text": HOSTILE})  # type: ignore[arg-type]
+    assert json.loads(lines.getvalue()) == {"text": HOSTILE}
+    assert next(iter(yaml.safe_load_all(documents.getvalue()))) == {"text": HOSTILE}
+    assert cells.getvalue().splitlines() == [
+        "text",
+        r'"\x1b]0;title\x07\x9b2J\r\nforged,line\x7f\u202e\u2028\"',
+    ]
+
+
+@pytest.mark.virtual_time
+async def test_a_remark_is_written_over_the_last_one() -> None:
+    stream = Terminal()
+    await Output(stream=stream).remark("new", over=3)
+    assert stream.getvalue() == "\x1b[3F\x1b[Jnew\n"
+
+
 def test_a_table_that_is_too_wide_folds_its_lists() -> None:
     rows = [
         {"topic": "log", "publishers": ["IMU1/log", "MOTOR/log", "PC1/log"], "subscribers": ["TOOL/echo"]},

@@ -18,6 +18,7 @@ from r2p.transports.url import Url
 
 MODES = ("peer", "client", "router")
 
+_MOST_NAMED = 8  # networks in one text
 _NETWORK = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _AT_PORTS = ("tcp", "udp", "tls", "quic", "ws")
 _PROTOCOLS = (*_AT_PORTS, "unixsock-stream", "unixpipe", "serial", "vsock")
@@ -83,8 +84,19 @@ def chosen(found: set[str]) -> str:
     if own in found or not others:
         return own
     if len(others) > 1:
-        raise ValueError(f"there are the networks {', '.join(others)}: say which, as ?network={others[0]}")
+        raise ValueError(f"there are the networks {listed(others)}: say which, as ?network={others[0]}")
     return others[0]
+
+
+def listed(networks: list[str]) -> str:
+    """Networks for a text: the first ones by name, where there are many."""
+    more = len(networks) - _MOST_NAMED
+    return ", ".join(networks[:_MOST_NAMED]) + f" and {more} more" * (more > 0)
+
+
+def is_network_name(text: str) -> bool:
+    """Whether a network can have this name; keys of others may hold anything in its place."""
+    return _NETWORK.fullmatch(text) is not None
 
 
 def _default_mode(endpoint: str | None, config: str | None) -> str | None:
@@ -103,7 +115,7 @@ def _one_of(*values: str) -> Callable[[str], str]:
 
 
 def _network_name(text: str) -> str:
-    if not _NETWORK.fullmatch(text):
+    if not is_network_name(text):
         raise ValueError("a network's name has 1 to 64 letters, digits, dots, dashes and underscores")
     return text
 

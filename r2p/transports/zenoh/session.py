@@ -22,6 +22,7 @@ from r2p.codecs import liveliness
 from r2p.errors import TransportError
 from r2p.transports.intake import TURN
 from r2p.transports.zenoh import threads
+from r2p.transports.zenoh.options import is_network_name
 
 T = TypeVar("T")
 
@@ -276,7 +277,8 @@ class Session:
         def tokens(kind: str) -> list[list[str]]:
             replies: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
             found = self._session.liveliness().get(f"r2p/*/live/*/*/{kind}/**", replies, timeout=1.0)
-            return [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
+            keys = [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
+            return [key for key in keys if is_network_name(key[1])]
 
         def ask() -> set[str]:
             everybody = tokens("module")

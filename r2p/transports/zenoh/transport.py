@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from r2p.backoff import Backoff
 from r2p.errors import TransportError
 from r2p.transports.link import Hub, Transport
-from r2p.transports.zenoh.options import Options, chosen, default_network
+from r2p.transports.zenoh.options import Options, chosen, default_network, listed
 from r2p.transports.zenoh.trouble import NOT_US, why, why_not_listening
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class ZenohTransport(Transport):
             if _has_company(link):
                 return
             if others:
-                text = f"nobody else is on the network {network}, but there are modules on {', '.join(others)}"
+                text = f"nobody else is on the network {network}, but there are modules on {listed(others)}"
                 text += f": is ?network={others[0]} meant?"
                 # A program without a log handler shows warnings only; a tool shows both.
                 hub.link_notice(link, "elsewhere", text, trouble=not hub.observer)

@@ -295,6 +295,22 @@ async def test_a_router_that_asks_who_is_there_is_not_stopped_by_many_answers() 
 
 
 @guarded
+async def test_what_cannot_be_the_name_of_a_network_is_none() -> None:
+    async with nodes(net := Net(), "A") as (alice,), alien_on(net) as alien:
+        live = alien.liveliness()
+        tokens = [
+            live.declare_token(f"r2p/{name}/live/1/a1/module/EVIL/a1/0/0") for name in ("\x1b]0;hi\x07", "a b", "other")
+        ]
+        session = link_of(alice)._session
+        assert session is not None
+        found: set[str] = set()
+        while "other" not in found:
+            found = await session.networks(tools=False)
+        assert found == {"lab", "other"}
+        del tokens
+
+
+@guarded
 async def test_the_last_words_of_a_module_arrive() -> None:
     net = Net()
     async with module("A", net.listen) as a, node_in(a) as alice:

@@ -84,6 +84,8 @@ def test_the_network_of_a_tool_that_was_told_none() -> None:
     assert chosen({"robot1"}) == "robot1"
     with pytest.raises(ValueError, match="networks robot1, robot2: say which"):
         chosen({"robot2", "robot1"})
+    with pytest.raises(ValueError, match=r"n0, n1, n2, n3, n4, n5, n6, n7 and 2 more: say which, as \?network=n0$"):
+        chosen({f"n{number}" for number in range(10)})
 
 
 @pytest.mark.anyio
