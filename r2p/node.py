@@ -91,6 +91,9 @@ class Node:
         self.closed = False
         self.crashed: Callable[[Exception], None] = self._log_crash
         """What to do with an error outside the node's own task; its supervisor sets it."""
+        self.unwinds: Callable[[], bool] = lambda: False
+        """Whether its function is on its way out by an exception; its supervisor sets it."""
+        self._ending = False
         self._space = space
         self._remap = remap or {}
         self._events = events or EventHub()
@@ -305,6 +308,21 @@ class Node:
         """End this node with an error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
         self.crashed(error)
 
+    @property
+    def ending(self) -> bool:
+        """Whether its end has begun: it was stopped, has crashed, or its function is in a `finally` by an exception.
+
+        From then on only its function has a say: no `fill`, `on_missed`, `on_timeout` or the like is called.
+        """
+        return self._ending or self.unwinds()
+
+    def end(self) -> None:
+        """Its end begins: periodic publishers fall silent, so that nothing contradicts what its clean-up publishes."""
+        self._ending = True
+        for publisher in self.publishers:
+            if isinstance(publisher, PeriodicPublisher):
+                publisher.silence()
+
     def forget(self, user: object) -> None:
         """A publisher or subscriber of the node was closed."""
         # The type checker wants a key that may be there; it is in one of the two at most.
@@ -318,7 +336,7 @@ class Node:
 
     def close(self) -> None:
         """Close all its publishers and subscribers; the module does so when the node's function has ended."""
-        self.closed = True
+        self.closed = self._ending = True
         for each in (*self.publishers, *self.subscribers, *self._tickers):
             each.close()
         if self._entered:

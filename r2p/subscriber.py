@@ -320,6 +320,8 @@ class Subscriber(Generic[T]):
         self.timeouts += 1
         if self._on_timeout is not None:
             self._silent = True
+            if self._node.ending:
+                return
             try:
                 self._on_timeout()
             except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node

@@ -2,24 +2,32 @@
 
 A node that raises ends alone: its traceback is logged, the others run on, and the module raises what happened when it
 ends. Stopping is cancellation, so `try/finally` in the node's function stops the motor.
+
+Nothing disturbs that clean-up: neither a function that the node gave away and that fails meanwhile, nor a second reason
+to end it. Whatever comes while an exception, the node's own or a cancellation, is in a `finally` waits for its end.
 """
 
 import asyncio
 import functools
 import inspect
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, cast
 
 from r2p.backoff import Backoff
 from r2p.clock import random_of
 from r2p.errors import Error, NameTooLong
 from r2p.names import NODE_MAX, node_name
 from r2p.node import Node
+from r2p.unwinding import cleans_up, ends
 
 NodeFunction = Callable[..., Awaitable[object]]
 """What `Module.start` runs: `async def blink(node: r2p.Node) -> None`; more arguments are given to `start`."""
 
 _FIRST_RESTART, _LONGEST_RESTART = 0.5, 30.0  # seconds
-_ENDING = 1.0  # seconds that a node has to end before somebody says so
+_LOOK = 0.01  # seconds after which it is looked at again whether clean-up is over
+_HANDLER = (
+    1.0  # seconds for which an `except` is taken for clean-up after a crash; then it is what the node goes on with
+)
 _STABLE = 60.0  # seconds after which a crash is the first one again
 
 
@@ -60,6 +68,7 @@ class Supervisor:
         self._make_node = make_node
         self._restart = restart
         self._task: asyncio.Task[None] | None = None
+        self._attempt: _Attempt | None = None
         self._stopping = False
 
     @property
@@ -72,8 +81,10 @@ class Supervisor:
             self.node = self._make_node()
         self.error = None
         self._stopping = False
-        self._task = tasks.create_task(self._run(), name=f"{self.node.module}/{self.node.name}")
-        self._task.add_done_callback(lambda _task: self._ended(ended))
+        name = f"{self.node.module}/{self.node.name}"
+        self._task = task = asyncio.get_running_loop().create_task(self._run(), name=name)
+        task.add_done_callback(lambda _task: self._ended(ended))
+        tasks.create_task(self._guard(task), name=f"{name} guard")
 
     def cancel(self) -> asyncio.Task[None] | None:
         """Ask it to end, once: its clean-up is not disturbed. Its task comes back if it still runs."""
@@ -81,7 +92,10 @@ class Supervisor:
             return None
         if not self._stopping:
             self._stopping = True
-            self._task.cancel()
+            if self._attempt is not None:
+                self._attempt.end()
+            else:
+                self._task.cancel()
         return self._task
 
     async def stop(self) -> None:
@@ -89,6 +103,20 @@ class Supervisor:
         task = self.cancel()
         if task is not None:
             await asyncio.wait([task])
+
+    async def _guard(self, task: asyncio.Task[None]) -> None:
+        """Stand for the node in its module's task group, which cancels again and again while it comes to its end."""
+        cancelled: asyncio.CancelledError | None = None
+        while not task.done():
+            try:
+                await asyncio.wait([task])
+            except asyncio.CancelledError as error:
+                cancelled = error
+                self.cancel()
+        if not task.cancelled():
+            task.result()
+        if cancelled is not None:
+            raise cancelled
 
     def _ended(self, tell: Callable[["Supervisor"], None]) -> None:
         self.node.close()  # a task that is cancelled before its first step never comes to do it
@@ -99,7 +127,7 @@ class Supervisor:
         backoff = Backoff(random_of(loop), first=_FIRST_RESTART, longest=_LONGEST_RESTART)
         while True:
             started = loop.time()
-            error = await self._attempt()
+            error = await self._try()
             if error is None:
                 return
             self.node.log.error("node %s crashed: %s: %s", self.node.name, type(error).__name__, error, exc_info=error)
@@ -113,15 +141,16 @@ class Supervisor:
             self.restarts += 1
             self.node = self._make_node()
 
-    async def _attempt(self) -> Exception | None:
+    async def _try(self) -> Exception | None:
         """Run the function to its end; what it raised."""
         task = asyncio.current_task()
         assert task is not None
-        attempt = _Attempt(self.node, task)
-        self.node.crashed = attempt.crash
+        # Only coroutine functions are let in (check_function), and those give coroutines.
+        body = cast("Coroutine[Any, Any, object]", self._function(self.node, *self._args))
+        self._attempt = attempt = _Attempt(self.node, task, body)
         self.node.enter()
         try:
-            await self._function(self.node, *self._args)
+            await body
         except asyncio.CancelledError as error:
             if attempt.error is None and task.cancelling():
                 raise
@@ -129,32 +158,66 @@ class Supervisor:
         except Exception as error:  # noqa: BLE001 - the user's code may raise anything
             return attempt.result(error)
         finally:
+            self._attempt = None
+            attempt.close()
             self.node.close()
         return attempt.result(None)
 
 
 class _Attempt:
-    """One run of a node's function, and what went wrong outside of it: in a `fill`, or in another callback."""
+    """One run of a node's function: how it is ended, and what went wrong outside of it, in a `fill` or a callback."""
 
-    def __init__(self, node: Node, task: asyncio.Task[None]) -> None:
+    def __init__(self, node: Node, task: asyncio.Task[None], body: Coroutine[Any, Any, object]) -> None:
         self.error: Exception | None = None
         self._node = node
         self._task = task
+        self._body = body
+        self._loop = task.get_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._cancelled = False
+        node.crashed = self.crash
+        node.unwinds = lambda: ends(body)
 
     def crash(self, error: Exception) -> None:
-        if asyncio.current_task() is self._task and not self._node.closed:
+        if self._node.ending:
+            self._node.log.error("node %s crashed while it ended: %r", self._node.name, error, exc_info=error)
+        elif asyncio.current_task() is self._task:
             raise error
-        if self.error is not None or self._node.closed:
-            self._node.log.error("node %s crashed again: %r", self._node.name, error, exc_info=error)
-            return
-        self.error = error
-        self._task.cancel()
+        else:
+            self.error = error
+            self.end()
+
+    def end(self) -> None:
+        """Cancel the function. What it cleans up already, for whatever reason, is not disturbed: that comes first."""
+        self._node.end()
+        if self._timer is None:
+            self._cancel(self._loop.time())
+
+    def _cancel(self, since: float) -> None:
+        """Cancel the function, which was to end at `since` (loop time), once it cleans nothing up any more."""
+        self._timer = None
+        failed = self.error is not None or self._task.cancelling() > 0
+        if cleans_up(self._body, handlers=failed and self._loop.time() - since < _HANDLER):
+            self._timer = self._loop.call_later(_LOOK, self._cancel, since)
+        else:
+            self._cancelled = True
+            self._task.cancel()
+
+    def close(self) -> None:
+        """The function has ended."""
+        if self._timer is not None:
+            self._timer.cancel()
 
     def result(self, error: Exception | None) -> Exception | None:
         """What ended the node: the error outside came first, and brought the other one about."""
         if self.error is None:
             return error
-        self._task.uncancel()
+        if self._cancelled:
+            self._task.uncancel()
+        elif error is not None:  # which came first, and was being dealt with
+            log = self._node.log
+            log.error("node %s crashed while it ended: %r", self._node.name, self.error, exc_info=self.error)
+            return error
         return self.error
 
 

@@ -48,6 +48,10 @@ class Owner(Protocol):
     @property
     def log(self) -> logging.LoggerAdapter[logging.Logger]: ...
 
+    @property
+    def ending(self) -> bool:
+        """Whether functions that it gave away are not to be called any more."""
+
     def crash(self, error: Exception) -> None:
         """End the node with an error of a function that it gave away."""
 

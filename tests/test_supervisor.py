@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import itertools
 import logging
+from typing import TYPE_CHECKING
 
 import pytest
 
 import r2p
 from r2p.msg import Led, Log
-from tests.bench import Recorder, collect, crashes, hold, led, local, settle
+from r2p.transports.link import Hub, Transport
+from tests.bench import Recorder, collect, crashes, elapsed, hold, led, local, settle
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
 
 
 @pytest.mark.virtual_time
@@ -275,30 +281,215 @@ async def test_two_errors_outside_of_a_node_are_one_crash(caplog: pytest.LogCapt
             await module.wait()
 
     assert [str(error) for error in await crashes(main)] == ["now", "0"]
-    assert "node doubly crashed again: ValueError(1)" in caplog.text
+    assert "node doubly crashed while it ended: ValueError(1)" in caplog.text
 
 
 @pytest.mark.virtual_time
-@pytest.mark.parametrize(("started", "text"), [(False, "pub, which does not run"), (True, "pub crashed again")])
-async def test_a_signal_that_raises_while_the_node_closes_is_logged(
-    started: bool, text: str, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_node_that_closes_calls_no_signal_and_counts_what_it_gives_up() -> None:
+    async with local() as module:
+        missed = Recorder()
+        module.start(hold, name="sub").subscribe("a", Led, queue=1)
+        node = module.start(hold, name="pub")
+        await settle()
+        publisher = node.advertise("a", Led, r2p.Sporadic(1.0, on_missed=missed))
+        node.subscribe("b", Led)
+        for number in range(2):
+            await publisher.publish(led(number))
+        await module.nodes["pub"].stop()
+        assert "b" not in module.space.topics
+    assert not missed.calls
+    assert publisher.missed == 1
+
+
+# Clean-up is not disturbed
+
+
+class Motor:
+    """A node whose clean-up takes a second, with what may disturb that: a `fill` that begins to fail when it begins."""
+
+    def __init__(self, *, fails: float = 1e6, style: str = "finally") -> None:
+        self.did: list[str] = []
+        self.fills = 0
+        self._fails = fails
+        self._style = style
+
+    async def __call__(self, node: r2p.Node) -> None:
+        node.advertise("state", Led, r2p.Periodic(0.01, self._fill, on_late=self._late))
+        node.subscribe("orders", Led, timeout=0.05, on_timeout=self._late)
+        await getattr(self, f"_{self._style}")()
+
+    async def _finally(self) -> None:
+        try:
+            await self._work()
+        finally:
+            await self._ramp_down()
+
+    async def _with(self) -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            stack.push_async_callback(self._ramp_down)
+            await self._work()
+
+    async def _helper(self) -> None:
+        await self._finally()
+
+    async def _except(self) -> None:
+        try:
+            await self._work()
+        except BaseException:
+            await self._ramp_down()
+            raise
+
+    async def _work(self) -> None:
+        await asyncio.sleep(self._fails)
+        raise OSError("sensor")
+
+    async def _ramp_down(self) -> None:
+        self.did.append("ramp")
+        await asyncio.sleep(0.5)
+        self.did.append("stopped")
+
+    def _fill(self) -> Led:
+        self.fills += 1
+        if self.did:
+            raise OSError("fill")
+        return led(1)
+
+    def _late(self, *_: object) -> None:
+        if self.did:
+            raise OSError("signal")
+
+
+STYLES = pytest.mark.parametrize("style", ["finally", "with", "helper", "except"])
+
+
+async def _ending(motor: Motor, end: Callable[[r2p.Module, r2p.Node], Awaitable[object]]) -> list[Exception]:
     async def main() -> None:
         async with local() as module:
-            missed = Recorder(then=lambda: 1 / 0)
-            module.start(hold, name="sub").subscribe("a", Led, queue=1)
-            node = module.start(hold, name="pub")
-            if started:
-                await settle()
-            publisher = node.advertise("a", Led, r2p.Sporadic(1.0, on_missed=missed))
-            node.subscribe("b", Led)
-            for number in range(2):
-                await publisher.publish(led(number))
-            await module.nodes["pub"].stop()
-            assert "b" not in module.space.topics
+            node = module.start(motor, name="motor")
+            await asyncio.sleep(1.25)
+            await end(module, node)
+            await module.wait()
 
-    await main()
-    assert f"node {text}: ZeroDivisionError" in caplog.text
+    return await crashes(main)
+
+
+@pytest.mark.virtual_time
+@STYLES
+async def test_nothing_disturbs_the_clean_up_after_stop(style: str) -> None:
+    motor = Motor(style=style)
+    assert await _ending(motor, lambda module, _node: module.nodes["motor"].stop()) == []
+    assert motor.did == ["ramp", "stopped"]
+
+
+@pytest.mark.virtual_time
+@STYLES
+async def test_nothing_disturbs_the_clean_up_of_a_module_that_closes(style: str) -> None:
+    motor = Motor(style=style)
+    async with local() as module:
+        module.start(motor, name="motor")
+        await asyncio.sleep(1.25)
+    assert motor.did == ["ramp", "stopped"]
+
+
+@pytest.mark.virtual_time
+@STYLES
+async def test_nothing_disturbs_the_clean_up_after_an_error_of_the_node(style: str) -> None:
+    motor = Motor(fails=1.005, style=style)
+    assert [str(error) for error in await _ending(motor, lambda *_: asyncio.sleep(0))] == ["sensor"]
+    assert motor.did == ["ramp", "stopped"]
+    if style != "except":  # which might as well go on
+        assert motor.fills == 100
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("style", ["finally", "with", "helper"])
+async def test_stop_and_close_wait_for_a_clean_up_that_has_begun(style: str) -> None:
+    motor = Motor(fails=1.0, style=style)
+    assert [str(e) for e in await _ending(motor, lambda module, _node: module.nodes["motor"].stop())] == ["sensor"]
+    assert motor.did == ["ramp", "stopped"]
+
+    async def main(motor: Motor) -> None:
+        async with local() as module:
+            module.start(motor, name="motor")
+            await asyncio.sleep(1.25)
+
+    motor = Motor(fails=1.0, style=style)
+    assert [str(error) for error in await crashes(lambda: main(motor))] == ["sensor"]
+    assert motor.did == ["ramp", "stopped"]
+
+
+@pytest.mark.virtual_time
+@STYLES
+async def test_stop_does_not_disturb_the_clean_up_after_a_crash(style: str) -> None:
+    async def crash_and_stop(module: r2p.Module, node: r2p.Node) -> None:
+        node.crash(ValueError("fill"))
+        await asyncio.sleep(0.1)
+        node.crash(ValueError("again"))
+        await module.nodes["motor"].stop()
+
+    motor = Motor(style=style)
+    assert [str(error) for error in await _ending(motor, crash_and_stop)] == ["fill"]
+    assert motor.did == ["ramp", "stopped"]
+
+
+@pytest.mark.virtual_time
+async def test_a_crash_ends_a_node_that_handles_an_error_for_long() -> None:
+    async def degraded(node: r2p.Node) -> None:
+        try:
+            raise OSError("sensor")
+        except OSError:
+            await asyncio.sleep(1e6)
+
+    async def main() -> None:
+        async with local() as module:
+            node = module.start(degraded)
+            await settle()
+            node.crash(ValueError("fill"))
+            await module.wait()
+            assert elapsed(module) == pytest.approx(1.0, abs=0.02)
+
+    assert [str(error) for error in await crashes(main)] == ["fill"]
+
+
+@pytest.mark.virtual_time
+async def test_a_node_that_gets_over_its_error_is_stopped_then() -> None:
+    did = []
+
+    async def stubborn(node: r2p.Node) -> None:
+        with contextlib.suppress(OSError):
+            try:
+                raise OSError("line")
+            finally:
+                await asyncio.sleep(0.5)
+                did.append("cleaned up")
+        await asyncio.sleep(1e6)
+
+    async with local() as module:
+        module.start(stubborn)
+        await settle()
+        await module.stop()
+        assert elapsed(module) == pytest.approx(0.5, abs=0.02)
+    assert did == ["cleaned up"]
+
+
+@pytest.mark.virtual_time
+async def test_a_transport_that_breaks_does_not_disturb_a_clean_up() -> None:
+    class Breaks(Transport):
+        async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+            opened()
+            await asyncio.sleep(1.25)
+            raise r2p.Broken("gone for good")
+
+    async def broken(motor: Motor) -> None:
+        async with r2p.Module("PC1", via=Breaks()) as module:
+            module.start(motor, name="motor")
+            await asyncio.sleep(1e6)
+
+    for fails in (1.0, 1e6):  # before, and by that
+        motor = Motor(fails=fails)
+        with pytest.raises(r2p.Broken):
+            await broken(motor)
+        assert motor.did == ["ramp", "stopped"]
 
 
 # What can run

@@ -172,7 +172,7 @@ class BasePublisher(Generic[M]):
         if now - self._logged >= _SECOND and missed.reason != LINK_DOWN:  # which was told when it went down
             self._logged = now
             self.node.log.warning("%s (missed %d, late %d so far)", missed, self.missed, self.late)
-        if callback is not None:
+        if callback is not None and not self.node.ending:
             try:
                 callback(missed)
             except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node

@@ -40,6 +40,10 @@ class PeriodicPublisher(BasePublisher[M]):
         """Start the clock: the first message follows one period later."""
         self._ticker.start()
 
+    def silence(self) -> None:
+        """Ask for no message any more: the node ends."""
+        self._ticker.close()
+
     def close(self) -> None:
         self._ticker.close()
         self._driver = None
@@ -63,7 +67,8 @@ class PeriodicPublisher(BasePublisher[M]):
         if self._driver is driver:
             self._driver = None
             self.period = self._own_period
-            self._ticker.start()
+            if not self.node.ending:
+                self._ticker.start()
 
     def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
         """One period: due at `scheduled` (monotonic ns), `late` by ns, after so many `skipped` ones.
@@ -71,7 +76,7 @@ class PeriodicPublisher(BasePublisher[M]):
         Local queues and all other links get the message, the driver gets it from here; None if there is none.
         """
         self._give_up("no room")
-        if self._encode == self._closed:
+        if self._encode == self._closed or self.node.ending:
             return None
         if skipped or late > self.period * _SECOND / _LATE_SHARE:
             self.late += 1

@@ -1,0 +1,113 @@
+"""Whether a coroutine that waits is in its clean-up: in a `finally`, or on its way out of an `async with`.
+
+An exception that passes through a node's function is invisible from outside until the function has ended, and clean-up
+such as stopping a motor takes its time before that. Python keeps no record of it but the place where each frame waits:
+the compiler has a copy of its own of each `finally` for the case of an exception. So this looks the place up in the
+compiled code. Where that is not understood, the answer is no.
+"""
+
+import dis
+import functools
+from collections.abc import Iterator
+from types import CodeType
+from typing import NamedTuple
+
+_CATCHES = ("CHECK_EXC_MATCH", "CHECK_EG_MATCH")
+_MOST = 1024  # functions to remember
+_CLOSES = ("COPY", "POP_EXCEPT", "RERAISE")  # how the compiled code of each handler ends
+
+
+class _Handler(NamedTuple):
+    """The code of one `except`, `finally` or `with`, by offsets; an exception in flight goes on from `end`."""
+
+    start: int
+    end: int
+    catches: bool
+
+
+def ends(coroutine: object) -> bool:
+    """Whether an exception has reached a `finally` or an `async with` in which it waits, and no `except` is around."""
+    return cleans_up(coroutine) and _uncaught(list(_places(coroutine)))
+
+
+def _uncaught(places: list[tuple[CodeType, int]]) -> bool:
+    return any(
+        _escapes(code, handler.end) and all(_escapes(*outer) for outer in places[:depth])
+        for depth, (code, offset) in enumerate(places)
+        for handler in _handlers(code)
+        if not handler.catches and handler.start <= offset < handler.end
+    )
+
+
+def cleans_up(coroutine: object, *, handlers: bool = False) -> bool:
+    """Whether an exception has reached a `finally` or an `async with` in which it waits; with `handlers`, an `except`.
+
+    What comes after it does not matter: also in the middle of a program that goes on, clean-up is not to be disturbed.
+    """
+    for code, offset in _places(coroutine):
+        for handler in _handlers(code):
+            if handler.start <= offset < handler.end and (handlers or not handler.catches):
+                return True
+    return False
+
+
+def _places(awaitable: object) -> Iterator[tuple[CodeType, int]]:
+    """Where each coroutine of a chain waits, the outermost first."""
+    while (frame := getattr(awaitable, "cr_frame", None)) is not None:
+        yield frame.f_code, frame.f_lasti
+        awaitable = getattr(awaitable, "cr_await", None)
+
+
+_known: dict[int, tuple[CodeType, tuple[_Handler, ...]]] = {}
+"""By identity, each kept alive by its entry: a code's own hash takes longer than all the rest."""
+
+
+def _handlers(code: CodeType) -> tuple[_Handler, ...]:
+    known = _known.get(id(code))
+    if known is None:
+        if len(_known) >= _MOST:
+            _known.clear()
+        known = _known[id(code)] = code, _find_handlers(code)
+    return known[1]
+
+
+def _find_handlers(code: CodeType) -> tuple[_Handler, ...]:
+    if not code.co_exceptiontable:
+        return ()
+    found: list[_Handler] = []
+    opened: list[tuple[int, bool]] = []
+    instructions = list(dis.get_instructions(code))
+    for number, each in enumerate(instructions):
+        if each.opname == "PUSH_EXC_INFO":
+            opened.append((each.offset, instructions[number + 1].opname == "POP_TOP"))  # `except:` catches everything
+        elif each.opname in _CATCHES and opened:
+            opened[-1] = opened[-1][0], True
+        elif opened and tuple(step.opname for step in instructions[number : number + 3]) == _CLOSES:
+            start, catches = opened.pop()
+            found.append(_Handler(start, instructions[number + 2].offset, catches))
+    return () if opened else tuple(found)
+
+
+@functools.lru_cache(maxsize=_MOST)
+def _escapes(code: CodeType, offset: int) -> bool:
+    """Whether an exception that is raised at this offset leaves the function, past no `except`."""
+    entries = dis.Bytecode(code).exception_entries  # type: ignore[attr-defined]  # since Python 3.11, unlisted
+    by_start = {handler.start: handler for handler in _handlers(code)}
+    for _ in range(len(entries) + 1):
+        target = next((each.target for each in entries if each.start <= offset < each.end), None)
+        if target is None:
+            return True
+        handler = by_start.get(target)
+        if handler is not None and handler.catches:
+            return False
+        offset = handler.end if handler is not None else _reraised(code, target)
+    return False
+
+
+def _reraised(code: CodeType, target: int) -> int:
+    """Where a piece of clean-up that the compiler adds raises the exception again."""
+    return next(
+        each.offset
+        for each in dis.get_instructions(code)
+        if each.offset >= target and each.opname in ("RERAISE", "CLEANUP_THROW", "END_ASYNC_FOR")
+    )
