@@ -17,11 +17,13 @@ from collections.abc import AsyncIterator, Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from r2p.clock import clock_of
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import Mailbox, Outcome
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
+from r2p.transports.losses import Losses
 from r2p.transports.url import parse
 
 if TYPE_CHECKING:
@@ -78,6 +80,7 @@ class BusMonitor:
             port, options = open_port(parse(self.via))
         else:
             port, options = self._port, Options()
+        self._errors = Losses(self.via, clock_of())
         self._now = port.now
         self.since = self._now()
         self._monitor = Monitor(options.timing)
@@ -200,3 +203,7 @@ class BusMonitor:
     def fault(self, kind: str) -> None:
         """An error frame."""
         self._monitor.fault(kind)
+
+    def internal_error(self, error: Exception) -> None:
+        """A frame raised: it is logged, and the next one follows."""
+        self._errors.internal_error(error)

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 LINK_DOWN = "link down"
 """Why samples for a link are lost while it is down: its publishers were told when that began."""
 
+INTERNAL_ERROR = "internal error"
+"""Why something is lost whose handling raised what it never should."""
+
 
 class Sink(abc.ABC):
     """What takes samples: a subscriber's queue, or a link's send buffer."""
@@ -155,7 +158,12 @@ class Room:
             while line:
                 first = line.popleft()
                 sink, claim = first
-                if not sink.offer(claim.sample):
+                try:
+                    taken = sink.offer(claim.sample)
+                except Exception:
+                    claim.settle(sink, INTERNAL_ERROR)  # nothing else would ever end the wait
+                    raise
+                if not taken:
                     line.appendleft(first)
                     break
                 claim.settle(sink)

@@ -6,13 +6,17 @@ real threads: it runs twice, on asyncio's loop and on uvloop's.
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from r2p.testing import plugin
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
 
 pytest_plugins = ["pytester"]
 
@@ -24,6 +28,34 @@ def pytest_configure(config: pytest.Config) -> None:
         config.pluginmanager.register(plugin, "r2p")
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's job in the background: nobody would obey Ctrl-C
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+class _Kept(logging.Handler):
+    """The errors of a logger."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.errors: list[BaseException] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.exc_info and record.exc_info[1] is not None:
+            self.errors.append(record.exc_info[1])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
+    """Links survive exceptions, and count and log them: tests must not."""
+    if item.get_closest_marker("internal_errors"):
+        return (yield)
+    logger, kept = logging.getLogger("r2p.link"), _Kept()
+    logger.addHandler(kept)
+    try:
+        result = yield
+    finally:
+        logger.removeHandler(kept)
+    if kept.errors:
+        raise BaseExceptionGroup("internal errors of links", kept.errors)
+    return result
 
 
 @pytest.fixture(

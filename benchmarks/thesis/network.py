@@ -208,6 +208,9 @@ class Node:
     def bus_fault(self, kind: str) -> None:
         raise RuntimeError(f"node {self.name}: {kind}")
 
+    def internal_error(self, error: Exception) -> None:
+        raise error
+
 
 class Source:
     """The events of one kind at one node, at random instants. Each begins with its number."""

@@ -17,6 +17,7 @@ from r2p.protocols.bridging.tree import MOST_PORTS, Changed, Port, Probe, Say, S
 from r2p.topic import Topic, TopicSpace, Waker
 from r2p.transports.announce import Told
 from r2p.transports.link import Link
+from r2p.transports.losses import TRY_AGAIN, internal_error_of
 
 logger = get_logger("r2p.bridge")
 
@@ -208,8 +209,14 @@ class Bridge:
     # The tree
 
     def _poll(self) -> None:
-        self.tree.poll(self._clock.monotonic())
-        self._act()
+        now = self._clock.monotonic()
+        try:
+            self.tree.poll(now)
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            internal_error_of((port.link.stats.lost for port in self.ports.values()), error)
+            self._alarm.set(now + TRY_AGAIN)
+        else:
+            self._act()
 
     def _act(self) -> None:
         changed: set[int] = set()
@@ -217,19 +224,23 @@ class Bridge:
             port = self._by_number.get(action.port)
             if port is None or not port.link.up:
                 continue
-            match action:
-                case Say(_, message):
-                    port.link.write_management(management.encode(message), urgent=True)
-                case Probe() if port.link.passes_probes:
-                    port.link.write_management(probes.encode(self.tree.gateway, port.number))
-                case Changed():
-                    changed.add(action.port)
+            if isinstance(action, Changed):
+                changed.add(action.port)
+            else:
+                port.link.stats.lost.guard(self._send, port, action)
         for number in changed:
-            self._state_changed(self._by_number[number])
+            port = self._by_number[number]
+            port.link.stats.lost.guard(self._state_changed, port)
         if changed:
             self.relays.all_changed()
             self.presences.changed()
         self._alarm.set(self.tree.next_deadline())
+
+    def _send(self, port: BridgePort, action: Say | Probe) -> None:
+        if isinstance(action, Say):
+            port.link.write_management(management.encode(action.message), urgent=True)
+        elif port.link.passes_probes:
+            port.link.write_management(probes.encode(self.tree.gateway, port.number))
 
     def _state_changed(self, port: BridgePort) -> None:
         state = port.place.state

@@ -89,7 +89,7 @@ class Presences:
             self._repeating()
         ports = [port for port in self._ports.values() if port.link.up]
         for port in ports:
-            self._tell(port, ports, now, refresh=refresh)
+            port.link.stats.lost.guard(self._tell, port, ports, now, refresh=refresh)
         waits = any(port.number in self._asked for port in ports)
         self._alarm.set(min(self._refresh_at, now + _APART) if waits else self._refresh_at)
 
@@ -116,12 +116,12 @@ class Presences:
             again = refresh and before is not None and (new.heard > before.heard or not _is_alive(new.message))
             again |= answers and (now < new.heard + _LATELY or not _is_alive(new.message))
             if before is None or before.message != new.message or again:
-                port.link.relay(new.message)
                 told[key] = new
+                port.link.stats.lost.guard(port.link.relay, new.message)
         for key in [key for key in told if key not in news]:
             gone = _gone(told.pop(key).message)
             if gone is not None:
-                port.link.relay(gone)
+                port.link.stats.lost.guard(port.link.relay, gone)
 
     def _news(self, port: BridgePort, ports: list[BridgePort], now: int) -> dict[_Key, _Told]:
         """What this link should know."""

@@ -19,6 +19,7 @@ from r2p.printable import get_logger
 from r2p.protocols.events import Shape
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told
+from r2p.transports.losses import internal_error_of
 
 logger = get_logger("r2p.bridge")
 
@@ -71,7 +72,10 @@ class Relays:
             while self._dirty:
                 topic = next(iter(self._dirty))
                 del self._dirty[topic]
-                self._review(topic)
+                try:
+                    self._review(topic)
+                except Exception as error:  # noqa: BLE001 - counted and logged; the next topic follows
+                    internal_error_of((port.link.stats.lost for port in self._ports.values()), error)
         finally:
             self._reviewing = False
 
@@ -129,7 +133,7 @@ class Relays:
             here = (topics or self._space.topics).get(name)
             if here is not None:
                 self._shapes[topic, port.name] = self._types(topic, port)
-                port.link.topic_changed(here)
+                port.link.stats.lost.guard(port.link.topic_changed, here)
             if topics is not None:
                 self._shapes.pop((topic, port.name), None)
 

@@ -15,6 +15,7 @@ from r2p.protocols.bridging.homes import Homes
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told
 from r2p.transports.link import Link
+from r2p.transports.losses import TRY_AGAIN, internal_error_of
 
 _KINDS = (0x11, 0x50, 0x60, 0x61, 0x62)  # ALIVE, HELLO, and what gateways say
 _ALL: frozenset[int] = frozenset()
@@ -192,8 +193,12 @@ class Standby:
         return self._space.clock.monotonic()
 
     def _poll(self) -> None:
-        self.homes.poll(self._now())
-        self._act()
+        try:
+            self.homes.poll(self._now())
+            self._act()
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            internal_error_of((port.link.stats.lost for port in self._ports.values()), error)
+            self._alarm.set(self._now() + TRY_AGAIN)
 
     def _act(self) -> None:
         for number, message in self.homes.take():

@@ -14,9 +14,10 @@ from typing import Any, Protocol
 
 import msgspec
 
-from r2p.room import Claim, Sink
+from r2p.room import INTERNAL_ERROR, Claim, Sink
 from r2p.sample import Sample
 from r2p.topic import PATIENCE, Outlet, QueueSink, Topic
+from r2p.transports.losses import Losses
 
 TURN = 64
 """Messages that a link hands out before it lets the event loop run once."""
@@ -42,7 +43,7 @@ class LinkStats(msgspec.Struct):
     bytes_sent: int = 0
     bytes_received: int = 0
     ups: int = 0
-    lost: Counter[str] = msgspec.field(default_factory=Counter)
+    lost: Losses = msgspec.field(default_factory=Losses)
     faults: Counter[str] = msgspec.field(default_factory=Counter)
 
 
@@ -210,21 +211,24 @@ class Intake:
                 self._read_on()
                 return
             arrival = backlog.popleft()
-            inlet = inlets.get(arrival.topic)
-            if inlet is None:
-                link.take_other(arrival)
-                continue
-            size = inlet.senders.get(link.sender(arrival))
-            if size is None:
-                lost["not subscribed"] += 1
-            elif size and len(arrival.data) != size:
-                lost["wrong size"] += 1
-            else:
-                self._stats.received += 1
-                inlet.last = sample = link.sample(inlet.topic.name, arrival)
-                blocked = inlet.topic.deliver(sample)
-                if blocked is not None and self._wait(sample, blocked):
-                    return
+            try:
+                inlet = inlets.get(arrival.topic)
+                if inlet is None:
+                    link.take_other(arrival)
+                    continue
+                size = inlet.senders.get(link.sender(arrival))
+                if size is None:
+                    lost["not subscribed"] += 1
+                elif size and len(arrival.data) != size:
+                    lost["wrong size"] += 1
+                else:
+                    self._stats.received += 1
+                    inlet.last = sample = link.sample(inlet.topic.name, arrival)
+                    blocked = inlet.topic.deliver(sample)
+                    if blocked is not None and self._wait(sample, blocked):
+                        return
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
+                lost.internal_error(error)
         self._loop.call_soon(self._hand_out)
         self._read_no_more()
 
@@ -241,7 +245,7 @@ class Intake:
     def _wait(self, sample: Sample, blocked: list[Sink]) -> bool:
         """Wait for room in these sinks; False if none of them is worth it."""
         for sink in self._lossy.intersection(blocked):
-            sink.force(sample)
+            self._stats.lost.guard(sink.force, sample)
         patient = [sink for sink in blocked if sink not in self._lossy]
         if not patient:
             return False
@@ -259,7 +263,7 @@ class Intake:
         links: list[Sink] = [sink for sink in claim.lacking if stands_still and isinstance(sink, Outlet)]
         for sink in claim.withdraw():
             if sink not in links:
-                sink.force(claim.sample)
+                self._stats.lost.guard(sink.force, claim.sample)
                 self._lossy.add(sink)
                 sink.room().recoveries.append(functools.partial(self._lossy.discard, sink))
         if links:
@@ -286,8 +290,11 @@ class Intake:
             self._stall = None
 
     def _give_up(self, claim: _Arrived, refusal: str) -> None:
+        guard = self._stats.lost.guard
         for sink in list(claim.lacking):
-            sink.refill()
+            guard(sink.refill)
         for sink in list(claim.lacking):
-            sink.give_up(refusal)
+            if not guard(sink.give_up, refusal):
+                sink.room().leave(sink, claim)
+                claim.settle(sink, INTERNAL_ERROR)  # else the line would stand still for ever
             self._in_vain = self._loop.time()

@@ -144,14 +144,29 @@ class LineLink(Link):
         """Bytes came in."""
         self.stats.bytes_received += len(data)
         self._stamp = self._clock.now()
-        self.take(self._reader.feed(bytes(data)))
+        try:
+            lines = self._reader.feed(bytes(data))
+        except Exception as error:  # noqa: BLE001 - counted and logged; the other lines follow
+            self.stats.lost.internal_error(error)
+            lines = self._sound_lines(bytes(data))
+        self.take(lines)
+
+    def _sound_lines(self, data: bytes) -> list[debug.Line]:
+        """What there is but for the line whose reading raised: each is read for itself."""
+        lines: list[debug.Line] = []
+        for piece in data.splitlines(keepends=True):
+            try:
+                lines += self._reader.feed(piece)
+            except Exception:  # noqa: BLE001 - counted before
+                self._reader = debug.Reader(self.stats.lost)
+        return lines
 
     def carrier_full(self) -> None:
         self._blocked = True
 
     def carrier_ready(self) -> None:
         self._blocked = False
-        self._see_held_off()
+        self.stats.lost.guard(self._see_held_off)
         self.made_room()  # before the bytes that wait fill the carrier again
         if not self._corked:
             self._uncork()
@@ -238,7 +253,10 @@ class LineLink(Link):
 
     def _uncork(self) -> None:
         self._corked = False
-        self._flush()
+        try:
+            self._flush()
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            self.stats.lost.internal_error(error)
         if self.room:
             self.made_room()
 

@@ -30,7 +30,7 @@ from r2p.sample import PublisherClass, Sample
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told, announce, wish_of
 from r2p.transports.intake import Arrival, Inlets, Intake, LinkStats
-from r2p.transports.losses import Losses
+from r2p.transports.losses import TRY_AGAIN, Losses
 from r2p.transports.outlet import LinkOutlet
 
 _SECOND = 1_000_000_000
@@ -258,7 +258,8 @@ class Link(abc.ABC):
 
     def made_room(self) -> None:
         """To be called whenever `takes` may say something else: whoever waits gets the room, in order."""
-        self.room.serve()
+        while not self.stats.lost.guard(self.room.serve):
+            pass  # the one that raised waits no more
         if not self.full:
             self.room.recover()
 
@@ -352,7 +353,14 @@ class Link(abc.ABC):
     # Discovery
 
     def _poll(self) -> None:
-        self._apply(self.discovery.poll(self._clock.monotonic()))
+        now = self._clock.monotonic()
+        try:
+            events = self.discovery.poll(now)
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            self.stats.lost.internal_error(error)
+            self._alarm.set(now + TRY_AGAIN)
+        else:
+            self._apply(events)
 
     def _apply(self, events: Iterable[Event]) -> None:
         self._events.extend(events)
@@ -361,13 +369,13 @@ class Link(abc.ABC):
         self._acting = True
         try:
             while self._events:
-                self._act(self._events.popleft())
+                self.stats.lost.guard(self._act, self._events.popleft())
         finally:
             self._acting = False
         if not self._closed:
             self._alarm.set(self.discovery.next_deadline())
             if self.gate is not None:
-                self.gate.looked()
+                self.stats.lost.guard(self.gate.looked)
 
     def _act(self, event: Event) -> None:
         match event:

@@ -137,6 +137,10 @@ class User:
         self.faults.append(kind)
         self._changed.set()
 
+    def internal_error(self, error: Exception) -> None:
+        self.faults.append(f"internal error: {error}")
+        self._changed.set()
+
     def has(self, count: int) -> bool:
         """Whether that many frames came in."""
         return len(self.frames) >= count

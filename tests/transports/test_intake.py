@@ -1,6 +1,7 @@
 """What comes in and finds no room: who waits, for how long, and what is lost."""
 
 import asyncio
+from collections import deque
 from collections.abc import Hashable
 from typing import Any
 
@@ -56,6 +57,7 @@ class End:
     def __init__(self, *, waits: bool) -> None:
         self.waits = waits
         self.reads = True
+        self.stats = LinkStats()
 
     def sample(self, topic: str, arrival: Arrival) -> Sample:
         return Sample(arrival.data, Source(link="line"), 0)
@@ -76,11 +78,11 @@ class End:
         self.reads = True
 
 
-def gateway(*, waits: bool) -> tuple[End, Intake, Other]:
+def gateway(*, waits: bool, other: Other | None = None) -> tuple[End, Intake, Other]:
     loop = asyncio.get_running_loop()
-    end, other, topic = End(waits=waits), Other(), Passing("leds", Waker(loop))
+    end, other, topic = End(waits=waits), other or Other(), Passing("leds", Waker(loop))
     topic.join(other)
-    intake = Intake(end, loop, LinkStats())
+    intake = Intake(end, loop, end.stats)
     intake.open(topic, 1, None)
     return end, intake, other
 
@@ -157,3 +159,64 @@ async def test_closed_while_it_waits() -> None:
     other.refill()
     await asyncio.sleep(STALL * 2)
     assert (other.taken, other.lost) == ([], 0)
+
+
+class Faulty(Other):
+    """A link that raises at the message 1, at what is forced on it, or when it is given up."""
+
+    def __init__(self, *faults: str) -> None:
+        super().__init__()
+        self.faults = faults
+
+    def offer(self, sample: Sample) -> bool:
+        if "offer" in self.faults and self.space and sample.data == b"\x01":
+            raise RuntimeError(sample)
+        return super().offer(sample)
+
+    def force(self, sample: Sample) -> None:
+        if "force" in self.faults:
+            raise RuntimeError(sample)
+        super().force(sample)
+
+    def give_up(self, refusal: str) -> None:
+        if "give up" in self.faults:
+            raise RuntimeError(refusal)
+        super().give_up(refusal)
+
+
+@pytest.mark.internal_errors
+@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize(
+    ("faults", "space", "taken", "errors"),
+    [
+        (["offer"], 9, [0, 2, 3, 4], 1),
+        (["force"], 2, [0, 1], 3),
+        (["force", "give up"], 2, [0, 1], 3),
+    ],
+)
+async def test_a_message_that_raises_does_not_stop_the_others(
+    faults: list[str], space: int, taken: list[int], errors: int, *, waits: bool
+) -> None:
+    end, intake, other = gateway(waits=waits, other=Faulty(*faults))
+    other.space = space
+    intake.take(LINES)
+    await asyncio.sleep(10 * STALL)
+    assert (other.taken, end.reads) == ([LINES[number].data for number in taken], True)
+    assert end.stats.lost["internal error"] == errors
+    other.space = 1
+    other.refill()
+    intake.take(LINES[:1])
+    await asyncio.sleep(10 * STALL)
+    assert other.taken[-1] == LINES[0].data
+
+
+@pytest.mark.internal_errors
+async def test_a_message_that_raises_while_it_waits_for_room_waits_no_more() -> None:
+    end, intake, other = gateway(waits=True, other=Faulty("offer"))
+    intake.take(LINES[1:])
+    await asyncio.sleep(STALL / 2)
+    other.space = 9
+    with pytest.raises(RuntimeError):
+        other.refill()  # a link guards this, and goes on
+    await asyncio.sleep(STALL)
+    assert (other.taken, end.reads, other.lines.claims) == (ALL[2:], True, deque())

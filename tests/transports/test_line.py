@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Annotated, Any, Literal
@@ -9,6 +10,7 @@ from typing import Annotated, Any, Literal
 import pytest
 
 import r2p
+from r2p.codecs import debug
 from r2p.codecs import management as m
 from r2p.msg import Led, Text
 from r2p.testing.network import node_in
@@ -456,3 +458,24 @@ async def test_user_code_that_raises_does_not_harm_the_link() -> None:
 
     with pytest.raises(r2p.NodeCrashed):
         await run(Script())
+
+
+@pytest.mark.internal_errors
+async def test_a_line_whose_reading_raises_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = debug._sound
+
+    def faulty(whole: re.Match[bytes]) -> debug.Line | None:
+        found = sound(whole)
+        if found is not None and found.data == b"1":
+            raise RuntimeError(found)
+        return found
+
+    monkeypatch.setattr(debug, "_sound", faulty)
+    async with scripted() as (script, _, node):
+        subscriber = node.subscribe("leds", None, lossy=True)
+        script.hear(manage(m.SubscribeResponse("leds", 1, 1)))
+        lines = b"".join(line("leds", str(number).encode()) for number in range(5))
+        script.hear(lines[:-5])
+        script.hear(lines[-5:])
+        assert [sample.data for sample in subscriber._sink.queue] == [b"0", b"2", b"3", b"4"]
+        assert script.link.losses == {"internal error": 1}

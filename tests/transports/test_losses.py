@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections import deque
 
 import pytest
 
@@ -46,3 +47,31 @@ async def test_nothing_is_told_unless_somebody_debugs(caplog: pytest.LogCaptureF
     losses = Losses("lab", clock_of())
     losses["garbage"] += 1
     assert lines(caplog) == []
+
+
+@pytest.mark.internal_errors
+async def test_internal_errors_are_counted_and_logged_once_a_second_with_their_traceback(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    losses = Losses("lab", clock_of())
+    losses.internal_error(ValueError("first"))
+    losses.internal_error(ValueError("second"), count=5)
+    assert losses == {"internal error": 6}
+    await asyncio.sleep(1.0)
+    losses.internal_error(ValueError("third"))
+    assert lines(caplog) == [f"link lab: internal error ({count} so far), please report it" for count in (1, 7)]
+    assert [str(record.exc_info and record.exc_info[1]) for record in caplog.records] == ["first", "third"]
+
+
+@pytest.mark.internal_errors
+async def test_the_items_behind_one_that_raises_are_handled() -> None:
+    losses, handled, items = Losses(), list[int](), deque([1, 0, 2, 0, 3, 4])
+
+    def handle(item: int) -> None:
+        handled.append(10 // item)
+
+    losses.drain(items, handle, 5)
+    assert (handled, items, losses) == ([10, 5, 3], deque([4]), {"internal error": 2})
+    assert losses.guard(handle, 5)
+    assert not losses.guard(handle, item=0)
+    assert (handled[-1], losses) == (2, {"internal error": 3})

@@ -107,6 +107,9 @@ class RtcanLink(Link):
     def bus_fault(self, kind: str) -> None:
         self.stats.faults[kind] += 1
 
+    def internal_error(self, error: Exception) -> None:
+        self.stats.lost.internal_error(error)
+
     def _learn(self, news: Action) -> None:
         match news:
             case Ready():

@@ -40,6 +40,9 @@ class PortUser(Protocol):
     def fault(self, kind: str) -> None:
         """Something went wrong on the bus, such as an error frame: counted by kind."""
 
+    def internal_error(self, error: Exception) -> None:
+        """The handling of a frame or of a timer raised: counted, logged; the port goes on with the next one."""
+
 
 class PortAlarm(Protocol):
     """One timer that can be moved."""

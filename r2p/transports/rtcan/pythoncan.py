@@ -21,6 +21,7 @@ from r2p.clock import ExactAlarm, clock_of, random_of
 from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
+from r2p.transports.losses import TRY_AGAIN
 from r2p.transports.rtcan.mailboxes import Mailboxes
 from r2p.transports.rtcan.port import InterfacePort, PortAlarm, PortUser
 
@@ -197,7 +198,10 @@ class _Bus:
         for _ in range(min(len(self._waiting), _BATCH)):
             message, arrived = self._waiting.popleft()
             age = utc - message.timestamp
-            self._receive(message, now - round(age * _SECOND) if 0.0 <= age < _OLDEST else arrived)
+            try:
+                self._receive(message, now - round(age * _SECOND) if 0.0 <= age < _OLDEST else arrived)
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
+                self._user.internal_error(error)
         while self._reported < self._dropped:
             self._reported += 1
             self._user.fault("receive queue full")
@@ -215,8 +219,14 @@ class _Bus:
                 self._user.received(Frame(message.arbitration_id, data), stamp)
 
     def _poll(self) -> None:
-        self._mailboxes.poll(self._clock.monotonic())
-        self._arm()
+        now = self._clock.monotonic()
+        try:
+            self._mailboxes.poll(now)
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            self._user.internal_error(error)
+            self._alarm.set(now + TRY_AGAIN)
+        else:
+            self._arm()
 
     def _arm(self) -> None:
         if not self._closed.is_set():

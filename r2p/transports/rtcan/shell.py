@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Mailbox, Outcome, Transmit, Withdraw
+from r2p.transports.losses import TRY_AGAIN
 from r2p.transports.rtcan.port import CanPort
 
 
@@ -36,6 +37,9 @@ class ShellOwner(Protocol):
     def bus_fault(self, kind: str) -> None:
         """Something went wrong on the bus."""
 
+    def internal_error(self, error: Exception) -> None:
+        """A frame or an action raised: counted, logged, and the next one follows."""
+
 
 class Shell:
     """An engine at work on a port, whose `PortUser` it is. `do` carries out what a call of the engine gives back."""
@@ -51,6 +55,7 @@ class Shell:
         self._actions: deque[Action] = deque()
         self._acting = False
         self._drained: asyncio.Future[None] | None = None
+        self.internal_error = owner.internal_error
 
     def do(self, actions: Sequence[Action]) -> None:
         """Carry these out, and wait for the engine's next deadline."""
@@ -81,20 +86,32 @@ class Shell:
     # For the port (`PortUser`)
 
     def received(self, frame: Frame, stamp: int) -> None:
-        self.do(self.engine.receive(self.now(), frame, stamp))
+        try:
+            self.do(self.engine.receive(self.now(), frame, stamp))
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
+            self._failed(error)
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        self.do(self.engine.confirm(self.now(), mailbox, outcome, at))
+        try:
+            self.do(self.engine.confirm(self.now(), mailbox, outcome, at))
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next confirmation follows
+            self._failed(error)
 
     def up(self) -> None:
-        self.refilter()
-        self.do(self.engine.start(self.now()))
-        self._owner.bus_up()
+        try:
+            self.refilter()
+            self.do(self.engine.start(self.now()))
+            self._owner.bus_up()
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            self._failed(error)
 
     def down(self, reason: str) -> None:
-        actions = self.engine.stop(self.now())
-        self._owner.bus_down(reason)
-        self.do(actions)
+        try:
+            actions = self.engine.stop(self.now())
+            self._owner.bus_down(reason)
+            self.do(actions)
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            self._failed(error)
 
     def waits(self, reason: str) -> None:
         self._owner.bus_waits(reason)
@@ -105,7 +122,16 @@ class Shell:
     # Inside
 
     def _poll(self) -> None:
-        self.do(self.engine.poll(self.now()))
+        try:
+            self.do(self.engine.poll(self.now()))
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        """The engine raised: go on with it, but not at once where a deadline is over that it can't get past."""
+        self.internal_error(error)
+        deadline = self.engine.next_deadline()
+        self._alarm.set(None if deadline is None else max(deadline, self.now() + TRY_AGAIN))
 
     def _act(self) -> None:
         actions, orders, act = self._actions, self._orders, self._owner.act
@@ -113,6 +139,9 @@ class Shell:
         try:
             while actions:
                 action = actions.popleft()
-                orders.get(type(action), act)(action)
+                try:
+                    orders.get(type(action), act)(action)
+                except Exception as error:  # noqa: BLE001 - counted and logged; the next action follows
+                    self.internal_error(error)
         finally:
             self._acting = False

@@ -19,6 +19,7 @@ from r2p.clock import ExactAlarm, clock_of, random_of
 from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
+from r2p.transports.losses import TRY_AGAIN
 from r2p.transports.rtcan import errorframes, interface, rawsocket
 from r2p.transports.rtcan.mailboxes import Mailboxes
 from r2p.transports.rtcan.port import InterfacePort, PortAlarm, PortUser
@@ -204,12 +205,15 @@ class _Bus:
         )
         for identifier, data, flags, stamp in arrived:
             kind = identifier & flags_of
-            if kind == plain and not flags & own:
-                received(Frame(identifier & mask, data), stamp)
-            elif kind == plain:
-                self._own(identifier & mask, data, stamp)
-            elif kind & rawsocket.ERROR:
-                self._error(identifier & mask, data)
+            try:
+                if kind == plain and not flags & own:
+                    received(Frame(identifier & mask, data), stamp)
+                elif kind == plain:
+                    self._own(identifier & mask, data, stamp)
+                elif kind & rawsocket.ERROR:
+                    self._error(identifier & mask, data)
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
+                self._user.internal_error(error)
         while self._dropped < self._socket.dropped:
             self._dropped += 1
             self._user.fault("receive queue full")
@@ -230,8 +234,14 @@ class _Bus:
                 self._mailboxes.failed(mailbox, outcome, self._clock.monotonic())
 
     def _poll(self) -> None:
-        self._mailboxes.poll(self._clock.monotonic())
-        self._arm()
+        now = self._clock.monotonic()
+        try:
+            self._mailboxes.poll(now)
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            self._user.internal_error(error)
+            self._alarm.set(now + TRY_AGAIN)
+        else:
+            self._arm()
 
     def _arm(self) -> None:
         if not self.ended.done():

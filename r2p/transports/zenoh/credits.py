@@ -77,7 +77,7 @@ class Credits:
     def _take(self, sample: "zenoh.Sample | None") -> None:
         outlets = {each.topic.name: each for each in self._outlets()}
         while sample is not None and self._tap is not None:
-            self._grant(sample.payload, outlets)
+            self._stats.lost.guard(self._grant, sample.payload, outlets)
             sample = self._tap.take()
 
     def _grant(self, payload: "zenoh.ZBytes", outlets: dict[str, "ZenohOutlet"]) -> None:
@@ -100,7 +100,7 @@ class Credits:
         outlets = list(self._outlets())
         for outlet in outlets:
             if outlet.room():
-                outlet.refill()
+                self._stats.lost.guard(outlet.refill)
         if any(outlet.expects for outlet in outlets):
             self.expect()
         elif not self._expected and self._rest is None:

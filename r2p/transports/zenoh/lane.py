@@ -60,11 +60,13 @@ class Lane:
         waiting, self.waiting = self.waiting, []
         serial = self.flow.serial - len(waiting) + 1
         for samples in _packets(waiting) if batching and len(waiting) > 1 else [[each] for each in waiting]:
-            data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
             try:
+                data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
                 self._put(data, attachment=self._header(samples, serial))
             except error:
                 stats.lost[LINK_DOWN] += len(samples)
+            except Exception as failure:  # noqa: BLE001 - counted and logged; the next packet follows
+                stats.lost.internal_error(failure, len(samples))
             else:
                 stats.sent += len(samples)
                 stats.bytes_sent += len(data)

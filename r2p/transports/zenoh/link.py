@@ -9,6 +9,7 @@ Keys, all under `r2p/NETWORK/`:
     schema/SESSION/TYPE     asks a module for the fields of a type, by fingerprint
 """
 
+import functools
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
 
 _EVENTS = 65_536
 """Tokens, messages of the protocol and the like that wait for the loop at most."""
+
+_QUERIES = 1024
+"""Queries for types that wait for the loop at most."""
 
 _ANSWER = 1.0
 """Seconds for the modules to answer a query."""
@@ -108,11 +112,11 @@ class ZenohLink(Link):
         session.watch(self._funnel(self._transport_changed))
         session.watch_tokens(f"{self.prefix}/live", self._funnel(self._token_changed))
         session.listen(f"{self.prefix}/control/*", self._funnel(self._controlled))
-        session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema)
+        session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema, functools.partial(self._funnel, most=_QUERIES))
         self.credits.connect(session, f"{self.prefix}/credit/{hexed}")
 
-    def _funnel(self, take: Callable[[Any], None]) -> Funnel:
-        funnel = Funnel(self._space.loop, take, most=_EVENTS)
+    def _funnel(self, take: Callable[[Any], None], most: int = _EVENTS) -> Funnel:
+        funnel = Funnel(self._space.loop, take, self.stats.lost, most=most)
         self._funnels.append(funnel)
         return funnel
 
@@ -305,7 +309,12 @@ class ZenohLink(Link):
 
     def _believed(self, key: str, there: bool) -> None:
         now = self._clock.monotonic()
-        self._apply(self._presence.appeared(now, key) if there else self._presence.disappeared(now, key))
+        try:
+            events = self._presence.appeared(now, key) if there else self._presence.disappeared(now, key)
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next token follows
+            self.stats.lost.internal_error(error)
+        else:
+            self._apply(events)
 
     def _controlled(self, message: tuple[str, bytes]) -> None:
         key, data = message

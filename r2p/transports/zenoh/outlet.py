@@ -80,7 +80,8 @@ class ZenohOutlet(LinkOutlet):
         self._link.stats.lost[reason] += 1
 
     def refill(self) -> None:
-        self.lines.serve()
+        while not self._link.stats.lost.guard(self.lines.serve):
+            pass  # the one that raised waits no more
         self.lines.recover()
 
     def give_up(self, refusal: str) -> None:

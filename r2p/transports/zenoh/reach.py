@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import asyncio
 
     from r2p.transports.zenoh.link import ZenohLink
+    from r2p.transports.zenoh.outlet import ZenohOutlet
 
 _NEXT = 0.002
 """Seconds between two looks whether messages reach a new subscriber; longer each time."""
@@ -59,27 +60,37 @@ class Reach:
     def _look(self, topic: str, session: int, guest: _Guest) -> None:
         if self._guests.get((topic, session)) is not guest or not self._link.knows(topic):
             return
-        if not self._link.senders.reach(topic):
+        if not self._reaches(topic):
             guest.waited += 1
             if guest.waited == _TRIES:
                 self._link.tell_unheard(topic, session)
             self._loop.call_later(_NEXT * min(guest.waited, 100), self._look, topic, session, guest)
             return
         del self._guests[topic, session]
-        self._link.let_in(topic, session, guest.window)
+        self._link.stats.lost.guard(self._link.let_in, topic, session, guest.window)
         if self._checking is None:
             self._checking = self._loop.call_later(_CHECK, self._check)
+
+    def _reaches(self, topic: str) -> bool:
+        try:
+            return self._link.senders.reach(topic)
+        except Exception as error:  # noqa: BLE001 - counted and logged; it is looked at again
+            self._link.stats.lost.internal_error(error)
+            return False
 
     def _check(self) -> None:
         self._checking = None
         self._link.credits.look()
         outlets = list(self._link.zenoh_outlets())
         for outlet in outlets:
-            for session in outlet.unheard():
-                outlet.tries[session] += 1
-                if outlet.tries[session] <= _REPEATS:
-                    outlet.welcome()
-                elif outlet.tries[session] == _REPEATS + 1:
-                    self._link.tell_unheard(outlet.topic.name, session)
+            self._link.stats.lost.guard(self._check_outlet, outlet)
         if outlets:
             self._checking = self._loop.call_later(_CHECK, self._check)
+
+    def _check_outlet(self, outlet: "ZenohOutlet") -> None:
+        for session in outlet.unheard():
+            outlet.tries[session] += 1
+            if outlet.tries[session] <= _REPEATS:
+                outlet.welcome()
+            elif outlet.tries[session] == _REPEATS + 1:
+                self._link.tell_unheard(outlet.topic.name, session)

@@ -21,6 +21,7 @@ from zenoh.handlers import FifoChannel, Handler, RingChannel
 from r2p.codecs import liveliness
 from r2p.errors import TransportError
 from r2p.transports.intake import TURN
+from r2p.transports.losses import Losses
 from r2p.transports.zenoh import threads
 from r2p.transports.zenoh.options import is_network_name
 
@@ -42,9 +43,12 @@ class Unreachable(Exception):
 class Funnel:
     """The way from zenoh's threads into the loop: what they put in comes out of `take`, in order."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, take: Callable[[Any], None], *, most: int) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, take: Callable[[Any], None], lost: Losses, *, most: int
+    ) -> None:
         self._loop = loop
         self._take = take
+        self._lost = lost
         self._most = most
         self._waiting: deque[Any] = deque()
         self._woken = False
@@ -62,11 +66,15 @@ class Funnel:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._empty)
 
+    def failed(self, error: Exception) -> None:
+        """In any thread: something raised before it could be put in."""
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._loop.call_soon_threadsafe(self._lost.internal_error, error)
+
     def _empty(self) -> None:
         self._woken = False
         waiting = self._waiting
-        for _ in range(min(len(waiting), TURN)):
-            self._take(waiting.popleft())
+        self._lost.drain(waiting, self._take, TURN)
         if waiting and not self._woken:  # a flood; others have their turn in between
             self._woken = True
             self._loop.call_soon(self._empty)
@@ -166,7 +174,7 @@ class Session:
             funnel.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
 
         events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_AT_ONCE)
-        self._hear(self._session.info.declare_transport_events_listener(events, history=True), changed)
+        self._hear(self._session.info.declare_transport_events_listener(events, history=True), changed, funnel)
 
     def watch_tokens(self, prefix: str, funnel: Funnel) -> None:
         """Tell of each token under a prefix, also those that are there: (rest of its key, whether it is there)."""
@@ -176,7 +184,8 @@ class Session:
             funnel.put((str(sample.key_expr)[start:], sample.kind == zenoh.SampleKind.PUT))
 
         tokens: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
-        self._hear(self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True), changed)
+        declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
+        self._hear(declared, changed, funnel)
 
     def listen(self, key: str, funnel: Funnel) -> None:
         """Tell of each message: (its key, payload); of one that is none of ours by its length, without the payload."""
@@ -186,11 +195,13 @@ class Session:
             funnel.put((str(sample.key_expr), payload.to_bytes() if len(payload) <= _MESSAGE_MAX else b""))
 
         messages: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
-        self._hear(self._session.declare_subscriber(key, messages, allowed_origin=zenoh.Locality.REMOTE), arrived)
+        declared = self._session.declare_subscriber(key, messages, allowed_origin=zenoh.Locality.REMOTE)
+        self._hear(declared, arrived, funnel)
 
-    def serve(self, key: str, answer: Callable[[str], bytes | None]) -> None:
-        """Answer queries: `answer` gives, in the loop, the payload for a key."""
-        loop = asyncio.get_running_loop()
+    def serve(
+        self, key: str, answer: Callable[[str], bytes | None], funnel_to: Callable[[Callable[[Any], None]], Funnel]
+    ) -> None:
+        """Answer queries: `answer` gives, in the loop, the payload for a key. `funnel_to` makes a way into the loop."""
 
         def reply(query: zenoh.Query) -> None:
             name = str(query.key_expr)
@@ -200,18 +211,24 @@ class Session:
                     query.reply(key.replace("*", name.rpartition("/")[2]), payload)
                 query.drop()
 
-        funnel = Funnel(loop, reply, most=_QUERIES)
+        funnel = funnel_to(reply)
         queries: FifoChannel[zenoh.Query] = FifoChannel(_AT_ONCE)
-        self._hear(self._session.declare_queryable(key, queries), funnel.put)
+        self._hear(self._session.declare_queryable(key, queries), funnel.put, funnel)
 
-    def _hear(self, declared: Any, heard: Callable[[Any], object]) -> None:
-        """Call it, in a thread, with each item that comes."""
+    def _hear(self, declared: Any, heard: Callable[[Any], object], funnel: Funnel) -> None:
+        """Call it, in a thread, with each item that comes; it puts that into the funnel."""
 
         def listen() -> None:
             receive = declared.handler.recv
-            with contextlib.suppress(zenoh.ZError):  # it is undeclared
-                while True:
-                    heard(receive())
+            while True:
+                try:
+                    item = receive()
+                except zenoh.ZError:  # it is undeclared
+                    return
+                try:
+                    heard(item)
+                except Exception as error:  # noqa: BLE001 - counted and logged in the loop; the next one follows
+                    funnel.failed(error)
 
         self._kept.append(declared)
         threads.start(listen)
@@ -304,7 +321,6 @@ class Session:
 
 
 _MESSAGE_MAX = 4096
-_QUERIES = 1024
 _AT_ONCE = 65_536
 """What waits in zenoh until its thread runs, at most: more than there is, as zenoh may hand out all in the very call
 that asks for it, holding its locks, and would wait there for ever.

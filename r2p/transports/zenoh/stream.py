@@ -139,8 +139,12 @@ class Stream:
             return
         left = TURN
         while arrived is not None and left > 0:
-            attachment = arrived.attachment
-            left -= self._unpack(arrived.payload.to_bytes(), b"" if attachment is None else attachment.to_bytes())
+            try:
+                attachment = arrived.attachment
+                left -= self._unpack(arrived.payload.to_bytes(), b"" if attachment is None else attachment.to_bytes())
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next packet follows
+                self._streams.stats.lost.internal_error(error)
+                left -= 1
             if self._blocked is not None and not self._queueing:
                 self._paused = True  # the rest stays where it is for now
                 return
@@ -202,7 +206,14 @@ class Stream:
         for sample in samples:
             if self._blocked is not None:
                 self._queue(lane, serial, sample)
-            elif (sinks := deliver(sample)) is not None:
+                serial += 1
+                continue
+            try:
+                sinks = deliver(sample)
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
+                stats.lost.internal_error(error)
+                sinks = None
+            if sinks is not None:
                 self._block(lane, serial, sample, sinks)
             else:
                 flow.until_credit -= 1
@@ -272,8 +283,8 @@ class Stream:
     def _queue(self, lane: _Lane, serial: int, sample: Sample) -> None:
         """Another one waits for room: events and periods don't wait behind a message that does not expire."""
         if lane.publisher_class != _NRT and self._queueing:
-            for sink in self.topic.deliver(sample) or ():
-                sink.force(sample)
+            for sink in self._delivered(sample) or ():
+                self._streams.stats.lost.guard(sink.force, sample)
             self._taken(lane, serial)
         elif len(self._waiting) < _MOST:
             self._waiting.append((lane, serial, sample))
@@ -282,11 +293,19 @@ class Stream:
             lane.flow.skipped(1)
 
     def _deliver(self, lane: _Lane, serial: int, sample: Sample) -> None:
-        sinks = self.topic.deliver(sample)
+        sinks = self._delivered(sample)
         if sinks is None:
             self._taken(lane, serial)
         else:
             self._block(lane, serial, sample, sinks)
+
+    def _delivered(self, sample: Sample) -> list[Sink] | None:
+        """Hand it to the topic: gives back who has no room. Where that raises it is lost, and counted."""
+        try:
+            return self.topic.deliver(sample)
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
+            self._streams.stats.lost.internal_error(error)
+            return None
 
     def _block(self, lane: _Lane, serial: int, sample: Sample, sinks: list[Sink]) -> None:
         """There is no room for this one."""
@@ -300,7 +319,7 @@ class Stream:
         if blocked is not self._blocked:
             return
         sample = blocked.sample
-        blocked.sinks = [sink for sink in blocked.sinks if not sink.offer(sample)]
+        blocked.sinks = [sink for sink in blocked.sinks if not self._settles(sink, sample)]
         blocked.turns -= 1
         if not blocked.sinks:
             self._go_on()
@@ -308,12 +327,20 @@ class Stream:
             self._loop.call_soon(self._retry, blocked)
         elif blocked.lane.publisher_class != _NRT:
             for sink in blocked.sinks:
-                sink.force(sample)
+                self._streams.stats.lost.guard(sink.force, sample)
             self._go_on()
         else:
             blocked.held = _Held(sample, blocked.sinks, self._settled)
             self._queueing = True
             self._read_on()
+
+    def _settles(self, sink: Sink, sample: Sample) -> bool:
+        """Whether it is not waited for any more: it has the message, or has raised."""
+        try:
+            return sink.offer(sample)
+        except Exception as error:  # noqa: BLE001 - counted and logged; the others follow
+            self._streams.stats.lost.internal_error(error)
+            return True
 
     def _settled(self) -> None:
         """The message that was held is placed; it may be in the middle of the reader's work, so go on after it."""
@@ -344,7 +371,7 @@ class Stream:
 
     def _give_credit(self, lane: _Lane, serial: int) -> None:
         lane.flow.credited()
-        self._streams.credit(self.topic.name, lane.origin, serial)
+        self._streams.stats.lost.guard(self._streams.credit, self.topic.name, lane.origin, serial)
 
     def _lane(self, origin: Origin) -> _Lane:
         """A publisher is new."""

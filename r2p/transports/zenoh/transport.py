@@ -112,12 +112,17 @@ class ZenohTransport(Transport):
         reason = ""
         while True:
             await asyncio.sleep(_LOOK)
-            if not link.up:
+            if link.up:
+                continue
+            try:
                 before, reason = reason, await why(way_of(config))
-                if NOT_US in reason and reason != before:
-                    continue  # zenoh may be about to try again
-                if not link.up:
-                    link.unreachable(reason)
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
+                link.stats.lost.internal_error(error)
+                continue
+            if NOT_US in reason and reason != before:
+                continue  # zenoh may be about to try again
+            if not link.up:
+                link.unreachable(reason)
 
     async def _look_around(self, session: "Session", link: "ZenohLink", hub: Hub, network: str) -> None:
         """Until somebody else is on the network: say once on which networks there are others."""

@@ -17,6 +17,7 @@ from r2p.transports.rtcan import INTERFACES, pythoncan
 from r2p.transports.rtcan.pythoncan import PythonCanPort
 from r2p.transports.url import open_transport
 from tests.can.rig import GUARD, User, now, using
+from tests.faults import once
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -258,3 +259,15 @@ def test_a_pc_is_no_master_of_short_slots() -> None:
     with pytest.raises(TransportError, match=r"can't be the master with slots of 166 us.*slots=20,cycle=10ms"):
         open_transport("rtcan:virtual:x?priority=1")
     open_transport("rtcan:virtual:x?priority=1&slots=20&cycle=10ms")
+
+
+async def test_a_frame_that_raises_does_not_stop_the_others(
+    channel: str, peer: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = port_on(channel)
+    async with using(port) as user:
+        monkeypatch.setattr(user, "received", once(user.received))
+        for number in range(3):
+            peer.send(can.Message(arbitration_id=SRT | number, is_extended_id=True))
+        await user.until(lambda: user.has(2))
+        assert ([frame.id for frame in user.frames], user.faults) == ([SRT | 1, SRT | 2], ["internal error: injected"])

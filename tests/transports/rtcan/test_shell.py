@@ -1,25 +1,24 @@
 """The loop around an engine, on a port that answers at once."""
 
 import asyncio
+import operator
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import pytest
 
 from r2p.clock import Alarm
 from r2p.codecs import management
 from r2p.codecs.management import Alive
+from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Action, Done, Fate, Mailbox, Outcome, Ready, Transmit, Withdraw
+from r2p.protocols.rtcan.events import Action, Done, Fate, Mailbox, Outcome, Profile, Ready, Transmit, Withdraw
 from r2p.protocols.rtcan.settings import Settings
 from r2p.sample import PublisherClass
 from r2p.transports.rtcan.options import Options
 from r2p.transports.rtcan.port import CanPort, PortAlarm
 from r2p.transports.rtcan.shell import Shell
 from r2p.transports.rtcan.words import Words
-
-if TYPE_CHECKING:
-    from r2p.codecs.rtcan import Frame
+from tests.faults import once
 
 pytestmark = pytest.mark.virtual_time
 
@@ -76,6 +75,9 @@ class Owner:
 
     def bus_fault(self, kind: str) -> None:
         self.changes.append(f"fault: {kind}")
+
+    def internal_error(self, error: Exception) -> None:
+        self.changes.append(f"internal error: {error}")
 
     def fates(self) -> list[Fate]:
         return [each.fate for each in self.actions if isinstance(each, Done)]
@@ -168,3 +170,36 @@ async def test_what_a_class_means_depends_on_the_controller() -> None:
     assert "fixed when a frame is handed to the controller" in words.guarantee(PublisherClass.SPORADIC, None)
     port.one_shot = True
     assert "fresh at each try" in words.guarantee(PublisherClass.SPORADIC, None)
+
+
+@pytest.mark.parametrize("call", ["poll", "receive", "_sender._post.confirm"])
+async def test_an_engine_that_raises_goes_on(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    shell, port, owner = make()
+    place, _, name = f"engine.{call}".rpartition(".")
+    part = operator.attrgetter(place)(shell)
+    monkeypatch.setattr(part, name, once(getattr(part, name)))
+    shell.up()
+    shell.received(Frame(0, b""), 0)
+    await asyncio.sleep(3.0)
+    assert [each for each in owner.changes if each != "up"] == ["internal error: injected"]
+    assert any(isinstance(each, Ready) for each in owner.actions)
+    shell.do(shell.engine.publish(port.now(), 0x42, b"x", handle="x"))
+    await asyncio.sleep(1.0)
+    assert owner.fates() == [Fate.SENT]
+
+
+async def test_an_engine_that_always_raises_does_not_take_all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    shell, _, owner = make()
+    monkeypatch.setattr(shell.engine, "poll", lambda _now: 1 // 0)
+    shell.up()
+    await asyncio.sleep(5.0)
+    assert 10 < len(owner.changes) < 60
+
+
+async def test_an_action_that_raises_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    shell, _, owner = make()
+    monkeypatch.setattr(owner, "act", once(owner.act))
+    actions = [Ready(9, Profile.RTCAN), Ready(10, Profile.RTCAN)]
+    shell.do(actions)
+    assert owner.actions == actions[1:]
+    assert owner.changes == ["internal error: injected"]

@@ -189,3 +189,14 @@ async def test_long_messages_go_alone() -> None:
         wire.add(bytes(size))
     wire.burst.flush()
     assert [len(each) for each in wire.sent] == [1, 15_000, 5000, 20_000, 20_000]
+
+
+@pytest.mark.internal_errors
+async def test_a_packet_that_raises_does_not_stop_the_others() -> None:
+    wire = Wire()
+    wire.add(b"0")
+    wire.add(b"1", stamp=-(2**80))
+    wire.add(b"22")
+    wire.burst.flush()
+    assert wire.sent == [b"0", b"22"]
+    assert (wire.stats.sent, wire.stats.lost) == (2, {"internal error": 1})

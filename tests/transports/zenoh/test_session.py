@@ -10,14 +10,15 @@ import pytest
 import zenoh
 
 from r2p.transports.intake import TURN
-from r2p.transports.zenoh.session import Funnel, Tap
+from r2p.transports.losses import Losses
+from r2p.transports.zenoh.session import Funnel, Session, Tap
 
 pytestmark = pytest.mark.anyio
 
 
 async def test_a_flood_lets_others_have_their_turn() -> None:
     taken: list[int] = []
-    funnel = Funnel(asyncio.get_running_loop(), taken.append, most=2 * TURN + 1)
+    funnel = Funnel(asyncio.get_running_loop(), taken.append, Losses(), most=2 * TURN + 1)
     for number in range(2 * TURN + 3):
         funnel.put(number)
     assert funnel.overflown == 2
@@ -127,3 +128,30 @@ async def test_the_thread_of_a_tap_ends_with_it(waiting: int) -> None:
     tap.close()
     await asyncio.to_thread(thread.join)
     assert arrived.empty()
+
+
+@pytest.mark.internal_errors
+async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
+    """Neither in the loop nor, before that, in the thread."""
+    taken: list[int] = []
+    losses, loop, ended = Losses(), asyncio.get_running_loop(), asyncio.Event()
+
+    def take(item: int) -> None:
+        if item == 10:
+            ended.set()
+        taken.append(10 // item)
+
+    funnel = Funnel(loop, take, losses, most=9)
+    for number in (5, 0, 2, 0, 1):
+        funnel.put(number)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert (taken, losses) == ([2, 5, 10], {"internal error": 2})
+
+    channel, nothing = Channel(), None
+    session = Session(nothing)  # type: ignore[arg-type]
+    session._hear(channel, lambda item: funnel.put(len(item)), funnel)
+    channel.put_all(["12345", 7, "1234567890"])
+    await ended.wait()
+    channel.undeclare()
+    assert (taken[3:], losses) == ([2, 1], {"internal error": 3})

@@ -11,8 +11,11 @@ from r2p.codecs import attachment
 from r2p.codecs.attachment import Header, Origin
 from r2p.messages import layout
 from r2p.msg import Led
+from r2p.room import Sink
+from r2p.sample import Sample
 from r2p.topic import QueueSink, Topic, Waker
 from r2p.transports.intake import LinkStats
+from r2p.transports.zenoh.stream import Stream
 from r2p.transports.zenoh.streams import WINDOW, Streams
 
 pytestmark = pytest.mark.virtual_time
@@ -23,12 +26,12 @@ SIZE = layout(Led).size
 class Ring:
     """A topic `leds` with a subscriber, and what waits for it in zenoh."""
 
-    def __init__(self, queue: int, *, typed: bool = True) -> None:
+    def __init__(self, queue: int, *, typed: bool = True, topic: type[Topic] = Topic) -> None:
         loop = asyncio.get_running_loop()
         self.credits: list[tuple[int, int]] = []
         self.stats = LinkStats()
         self.waker = Waker(loop)
-        self.topic = Topic("leds", self.waker)
+        self.topic = topic("leds", self.waker)
         self.topic.layout = layout(Led) if typed else None
         self._ring: deque[Any] = deque()
         self._idle = True
@@ -161,3 +164,72 @@ async def test_what_eight_publishers_may_send_is_kept_where_nobody_reads() -> No
         await turns(2 * WINDOW // 64)
     assert not ring.stats.lost
     assert ring.stats.received == 8 * WINDOW
+
+
+class FaultyTopic(Topic):
+    """Raises at the messages with these sequence numbers."""
+
+    faulty: frozenset[int] = frozenset()
+
+    def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
+        if sample.sequence in self.faulty:
+            raise RuntimeError(sample)
+        return super().deliver(sample, own, driver)
+
+
+@pytest.mark.internal_errors
+@pytest.mark.parametrize("publisher_class", [1, 2])
+@pytest.mark.parametrize("queue", [3, 99])
+async def test_a_message_that_raises_does_not_stop_the_others(queue: int, publisher_class: int) -> None:
+    """It is as good as taken: its publisher does not wait for it."""
+    ring = Ring(queue=queue, topic=FaultyTopic)
+    assert isinstance(ring.topic, FaultyTopic)
+    ring.topic.faulty = frozenset({2, 6, 8})
+    ring.put(1, publisher_class=publisher_class)
+    ring.put(2, 5, publisher_class=publisher_class)
+    ring.put(7, publisher_class=publisher_class)
+    ring.put(8, publisher_class=publisher_class)
+    taken = []
+    for _ in range(12):
+        await turns()
+        taken += numbers(ring.sink)
+        ring.sink.queue.clear()
+        ring.sink.refill()
+    assert taken == [each for each in (1, 3, 4, 5, 7) if each in taken]
+    assert len(taken) + ring.sink.lost == 5
+    assert ring.stats.lost == {"internal error": 3}
+    assert ring.streams._streams["leds"]._blocked is None
+
+
+@pytest.mark.internal_errors
+async def test_a_packet_that_raises_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring = Ring(queue=99)
+    unpack, stream = Stream._unpack, ring.streams._streams["leds"]
+
+    def faulty(data: bytes, header: bytes) -> int:
+        if data[0] == 2:
+            raise RuntimeError(data)
+        return unpack(stream, data, header)
+
+    monkeypatch.setattr(stream, "_unpack", faulty, raising=False)
+    for serial in range(1, 4):
+        ring.put(serial)
+    await turns()
+    assert numbers(ring.sink) == [1, 3]
+    assert ring.stats.lost == {"internal error": 1, "on the way": 1}
+
+
+@pytest.mark.internal_errors
+async def test_a_sink_that_raises_while_a_message_waits_for_it_does_not_stop_the_stream(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ring = Ring(queue=1)
+    ring.put(1, 2)
+    monkeypatch.setattr(QueueSink, "offer", lambda *_: 1 // 0)
+    await turns(3)
+    monkeypatch.undo()
+    ring.sink.queue.clear()
+    ring.put(3)
+    await turns()
+    assert numbers(ring.sink) == [3]
+    assert ring.stats.lost == {"internal error": 1}

@@ -1,0 +1,102 @@
+"""What a gateway, or a module with several links, does when the handling of one thing raises: it goes on."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import pytest
+
+import r2p
+from r2p.bridge import Standby
+from r2p.codecs.management import Endpoint, Hello
+from r2p.msg import Led
+from tests.bridge.test_bridge import drain, gateway, node
+from tests.faults import once
+
+if TYPE_CHECKING:
+    from r2p.bridge import Bridge
+
+pytestmark = [pytest.mark.virtual_time, pytest.mark.internal_errors]
+
+SETTLED = 5.0
+
+
+def bridge_of(module: r2p.Module) -> Bridge:
+    hub = module._hub
+    assert hub is not None
+    assert hub.bridge is not None
+    return hub.bridge
+
+
+def errors(module: r2p.Module) -> list[int]:
+    return [link.losses["internal error"] for link in module.links]
+
+
+async def passes(topic: str = "leds") -> None:
+    """Messages of modules that are new go through the gateway."""
+    async with node("NEW1", "a") as alice, node("NEW2", "b") as bob:
+        publisher, subscriber = alice.advertise(topic, Led), bob.subscribe(topic, Led)
+        await asyncio.sleep(SETTLED)
+        await publisher.publish(Led(1))
+        await asyncio.sleep(0.1)
+        assert drain(subscriber) == [1]
+
+
+async def test_the_alarm_of_the_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway() as module:
+        bridge = bridge_of(module)
+        monkeypatch.setattr(bridge.tree, "poll", once(bridge.tree.poll))
+        await asyncio.sleep(SETTLED)
+        assert errors(module) == [1, 1]
+        await passes()
+
+
+async def test_what_the_tree_sends(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway() as module:
+        first, second = module.links
+        monkeypatch.setattr(first, "write_management", once(first.write_management))
+        sent = []
+        monkeypatch.setattr(second, "write_management", lambda data, **_: sent.append(data))
+        bridge_of(module)._act()
+        await asyncio.sleep(1.0)
+        assert (errors(module), bool(sent)) == ([1, 0], True)
+
+
+@pytest.mark.parametrize("kind", [Hello, Endpoint])
+async def test_what_is_told_of_modules(kind: type[object], monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway() as module:
+        link = module.links[1]
+        monkeypatch.setattr(link, "relay", once(link.relay, lambda message: isinstance(message, kind)))
+        async with node("A", "a") as alice, node("C", "a") as carol, r2p.Module("B", via="memory:b") as b:
+            alice.advertise("leds", Led)
+            carol.advertise("leds", Led)
+            await asyncio.sleep(SETTLED)
+            assert errors(module) == [0, 1]
+            assert {each.name for each in b.network.modules()} == {"A", "B", "C", "GW"}
+            publishers = b.network.topics()["leds"].publishers
+            assert sorted(each.module for each in publishers) == ["A", "C"]
+
+
+async def test_the_review_of_one_topic(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway() as module, node("A", "a") as alice, node("B", "b") as bob:
+        relays = bridge_of(module).relays
+        monkeypatch.setattr(relays, "_review", once(relays._review))
+        publishers = [alice.advertise(name, Led) for name in ("one", "two", "three")]
+        subscribers = [bob.subscribe(name, Led) for name in ("one", "two", "three")]
+        await asyncio.sleep(SETTLED)
+        for publisher in publishers:
+            await publisher.publish(Led(1))
+        await asyncio.sleep(0.1)
+        assert [drain(each) for each in subscribers] == [[1]] * 3
+        assert errors(module) == [1, 1]
+
+
+async def test_the_alarm_of_a_module_with_several_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway(), r2p.Module("PC", via=["memory:a", "memory:b"]) as module:
+        standby = module._hub and module._hub._joints
+        assert isinstance(standby, Standby)
+        monkeypatch.setattr(standby.homes, "poll", once(standby.homes.poll))
+        await asyncio.sleep(SETTLED)
+        assert errors(module) == [1, 1]
+        assert sum(bool(link.stands_by) for link in module.links) == 1
