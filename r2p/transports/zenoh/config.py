@@ -21,12 +21,18 @@ _OURS: dict[str, object] = {
     # Urgent messages are batches of their own: what comes while zenoh's threads do not get to run fits.
     "transport/link/tx/queue/size/interactive_high": 16,
     "transport/link/tx/queue/size/real_time": 16,
-    "adminspace/enabled": True,  # this session's own: it tells where it listens
 }
 
 _AT_THE_USUAL_PORT: dict[str, object] = {  # the first one on this computer; so clients find it without a router
     "listen/endpoints": ["tcp/[::]:7447", "tcp/[::]:0"],
     "listen/exit_on_failure": False,
+}
+
+
+_LISTENS: dict[str, object] = {
+    # This session's own, which tells where it listens. Not for clients: zenoh keeps 37 kB for ever of each session that
+    # is closed with one.
+    "adminspace/enabled": True,
 }
 
 
@@ -59,7 +65,8 @@ def way_of(config: zenoh.Config) -> Way:
 
 def _from_file(options: Options) -> zenoh.Config:
     config = zenoh.Config()
-    for key, value in _OURS.items():
+    ours = _OURS if options.mode == "client" else _OURS | _LISTENS
+    for key, value in ours.items():
         config.insert_json5(key, json.dumps(value))
     if options.config is None:
         return config
@@ -69,7 +76,7 @@ def _from_file(options: Options) -> zenoh.Config:
         reason = "there is no such file" if not options.config.exists() else _words(error)
         raise options.error(f"can't read {options.config}: {reason}") from error
     blank = zenoh.Config()
-    for key, value in _OURS.items():
+    for key, value in ours.items():
         if theirs.get_json(key) == blank.get_json(key):  # what the file says counts
             theirs.insert_json5(key, json.dumps(value))
     return theirs

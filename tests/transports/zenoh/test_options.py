@@ -1,5 +1,6 @@
 """What a `zenoh:` URL may say."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -122,3 +123,11 @@ async def test_what_the_file_says_counts(tmp_path: Path) -> None:
     assert way_of(config).tls.root == "ca.pem"
     ours = config_of(options("zenoh:"))
     assert ours.get_json("transport/link/tx/lease") == "1000"
+
+
+@pytest.mark.parametrize(("url", "listens"), [("zenoh:tcp/robot:7447", False), ("zenoh:", True)])
+def test_only_sessions_that_listen_have_an_admin_space(url: str, listens: bool) -> None:
+    """zenoh's memory grows with each session that had one."""
+    from r2p.transports.zenoh.config import config_of
+
+    assert json.loads(config_of(options(url)).get_json("adminspace/enabled")) is listens

@@ -155,3 +155,38 @@ async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
     await ended.wait()
     channel.undeclare()
     assert (taken[3:], losses) == ([2, 1], {"internal error": 3})
+
+
+class Zenoh:
+    """Stands for zenoh's session: notes what is undeclared, and when it is closed."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def declare_publisher(self, key: str, **_options: object) -> "Declared":
+        return Declared(key, self.calls)
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+class Declared:
+    """A publisher."""
+
+    def __init__(self, key: str, calls: list[str]) -> None:
+        self._key = key
+        self._calls = calls
+
+    def undeclare(self) -> None:
+        self._calls.append(self._key)
+
+
+async def test_publishers_are_undeclared_before_their_session_is_closed() -> None:
+    """Otherwise zenoh's memory grows with each session."""
+    bare = Zenoh()
+    stand_in: Any = bare
+    session = Session(stand_in)
+    session.publisher("stays", 1)
+    session.ends(session.publisher("ended", 2))
+    await session.close()
+    assert bare.calls == ["ended", "stays", "close"]
