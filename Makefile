@@ -5,7 +5,7 @@ BIN := .venv/bin
 RUN := .venv/stamp-run
 STAMP := .venv/stamp
 
-.PHONY: demo test lint bench docs clean
+.PHONY: demo test lint bench soak docs clean
 
 demo: $(RUN)
 	$(BIN)/r2p demo
@@ -22,6 +22,13 @@ lint: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
+
+# Seconds, and messages a second (0: as many as are taken): `make soak SECONDS=600 RATE=2000`.
+SECONDS := 3600
+RATE := 0
+
+soak: $(STAMP)
+	$(BIN)/python -m benchmarks.soak $(SECONDS) --rate $(RATE)
 
 docs: $(STAMP)
 	$(BIN)/mkdocs build --strict

@@ -82,8 +82,12 @@ class BridgedTopic(Topic):
         if sample.sequence and self._seen.again(sample) and not port.link.latched(self.name):
             port.dropped["seen before"] += 1
             return None
+        ways = self.open.get(link)
+        if ways is None and not self.queues:  # not yet, or not any more, as its publisher will soon know
+            port.dropped["not subscribed"] += 1
+            return None
         blocked = super().deliver(sample) if self.queues else None
-        for way in self.open.get(link, ()):
+        for way in ways or ():
             blocked = self._forward(way, sample, now, blocked)
         return blocked
 
