@@ -22,6 +22,16 @@ INTERNAL_ERROR = "internal error"
 """Why something is lost whose handling raised what it never should."""
 
 
+NO_ROOM = "no room"
+"""Why a sample is lost that does not wait, or waits no longer."""
+
+CANCELLED = "publish cancelled"
+"""Why a sample is lost whose `publish()` was cancelled while it waited for room."""
+
+GIVEN_UP = "given up by its publisher"
+"""Why a link lacks a sample that its publisher kept until it was stale, or too many waited, or it was closed."""
+
+
 class Sink(abc.ABC):
     """What takes samples: a subscriber's queue, or a link's send buffer."""
 
@@ -49,6 +59,10 @@ class Sink(abc.ABC):
     @abc.abstractmethod
     def force(self, sample: Sample) -> None:
         """Take the sample even without room, losing and counting one."""
+
+    def lose(self, reason: str) -> None:
+        """Count a sample that waited for room and does not any more; links count it by reason, too."""
+        self.lost += 1
 
     @abc.abstractmethod
     def room(self) -> "Room":
@@ -185,6 +199,18 @@ class Room:
         for claim in _take(self.claims, sink):
             sink.force(claim.sample)
             claim.settle(sink, refusal)
+
+    def take_earlier(self, sink: Sink, sample: Sample) -> list[Claim]:
+        """Take out what waits for this sink, and its publisher has published before this sample."""
+        line = self.line(sample)
+        earlier = [
+            claim
+            for each, claim in line
+            if each is sink and claim.sample.source is sample.source and claim.sample.sequence < sample.sequence
+        ]
+        for claim in earlier:
+            line.remove((sink, claim))
+        return earlier
 
     def refuse_all(self, refusal: str) -> None:
         """No room for anything."""

@@ -21,13 +21,14 @@ import msgspec
 from r2p.clock import Clock
 from r2p.errors import MessageError, TypeMismatch
 from r2p.messages import Layout
-from r2p.room import Room, Sink
+from r2p.room import NO_ROOM, Room, Sink
 from r2p.sample import PublisherClass, Sample
 
 BURST = 16
 """Messages that publish() or an iteration handles before it lets the event loop run once."""
 
 _LONGEST = 1e9  # s
+_NRT = PublisherClass.NON_REAL_TIME
 
 PATIENCE = 4
 """Turns of the event loop that a link waits for a full queue before it goes on without it."""
@@ -133,13 +134,23 @@ class QueueSink(Sink):
         self._put(sample)
         return True
 
+    def waits_for(self, sample: Sample) -> bool:
+        """Who made no room for what does not expire is lossy for that only: events wait until their deadline."""
+        return not self.lossy and sample.publisher_class != _NRT
+
     def force(self, sample: Sample) -> None:
         if self.offer(sample):
             return
         self.lost += 1
-        if not self.keep_oldest:
+        if self.keep_oldest:
+            return
+        overtaken = [] if self.lines is None else self.lines.take_earlier(self, sample)
+        for earlier in (*(claim.sample for claim in overtaken), sample):
             self.queue.popleft()
-            self._put(sample)
+            self._put(earlier)
+        self.lost += len(overtaken)
+        for claim in overtaken:  # after all are in: this may bring about that more is published
+            claim.settle(self, NO_ROOM)
 
     def room(self) -> Room:
         if self.lines is None:
@@ -266,12 +277,13 @@ class Topic:
         for sink in self.queues:
             queue = sink.queue
             if len(queue) >= sink.limit:
-                if sink.patient and sink.node is not own:
+                if sink.node is not own and (sink.patient or sink.waits_for(sample)):
                     blocked = [sink] if blocked is None else [*blocked, sink]
                     continue
-                sink.lost += 1
-                if sink.keep_oldest:
+                if sink.lines is not None or sink.keep_oldest:
+                    sink.force(sample)
                     continue
+                sink.lost += 1
                 queue.popleft()
             queue.append(sample)
             if (waiter := sink.waiter) is not None:

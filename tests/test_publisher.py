@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import math
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import r2p
 from r2p.msg import Encoder, Led
 from tests.bench import MS, Recorder, Turns, crashes, drain, elapsed, hold, led, local, numbers, pair, settle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 STALL = 1.0
 
@@ -168,6 +172,29 @@ async def test_what_a_signal_raises_crashes_the_node() -> None:
 
     (error,) = await crashes(main)
     assert str(error) == "no idea"
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("klass", [r2p.NonRealTime, functools.partial(r2p.Sporadic, 0.01, pending=1)])
+async def test_a_signal_that_publishes_is_told_what_becomes_of_that_a_little_later(
+    klass: Callable[..., r2p.NonRealTime],
+) -> None:
+    async with local() as module:
+        node, other = pair(module)
+        leds = other.subscribe("leds", Led, queue=1)
+        missed = Recorder(then=lambda: [publisher.publish_nowait(led(7)) for _ in range(2)])
+        publisher = node.advertise("leds", Led, klass(on_missed=missed))
+        for number in range(3):
+            publisher.publish_nowait(led(number))
+        await asyncio.sleep(0.1)
+        assert not module.nodes["pub"].error
+        assert 50 <= len(missed.calls) <= 410
+        assert sum(each.count for each in missed.calls) == pytest.approx(publisher.missed, abs=16)
+        leds.close()
+        await asyncio.sleep(0.1)
+        calls = len(missed.calls)
+        await asyncio.sleep(1.0)
+        assert len(missed.calls) == calls
 
 
 @pytest.mark.anyio
@@ -330,7 +357,7 @@ async def test_a_publish_that_waits_can_be_cancelled() -> None:
         for number in range(100):
             with pytest.raises(TimeoutError):
                 await asyncio.wait_for(publisher.publish(led(number)), 0.01)
-        assert leds.lost == 100
+        assert (leds.lost, publisher.missed) == (100, 100)
         assert not leds._sink.lines  # nothing grows
         assert (await leds.fetch()).led == 1
         await publisher.publish(led(7))
@@ -424,6 +451,41 @@ async def test_tasks_of_one_publisher_do_not_overtake_each_other() -> None:
                 await settle()
             got += [(await leds.fetch()).led for _ in range(20)]
         assert got == list(range(40))
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(("keep", "left"), [("newest", [2, 3]), ("oldest", [0, 1])])
+async def test_a_message_that_does_not_wait_pushes_in_what_waits_before_it(
+    keep: r2p.subscriber.Keep, left: list[int]
+) -> None:
+    async with local() as module, asyncio.TaskGroup() as tasks:
+        node, other = pair(module)
+        leds = other.subscribe("leds", Led, queue=2, keep=keep)
+        publisher = node.advertise("leds", Led)
+        for number in range(2):
+            await publisher.publish(led(number))
+        waits = tasks.create_task(publisher.publish(led(2)))
+        await settle()
+        assert not publisher.publish_nowait(led(3))
+        await settle()
+        assert waits.done() == (keep == "newest")
+        assert [(await leds.fetch()).led for _ in range(2)] == left
+        assert leds.lost == {"newest": 2, "oldest": 1}[keep]
+
+
+@pytest.mark.virtual_time
+async def test_a_newer_value_pushes_in_a_latched_one_that_waits() -> None:
+    async with local() as module:
+        node, other = pair(module)
+        values = [node.advertise("leds", Led, latch=True) for _ in range(2)]
+        for number, publisher in enumerate(values):
+            await publisher.publish(led(number))
+        leds = other.subscribe("leds", Led, queue=1, lossy=True)  # the first one is in, the second one waits
+        await values[1].publish(led(2))
+        assert [(await leds.fetch()).led for _ in range(len(leds.queue))] == [2]
+        await settle()
+        assert not leds.queue
+        assert leds.lost == 2
 
 
 @pytest.mark.virtual_time

@@ -143,6 +143,26 @@ async def test_a_link_that_makes_no_room_in_time_is_lossy_until_it_has(monkeypat
 
 
 @pytest.mark.virtual_time
+async def test_what_a_link_does_not_get_any_more_is_counted_by_both() -> None:
+    async with joined("A") as module, joined("B") as peer:
+        node, other = pair(module)[0], pair(peer)[1]
+        other.subscribe("leds", Led, queue=2 * IN_FLIGHT)
+        publisher = node.advertise("leds", Led, r2p.NonRealTime(stall=5.0))
+        events = node.advertise("leds", Led, r2p.Sporadic(deadline=0.5))
+        await publisher.wait_subscriber()
+        network("lab").delay = 3.0
+        while not module.links[0].full:
+            publisher.publish_nowait(led(0))
+        for number in range(3):
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(publisher.publish(led(number)), 0.01)
+        await events.publish(led(0))
+        await asyncio.sleep(1.0)
+        assert (publisher.missed, events.missed) == (3, 1)
+        assert module.links[0].losses == {"publish cancelled": 3, "given up by its publisher": 1}
+
+
+@pytest.mark.virtual_time
 async def test_events_that_wait_when_a_link_breaks_are_lost_and_counted() -> None:
     async with joined("A") as a, joined("B") as b:
         node, other = a.start(hold), b.start(hold)

@@ -42,6 +42,22 @@ async def test_a_younger_event_does_not_overtake_one_that_waits() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_an_event_waits_where_a_publisher_without_a_deadline_has_given_up() -> None:
+    async with local() as module:
+        node, other = pair(module)
+        leds = other.subscribe("leds", Led, queue=2)
+        events = node.advertise("leds", Led, r2p.Sporadic(deadline=5.0))
+        others = node.advertise("leds", Led, r2p.NonRealTime(stall=0.1))
+        for number in (100, 101):
+            await others.publish(led(number))
+        await events.publish(led(1))
+        await others.publish(led(102))  # gives up, in vain
+        await events.publish(led(2))
+        assert [(await leds.fetch(0.05)).led for _ in range(4)] == [101, 102, 1, 2]
+        assert (leds.lost, events.missed, others.missed) == (1, 0, 1)
+
+
+@pytest.mark.virtual_time
 async def test_an_event_that_is_not_everywhere_by_its_deadline_is_given_up() -> None:
     missed, late = Recorder(), Recorder()
     async with local() as module:

@@ -5,6 +5,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Generic, NoReturn, TypeVar
 
+from msgspec import structs
+
 from r2p.classes import Missed, Signal
 from r2p.errors import Closed, MessageError
 from r2p.messages import Layout, Message
@@ -15,6 +17,8 @@ from r2p.topic import BURST, Owner, Topic, TopicSpace
 M = TypeVar("M", bound=Message)
 
 _SECOND = 1_000_000_000
+_AGAIN = 0.001  # seconds until a signal that publishes is told what became of that
+_AT_ONCE = 4  # of those, one by one
 _REMEMBERED = 64  # messages that were missed last
 
 
@@ -44,6 +48,8 @@ class BasePublisher(Generic[M]):
         self._credit = BURST
         self._logged = -_SECOND
         self._waiters: list[asyncio.Future[None]] = []
+        self._signalling = False
+        self._later: list[tuple[Signal, Missed]] = []
         self._missed_lately: deque[int] = deque(maxlen=_REMEMBERED)
 
     @property
@@ -172,12 +178,37 @@ class BasePublisher(Generic[M]):
         if now - self._logged >= _SECOND and missed.reason != LINK_DOWN:  # which was told when it went down
             self._logged = now
             self.node.log.warning("%s (missed %d, late %d so far)", missed, self.missed, self.late)
-        if callback is not None and not self.node.ending:
-            try:
-                callback(missed)
-            except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
-                # Later: a link may be at work in the node's own task, where a crash would raise through it.
-                self._space.loop.call_soon(self.node.crash, error)
+        if callback is None:
+            return
+        if self._signalling:
+            self._signal_later(missed, callback)
+        else:
+            self._call(missed, callback)
+
+    def _call(self, missed: Missed, callback: Signal) -> None:
+        if self.node.ending:
+            return
+        self._signalling = True
+        try:
+            callback(missed)
+        except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
+            # Later: a link may be at work in the node's own task, where a crash would raise through it.
+            self._space.loop.call_soon(self.node.crash, error)
+        finally:
+            self._signalling = False
+
+    def _signal_later(self, missed: Missed, callback: Signal) -> None:
+        """A signal publishes, and that is missed, too: signal it when that is over; what is too much becomes one."""
+        if not self._later:
+            self._space.loop.call_later(_AGAIN, self._signal_now)
+        elif len(self._later) >= _AT_ONCE and self._later[-1][0] is callback:
+            missed = structs.replace(missed, count=self._later.pop()[1].count + missed.count)
+        self._later.append((callback, missed))
+
+    def _signal_now(self) -> None:
+        later, self._later = self._later, []
+        for callback, missed in later:
+            self._call(missed, callback)
 
 
 def where(sinks: Sequence[Sink]) -> str:

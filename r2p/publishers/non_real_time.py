@@ -5,7 +5,7 @@ import asyncio
 from r2p.classes import NonRealTime
 from r2p.messages import Layout
 from r2p.publishers.base import BasePublisher, M, where
-from r2p.room import Claim, Sink
+from r2p.room import CANCELLED, NO_ROOM, Claim, Sink
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import BURST, Owner, Topic, TopicSpace, pause
 
@@ -54,7 +54,7 @@ class Publisher(BasePublisher[M]):
         if blocked is not None:
             for sink in blocked:
                 sink.force(sample)
-            self._miss(sample.sequence, "no room", where(blocked))
+            self._miss(sample.sequence, NO_ROOM, where(blocked))
         return blocked is None
 
     async def _wait_for_room(self, sample: Sample, blocked: list[Sink]) -> None:
@@ -65,8 +65,11 @@ class Publisher(BasePublisher[M]):
             await wait.over
         finally:
             timer.cancel()
-            for sink in wait.withdraw():  # cancelled
-                sink.lost += 1
+            without = wait.withdraw()
+            for sink in without:
+                sink.lose(CANCELLED)
+            if without:
+                self._miss(sample.sequence, CANCELLED, where(without))
             if wait.refused:
                 self._miss(sample.sequence, wait.refusal, where(wait.refused))
 

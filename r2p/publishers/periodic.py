@@ -6,7 +6,7 @@ from r2p.classes import Missed, Periodic
 from r2p.clock import Ticker
 from r2p.messages import Layout
 from r2p.publishers.base import BasePublisher, M, where
-from r2p.room import Claim, Sink
+from r2p.room import GIVEN_UP, NO_ROOM, Claim, Sink
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Owner, QueueSink, Topic, TopicSpace
 
@@ -75,7 +75,7 @@ class PeriodicPublisher(BasePublisher[M]):
 
         Local queues and all other links get the message, the driver gets it from here; None if there is none.
         """
-        self._give_up("no room")
+        self._give_up(NO_ROOM)
         if self._encode == self._closed or self.node.ending:
             return None
         if skipped or late > self.period * _SECOND / _LATE_SHARE:
@@ -107,7 +107,7 @@ class PeriodicPublisher(BasePublisher[M]):
         if queues:
             for sink in queues:
                 sink.force(sample)
-            self._miss(sample.sequence, "no room", where(queues))
+            self._miss(sample.sequence, NO_ROOM, where(queues))
         if down:
             self._unreachable(sample, down)
 
@@ -126,7 +126,7 @@ class PeriodicPublisher(BasePublisher[M]):
         without = waited.withdraw() if waited is not None else []
         if waited is not None and without:
             for sink in without:
-                sink.lost += 1
+                sink.lose(GIVEN_UP)
             self._miss(waited.sample.sequence, reason, where(without))
 
 

@@ -6,7 +6,7 @@ from r2p.classes import Missed, Sporadic
 from r2p.clock import Alarm
 from r2p.messages import Layout
 from r2p.publishers.base import BasePublisher, M, where
-from r2p.room import Claim, Sink
+from r2p.room import GIVEN_UP, Claim, Sink
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import BURST, Owner, Topic, TopicSpace, pause
 
@@ -97,7 +97,7 @@ class SporadicPublisher(BasePublisher[M]):
             self._pending.remove(event)
             without = event.withdraw()
             for sink in without:
-                sink.lost += 1
+                sink.lose(GIVEN_UP)
             late = max(0, self._clock.monotonic() - event.due) / _SECOND
             self._miss(event.sample.sequence, reason, where(without), late)
 

@@ -49,5 +49,9 @@ class LinkOutlet(Outlet):
             self.lost += 1
             link.stats.lost["send buffer full" if link.up else LINK_DOWN] += 1
 
+    def lose(self, reason: str) -> None:
+        super().lose(reason)
+        self._link.stats.lost[reason] += 1
+
     def refill(self) -> None:
         self._link.made_room()
