@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from r2p.clock import clock_of
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import Mailbox, Outcome
@@ -46,7 +46,11 @@ __all__ = [
 QUEUE = 8192
 """Frames that wait for the iteration before the oldest are lost, counted."""
 
-_ALL = [(0, 0)]
+_SECOND = 1_000_000_000
+_LOOK = 10_000_000  # ns between two looks whether frames of a period that is over are still to be read
+_QUIET = 4  # looks without any, after which there are none
+_LATE = 500_000_000  # ns: more than a busy computer takes
+_STOPPED = 40_000_000  # ns that a look took longer: the process stood still, what came meanwhile is not read yet
 
 
 class BusMonitor:
@@ -85,7 +89,7 @@ class BusMonitor:
         self.since = self._now()
         self._monitor = Monitor(options.timing)
         self._monitor.reset(self.since)
-        port.set_filters(_ALL)
+        port.set_filters(None)
         opened = asyncio.Event()
         self._running = asyncio.create_task(port.run(self, opened.set), name=f"listen {self.via}")
         self._running.add_done_callback(self._wake)
@@ -147,15 +151,34 @@ class BusMonitor:
             await self._arrived.wait()
 
     async def loads(self, period: float) -> AsyncIterator[BusLoad]:
-        """What the bus carried, every `period` seconds."""
-        loop = asyncio.get_running_loop()
-        due = loop.time()
+        """What the bus carried, every `period` seconds; by the time at which it did, also when this program is late."""
+        length = round(period * _SECOND)
+        end = self._now()
+        self._monitor.begin(end, length)
         while True:
-            self._monitor.reset(self._now())
-            due += period
-            await asyncio.sleep(due - loop.time())
+            end += length
+            await self._read_until(end)
             self._check()
-            yield self._monitor.load(self._now())
+            yield self._monitor.next_load()
+
+    async def _read_until(self, end: int) -> None:
+        """Wait until all frames are read that were on the bus until then."""
+        if (left := end - self._now()) > 0:
+            await self._sleep(left)
+        quiet = 0
+        while self._monitor.heard < end and quiet < _QUIET:
+            heard, before = self._monitor.heard, self._now()
+            late = await self._sleep(_LOOK)
+            quiet = quiet + 1 if self._monitor.heard == heard and before >= end and late < _STOPPED else 0
+
+    async def _sleep(self, duration: int) -> int:
+        """Sleep for so many ns, and return how many it took longer."""
+        due = self._now() + duration
+        await asyncio.sleep(duration / _SECOND)
+        late = self._now() - due
+        if late > _LATE:
+            self._tell(f"this program stood still for {late / _SECOND:.1f} s: frames that were not kept are missing")
+        return late
 
     async def cycles(self, count: int, patience: float) -> bool:
         """Watch so many whole cycles. False: there was no sync for `patience` seconds."""
@@ -174,7 +197,13 @@ class BusMonitor:
 
     def received(self, frame: Frame, stamp: int) -> None:
         """A frame was on the bus until `stamp`."""
-        seen = self._monitor.frame(frame, stamp)
+        self._saw(self._monitor.frame(frame, stamp))
+
+    def other(self, frame: OtherFrame, stamp: int) -> None:
+        """A frame that RTCAN does not use was on the bus until `stamp`."""
+        self._saw(self._monitor.other(frame, stamp))
+
+    def _saw(self, seen: SeenFrame) -> None:
         if seen.kind is FrameKind.SYNC:
             self._synced.set()
         if self._wanted:

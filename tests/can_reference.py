@@ -31,14 +31,17 @@ def stuffed(bits: str) -> str:
     return sent
 
 
-def on_the_bus(identifier: int, data: bytes, *, extended: bool = True, acknowledged: bool = True) -> str:
-    """All bits of a frame, start of frame to end of frame."""
+def on_the_bus(
+    identifier: int, data: bytes, *, extended: bool = True, acknowledged: bool = True, remote: int | None = None
+) -> str:
+    """All bits of a frame, start of frame to end of frame; `remote`: of a remote frame, the length that it asks for."""
+    rtr, length = ("0", len(data)) if remote is None else ("1", remote)
     if extended:
         id_bits = f"{identifier:029b}"
-        head = "0" + id_bits[:11] + "11" + id_bits[11:] + "0" + "00"
+        head = "0" + id_bits[:11] + "11" + id_bits[11:] + rtr + "00"
     else:
-        head = "0" + f"{identifier:011b}" + "0" + "0" + "0"
-    bits = head + f"{len(data):04b}" + "".join(f"{byte:08b}" for byte in data)
+        head = "0" + f"{identifier:011b}" + rtr + "0" + "0"
+    bits = head + f"{length:04b}" + "".join(f"{byte:08b}" for byte in data)
     return stuffed(bits + crc15(bits)) + "1" + ("01" if acknowledged else "11") + "1111111"
 
 

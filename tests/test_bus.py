@@ -3,19 +3,23 @@
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 import typer
 
 import r2p
-from r2p.bus import BusMonitor, FrameKind
+from r2p.bus import BusLoad, BusMonitor, FrameKind
+from r2p.codecs.rtcan import Frame
 from r2p.msg import Led
+from r2p.protocols.rtcan.events import Transmit, Withdraw
+from r2p.protocols.rtcan.monitor import Tally
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimCan, SimPort
 from r2p.tools import bus_dump, bus_load, bus_schedule
 from r2p.tools._bus.listening import listen
 from r2p.tools.session import Usage
+from r2p.transports.rtcan.port import CanPort, PortUser
 
 pytestmark = pytest.mark.virtual_time
 
@@ -174,3 +178,56 @@ async def test_the_commands_take_one_can_bus(via: list[str]) -> None:
     with pytest.raises(Usage, match="give one CAN bus"):
         async with listen(via):
             pass
+
+
+class LatePort(CanPort):
+    """A bus with one frame each `APART`, read by a process that can stand still: then its clock jumps."""
+
+    APART = 5_000_000
+
+    def __init__(self) -> None:
+        super().__init__("late")
+        self._stood = 0
+
+    def now(self) -> int:
+        return super().now() + self._stood
+
+    def stand_still(self, duration: int) -> None:
+        self._stood += duration
+
+    async def run(self, user: PortUser, opened: Callable[[], object]) -> None:
+        opened()
+        frame, stamp = Frame(20 << 23, bytes(8)), self.now() + self.APART // 2
+        while True:
+            for _ in range(8):  # as much as one turn of the loop reads
+                if stamp <= self.now():
+                    user.received(frame, stamp)
+                    stamp += self.APART
+            await asyncio.sleep(0.001)
+
+    def transmit(self, order: Transmit) -> None:
+        raise AssertionError
+
+    def withdraw(self, order: Withdraw) -> None:
+        raise AssertionError
+
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
+        assert filters is None
+
+
+@pytest.mark.parametrize("stopped_at", [0.3, 0.9999, 1.0, 1.0001])
+async def test_the_load_is_right_after_the_process_stood_still(stopped_at: float) -> None:
+    port, told = LatePort(), list[str]()
+    async with BusMonitor(port, on_news=told.append) as bus:
+        asyncio.get_running_loop().call_later(stopped_at, port.stand_still, 2_500_000_000)
+        loads = bus.loads(1.0)
+        frames = [sum(tally.frames for tally in (await anext(loads)).tallies.values()) for _ in range(6)]
+        await loads.aclose()  # type: ignore[attr-defined]
+    assert frames == [200] * 6
+    assert ["this program stood still for 2" in text for text in told] == [True]
+
+
+async def test_a_load_that_cannot_be_is_told() -> None:
+    tallies = {("", "", FrameKind.OTHER): Tally(1, 2000)}
+    load = BusLoad(1_000_000, 1000, tallies, {}, 0.0, 0.0, None)
+    assert "200% is more than the bus can carry" in str(bus_load.trouble(load))

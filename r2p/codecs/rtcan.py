@@ -53,6 +53,15 @@ class Identifier(msgspec.Struct, frozen=True, gc=False):
     left: int
 
 
+class OtherFrame(msgspec.Struct, frozen=True):
+    """A frame that RTCAN does not use: with an 11-bit identifier, or `remote`, which asks for so many bytes."""
+
+    id: int
+    data: bytes = b""
+    extended: bool = False
+    remote: int | None = None
+
+
 class Sync(msgspec.Struct, frozen=True, gc=False):
     """What starts a cycle: its counter mod 256, and a mask in which bit i says that slot i is reserved."""
 
@@ -179,6 +188,17 @@ def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
     return bits + high + row[_SEVEN | crc & 0x7F][1] + TAIL
 
 
+def other_frame_bits(frame: OtherFrame) -> int:
+    """How many bits a frame takes that RTCAN does not use, as `frame_bits`. Raises `MessageError` as that does."""
+    if frame.remote is None:
+        return frame_bits(frame.id, frame.data, extended=frame.extended)
+    if frame.id >> (29 if frame.extended else 11) or not 0 <= frame.remote <= 0xF:
+        raise MessageError(f"identifier {frame.id:#x}, {frame.remote} bytes asked for: no frame has room")
+    bits = (_arbitration(frame.id) if frame.extended else frame.id) << 7 | _REMOTE | frame.remote
+    count = (_HEADER if frame.extended else _STANDARD_HEADER) + _CRC
+    return count + (_stuff(_START, bits << _CRC | _crc(bits.to_bytes(5, "big")), count) >> 3) + TAIL
+
+
 def bits_until_lost(winner: int, loser: int) -> int:
     """Bits from the start of frame to the end of the one where `loser` gives up: the first in which the two differ.
 
@@ -206,6 +226,8 @@ def wire_bits(frame: Frame) -> str:
 # How bits are counted. The state of the stuffing is (the last bit) << 2 | (how many of it there were) - 1.
 
 _HEADER = 39  # bits: start of frame, 11 of the identifier, SRR, IDE, 18 of the identifier, RTR, 2 reserved, 4 of length
+_STANDARD_HEADER = _HEADER - 20  # with an identifier of 11 bits, one of the reserved bits, and no SRR
+_REMOTE = 1 << 6  # RTR, with what follows it of the header
 _CRC = 15
 _START = 1 << 2  # before a frame the bus is recessive; the start of frame is dominant, so how long does not matter
 _Row: TypeAlias = "list[tuple[_Row, int]]"
@@ -229,7 +251,7 @@ def _header(identifier: int, size: int, extended: bool) -> tuple[_Row, int, int]
     if identifier >> (29 if extended else 11) or size > FRAME_MAX:
         raise MessageError(f"identifier {identifier:#x} with {size} bytes: no frame has room")
     bits = _arbitration(identifier) << 7 | size if extended else identifier << 7 | size
-    count = _HEADER if extended else _HEADER - 20
+    count = _HEADER if extended else _STANDARD_HEADER
     step = _stuff(_START, bits, count)
     return _ROWS[step & 7], _crc(bits.to_bytes(5, "big") + bytes(size)), count + (step >> 3)
 

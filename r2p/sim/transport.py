@@ -142,8 +142,8 @@ class SimPort(CanPort):
         if self.controller.abort(order.mailbox):
             self._confirm(order.mailbox, _LATE, self.now())
 
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
-        self.controller.filters = filters
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
+        self.controller.filters = [(0, 0)] if filters is None else filters
 
     def monotonic(self, instant: int) -> int:
         return self._clock.true(instant)

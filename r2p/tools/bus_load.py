@@ -27,7 +27,8 @@ def load(
 ) -> None:
     """Print the true load of a CAN bus once a second: all bits, stuffed ones included, by topic and module.
 
-    `free used` is the load of what nobody reserved: above 80 % events wait long. Sends nothing.
+    `free used` is the load of what nobody reserved: above 80 % events wait long. Frames that are none of RTCAN (11-bit
+    identifiers, remote frames) are of kind `other`. Sends nothing.
     """
     reports = 1 if once else count
 
@@ -71,6 +72,11 @@ def text(report: BusLoad) -> str:
 
 def trouble(report: BusLoad) -> str | None:
     """What the user should know."""
+    if report.total > 1.0:
+        return (
+            f"{report.total:.0%} is more than the bus can carry: this program was late to read it, and the driver does "
+            "not stamp frames when they come; or another bit rate is meant (?bitrate=)"
+        )
     if report.free_used <= CROWDED:
         return None
     gap = "none was seen" if report.nrt_gap is None else f"the longest pause was {report.nrt_gap / SECOND:.3f} s"

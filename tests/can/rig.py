@@ -15,7 +15,7 @@ from r2p.transports.rtcan.socketcan import SocketCanPort
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from r2p.codecs.rtcan import Frame
+    from r2p.codecs.rtcan import Frame, OtherFrame
     from r2p.protocols.rtcan.events import Mailbox, Outcome
     from r2p.transports.rtcan.port import CanPort
 
@@ -105,6 +105,7 @@ class User:
 
     def __init__(self) -> None:
         self.frames: list[Frame] = []
+        self.others: list[OtherFrame] = []
         self.stamps: list[int] = []
         self.outcomes: list[tuple[Mailbox, Outcome]] = []
         self.instants: list[int] = []
@@ -116,6 +117,10 @@ class User:
     def received(self, frame: Frame, stamp: int) -> None:
         self.frames.append(frame)
         self.stamps.append(stamp)
+        self._changed.set()
+
+    def other(self, frame: OtherFrame, stamp: int) -> None:
+        self.others.append(frame)
         self._changed.set()
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:

@@ -107,6 +107,26 @@ def test_the_load(played: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert report["faults"] == {}
 
 
+def test_frames_of_others_are_in_the_load(vcan: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """As `canbusload` has it: 11-bit identifiers and remote frames take their time on the bus, too."""
+    players = [
+        subprocess.Popen(("cangen", vcan, *kind, "-g", "20", "-L", "8"))
+        for kind in (("-I", "123"), ("-I", "124", "-R"), ("-e", "-R"), ("-e",))
+    ]
+    try:
+        assert command("load", "-n", "2", "--format", "json", "--via", f"rtcan:{vcan}") == 0
+    finally:
+        for player in players:
+            player.kill()
+            player.wait()
+    report = records(capsys)[-1]
+    other = next(row for row in report["traffic"] if row["kind"] == "other")
+    ours = [row for row in report["traffic"] if row["kind"] != "other"]
+    assert other["frames_s"] == pytest.approx(3 * sum(row["frames_s"] for row in ours), rel=0.5)
+    assert (other["topic"], other["module"]) == ("", "")
+    assert report["load"] == pytest.approx(sum(row["share"] for row in report["traffic"]), abs=1e-3)
+
+
 def test_the_slots_as_text_and_as_a_drawing(
     played: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.rtcan import interface, socketcan
@@ -120,6 +120,21 @@ async def test_the_kernel_filters(vcan: str) -> None:
         cansend(vcan, f"{0x4444 << 7:08X}#")
         await user.until(lambda: len(user.frames) >= 5)
         assert user.frames[4:] == [Frame(0x4444 << 7, b"")]
+
+
+async def test_frames_that_rtcan_does_not_use_come_where_all_are_wanted(vcan: str) -> None:
+    async with port_on(vcan) as (port, user):
+        cansend(vcan, "001#AA")
+        port.set_filters(None)
+        for text in ("123#0102", "7FF#R3", "1ABCDE00#R8", f"{SRT:08X}#BB"):
+            cansend(vcan, text)
+        await user.until(lambda: user.frames)
+        assert user.frames == [Frame(SRT, b"\xbb")]
+        assert user.others == [
+            OtherFrame(0x123, b"\x01\x02"),
+            OtherFrame(0x7FF, b"", False, 3),
+            OtherFrame(0x1ABCDE00, b"", True, 8),
+        ]
 
 
 async def test_each_class_has_one_frame_on_its_way(vcan: str) -> None:

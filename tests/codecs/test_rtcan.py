@@ -16,6 +16,7 @@ from r2p.codecs.rtcan import (
     SYNC,
     Frame,
     Identifier,
+    OtherFrame,
     Sync,
     bits_until_lost,
     decode_identifier,
@@ -32,6 +33,7 @@ from r2p.codecs.rtcan import (
     id8_of,
     is_sync,
     message_id,
+    other_frame_bits,
     srt_laxity,
     wire_bits,
 )
@@ -307,6 +309,20 @@ def test_bits_on_the_wire(identifier: int, data: bytes) -> None:
 @given(st.integers(0, 0x7FF), frame_data | runs)
 def test_length_of_standard_frames(identifier: int, data: bytes) -> None:
     assert frame_bits(identifier, data, extended=False) == len(on_the_bus(identifier, data, extended=False))
+    assert other_frame_bits(OtherFrame(identifier, data)) == frame_bits(identifier, data, extended=False)
+
+
+@given(st.integers(0, (1 << 29) - 1), st.booleans(), st.integers(0, 8))
+def test_the_bits_of_remote_frames(identifier: int, extended: bool, length: int) -> None:
+    identifier = identifier if extended else identifier >> 18
+    expected = len(on_the_bus(identifier, b"", extended=extended, remote=length))
+    assert other_frame_bits(OtherFrame(identifier, b"", extended, length)) == expected
+
+
+def test_no_frame_has_room() -> None:
+    for frame in (OtherFrame(1 << 11), OtherFrame(1 << 29, b"", True, 1), OtherFrame(1, b"", False, 16)):
+        with pytest.raises(MessageError):
+            other_frame_bits(frame)
 
 
 @given(identifiers, runs)

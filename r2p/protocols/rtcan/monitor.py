@@ -1,21 +1,24 @@
 """Watching an RTCAN bus without a word: what each frame is, what the bus carries, and who uses which slots.
 
 Lengths are counted with the bits stuffed in, so loads are true for the bit rate that is given. The cycle is the
-master's, by its sync frames (PROTOCOL.md 6): a slot is what lies that far behind the start of one.
+master's, by its sync frames (PROTOCOL.md 6): a slot is what lies that far behind the start of one. A frame counts for
+the time at which it was on the bus, however late it is read.
 """
 
 import enum
-from collections import Counter
+from collections import Counter, deque
 
 import msgspec
 
 from r2p.codecs import management, rtcan
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.census import Census
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.reassembly import Reassembly
 
 _SYNC = -1  # in place of a message id
+_OTHER = -2
+_NEVER = 1 << 63
 _EARLY = 8  # a frame that starts less than this part of a slot early belongs to the slot
 
 
@@ -27,12 +30,15 @@ class FrameKind(enum.Enum):
     SRT = "srt"
     NRT = "nrt"
     MANAGEMENT = "management"
+    OTHER = "other"
+    """None of RTCAN: with an 11-bit identifier, or a remote frame."""
 
 
 class SeenFrame(msgspec.Struct, frozen=True):
     """One frame. `stamp` is its end (ns), `bits` its length with the intermission, `left` how many fragments follow.
 
-    `cycle` (mod 256) and `slot` are None while no sync has been heard. `text` tells a whole management message.
+    `cycle` (mod 256) and `slot` are None while no sync has been heard. `text` tells a whole management message, or what
+    a frame of another kind is: of that, `frame` has the identifier and the data.
     """
 
     stamp: int
@@ -113,6 +119,11 @@ class Monitor:
         self.census = Census(timing)
         self.cycles = 0
         """Whole cycles watched since the last `reset`."""
+        self.heard = 0
+        """When the last frame was on the bus."""
+        self._period = 0
+        self._end = _NEVER  # of the current period
+        self._loads: deque[BusLoad] = deque()  # of those that are over
         self._reassembly = Reassembly()
         self._sync: int | None = None  # start of the current cycle
         self._cycle = 0
@@ -121,7 +132,30 @@ class Monitor:
         self.reset(0)
 
     def reset(self, now: int) -> None:
-        """Count from now on."""
+        """Count from now on, until the next `reset`."""
+        self._end = _NEVER
+        self._loads.clear()
+        self._begin_at(now)
+
+    def begin(self, now: int, period: int) -> None:
+        """Count from now on, in periods of so many ns, each of which `next_load` gives once."""
+        self.reset(now)
+        self._period = period
+        self._end = now + period
+
+    def next_load(self) -> BusLoad:
+        """What was carried in the next period that is over; call it when all frames of that are here."""
+        if not self._loads:
+            self._end_period()
+        return self._loads.popleft()
+
+    def _end_period(self) -> None:
+        end = self._end
+        self._loads.append(self.load(end))
+        self._begin_at(end)
+        self._end = end + self._period
+
+    def _begin_at(self, now: int) -> None:
         self._since = now
         self._tallies: dict[tuple[int, FrameKind], Tally] = {}
         self._faults: Counter[str] = Counter()
@@ -142,6 +176,7 @@ class Monitor:
 
     def frame(self, frame: Frame, stamp: int) -> SeenFrame:
         """A frame was on the bus until `stamp`."""
+        self._on_bus(stamp)
         message = frame.id >> 7 & 0xFFFF
         kind = self._kind(frame, message)
         bits = rtcan.frame_bits(frame.id, frame.data)
@@ -149,9 +184,7 @@ class Monitor:
         if kind is FrameKind.SYNC:
             self._begin(start, frame)
         slot = self._slot(start, message, kind)
-        tally = self._tallies.setdefault((message, kind), Tally())
-        tally.frames += 1
-        tally.bits += bits + rtcan.INTERMISSION
+        self._tally(message, kind, bits)
         if kind is FrameKind.NRT:
             self._note_nrt(stamp)
         text = self._hear(frame, message, stamp) if kind is FrameKind.MANAGEMENT else ""
@@ -171,6 +204,30 @@ class Monitor:
             text,
         )
 
+    def other(self, frame: OtherFrame, stamp: int) -> SeenFrame:
+        """A frame that RTCAN does not use was on the bus until `stamp`."""
+        self._on_bus(stamp)
+        bits = rtcan.other_frame_bits(frame)
+        slot = self._slot(stamp - bits * self.census.timing.bit, _OTHER, FrameKind.OTHER)
+        self._tally(_OTHER, FrameKind.OTHER, bits)
+        text = f"{'29-bit' if frame.extended else '11-bit'} identifier {frame.id:X}"
+        if frame.remote is not None:
+            text += f", asks for {frame.remote} bytes"
+        cycle = self._cycle if self._sync is not None else None
+        seen = Frame(frame.id, frame.data)
+        bits += rtcan.INTERMISSION
+        return SeenFrame(stamp, seen, FrameKind.OTHER, "", "", 0, 0, bits, None, cycle, slot, text)
+
+    def _on_bus(self, stamp: int) -> None:
+        self.heard = max(self.heard, stamp)
+        while stamp >= self._end:
+            self._end_period()
+
+    def _tally(self, message: int, kind: FrameKind, bits: int) -> None:
+        tally = self._tallies.setdefault((message, kind), Tally())
+        tally.frames += 1
+        tally.bits += bits + rtcan.INTERMISSION
+
     @property
     def slots(self) -> list[BusSlot]:
         """The use of each slot since the last `reset`, with the names that are known by now."""
@@ -188,7 +245,8 @@ class Monitor:
         elapsed = now - self._since
         tallies: dict[tuple[str, str, FrameKind], Tally] = {}
         for (message, kind), tally in self._tallies.items():
-            names = ("", "") if kind is FrameKind.SYNC else (self.census.topic(message), self.census.module(message))
+            nameless = kind is FrameKind.SYNC or kind is FrameKind.OTHER
+            names = ("", "") if nameless else (self.census.topic(message), self.census.module(message))
             total = tallies.setdefault((*names, kind), Tally())
             total.frames += tally.frames
             total.bits += tally.bits

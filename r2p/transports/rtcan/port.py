@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from r2p.clock import ExactAlarm, clock_of
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 
 
@@ -21,6 +21,9 @@ class PortUser(Protocol):
 
     def received(self, frame: Frame, stamp: int) -> None:
         """A frame of another node came in; `stamp`: the end of the frame plus `receive_latency`."""
+
+    def other(self, frame: OtherFrame, stamp: int) -> None:
+        """A frame that RTCAN does not use was on the bus; only where there are no filters."""
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         """What became of the frame in this mailbox, which is empty now, and when: for SENT, the frame's end.
@@ -87,8 +90,11 @@ class CanPort(abc.ABC):
         """Take it back if it has not started; it is confirmed as every frame is: LATE if nobody has seen it."""
 
     @abc.abstractmethod
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
-        """Only frames with `id & mask == identifier` of one of these (identifier, mask) are needed."""
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
+        """Only frames with `id & mask == identifier` of one of these (identifier, mask) are needed.
+
+        None: all frames are, those too that RTCAN does not use.
+        """
 
     def now(self) -> int:
         """The port's clock."""
@@ -112,7 +118,7 @@ class OpenInterface(Protocol):
     def withdraw(self, order: Withdraw) -> None:
         """As `CanPort.withdraw`."""
 
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         """As `CanPort.set_filters`."""
 
 
@@ -124,7 +130,7 @@ class InterfacePort(CanPort, Generic[B]):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
-        self._filters: list[tuple[int, int]] = [(0, 0)]
+        self._filters: list[tuple[int, int]] | None = [(0, 0)]
         self._bus: B | None = None
 
     def transmit(self, order: Transmit) -> None:
@@ -135,7 +141,7 @@ class InterfacePort(CanPort, Generic[B]):
         if self._bus is not None:
             self._bus.withdraw(order)
 
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         self._filters = filters
         if self._bus is not None:
             self._bus.set_filters(filters)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from r2p.backoff import Backoff
 from r2p.clock import ExactAlarm, clock_of, random_of
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.losses import TRY_AGAIN
@@ -166,9 +166,11 @@ class _Bus:
         self._mailboxes.withdraw(self._clock.monotonic(), order.mailbox)
         self._arm()
 
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         assert self._bus is not None
-        wanted: Any = [{"can_id": identifier, "can_mask": mask, "extended": True} for identifier, mask in filters]
+        wanted: Any = filters and [
+            {"can_id": identifier, "can_mask": mask, "extended": True} for identifier, mask in filters
+        ]
         self._do(partial(self._bus.set_filters, wanted), lambda error: self._failed(error) if error else None)
 
     # In the event loop
@@ -212,7 +214,14 @@ class _Bus:
     def _receive(self, message: "can.Message", stamp: int) -> None:
         if message.is_error_frame:
             self._user.fault("bus error")
-        elif message.is_extended_id and not message.is_remote_frame and not message.is_fd:
+        elif message.is_fd:
+            return
+        elif message.is_remote_frame or not message.is_extended_id:
+            remote = message.dlc if message.is_remote_frame else None
+            frame = OtherFrame(message.arbitration_id, bytes(message.data), message.is_extended_id, remote)
+            if message.is_rx:
+                self._user.other(frame, stamp)
+        else:
             data = bytes(message.data)
             own = self._echo and self._mailboxes.seen(message.arbitration_id, data, stamp, self._clock.monotonic())
             if not own and message.is_rx:

@@ -93,9 +93,16 @@ class RawSocket:
     def close(self) -> None:
         self._socket.close()
 
-    def set_filters(self, filters: Iterable[tuple[int, int]]) -> None:
-        """Take frames with `id & mask == identifier` of one of these (identifier, mask), 29 bits each."""
-        packed = [_FILTER.pack(identifier | DATA, mask | _KIND) for identifier, mask in filters]
+    def set_filters(self, filters: Iterable[tuple[int, int]] | None) -> None:
+        """Take data frames with `id & mask == identifier` of one of these (identifier, mask), 29 bits each; None: all
+        frames, those with 11 bits and remote ones too.
+        """
+        every = [_FILTER.pack(0, 0)]
+        packed = (
+            every
+            if filters is None
+            else [_FILTER.pack(identifier | DATA, mask | _KIND) for identifier, mask in filters]
+        )
         if len(packed) > _FILTERS_MAX:
             packed = [_FILTER.pack(DATA, _KIND)]
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(packed))

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.losses import TRY_AGAIN
@@ -90,6 +90,9 @@ class Shell:
             self.do(self.engine.receive(self.now(), frame, stamp))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
             self._failed(error)
+
+    def other(self, frame: OtherFrame, stamp: int) -> None:
+        """Nothing that concerns RTCAN."""
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         try:

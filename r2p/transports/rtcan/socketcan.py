@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 from r2p.backoff import Backoff
 from r2p.clock import ExactAlarm, clock_of, random_of
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.losses import TRY_AGAIN
@@ -157,7 +157,7 @@ class _Bus:
         self._mailboxes.withdraw(self._clock.monotonic(), order.mailbox)
         self._arm()
 
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         try:
             self._socket.set_filters(filters)
         except OSError as error:
@@ -212,6 +212,8 @@ class _Bus:
                     self._own(identifier & mask, data, stamp)
                 elif kind & rawsocket.ERROR:
                     self._error(identifier & mask, data)
+                else:
+                    self._other(identifier, data, stamp)
             except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
                 self._user.internal_error(error)
         while self._dropped < self._socket.dropped:
@@ -221,6 +223,12 @@ class _Bus:
     def _own(self, identifier: int, data: bytes, stamp: int) -> None:
         if not self._mailboxes.seen(identifier, data, stamp, self._clock.monotonic()):
             self._user.fault("confirmed too late")
+
+    def _other(self, identifier: int, data: bytes, stamp: int) -> None:
+        extended, remote = bool(identifier & rawsocket.DATA), bool(identifier & socket.CAN_RTR_FLAG)
+        number = identifier & (_MASK if extended else socket.CAN_SFF_MASK)
+        frame = OtherFrame(number, b"", extended, len(data)) if remote else OtherFrame(number, data)
+        self._user.other(frame, stamp)
 
     def _error(self, identifier: int, data: bytes) -> None:
         report = errorframes.decode(identifier, data)

@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs import management, rtcan
-from r2p.codecs.rtcan import INTERMISSION, Frame
+from r2p.codecs.rtcan import INTERMISSION, Frame, OtherFrame
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.events import Granted
-from r2p.protocols.rtcan.monitor import FrameKind, Monitor, SeenFrame
+from r2p.protocols.rtcan.monitor import FrameKind, Monitor, SeenFrame, Tally
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import CYCLE, TOPIC, counted, network, publish
 
@@ -227,3 +227,32 @@ def test_management_of_firmware_that_has_no_time_left_is_not_shown_as_a_sync() -
     assert [each.kind for each in seen] == [FrameKind.MANAGEMENT] * 4
     assert seen[-1].text == "Stop module=PC1"
     assert monitor.frame(Frame(0, bytes(8)), 9 * MS).kind is FrameKind.SYNC
+
+
+def test_a_frame_counts_for_the_period_in_which_it_was_on_the_bus() -> None:
+    """However late it is read: periods that are over wait until somebody asks for them."""
+    monitor = Monitor(timing())
+    monitor.begin(SECOND, SECOND)
+    for number in range(50):
+        monitor.frame(Frame(rtcan.encode_identifier(20, 0x0501), b"%8d" % number), SECOND + number * 100 * MS)
+    frames = [sum(tally.frames for tally in monitor.next_load().tallies.values()) for _ in range(7)]
+    assert frames == [10, 10, 10, 10, 10, 0, 0]
+    monitor.reset(9 * SECOND)
+    monitor.frame(Frame(1, b""), 20 * SECOND)
+    assert monitor.load(29 * SECOND).elapsed == 20 * SECOND
+
+
+def test_frames_that_rtcan_does_not_use_are_counted_as_other_ones() -> None:
+    monitor = Monitor(timing())
+    monitor.reset(0)
+    frames = [OtherFrame(0x123, bytes(8)), OtherFrame(0x7FF, b"", False, 8), OtherFrame(1 << 28, b"", True, 2)]
+    texts = [monitor.other(frame, SECOND // 2).text for frame in frames]
+    assert texts == [
+        "11-bit identifier 123",
+        "11-bit identifier 7FF, asks for 8 bytes",
+        "29-bit identifier 10000000, asks for 2 bytes",
+    ]
+    load = monitor.load(SECOND)
+    bits = sum(rtcan.other_frame_bits(frame) + INTERMISSION for frame in frames)
+    assert load.tallies == {("", "", FrameKind.OTHER): Tally(3, bits)}
+    assert load.total == bits * BIT / SECOND

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import can
 import pytest
 
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.rtcan import INTERFACES, pythoncan
@@ -82,14 +82,17 @@ async def test_frames_come_in(channel: str, peer: can.BusABC) -> None:
 
 
 async def test_other_kinds_of_frames(channel: str, peer: can.BusABC) -> None:
-    async with using(port_on(channel)) as user:
-        peer.send(can.Message(arbitration_id=1, is_extended_id=False))
-        peer.send(can.Message(arbitration_id=2, is_remote_frame=True))
+    port = port_on(channel)
+    port.set_filters(None)
+    async with using(port) as user:
+        peer.send(can.Message(arbitration_id=1, is_extended_id=False, data=b"ab"))
+        peer.send(can.Message(arbitration_id=2, is_remote_frame=True, dlc=4))
         peer.send(can.Message(arbitration_id=3, is_error_frame=True))
         peer.send(can.Message(arbitration_id=4, is_fd=True))
         peer.send(can.Message(arbitration_id=5))
         await user.until(lambda: user.frames)
         assert (user.frames, user.faults) == ([Frame(5, b"")], ["bus error"])
+        assert user.others == [OtherFrame(1, b"ab"), OtherFrame(2, b"", True, 4)]
 
 
 async def test_only_what_is_needed(channel: str, peer: can.BusABC) -> None:

@@ -29,7 +29,7 @@ class Port(CanPort):
     def __init__(self) -> None:
         super().__init__("port")
         self.sent: list[Frame] = []
-        self.filters: list[tuple[int, int]] = []
+        self.filters: list[tuple[int, int]] | None = []
         self.stuck = False
         self.shell: Shell
 
@@ -44,7 +44,7 @@ class Port(CanPort):
     def withdraw(self, order: Withdraw) -> None:
         self.shell.confirmed(order.mailbox, Outcome.LATE, self.now())
 
-    def set_filters(self, filters: list[tuple[int, int]]) -> None:
+    def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         self.filters = filters
 
     def alarm(self, callback: Callable[[], object]) -> PortAlarm:
