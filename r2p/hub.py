@@ -15,6 +15,7 @@ from r2p.network import describe_mismatch
 from r2p.printable import get_logger
 from r2p.protocols.events import (
     Command,
+    ConnectionDenied,
     Echoes,
     Event,
     Mismatched,
@@ -26,6 +27,7 @@ from r2p.protocols.events import (
     OrderDenied,
 )
 from r2p.topic import Topic, TopicSpace
+from r2p.transports.intake import LinkStats
 from r2p.transports.link import Link
 
 logger = get_logger("r2p.module")
@@ -34,6 +36,7 @@ _CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
 _ANSWERED = 5_000_000_000  # ns after an order in which gateways may say that it does not pass
 _APART = 1_000_000_000  # ns between two lines about one topic whose types differ
+_REFUSED_APART = 60_000_000_000  # ns between two lines about connections that one URL refuses, or is refused
 
 
 class ModuleHub:
@@ -60,6 +63,8 @@ class ModuleHub:
         """Those of ALIVE."""
         self.bridge: Bridge | None = None
         self._joints: Bridge | Standby
+        self.closed_links = LinkStats()
+        """The sum of what links have counted that are closed for good."""
         self.addresses: list[tuple[str, str]] = []
         """Where it takes connections: the URL that was opened, and the address."""
         self._events = events
@@ -67,6 +72,7 @@ class ModuleHub:
         self._suspected: set[str] = set()
         self._ordered: dict[tuple[Command, str], int] = {}
         self._mismatches: dict[tuple[str, str], int] = {}
+        self._refused: dict[str, tuple[int, int]] = {}
         space.changed = self._topic_changed
         if bridging is not None:
             self._joints = self.bridge = Bridge(space, self.instance, bridging, self._port_changed)
@@ -106,6 +112,7 @@ class ModuleHub:
         self.links.remove(link)
         self.space.links.remove(link)
         self._joints.detach(link)
+        self.closed_links.add(link.stats, link.losses)
 
     def link_waits(self, link: Link, reason: str) -> None:
         """The link can't be had yet."""
@@ -133,6 +140,26 @@ class ModuleHub:
         self.addresses.append((url, address))
         self._events.tell(Listening(url, address))
 
+    def connection_refused(self, url: str, reason: str) -> None:
+        """A transport does not take a connection: how many that were is logged once a minute."""
+        self.closed_links.faults["connection refused"] += 1
+        at, count = self._refused.get(url, (-_REFUSED_APART, 0))
+        now = self.space.clock.monotonic()
+        if now - at < _REFUSED_APART:
+            self._refused[url] = at, count + 1
+            return
+        self._refused[url] = now, 0
+        more = f" ({count} more since it was logged last)" if count else ""
+        logger.warning("%s refuses a connection%s: %s", url, more, reason)
+
+    def _connection_denied(self, link: Link, event: ConnectionDenied) -> None:
+        """The other end refuses this one; the transport tries again and again."""
+        now = self.space.clock.monotonic()
+        if now - self._refused.get(link.name, (-_REFUSED_APART, 0))[0] >= _REFUSED_APART:
+            self._refused[link.name] = now, 0
+            text = f"{event.server} has no connection left (max_clients= of its tcp-listen:); trying again"
+            self.link_notice(link, "connection refused", text, trouble=True)
+
     def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
         """The link went up or down."""
         if link.up:
@@ -159,6 +186,8 @@ class ModuleHub:
                 self._events.tell(event)
             case OrderDenied():
                 self._tell_denied(link, event)
+            case ConnectionDenied():
+                self._connection_denied(link, event)
             case NameConflict():
                 logger.error("link %s: two modules carry the name %s: rename one (--module)", link.title, event.module)
                 self._events.tell(event)

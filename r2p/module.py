@@ -26,6 +26,7 @@ from r2p.printable import get_logger
 from r2p.protocols.events import Command
 from r2p.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.topic import TopicSpace
+from r2p.transports.intake import LinkStats
 from r2p.transports.link import Link, Transport
 from r2p.transports.url import open_transport
 from r2p.watchdog import Watchdog
@@ -156,6 +157,11 @@ class Module:
     def addresses(self) -> list[tuple[str, str]]:
         """Where it takes connections: each URL that was opened, and its address. Raises Closed before it is opened."""
         return list(self._opened.addresses)
+
+    @property
+    def closed_links(self) -> LinkStats:
+        """The sum of what links have counted that are closed for good, as those of clients of a `tcp-listen:`."""
+        return self._opened.closed_links
 
     @property
     def _opened(self) -> ModuleHub:

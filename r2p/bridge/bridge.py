@@ -23,6 +23,7 @@ logger = get_logger("r2p.bridge")
 
 _ORDERS = (0x12, 0x13, 0x14)
 _DENIED = 0x55
+_DENIED_ORDER = 15  # its place
 _DENIED_APART = 200_000_000  # ns between two answers on one link to orders that do not pass
 _ALIVE = 0x11
 _HELLO = 0x50
@@ -127,7 +128,7 @@ class Bridge:
             return True
         if kind in _ORDERS:
             self._pass_order(port, data)
-        if kind == _DENIED:
+        if kind == _DENIED and data[_DENIED_ORDER]:
             self._pass_on(port, data)
         if kind in (_ALIVE, _HELLO) and self._is_our_own(port, data):
             return True

@@ -62,6 +62,7 @@ ANY_TYPE = bytes(8)
 # Denied.reason
 DENIED_CONTROL = 1  # the gateway takes it from nobody on this link
 DENIED_READ_ONLY = 2  # nothing goes onto the link of the module
+DENIED_CLIENTS = 3  # the server of a debug line serves as many clients as it may: `order` is 0
 
 # Claim.flags
 CLAIM_FIXED = 1  # the module can't take another id8
@@ -183,7 +184,10 @@ class Conflict(msgspec.Struct, frozen=True, gc=False):
 
 
 class Denied(msgspec.Struct, frozen=True, gc=False):
-    """A gateway does not let an order through to this module: `order` is the order's type byte, `reason` DENIED_..."""
+    """A gateway does not let an order through to this module: `order` is the order's type byte, `reason` DENIED_...
+
+    Or a server does not serve one more client: `order` is 0.
+    """
 
     gateway: str
     module: str

@@ -18,6 +18,7 @@ from r2p.protocols.directory import Directory, EndpointInfo, EndpointKey, TopicI
 from r2p.protocols.events import (
     ORDERS,
     Command,
+    ConnectionDenied,
     Echoes,
     Event,
     Joined,
@@ -329,7 +330,9 @@ class Discovery:
     # Orders
 
     def _denied(self, now: int, message: management.Denied, source: Source) -> None:
-        if message.order in ORDERS:
+        if message.reason == management.DENIED_CLIENTS:
+            self._outbox.tell(ConnectionDenied(message.gateway))
+        elif message.order in ORDERS:
             denied = OrderDenied(message.gateway, ORDERS[message.order], message.module, message.reason)
             self._outbox.tell(denied)
 

@@ -139,6 +139,12 @@ class OrderDenied(msgspec.Struct, frozen=True):
     reason: int
 
 
+class ConnectionDenied(msgspec.Struct, frozen=True):
+    """The module at the other end serves as many clients as it may, and closes the connection."""
+
+    server: str
+
+
 class Echoes(msgspec.Struct, frozen=True):
     """The line gives back what we send."""
 
@@ -185,6 +191,7 @@ Event = (
     | Mismatched
     | NameConflict
     | OrderDenied
+    | ConnectionDenied
     | Echoes
     | ModuleChanged
     | ModuleGone

@@ -46,6 +46,13 @@ class LinkStats(msgspec.Struct):
     lost: Losses = msgspec.field(default_factory=Losses)
     faults: Counter[str] = msgspec.field(default_factory=Counter)
 
+    def add(self, other: "LinkStats", losses: Counter[str]) -> None:
+        """Count what another link has counted, too; its `losses` are those of its discovery as well."""
+        for name in ("sent", "received", "bytes_sent", "bytes_received", "ups"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.lost.update(losses)
+        self.faults.update(other.faults)
+
 
 class Arrival(Protocol):
     """What came in: a topic's name as it is on this link, and packed bytes."""

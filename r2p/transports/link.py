@@ -67,6 +67,9 @@ class Hub(Protocol):
     def listening(self, url: str, address: str) -> None:
         """A transport takes connections at an address."""
 
+    def connection_refused(self, url: str, reason: str) -> None:
+        """A transport that takes connections did not take one."""
+
     def link_changed(self, link: "Link", reason: str, outage: float, lost: int) -> None:
         """It went up or down; on the way up: s that it was down, messages lost by that."""
 

@@ -3,14 +3,18 @@
 import abc
 import asyncio
 import errno
+import ipaddress
 import os
+import re
 import socket
 import sys
 from collections.abc import Callable
 from typing import cast
 
 from r2p.backoff import Backoff
+from r2p.codecs import debug, management
 from r2p.errors import TransportError
+from r2p.names import MANAGEMENT
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url
@@ -18,6 +22,11 @@ from r2p.transports.url import Url
 PORT = 2323
 """Where `tcp-listen:` listens, and `tcp:HOST` connects, unless told otherwise."""
 
+MAX_CLIENTS = 200
+"""Connections that `tcp-listen:` serves at once, unless `max_clients=` says otherwise."""
+
+_REFUSED = 8  # refused clients that are being told why at a time; others are cut off
+_REFUSED_FOR = 0.5  # seconds for a refused client to read it and close
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
 _CONNECT_TIMEOUT = 5.0  # seconds
 _STABLE = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
@@ -83,7 +92,11 @@ class _Tcp(asyncio.BufferedProtocol, Connection):
             self._transport.abort()
             return
         _find_dead_peers(self._transport.get_extra_info("socket"))
-        self.link = self.open_link(f"tcp:{peer[0]}:{peer[1]}")
+        self.opened(self._transport, f"tcp:{_address(peer[0], peer[1])}")
+
+    def opened(self, transport: asyncio.Transport, peer: str) -> None:
+        """The other end is there."""
+        self.link = self.open_link(peer)
         self.link.connected(self)
 
     def get_buffer(self, sizehint: int) -> bytearray:
@@ -129,7 +142,7 @@ class TcpTransport(Transport):
             raise TransportError(f"{url}: give the other end's address: tcp:HOST:PORT")
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
-        link = LineLink(f"tcp:{self._host}:{self._port}", hub)
+        link = LineLink(f"tcp:{_address(self._host, self._port)}", hub)
         backoff = Backoff(hub.random)
         hub.attach(link)
         opened()
@@ -178,60 +191,91 @@ class _Outgoing(_Tcp):
 
 
 class TcpListenTransport(Transport):
-    """`tcp-listen:HOST:PORT`: serves any number of clients; on loopback unless an address is given."""
+    """`tcp-listen:HOST:PORT`: serves up to `max_clients` clients at once; on loopback unless an address is given."""
 
     def __init__(self, url: Url) -> None:
-        url.parsed({})
+        options = url.parsed({"max_clients": _client_count})
         host, self._port = _host_port(url)
         self._host = host or "127.0.0.1"
         self._url = url
+        self._max_clients = options.get("max_clients", MAX_CLIENTS)
         self.port: int | None = None
         """The port that it listens on, once it does (port 0 in the URL: any free one)."""
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         loop = asyncio.get_running_loop()
-        clients: set[_Incoming] = set()
-        closing = asyncio.Event()
+        clients = _Clients(hub, str(self._url), self._max_clients)
         try:
-            server = await loop.create_server(lambda: _Incoming(hub, clients, closing), self._host, self._port)
+            server = await loop.create_server(lambda: _Incoming(clients), self._host, self._port)
         except OSError as error:
             raise TransportError(f"{self._url}: can't listen: {_explain(error)}") from error
         try:
             self.port = server.sockets[0].getsockname()[1]
-            hub.listening(str(self._url), f"{self._host}:{self.port}")
+            hub.listening(str(self._url), _address(self._host, self.port))
             opened()
             await loop.create_future()
         finally:
-            closing.set()
+            clients.closing.set()
             server.close()
-            await asyncio.gather(*(client.leave() for client in list(clients)))
+            await asyncio.gather(*(client.leave() for client in [*clients.served, *clients.refused]))
             await server.wait_closed()
 
 
-class _Incoming(_Tcp):
-    """A connection of the server, with a link of its own; while that exists, it is one of `clients`."""
+class _Clients:
+    """The connections of one server: those that are served, and those that are being refused."""
 
-    def __init__(self, hub: Hub, clients: "set[_Incoming]", closing: asyncio.Event) -> None:
+    def __init__(self, hub: Hub, url: str, most: int) -> None:
+        self.hub = hub
+        self.most = most
+        self.served: set[_Incoming] = set()
+        self.refused: set[_Incoming] = set()
+        self.closing = asyncio.Event()
+        self._url = url
+
+    def refuse(self, client: "_Incoming", transport: asyncio.Transport) -> None:
+        """Tell an r2p client why (PROTOCOL.md 9): when it has read that, it closes."""
+        self.hub.connection_refused(self._url, f"all {self.most} connections are in use: see max_clients=")
+        if len(self.refused) >= _REFUSED:
+            transport.abort()
+            return
+        self.refused.add(client)
+        name = self.hub.space.module
+        denied = management.Denied(name, name, 0, management.DENIED_CLIENTS)
+        transport.write(debug.encode(MANAGEMENT.encode(), management.encode(denied), 0))
+        transport.write_eof()
+        asyncio.get_running_loop().call_later(_REFUSED_FOR, client.abort)
+
+
+class _Incoming(_Tcp):
+    """A connection of the server, with a link of its own if it is served."""
+
+    def __init__(self, clients: _Clients) -> None:
         super().__init__()
-        self._hub = hub
         self._clients = clients
-        self._closing = closing
+        self._hub = clients.hub
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if self._closing.is_set():  # accepted just before the server was closed
+        if self._clients.closing.is_set():  # accepted just before the server was closed
             self.ended.set()
         super().connection_made(transport)
 
+    def opened(self, transport: asyncio.Transport, peer: str) -> None:
+        if len(self._clients.served) < self._clients.most:
+            super().opened(transport, peer)
+        else:
+            self._clients.refuse(self, transport)
+
     def open_link(self, peer: str) -> LineLink:
         link = LineLink(peer, self._hub)
-        self._clients.add(self)
+        self._clients.served.add(self)
         self._hub.attach(link)
         return link
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
+        self._clients.refused.discard(self)
         if self.link is not None:
-            self._clients.remove(self)
+            self._clients.served.remove(self)
             self.link.close()
             self._hub.detach(self.link)
             self.link = None
@@ -266,25 +310,49 @@ _HINTS = {
 }
 
 
+def _client_count(text: str) -> int:
+    if not text.isdecimal() or not int(text):
+        raise ValueError("it is a number of connections, 1 or more")
+    return int(text)
+
+
+def _address(host: str, port: int) -> str:
+    """As it stands in a URL."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+_ADDRESS = re.compile(r"(?P<host>\[[^\]]*\]|[^:\[\]]*)(:(?P<port>[^:]*))?")
+_NAME = re.compile(rb"[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
+
+
 def _host_port(url: Url) -> tuple[str, int]:
     """The address's host (may be empty) and port."""
     if url.address.startswith("//"):
         raise TransportError(f"{url}: leave out the //: {url.scheme}:{url.address.lstrip('/')}")
-    host, colon, port = url.address.rpartition(":")
     if url.address.isdecimal():
-        port = url.address
-    elif not colon or port.endswith("]"):
-        host, port = url.address, str(PORT)
-    if not port.isdecimal() or int(port) > 0xFFFF:
+        host, port = "", url.address
+    elif (parts := _ADDRESS.fullmatch(url.address)) is not None:
+        host, port = parts["host"], parts["port"] if parts["port"] is not None else str(PORT)
+    else:
+        brackets = f"{url.scheme}:[::1]:{PORT}"
+        raise TransportError(f"{url}: give it as {url.scheme}:HOST:PORT; an IPv6 address needs brackets: {brackets}")
+    if not (port.isascii() and port.isdecimal()) or int(port) > 0xFFFF:
         raise TransportError(f"{url}: {port!r} is no port: give it as {url.scheme}:HOST:PORT")
-    host = host.strip("[]")
+    return _checked_host(url, host), int(port)
+
+
+def _checked_host(url: Url, host: str) -> str:
+    if host.startswith("["):
+        try:
+            return str(ipaddress.IPv6Address(host[1:-1]))
+        except ValueError as error:
+            raise TransportError(f"{url}: {host} is not a valid IPv6 address") from error
     try:
-        host.encode("idna")
-        is_name = host.isprintable()
+        is_name = not host or _NAME.fullmatch(host.encode("idna")) is not None
     except UnicodeError:
         is_name = False
     if not is_name:
         raise TransportError(
             f"{url}: {host!r} is no host name: between its dots are 1 to 63 letters, digits or hyphens"
         )
-    return host, int(port)
+    return host

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from contextlib import AsyncExitStack
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pytest
 
@@ -13,9 +14,17 @@ from r2p.codecs import management
 from r2p.events import LinkNotice
 from r2p.msg import Led
 from r2p.testing.network import node_in
+from r2p.transports.line import Carrier, LineLink
+from r2p.transports.link import Hub, Transport
 from tests.bridge.test_bridge import Tap, drain, gateway, node
 from tests.bridge.world import Numbered, TestNetwork
 from tests.transports.cables import LineCable
+from tests.transports.conversation import manage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from r2p.topic import Topic
 
 pytestmark = pytest.mark.virtual_time
 
@@ -231,3 +240,61 @@ async def test_a_bus_that_comes_first_keeps_its_slots() -> None:
         late = drain(far)[-200:]
         assert late == list(range(late[0], late[0] + 200))
         assert drain(near)[-200:] == late
+
+
+class Clients(Transport):
+    """So many lines, one after the other, each to another module; each change of a topic that one is told counts."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self.told: Counter[str] = Counter()
+
+    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+        links = [Counting(self, hub, f"client{n}") for n in range(self.count)]
+        opened()
+        try:
+            for number, link in enumerate(links):
+                hub.attach(link)
+                link.connected(Nowhere())
+                await asyncio.sleep(0.01)
+                link.fed(manage(management.Hello(f"C{number}", 1000 + number, 0, 0, 60_000)))
+            await asyncio.get_running_loop().create_future()
+        finally:
+            for link in links:
+                link.close()
+                hub.detach(link)
+
+
+class Counting(LineLink):
+    def __init__(self, clients: Clients, hub: Hub, name: str) -> None:
+        super().__init__(name, hub)
+        self.clients = clients
+
+    def topic_changed(self, topic: Topic) -> None:
+        self.clients.told[topic.name] += 1
+        super().topic_changed(topic)
+
+
+class Nowhere(Carrier):
+    """Takes all."""
+
+    def send(self, data: bytes) -> None:
+        pass
+
+    def pause(self) -> None:
+        pass
+
+    def resume(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+async def test_a_client_more_costs_as_much_as_the_first_one() -> None:
+    clients = Clients(100)
+    async with r2p.Module("PC1", via=clients) as module, node_in(module) as sender:
+        sender.advertise("leds", Led)
+        await asyncio.sleep(2)
+        assert sum("C" in name for link in module.links for name in link.discovery.modules) == 100
+        assert clients.told["leds"] <= 2 * 100 + 2

@@ -4,7 +4,7 @@ import asyncio
 import gc
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import cast
 
@@ -15,6 +15,7 @@ from r2p.backoff import Backoff
 from r2p.codecs import management as m
 from r2p.codecs.debug import Reader
 from r2p.errors import TransportError
+from r2p.events import ModuleEvent
 from r2p.msg import Led
 from r2p.protocols.discovery import Discovery
 from r2p.testing.network import node_in
@@ -255,6 +256,72 @@ async def test_a_host_that_nobody_knows() -> None:
             raise AssertionError("it is open")
 
 
+async def test_a_client_too_many_is_told_why(caplog: pytest.LogCaptureFixture) -> None:
+    """And served as soon as another one leaves."""
+    transport = TcpListenTransport(parse("tcp-listen:127.0.0.1:0,max_clients=1"))
+    async with asyncio.timeout(GUARD), r2p.Module("A", via=transport, watchdog=False) as server:
+        _, first = await dial(transport)
+        await until(lambda: server.links)
+        reader, writer = await dial(transport)
+        writer.write(SUBSCRIBE)
+        assert _denials(await reader.read()) == [m.Denied("A", "A", 0, m.DENIED_CLIENTS)]
+        writer.close()
+        assert len(server.links) == 1
+        assert server.closed_links.faults == {"connection refused": 1}
+        assert "refuses a connection: all 1 connections are in use: see max_clients=" in caplog.text
+        client = r2p.Module("B", via=f"tcp:127.0.0.1:{transport.port}", watchdog=False)
+        events = client.events()
+        async with client:
+            notice = next_of(events, r2p.LinkNotice)
+            text = "A has no connection left (max_clients= of its tcp-listen:); trying again"
+            assert await notice == r2p.LinkNotice(f"tcp:127.0.0.1:{transport.port}", "connection refused", text)
+            first.close()
+            await until(lambda: "B" in [each for link in server.links for each in link.discovery.modules])
+
+
+async def next_of(events: AsyncIterator[ModuleEvent], kind: type[ModuleEvent]) -> ModuleEvent:
+    return await anext(each async for each in events if isinstance(each, kind))
+
+
+def _denials(data: bytes) -> list[m.Management]:
+    return [m.decode(each.data) for each in Reader().feed(data)]
+
+
+async def test_a_flood_of_clients_too_many_is_bounded_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    transport = TcpListenTransport(parse("tcp-listen:127.0.0.1:0,max_clients=1"))
+    async with asyncio.timeout(GUARD), r2p.Module("A", via=transport, watchdog=False) as server:
+        kept = await dial(transport)
+        await until(lambda: server.links)
+        others = [await dial(transport) for _ in range(50)]
+        heard = await asyncio.gather(*(reader.read() for reader, _ in others), return_exceptions=True)
+        assert sum(isinstance(each, bytes) and bool(_denials(each)) for each in heard) >= 1
+        await until(lambda: server.closed_links.faults == {"connection refused": 50})
+        assert caplog.text.count("refuses a connection") == 1
+        for _, writer in (kept, *others):
+            writer.close()
+
+
+async def test_a_client_that_leaves_does_not_take_what_it_has_lost_with_it() -> None:
+    transport = listen()
+    async with (
+        asyncio.timeout(GUARD),
+        r2p.Module("A", via=transport, watchdog=False) as module,
+        node_in(module) as node,
+    ):
+        publisher = node.advertise("leds", Led)
+        for _ in range(2):
+            reader, writer = await dial(transport)
+            writer.write(SUBSCRIBE + b"garbage\r\n")
+            await until(lambda: publisher.subscribers)
+            await publisher.publish(Led())
+            await hear(reader, "leds")
+            writer.close()
+            await until(lambda: not module.links)
+        assert (module.closed_links.ups, module.closed_links.sent) == (2, 2)
+        assert module.closed_links.lost["garbage"] == 2
+        assert not publisher.subscribers
+
+
 async def test_a_server_that_is_cancelled_twice_lets_go_of_its_clients() -> None:
     """The second time while it waits for a client that does not read."""
     transport = listen()
@@ -329,10 +396,53 @@ def test_where_it_listens(url: str, address: tuple[str, int]) -> None:
     assert (transport._host, transport._port) == address
 
 
-@pytest.mark.parametrize("url", ["tcp:host:http", "tcp:host:70000", "tcp:", "tcp:7", "tcp:host:", "tcp:host,x=1"])
-def test_addresses_that_are_none(url: str) -> None:
-    with pytest.raises(TransportError):
+NO_ADDRESSES = [
+    "host:http",
+    "host:70000",
+    "host:",
+    "host,x=1",
+    "[::1",
+    "[::1]7",
+    "[host]:7",
+    "::1:7",
+    "[::1]]:7",
+    "x y:1",
+]
+
+
+@pytest.mark.parametrize("transport", [TcpTransport, TcpListenTransport])
+@pytest.mark.parametrize("address", NO_ADDRESSES)
+def test_addresses_that_are_none(transport: type[TcpTransport] | type[TcpListenTransport], address: str) -> None:
+    with pytest.raises(TransportError, match=r"^tcp:"):
+        transport(parse(f"tcp:{address}"))
+
+
+@pytest.mark.parametrize("url", ["tcp:", "tcp:7"])
+def test_a_client_needs_a_host(url: str) -> None:
+    with pytest.raises(TransportError, match="give the other end's address"):
         TcpTransport(parse(url))
+
+
+def test_an_ipv6_address_without_brackets_is_told_how_it_is_written() -> None:
+    with pytest.raises(TransportError, match=r"an IPv6 address needs brackets: tcp:\[::1\]:2323"):
+        TcpTransport(parse("tcp:::1:7"))
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "many", "1.5"])
+def test_a_number_of_clients_that_is_none(count: str) -> None:
+    with pytest.raises(TransportError, match="it is a number of connections, 1 or more"):
+        TcpListenTransport(parse(f"tcp-listen:,max_clients={count}"))
+
+
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this computer has no IPv6")
+async def test_an_ipv6_address_is_told_as_it_is_written_in_a_url() -> None:
+    transport = TcpListenTransport(parse("tcp-listen:[::1]:0"))
+    async with asyncio.timeout(GUARD), r2p.Module("A", via=transport, watchdog=False) as server:
+        assert server.addresses == [("tcp-listen:[::1]:0", f"[::1]:{transport.port}")]
+        async with r2p.Module("B", via=f"tcp:{server.addresses[0][1]}", watchdog=False) as client:
+            await until(lambda: server.links and client.links[0].up)
+            assert client.links[0].name == f"tcp:[::1]:{transport.port}"
+            assert server.links[0].name.startswith("tcp:[::1]:")
 
 
 @pytest.mark.parametrize("transport", [TcpTransport, TcpListenTransport])

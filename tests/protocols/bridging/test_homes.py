@@ -7,6 +7,9 @@ import random
 
 import pytest
 
+from r2p.codecs.management import Bridge, Leaf
+from r2p.protocols.bridging.homes import Homes
+from r2p.protocols.bridging.tree import ACK
 from tests.protocols.bridging.test_tree import (
     SECOND,
     STABLE,
@@ -323,3 +326,49 @@ def _random_module(made: World, chance: random.Random, networks: str) -> Module:
 
 def _ports(chance: random.Random, networks: str) -> str:
     return "".join(chance.sample(networks, min(len(networks), chance.randint(2, 3))))
+
+
+class Thorough(Homes):
+    """Weighs all links against each other whenever anything changes."""
+
+    def _stands_alone(self, home: object) -> bool:
+        return False
+
+
+def step(homes: Homes, now: int, count: int, numbers: random.Random) -> None:
+    """Something happens to one of eight links."""
+    number = numbers.randrange(8)
+    operation = numbers.randrange(20)
+    if operation < 6 and number not in homes.by_number:
+        homes.open(now, number, lone=numbers.random() < 0.8)
+    elif operation < 8:
+        homes.shut(now, number)
+    elif operation < 14:
+        homes.ended(now, number, numbers.choice([None, 5, 6, 7, 8]))
+    elif operation < 16:
+        homes.bridge(now, number, Bridge(9, 1, count, 0, 9, ACK.pack(1, count)))
+    elif operation == 16:
+        homes.leaf(now, number, Leaf(1, (number + 1) % 8, count, b""))
+    elif operation == 17:
+        homes.probed(now, number, number + 1)
+    else:
+        homes.poll(now)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_links_that_stand_alone_are_used_as_if_all_were_looked_at_anew(seed: int) -> None:
+    """A link that makes no difference to others is not weighed against them all; that must not show."""
+    both = Homes(1), Thorough(1)
+    numbers = [random.Random(seed) for _ in both]
+    delays = random.Random(seed)
+    now = 0
+    for count in range(400):
+        now += delays.choice([0, 10 * MS, 400 * MS, 3 * SECOND])
+        seen = []
+        for homes, drawn in zip(both, numbers, strict=True):
+            if (due := homes.next_deadline()) is not None and due <= now:
+                homes.poll(now)
+            step(homes, now, count, drawn)
+            used = [homes.used(now, without) for without in (frozenset[int](), frozenset({2, 5}))]
+            seen.append((used, homes.guards, [number for number in range(8) if homes.is_twin(number)]))
+        assert seen[0] == seen[1]
