@@ -29,7 +29,7 @@ from r2p.topic import TopicSpace
 from r2p.transports.intake import LinkStats
 from r2p.transports.link import Link, Transport
 from r2p.transports.url import open_transport
-from r2p.watchdog import Watchdog
+from r2p.watchdog import Watchdog, watch
 
 logger = get_logger("r2p.module")
 
@@ -120,8 +120,7 @@ class Module:
             await self._close(self._tasks)
             raise
         if self._with_watchdog and not clock.virtual:  # not before: opening imports the transports' libraries
-            self._watchdog = Watchdog(loop)
-            self._watchdog.start()
+            self._watchdog = watch(loop)
         return self
 
     async def __aexit__(

@@ -105,6 +105,7 @@ async def test_a_loop_that_only_waits_has_nobody_to_blame(reports: Reports) -> N
 
     def look() -> None:
         for _ in range(1000):  # once the loop has come to where it waits for this thread
+            watchdog._reported = -(1 << 62)
             watchdog._report()
             if "none of its code runs" in reports.texts[-1]:
                 return
@@ -179,3 +180,53 @@ async def test_a_module_has_a_watchdog_unless_it_says_no(watched: bool) -> None:
     async with r2p.Module("PC1", via=[], watchdog=watched):
         assert any(thread.name == "r2p-watchdog" for thread in threading.enumerate()) == watched
     assert not any(thread.name == "r2p-watchdog" for thread in threading.enumerate())
+
+
+@pytest.mark.anyio
+async def test_all_modules_of_a_loop_share_one_watchdog() -> None:
+    def threads() -> int:
+        return sum(thread.name == "r2p-watchdog" for thread in threading.enumerate())
+
+    async with r2p.Module("A", via=[]):
+        async with r2p.Module("B", via=[]), r2p.Module("C", via=[]):
+            assert threads() == 1
+        assert threads() == 1
+    assert threads() == 0
+    async with r2p.Module("A", via=[]):
+        assert threads() == 1
+
+
+@pytest.mark.anyio
+async def test_one_report_a_second_and_each_stack_once(reports: Reports) -> None:
+    """Clock and blocks are made up: `_report` is called as the thread would, from within two places."""
+    watchdog = Watchdog(asyncio.get_running_loop())
+    clock = Steps()
+    watchdog._clock = cast("Clock", clock)
+    watchdog._watched = threading.get_ident()
+
+    def one() -> bool:
+        return watchdog._report()
+
+    def other() -> bool:
+        return watchdog._report()
+
+    told = []
+    for step, block in ((0, one), (100, one), (500, other), (1000, one), (1999, one), (2000, other)):
+        clock.ms = step
+        told.append(block())
+    assert told == [True, False, False, True, False, True]
+    first, again, second = reports.texts
+    assert "in one\n" in first
+    assert again.splitlines() == [again]
+    assert "ms (2 more blocks since the last report), again in " in again
+    assert "in other\n" in second
+    assert "(1 more blocks" in second
+
+
+class Steps:
+    """A clock that stands where it is put."""
+
+    ms = 0
+
+    def monotonic(self) -> int:
+        return self.ms * 1_000_000
