@@ -45,6 +45,7 @@ _FIXED = struct.Struct("<BBBBIQqq")
 _CLOCK = struct.Struct("<IqI")
 _ORIGIN = struct.Struct("<BII8s")
 _CREDIT = struct.Struct("<BBII")
+_LEAVING = 0x80
 _unpack = _FIXED.unpack_from
 _pack_start = struct.Struct("<IIQqq").pack
 
@@ -193,17 +194,22 @@ def decode(data: bytes) -> Header:
 
 
 class Credit(msgspec.Struct, frozen=True, gc=False):
-    """A subscriber's session tells a publisher's how far it has come: serial `serial` of this topic and class."""
+    """A subscriber's session tells a publisher's how far it has come: serial `serial` of this topic and class.
+
+    `leaving`: it does not subscribe any more, so this is the last one.
+    """
 
     session: int
     publisher_class: int
     serial: int
     topic: str
+    leaving: bool = False
 
 
 def encode_credit(credit: Credit) -> bytes:
-    """`u8 version; u8 class; u32 session; u32 serial`, then the topic in ASCII."""
-    fixed = _CREDIT.pack(VERSION, credit.publisher_class, credit.session, credit.serial & SERIAL_WRAP)
+    """`u8 version; u8 class; u32 session; u32 serial`, then the topic in ASCII; class + 128: the last one."""
+    publisher_class = credit.publisher_class | _LEAVING * credit.leaving
+    fixed = _CREDIT.pack(VERSION, publisher_class, credit.session, credit.serial & SERIAL_WRAP)
     return fixed + credit.topic.encode()
 
 
@@ -214,7 +220,8 @@ def decode_credit(data: bytes) -> Credit:
     if _TOPIC.fullmatch(data, _CREDIT.size) is None:
         raise DecodeError("a credit for no topic")
     _, publisher_class, session, serial = _CREDIT.unpack_from(data)
-    return Credit(session, publisher_class, serial, data[_CREDIT.size :].decode())
+    leaving = bool(publisher_class & _LEAVING)
+    return Credit(session, publisher_class & ~_LEAVING, serial, data[_CREDIT.size :].decode(), leaving)
 
 
 def _itself(origin: Origin) -> Origin:

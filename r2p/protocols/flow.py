@@ -10,6 +10,11 @@ import msgspec
 
 NO_LIMIT = 1 << 62
 
+SHARE = 1024
+"""Messages from one credit to the next where no window limits them: more than that are not unknown when a link breaks,
+beside what was on the way.
+"""
+
 _WRAP = 0xFFFFFFFF
 _HALF = 0x80000000
 
@@ -22,6 +27,7 @@ class _Taker(msgspec.Struct):
     joined: int
     heard: bool = False
     waited_for: bool = True
+    leaving: bool = False
 
 
 class Outflow:
@@ -44,13 +50,20 @@ class Outflow:
             taker.taken = self.serial
         self._update()
 
-    def parted(self, session: int) -> None:
-        """It is gone."""
-        self.takers.pop(session, None)
-        self._update()
+    def parted(self, session: int) -> int:
+        """It is gone; says how many messages it may not have got: those that it has not granted credit for.
 
-    def credited(self, session: int, serial: int) -> None:
-        """It has taken everything up to this serial, of which the wire tells the low 32 bits."""
+        One that left in order does not want them.
+        """
+        taker = self.takers.pop(session, None)
+        self._update()
+        return 0 if taker is None or taker.leaving else self.serial - taker.taken
+
+    def credited(self, session: int, serial: int, *, leaving: bool = False) -> None:
+        """It has taken everything up to this serial, of which the wire tells the low 32 bits.
+
+        `leaving`: this is its last credit, as it does not subscribe any more.
+        """
         taker = self.takers.get(session)
         if taker is None:
             return
@@ -58,6 +71,7 @@ class Outflow:
         if behind < _HALF:  # else it is from before, or nonsense
             taker.taken = max(taker.taken, self.serial - behind)
             taker.heard = taker.waited_for = True
+            taker.leaving = leaving
         self._update()
 
     def give_up(self) -> list[int]:
@@ -121,4 +135,4 @@ class Inflow:
     @property
     def _share(self) -> int:
         """Messages from one credit to the next: so many that the sender need not stop for it."""
-        return max(1, self.window // 4) if self.window else NO_LIMIT
+        return max(1, self.window // 4) if self.window else SHARE

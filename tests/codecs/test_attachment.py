@@ -150,7 +150,9 @@ def test_a_class_that_does_not_exist() -> None:
         attachment.decode(attachment.encode(header))
 
 
-@given(st.builds(Credit, session=U32, publisher_class=st.integers(0, 255), serial=U32, topic=TOPICS))
+@given(
+    st.builds(Credit, session=U32, publisher_class=st.integers(0, 127), serial=U32, topic=TOPICS, leaving=st.booleans())
+)
 def test_credits(credit: Credit) -> None:
     assert attachment.decode_credit(attachment.encode_credit(credit)) == credit
 

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r2p.protocols.flow import NO_LIMIT, Inflow, Outflow
+from r2p.protocols.flow import NO_LIMIT, SHARE, Inflow, Outflow
 
 A, B = 1, 2
 
@@ -101,11 +101,41 @@ def test_the_first_is_answered_at_once_then_each_quarter_of_a_window() -> None:
     assert answered == [0, 2, 4, 6, 8, 10]
 
 
-def test_a_lossy_one_answers_once() -> None:
+def test_a_lossy_one_answers_rarely() -> None:
     flow = Inflow(0)
     flow.until_credit -= 1
     flow.credited()
-    assert flow.until_credit == NO_LIMIT
+    assert flow.until_credit == SHARE
+
+
+def test_what_one_that_is_gone_has_not_confirmed_is_unknown() -> None:
+    flow = Outflow()
+    flow.serial = 100
+    for session, window in ((A, 0), (B, 10)):
+        flow.joined(session, window)
+    flow.serial = 108
+    flow.credited(B, 106)
+    assert (flow.parted(A), flow.parted(B), flow.parted(B)) == (8, 2, 0)
+
+
+def test_one_that_leaves_in_order_wants_no_more() -> None:
+    flow = Outflow()
+    flow.joined(A, 10)
+    flow.serial = 8
+    flow.credited(A, 5, leaving=True)
+    assert flow.parted(A) == 0
+    flow.joined(A, 10)  # it is back
+    flow.serial = 10
+    assert flow.parted(A) == 2
+
+
+def test_one_that_comes_back_before_it_is_gone_has_not_left() -> None:
+    flow = Outflow()
+    flow.joined(A, 10)
+    flow.serial = 8
+    flow.credited(A, 5, leaving=True)
+    flow.credited(A, 6)
+    assert flow.parted(A) == 2
 
 
 @given(st.integers(2, 64), st.lists(st.sampled_from(["send", "arrive", "lose"]), max_size=400))

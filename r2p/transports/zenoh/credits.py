@@ -91,7 +91,7 @@ class Credits:
         else:
             outlet = outlets.get(credit.topic)
             if outlet is not None:
-                outlet.credited(credit.session, publisher_class, credit.serial)
+                outlet.credited(credit.session, publisher_class, credit.serial, leaving=credit.leaving)
 
     def _serve(self) -> None:
         """Those who wait."""

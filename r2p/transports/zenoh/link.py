@@ -15,7 +15,7 @@ from collections.abc import Callable, Hashable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from r2p.codecs import schemas
-from r2p.codecs.attachment import Credit, Origin, encode_credit
+from r2p.codecs.attachment import Credit, encode_credit
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
@@ -275,10 +275,10 @@ class ZenohLink(Link):
             return None
         return self._session.subscribe(f"{self.prefix}/topic/{topic}", RING, arrived)
 
-    def _credit(self, topic: str, origin: Origin, serial: int) -> None:
+    def _credit(self, topic: str, sender: int, publisher_class: int, serial: int, *, leaving: bool = False) -> None:
         if self._session is not None:
-            data = encode_credit(Credit(self.instance, origin.publisher_class, serial, topic))
-            self._session.put(f"{self.prefix}/credit/{origin.sender:x}", data)
+            data = encode_credit(Credit(self.instance, publisher_class, serial, topic, leaving))
+            self._session.put(f"{self.prefix}/credit/{sender:x}", data)
 
     # What comes in; in the loop
 
@@ -296,11 +296,13 @@ class ZenohLink(Link):
                 self.went_down("the connection is lost")
 
     def went_up(self) -> None:
+        self._streams.resumed()
         super().went_up()
         self._tokens.went_up()
 
     def went_down(self, reason: str) -> None:
         self._tokens.went_down()
+        self._streams.interrupted()
         super().went_down(reason)
 
     def _token_changed(self, change: tuple[str, bool]) -> None:

@@ -109,13 +109,16 @@ class ZenohOutlet(LinkOutlet):
         self.welcoming = False
 
     def parted(self, session: int) -> None:
-        for lane in self._lanes.values():
-            lane.flow.parted(session)
+        """A subscriber is gone: what it was sent and has not confirmed may be lost, unless it left in order."""
+        self._zenoh.credits.look()
+        unknown = sum([lane.flow.parted(session) for lane in self._lanes.values()])
+        if unknown:
+            self._link.stats.lost["unknown at disconnect"] += unknown
         self.refill()
 
-    def credited(self, session: int, publisher_class: PublisherClass, serial: int) -> None:
+    def credited(self, session: int, publisher_class: PublisherClass, serial: int, *, leaving: bool = False) -> None:
         """A subscriber has taken everything up to this serial; who waits for that is served by `refill`."""
-        self._lanes[publisher_class].flow.credited(session, serial)
+        self._lanes[publisher_class].flow.credited(session, serial, leaving=leaving)
 
     @property
     def expects(self) -> bool:

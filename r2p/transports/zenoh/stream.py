@@ -34,6 +34,9 @@ RING = 4096
 _MOST = 16_384
 """Messages of one topic that wait behind one for which there is no room: what eight publishers may send meanwhile."""
 
+Flows = dict[tuple[int, int], Inflow]
+"""By session and class."""
+
 SENDERS = 4096
 """Senders of which a stream, or the link, keeps count."""
 
@@ -84,14 +87,15 @@ class _Blocked(msgspec.Struct):
 class Stream:
     """What comes in of one topic."""
 
-    def __init__(self, topic: Topic, streams: "Streams") -> None:
+    def __init__(self, topic: Topic, streams: "Streams", flows: Flows) -> None:
         self.topic = topic
         self.senders: set[Hashable] = set()
         self.tap: Tap | None = None
         self.last: Sample | None = None
         self._streams = streams
         self._loop = streams.loop
-        self._flows: dict[tuple[int, int], Inflow] = {}
+        self.flows = flows
+        """How far each session has come in each class."""
         self._blocked: _Blocked | None = None
         self._waiting: deque[tuple[_Lane, int, Sample]] = deque()
         self._paused = False
@@ -107,7 +111,7 @@ class Stream:
             for lane in self._reader.known.values():
                 self._fit(lane)
         window = self._streams.window(self.topic)
-        for (_, publisher_class), flow in self._flows.items():
+        for (_, publisher_class), flow in self.flows.items():
             if publisher_class == _NRT and flow.window != window:
                 flow.resized(window)
 
@@ -119,7 +123,7 @@ class Stream:
             known = self._reader.known
             for key in [key for key, lane in known.items() if lane.origin.sender == sender]:
                 del known[key]
-        for (session, _), flow in self._flows.items():
+        for (session, _), flow in self.flows.items():
             if session == sender:
                 flow.interrupted()
 
@@ -127,10 +131,20 @@ class Stream:
         tap, self.tap = self.tap, None
         if tap is not None:
             tap.close()
-        self._waiting.clear()
+        self._take_leave()
+        if self._waiting:
+            self._streams.stats.lost["not subscribed"] += len(self._waiting)
+            self._waiting.clear()
         blocked, self._blocked = self._blocked, None
         if blocked is not None and blocked.held is not None:
             blocked.held.withdraw()
+
+    def _take_leave(self) -> None:
+        """Tell those who publish that what is still on the way is not wanted any more."""
+        for (session, publisher_class), flow in self.flows.items():
+            if session in self.senders and flow.next >= 0:
+                last = (flow.next - 1) & SERIAL_WRAP
+                self._streams.credit(self.topic.name, session, publisher_class, last, leaving=True)
 
     def arrived(self, arrived: "zenoh.Sample | None") -> None:
         """In the loop: hand out what is there, about TURN messages in one turn."""
@@ -247,7 +261,7 @@ class Stream:
     def _came_again(self, lane: _Lane, serial: int, sequence: int) -> None:
         """A message that was here before: by this way, as somebody wants to know whether it came, or by another one."""
         if sequence == lane.sequence:
-            self._streams.credit(self.topic.name, lane.origin, serial)
+            self._streams.credit(self.topic.name, lane.origin.sender, lane.origin.publisher_class, serial)
         else:
             lane.sequence = sequence
             self._streams.stats.lost["seen before"] += 1
@@ -371,21 +385,22 @@ class Stream:
 
     def _give_credit(self, lane: _Lane, serial: int) -> None:
         lane.flow.credited()
-        self._streams.stats.lost.guard(self._streams.credit, self.topic.name, lane.origin, serial)
+        origin, streams = lane.origin, self._streams
+        streams.stats.lost.guard(streams.credit, self.topic.name, origin.sender, origin.publisher_class, serial)
 
     def _lane(self, origin: Origin) -> _Lane:
         """A publisher is new."""
         key = origin.sender, origin.publisher_class
-        if key not in self._flows:
-            if len(self._flows) >= SENDERS:
-                self._flows.clear()
+        if key not in self.flows:
+            if len(self.flows) >= SENDERS:
+                self.flows.clear()
             window = self._streams.window(self.topic) if origin.publisher_class == _NRT else 0
-            self._flows[key] = Inflow(window)
+            self.flows[key] = Inflow(window)
         lane = _Lane(
             origin,
             Source(origin.module, origin.node, self._streams.link),
             PublisherClass(origin.publisher_class),
-            self._flows[key],
+            self.flows[key],
             -1,
             False,
             self.topic.heard((origin.instance or key, origin.module, origin.node, origin.publisher_class)),

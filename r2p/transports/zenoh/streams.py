@@ -2,13 +2,12 @@
 
 import asyncio
 from collections.abc import Callable, Hashable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from r2p.codecs.attachment import Origin
 from r2p.sample import Source
 from r2p.topic import QueueSink, Topic
 from r2p.transports.intake import LinkStats
-from r2p.transports.zenoh.stream import SENDERS, Stream
+from r2p.transports.zenoh.stream import SENDERS, Flows, Stream
 
 if TYPE_CHECKING:
     import zenoh
@@ -21,7 +20,18 @@ WINDOW = 2048
 _WINDOW_BYTES = 192 * 1024
 """... and their bytes: five topics at full speed fit into zenoh's own queue of 1 MB."""
 
+_RESUME = 10.0
+"""Seconds after a link came up in which its topics are subscribed again, or are used on another link."""
+
 _OVERHEAD = 32  # bytes of stamp, and share in header and framing, in a packet of several
+
+
+class GiveCredit(Protocol):
+    """Tells the session `sender` that its messages up to this serial have been taken."""
+
+    def __call__(
+        self, topic: str, sender: int, publisher_class: int, serial: int, /, *, leaving: bool = False
+    ) -> None: ...
 
 
 class Streams:
@@ -35,7 +45,7 @@ class Streams:
         *,
         longest: int,
         latched: Callable[[str], bool],
-        credit: Callable[[str, Origin, int], None],
+        credit: "GiveCredit",
         subscribe: Callable[[str, Callable[["zenoh.Sample"], None]], "Tap | None"],
     ) -> None:
         self.link = link
@@ -48,6 +58,8 @@ class Streams:
         self._latched = latched
         self._subscribe = subscribe
         self._streams: dict[str, Stream] = {}
+        self._kept: dict[str, Flows] = {}
+        self._kept_until = 0.0
 
     def begin(self, topic: Topic) -> None:
         """Somebody here subscribes the topic, or its type has changed."""
@@ -55,7 +67,7 @@ class Streams:
         if stream is not None and stream.topic is topic:
             stream.retype()
             return
-        stream = self._streams[topic.name] = Stream(topic, self)
+        stream = self._streams[topic.name] = Stream(topic, self, self._flows(topic.name))
         topic.memories.append(self)
         stream.tap = self._subscribe(topic.name, stream.arrived)
 
@@ -63,6 +75,21 @@ class Streams:
         """There is a session now: subscribe what was begun before."""
         for name, stream in self._streams.items():
             stream.tap = self._subscribe(name, stream.arrived)
+
+    def interrupted(self) -> None:
+        """The link is down: what is sent until it is back is lost, so keep how far each publisher had come."""
+        if len(self._kept) >= SENDERS:
+            self._kept.clear()
+        self._kept |= {name: stream.flows for name, stream in self._streams.items()}
+
+    def resumed(self) -> None:
+        """It is up again."""
+        self._kept_until = self.loop.time() + _RESUME
+
+    def _flows(self, topic: str) -> "Flows":
+        """How far the publishers of a topic had come when the link went down; else it begins anew."""
+        flows = self._kept.pop(topic, {})
+        return flows if self.loop.time() < self._kept_until else {}
 
     def window(self, topic: Topic) -> int:
         """How many messages may be on the way; 0: as many as come, the subscribers would rather lose some."""

@@ -29,6 +29,7 @@ class Ring:
     def __init__(self, queue: int, *, typed: bool = True, topic: type[Topic] = Topic) -> None:
         loop = asyncio.get_running_loop()
         self.credits: list[tuple[int, int]] = []
+        self.last_words = 0
         self.stats = LinkStats()
         self.waker = Waker(loop)
         self.topic = topic("leds", self.waker)
@@ -41,7 +42,7 @@ class Ring:
             self.stats,
             longest=1024,
             latched=lambda _: False,
-            credit=lambda _, origin, serial: self.credits.append((origin.publisher_class, serial)),
+            credit=self._credit,
             subscribe=self._subscribe,
         )
         self.sink = self.subscribe(queue)
@@ -57,11 +58,20 @@ class Ring:
         self._arrived = arrived
         return SimpleNamespace(take=self._take, wait=self._wait, close=lambda: None)
 
+    def _credit(self, _topic: str, _sender: int, publisher_class: int, serial: int, *, leaving: bool = False) -> None:
+        self.credits.append((publisher_class, serial))
+        self.last_words += leaving
+
     def _take(self) -> Any:
         return self._ring.popleft() if self._ring else None
 
     def _wait(self) -> None:
         self._idle = True
+
+    def idle(self) -> None:
+        """It has been declared anew."""
+        self._idle = True
+        self._ring.clear()
 
     def put(self, serial: int, count: int = 1, *, publisher_class: int = 1, size: int = SIZE, sender: int = 7) -> None:
         """So many messages in one packet; sequences are as the serials, stamps ten times as much."""
@@ -233,3 +243,64 @@ async def test_a_sink_that_raises_while_a_message_waits_for_it_does_not_stop_the
     await turns()
     assert numbers(ring.sink) == [3]
     assert ring.stats.lost == {"internal error": 1}
+
+
+def reconnect(ring: Ring) -> None:
+    """The link goes down and comes up; its topics are subscribed anew then."""
+    ring.streams.interrupted()
+    ring.streams.shut("leds", 7)
+    ring.streams.resumed()
+    ring.streams.shut_all("leds")
+    ring.streams.begin(ring.topic)
+
+
+async def test_what_was_sent_while_the_link_was_down_is_counted_when_it_is_back() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    reconnect(ring)
+    ring.idle()
+    ring.put(10)
+    await turns()
+    assert (ring.stats.received, ring.stats.lost) == (4, Counter({"on the way": 6}))
+
+
+async def test_what_was_sent_before_a_topic_is_subscribed_again_is_not_lost() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    reconnect(ring)
+    ring.streams.shut_all("leds")  # nobody here subscribes it any more
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(10)
+    await turns()
+    assert ring.stats.lost == Counter()
+
+
+async def test_what_came_by_another_link_in_the_meantime_is_not_lost() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.interrupted()
+    ring.streams.shut_all("leds")
+    ring.streams.resumed()
+    await asyncio.sleep(11)  # the topic is used elsewhere
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(10)
+    await turns()
+    assert ring.stats.lost == Counter()
+
+
+async def test_who_unsubscribes_tells_those_who_publish_and_counts_what_waits() -> None:
+    ring = Ring(queue=2)
+    ring.streams.open(ring.topic, SIZE, 7)
+    for serial in range(1, 5):
+        ring.put(serial)
+    await turns()
+    ring.streams.shut_all("leds")
+    assert ring.last_words == 1
+    assert ring.credits[-1] == (1, 4)
+    assert ring.stats.received == 4
+    assert (len(ring.sink.queue), ring.stats.lost) == (2, Counter({"not subscribed": 1}))  # one was being placed
