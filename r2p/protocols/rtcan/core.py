@@ -69,7 +69,16 @@ class Core:
         self.sender = Sender(
             cycle, self.queue, self.agenda, self.post, out, counts, self._turn, latency=latency, coarse=coarse
         )
-        self.wishes = Wishes(cycle, self.agenda, timers, self.periodics, out, self._ask, enabled=settings.reserves)
+        self.wishes = Wishes(
+            cycle,
+            self.agenda,
+            timers,
+            self.periodics,
+            out,
+            self._ask,
+            self._slots_lost,
+            enabled=settings.reserves,
+        )
         parts = self.identity, self.election, self.grants, self.wishes
         self.network = Network(cycle, self.sender, *parts, timers, out, counts, self.say, settings.priority)
         self.answers = Answers(*parts, self.network, self.periodics, self.say, self.tick)
@@ -102,7 +111,7 @@ class Core:
         handles = self.pacer.clear() + [message.handle for message in self.post.discard()]
         self.out += [Done(each, Fate.DISCARDED, missed=True, at=now) for each in handles if each is not None]
         for periodic in self.periodics.values():
-            self.wishes.lapse(periodic, "the node may not send")
+            self.wishes.lapse(now, periodic, "the node may not send")
             self.timers.clear(("tick", periodic.high))
 
     # Management
@@ -219,7 +228,7 @@ class Core:
         if kind == "ask":
             self.wishes.request(now, periodic)
         elif kind == "lease":
-            self.wishes.suspend(periodic, "the master does not answer")
+            self.wishes.suspend(now, periodic, "the master does not answer")
             self.wishes.want(now, periodic)
             self.tick(now, periodic)
         elif not periodic.active or self.cycle.counter < periodic.from_cycle:
@@ -234,6 +243,9 @@ class Core:
     def _turn(self, now: int) -> None:
         self.network.turn(now)
         self.settle(now)
+
+    def _slots_lost(self, now: int, periodic: Periodic) -> None:
+        self.sender.abandon(now, periodic, "slots lost")
 
     def _pause(self) -> int:
         return _PAUSE + self.identity.draw(_PAUSE_SPREAD)

@@ -170,7 +170,7 @@ class Engine:
         """The bus can't be used any more, or the node leaves: everything that waits is discarded."""
         self._running = False
         self._identity.stop(now)
-        self._core.network.stop()
+        self._core.network.stop(now)
         self._sender.reset()
         self._reassembly.reset()
         return self._take()
@@ -338,6 +338,8 @@ class Engine:
         periodic = core.periodics.pop(high, None)
         if periodic is None:
             return
+        if periodic.payload is not None:
+            self._sender.abandon(now, periodic, "slots given back")
         self._sender.remove(periodic)
         core.timers.clear(("tick", high))
         if core.wishes.forget(periodic) and self.ready:

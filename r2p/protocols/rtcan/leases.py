@@ -74,7 +74,7 @@ class Grants:
 class Wishes:
     """The owner's side: what this node wants slots for. `ask` sends a request to the master, which may be this node.
 
-    Not `enabled`: it wants nothing.
+    `abandon` gives up a message that waits for its slot. Not `enabled`: it wants nothing.
     """
 
     def __init__(
@@ -85,6 +85,7 @@ class Wishes:
         periodics: dict[int, Periodic],
         out: list[Action],
         ask: Callable[[int, Reserve | Renew], None],
+        abandon: Callable[[int, Periodic], None],
         *,
         enabled: bool = True,
     ) -> None:
@@ -96,6 +97,7 @@ class Wishes:
         self._periodics = periodics
         self._out = out
         self._ask = ask
+        self._abandon = abandon
         self._enabled = enabled
         self._serial = 0
         self._asked: dict[int, dict[int, int]] = {}  # by high byte: when it was asked, by serial
@@ -108,16 +110,16 @@ class Wishes:
         for each in self._periodics.values():
             self.want(now, each)
 
-    def pause(self, reason: str) -> None:
+    def pause(self, now: int, reason: str) -> None:
         """There is none: nobody has slots."""
         self.open = False
         for each in self._periodics.values():
-            self.suspend(each, reason)
+            self.suspend(now, each, reason)
 
-    def void(self, reason: str) -> None:
+    def void(self, now: int, reason: str) -> None:
         """What was granted is worth nothing any more."""
         for each in self._periodics.values():
-            self.lapse(each, reason)
+            self.lapse(now, each, reason)
 
     def want(self, now: int, periodic: Periodic) -> None:
         """Ask for slots for this message, now and again, if there is a master."""
@@ -192,7 +194,7 @@ class Wishes:
             if high in answer.highs:
                 self._confirm(periodic, asked, answer.lease_ms)
             elif asked > self._confirmed.get(high, LONG_AGO):
-                self.suspend(periodic, "the master does not know of it")
+                self.suspend(now, periodic, "the master does not know of it")
                 self.want(now, periodic)
 
     def refused(self, now: int, periodic: Periodic, refuse: Refuse) -> None:
@@ -205,23 +207,25 @@ class Wishes:
             return
         period, fragments, other, rival = refuse.period, refuse.fragments, refuse.other, refuse.rival
         text = Refusal(periodic.message, reason, period, fragments, other, rival).text
-        self.lapse(periodic, text)
+        self.lapse(now, periodic, text)
         self._timers.set(("ask", periodic.high), now + (_RETRY if reason == Reason.TAKEN else _RENEWAL))
         if self._refused.get(periodic.high) != text:
             self._refused[periodic.high] = text
             self._out.append(Refused(periodic.high, text))
 
-    def lapse(self, periodic: Periodic, reason: str) -> None:
+    def lapse(self, now: int, periodic: Periodic, reason: str) -> None:
         """Its slots are gone. What was answered to earlier requests does not count any more."""
         periodic.reservation = None
         self._asked.pop(periodic.high, None)
-        self.suspend(periodic, reason)
+        self.suspend(now, periodic, reason)
 
-    def suspend(self, periodic: Periodic, reason: str) -> None:
+    def suspend(self, now: int, periodic: Periodic, reason: str) -> None:
         """Its slots may not be used until a master has confirmed them."""
         self._timers.clear(("lease", periodic.high))
         if periodic.active:
             periodic.active = False
+            if periodic.payload is not None:
+                self._abandon(now, periodic)
             periodic.restart()
             self._agenda.changed()
             self._out.append(Degraded(periodic.high, reason))

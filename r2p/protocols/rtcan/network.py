@@ -195,14 +195,14 @@ class Network:
             self._abdicate(now, "this node was the master, and may not send")
         self._reign.cancel()
         self._election.end(Role.SLAVE if self._cycle.running else Role.NONE)
-        self._wishes.pause("the node may not send")
+        self._wishes.pause(now, "the node may not send")
 
-    def stop(self) -> None:
+    def stop(self, now: int) -> None:
         """The bus is gone."""
         self._cycle.stop()
         self._reign.cancel()
         self._election.end(Role.NONE)
-        self._forget_master("the bus is gone")
+        self._forget_master(now, "the bus is gone")
         self._timers.clear("silence")
         self.silenced = None
 
@@ -224,7 +224,7 @@ class Network:
             return
         renumbered = self._cycle.anchor(told.cycle)
         if told.epoch != self.epoch or renumbered:
-            self._wishes.void("another network")
+            self._wishes.void(now, "another network")
         self.utc_offset, self.utc_error = told.utc_offset, told.utc_error
         self._timers.clear("silence")
         self.unsilence(now)
@@ -232,7 +232,7 @@ class Network:
         self.master, self.epoch = told.id8, told.epoch
         self.verified = True
         if news or not self._wishes.open:
-            self._wishes.pause("another master")
+            self._wishes.pause(now, "another master")
             if news:
                 self._out.append(NewMaster(told.id8, told.epoch, own=False))
             self._wishes.resume(now)
@@ -254,7 +254,7 @@ class Network:
             self.silenced = reason
             self.verified = False
             self._reign.cancel()
-            self._wishes.pause("the network has other parameters")
+            self._wishes.pause(now, "the network has other parameters")
             self._out.append(Silenced(reason))
 
     def _elect(self, now: int, *, forget: bool) -> None:
@@ -264,7 +264,7 @@ class Network:
     def _lose(self, now: int, reason: str) -> None:
         """There is no cycle any more."""
         self._allegiance.forget(self.master)
-        self._forget_master(reason)
+        self._forget_master(now, reason)
         self._out.append(LostSync(reason))
         if self._identity.stage is Stage.OWNING:
             self._elect(now, forget=True)
@@ -295,7 +295,7 @@ class Network:
     def _abdicate(self, now: int, reason: str) -> None:
         self._reign.end()
         self._timers.clear("network")
-        self._forget_master(reason)
+        self._forget_master(now, reason)
         self._out.append(LostSync(reason))
 
     def _introduce(self, now: int) -> None:
@@ -303,7 +303,7 @@ class Network:
         if now >= self._told + 3 * self._cycle.timing.cycle:
             self.tell(now)
 
-    def _forget_master(self, reason: str) -> None:
+    def _forget_master(self, now: int, reason: str) -> None:
         self.master = None
         self.verified = False
-        self._wishes.pause(reason)
+        self._wishes.pause(now, reason)

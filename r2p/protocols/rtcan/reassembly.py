@@ -49,11 +49,15 @@ class Reassembly:
         """Take messages with this id, of `size` bytes. Raises `MessageError` beyond 1..1024."""
         before = self._inlets.get(message)
         if before is None or before.size != size:
-            self._inlets[message] = Inlet(rtcan.fragment_count(size) - 1, size)
-            self.open.pop(message, None)
+            inlet = Inlet(rtcan.fragment_count(size) - 1, size)
+            self.unsubscribe(message)
+            self._inlets[message] = inlet
 
     def unsubscribe(self, message: int) -> None:
-        self.open.pop(message, None)
+        """Take no more messages with this id; one that is being received is lost."""
+        unfinished = self.open.get(message)
+        if unfinished is not None:
+            self._reset(message, unfinished, "interrupted")
         self._inlets.pop(message, None)
 
     def subscribed(self, message: int) -> bool:

@@ -252,7 +252,7 @@ class Sender:
 
     def _ask(self, now: int, periodic: Periodic, slot: int) -> None:
         if periodic.restart():
-            self._abandon(now, periodic, "not sent in time")
+            self.abandon(now, periodic, "not sent in time")
         for message in self._queue.withdraw(periodic.message):  # from the time before it had slots
             self._post.report(message.handle, Fate.REPLACED, missed=False, at=now)
         self._out.append(Due(periodic.high, self._cycle.start_of(slot), True))
@@ -266,7 +266,7 @@ class Sender:
         elif periodic.payload is not None and periodic.sent == fragment:
             self._send_periodic(now, periodic, fragment, slot, current)
         elif periodic.payload is not None:
-            self._abandon(now, periodic, "fragment not confirmed in time")
+            self.abandon(now, periodic, "fragment not confirmed in time")
         elif fragment == 0:
             self._counts["slots without data"] += 1
 
@@ -278,16 +278,17 @@ class Sender:
         start = self._cycle.reference + slot * self._slot
         last = self._exact_latest_start(frame, start + self._slot) if slot == current else LONG_AGO
         if mask is not None and not mask >> slot & 1:
-            self._abandon(now, periodic, "not in the mask")
+            self.abandon(now, periodic, "not in the mask")
         elif self._post.boxes[_HRT] is not None:
-            self._abandon(now, periodic, "mailbox full")
+            self.abandon(now, periodic, "mailbox full")
         elif now + self._latency > last:
             self._counts["late_to_slot"] += 1
-            self._abandon(now, periodic, "too late for the slot")
+            self.abandon(now, periodic, "too late for the slot")
         else:
             self._post.put(periodic, frame, _HRT, start, last)
 
-    def _abandon(self, now: int, periodic: Periodic, reason: str) -> None:
+    def abandon(self, now: int, periodic: Periodic, reason: str) -> None:
+        """What waits of a periodic message will not be sent."""
         periodic.restart()
         self._counts["hrt " + reason] += 1
         self._post.report(periodic.handle, Fate.ABANDONED, missed=True, at=now)
@@ -296,7 +297,7 @@ class Sender:
         if periodic.payload is None:
             return  # abandoned meanwhile
         if outcome is not _SENT and outcome is not _UNKNOWN:
-            self._abandon(now, periodic, outcome.value)
+            self.abandon(now, periodic, outcome.value)
             return
         periodic.unknown = periodic.unknown or outcome is _UNKNOWN
         periodic.sent += 1

@@ -48,6 +48,11 @@ class Handover:
         self._messages = 0
 
     @property
+    def waiting(self) -> bool:
+        """Whether the engine has samples of ours."""
+        return bool(self._frames or self._messages)
+
+    @property
     def full(self) -> bool:
         """Whether there is no room for messages that do not expire."""
         return self._frames >= NRT_FRAMES

@@ -83,6 +83,9 @@ class RtcanLink(Link):
     def act(self, action: Action) -> None:
         if isinstance(action, Received):
             topic = self._inlets.topics.get(action.message, _MANAGEMENT)
+            if topic is _MANAGEMENT and action.message in self._inlets.shutting:
+                self.stats.lost["not subscribed"] += 1
+                return
             self._intake.take((Arrived(topic, action.payload, action.message, action),))
         elif isinstance(action, Done):
             self._done(action)
@@ -242,10 +245,10 @@ class RtcanLink(Link):
     def _act(self, event: Event) -> None:
         match event:
             case Opened(topic, source, params, size):
-                self._inlets.open(topic, source, params, size)
+                self._inlets.open(self._clock.monotonic(), topic, source, params, size)
                 self.shell.refilter()
             case Shut(topic, source):
-                self._inlets.shut(topic, source)
+                self._inlets.shut(self._clock.monotonic(), topic, source)
                 self.shell.refilter()
             case _:
                 if isinstance(event, ModuleGone) and isinstance(event.info.source, int):
@@ -301,10 +304,17 @@ class RtcanLink(Link):
 
     def _poll(self) -> None:
         self._tell_utc()
-        self._renumber(self._high_bytes.freed(self._clock.monotonic()))
+        now = self._clock.monotonic()
+        self._renumber(self._high_bytes.freed(now))
+        if self._inlets.forget_shut(now):
+            self.shell.refilter()
         super()._poll()
 
     # Life
+
+    async def drained(self, longest: float) -> None:
+        """Wait until the samples that the engine has are on the bus, at most `longest` seconds."""
+        await self.shell.drained(longest, lambda: self._handover.waiting)
 
     def close(self) -> None:
         """Give the slots back and say good-bye; that takes a while on the bus: `shell.drained`."""

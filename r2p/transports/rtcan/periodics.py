@@ -169,7 +169,8 @@ class Periodics:
         self._link.stats.sent -= 1
         if done.fate is Fate.ABANDONED:
             self._link.stats.lost[done.fate.value] += 1
-            each.publisher.link_missed(self._link.name, done.fate.value)
+            if self.by_topic.get(each.topic.name) is each:  # else its publisher is closed
+                each.publisher.link_missed(self._link.name, done.fate.value)
 
     def _tick(self, each: Slotted, due: Due) -> bytes | None:
         """Let the publisher make the message of this slot."""

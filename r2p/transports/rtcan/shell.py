@@ -56,6 +56,7 @@ class Shell:
         self._acting = False
         self._drained: asyncio.Future[None] | None = None
         self.internal_error = owner.internal_error
+        self._waiting: Callable[[], object] = lambda: engine.waiting
 
     def do(self, actions: Sequence[Action]) -> None:
         """Carry these out, and wait for the engine's next deadline."""
@@ -65,16 +66,17 @@ class Shell:
                 return
             self._act()
         self._alarm.set(self.engine.next_deadline())
-        if self._drained is not None and not self.engine.waiting and not self._drained.done():
+        if self._drained is not None and not self._waiting() and not self._drained.done():
             self._drained.set_result(None)
 
     def refilter(self) -> None:
         """The engine needs other frames than before."""
         self._port.set_filters(self.engine.filters())
 
-    async def drained(self, longest: float) -> None:
-        """Wait until all messages are on the bus, at most `longest` seconds."""
-        if self.engine.waiting:
+    async def drained(self, longest: float, waiting: Callable[[], object] | None = None) -> None:
+        """Wait until all messages are on the bus, at most `longest` seconds; or until there is nothing `waiting`."""
+        self._waiting = waiting or (lambda: self.engine.waiting)
+        if self._waiting():
             self._drained = asyncio.get_running_loop().create_future()
             await asyncio.wait([self._drained], timeout=longest)
 

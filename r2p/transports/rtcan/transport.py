@@ -8,7 +8,8 @@ from r2p.transports.rtcan.link import RtcanLink
 from r2p.transports.rtcan.options import Options
 from r2p.transports.rtcan.port import CanPort
 
-_CLOSING = 0.5  # seconds for the last words to get through
+_DRAINING = 0.5  # seconds for the last messages to get through: their subscribers take nothing after the good-bye
+_CLOSING = 0.5  # ... and for the good-bye
 
 
 class RtcanTransport(Transport):
@@ -24,7 +25,7 @@ class RtcanTransport(Transport):
 
 
 async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanPort, options: Options) -> None:
-    """Run a link on a port until cancelled; the port is closed after the link's last words."""
+    """Run a link on a port until cancelled; the port is closed after the link's last messages and its good-bye."""
     settings = options.settings(hub.random.getrandbits(64), port)
     link = RtcanLink(name, hub, port, settings, options.utc_error)
     hub.attach(link)
@@ -33,11 +34,14 @@ async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanP
         await asyncio.wait([running])
         await running
     finally:
-        link.close()
         try:
+            if not running.done():
+                await link.drained(_DRAINING)
+            link.close()
             if not running.done():
                 await link.shell.drained(_CLOSING)
         finally:
+            link.close()
             running.cancel()
             await asyncio.wait([running])
             link.shell.close()

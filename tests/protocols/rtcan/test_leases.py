@@ -19,6 +19,7 @@ class Owner:
     def __init__(self) -> None:
         self.out: list[Action] = []
         self.asked: list[Reserve | Renew] = []
+        self.abandoned: list[int] = []
         self.timers = Timers()
         self.periodic = Periodic(HIGH, MESSAGE, 8, 1, 10_000_000, 0, None)
         cycle = Cycle(timing())
@@ -29,6 +30,7 @@ class Owner:
             {HIGH: self.periodic},
             self.out,
             lambda now, wanted: self.asked.append(wanted),
+            lambda now, periodic: self.abandoned.append(now),
         )
         self.wishes.open = True
 
@@ -89,7 +91,7 @@ def test_an_older_answer_does_not_end_a_lease() -> None:
     owner = Owner()
     owner.grant(0, owner.ask(0))
     before = owner.renew(SECOND)
-    owner.wishes.suspend(owner.periodic, "another master")
+    owner.wishes.suspend(SECOND, owner.periodic, "another master")
     owner.grant(2 * SECOND, owner.ask(2 * SECOND))
     owner.renewed(2 * SECOND, before)
     assert owner.periodic.active
@@ -112,3 +114,13 @@ def test_answers_to_nobody_change_nothing() -> None:
     owner.ask(4 * SECOND + LEASE)
     owner.grant(4 * SECOND + LEASE, forgotten)
     assert not owner.periodic.active
+
+
+def test_what_waits_for_a_slot_that_is_lost_is_given_up() -> None:
+    owner = Owner()
+    owner.grant(0, owner.ask(0))
+    owner.periodic.restart(b"12345678")
+    owner.wishes.suspend(SECOND, owner.periodic, "another master")
+    owner.wishes.suspend(SECOND, owner.periodic, "another master")
+    assert owner.abandoned == [SECOND]
+    assert owner.periodic.payload is None

@@ -210,3 +210,19 @@ def test_an_agenda_that_knows_its_cycles_says_what_a_new_one_says(messages: list
         agenda.turn(cycle, messages)
         fresh.turn(cycle, messages)
         assert (agenda.sends, agenda.fills, agenda.next) == (fresh.sends, fresh.fills, fresh.next)
+
+
+def test_what_waits_for_its_slot_when_the_slots_are_given_back_is_counted() -> None:
+    bus = Bus()
+    _master, owner, _ = network(bus, 1, 0, 0)
+    told = counted(owner, 20)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 20, 5 * MS, lead=2 * MS, handle="hrt"))
+    bus.run(SECOND)
+    asked = len(told)
+    bus.run_until(lambda: len(told) > asked)
+    owner.act(owner.engine.release(owner.now, TOPIC))
+    bus.run(20 * MS)
+    fates = [done.fate for done in owner.of(Done) if done.fate is not Fate.REPLACED]
+    assert fates[-1] is Fate.ABANDONED
+    assert fates.count(Fate.SENT) == len(told) - 1
+    assert owner.engine.counts["hrt slots given back"] == 1

@@ -200,6 +200,17 @@ def test_another_size_starts_anew() -> None:
         receiver.reassembly.subscribe(A, 1025)
 
 
+def test_a_message_that_is_not_wanted_any_more_in_its_middle_is_counted() -> None:
+    receiver = Receiver(20)
+    receiver.feed(*frames(payload(20))[:2])
+    receiver.reassembly.subscribe(A, 30)
+    receiver.feed(*frames(payload(30))[:2])
+    receiver.reassembly.unsubscribe(A)
+    receiver.reassembly.unsubscribe(A)
+    assert receiver.losses == {10: {"interrupted": 2}}
+    assert receiver.reassembly.due == NEVER
+
+
 def test_interrupted() -> None:
     receiver = Receiver(24)
     first, second, third = frames(payload(24))
