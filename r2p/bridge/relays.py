@@ -23,9 +23,6 @@ from r2p.transports.losses import internal_error_of
 
 logger = get_logger("r2p.bridge")
 
-QUEUE = 16
-"""Messages that a gateway asks firmware to keep for it."""
-
 _NAME = re.compile(r"[A-Za-z0-9_/]+")
 _BUSES = frozenset({"rtcan", "sim"})
 
@@ -158,7 +155,6 @@ class Relays:
             size=shape.size,
             fingerprint=shape.fingerprint,
             asked=asked,
-            queue=max(own.queue, QUEUE),
         )
 
     def _types(self, topic: str, port: BridgePort) -> tuple[Shape, Shape]:

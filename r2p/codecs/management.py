@@ -59,6 +59,14 @@ UNANSWERED = bytes(9) + b"\1"
 """Params of a SUBSCRIBE_REQUEST between r2p modules: no SUBSCRIBE_RESPONSE has been heard yet."""
 ANY_TYPE = bytes(8)
 
+QUEUE = 5
+"""Entries of a SUBSCRIBE_REQUEST's queue unless something speaks for another number."""
+QUEUE_MOST = 16
+QUEUE_BYTES = 1024
+"""Firmware has 20 kB of RAM in all and takes a queue from its heap; where there is no room left it writes to NULL."""
+QUEUE_ENTRY = 8
+"""Bytes that firmware needs for an entry besides its message."""
+
 # Denied.reason
 DENIED_CONTROL = 1  # the gateway takes it from nobody on this link
 DENIED_READ_ONLY = 2  # nothing goes onto the link of the module
@@ -114,7 +122,10 @@ class Advertise(msgspec.Struct, frozen=True, gc=False):
 
 
 class SubscribeRequest(msgspec.Struct, frozen=True, gc=False):
-    """Send me this topic. Fields as `Advertise`, but `queue` is 1 or more: 0 halts firmware, so `encode` refuses it."""
+    """Send me this topic. Fields as `Advertise`, but `queue` is 1 or more: 0 halts firmware, so `encode` refuses it.
+
+    Firmware must not get a size of 0 either, nor a queue that its heap can't hold: see `queue_length`.
+    """
 
     topic: str
     size: int
@@ -383,6 +394,11 @@ _CODEC = Codec[Management](
     Record(Mesh, 0x61, "I H B 18s", version=_VERSION),
     Record(Leaf, 0x62, "I B H 18s", version=_VERSION),
 )
+
+
+def queue_length(size: int, wanted: int = QUEUE) -> int:
+    """The entries to ask firmware for, of messages of `size` bytes: 1 to 16, and one or 1024 bytes at most."""
+    return max(1, min(wanted, QUEUE_MOST, QUEUE_BYTES // (size + QUEUE_ENTRY)))
 
 
 def encode(message: Management) -> bytes:

@@ -1,5 +1,7 @@
 """What this module has to say of itself on one link: what it publishes, subscribes, and who in it does so."""
 
+from collections.abc import Callable
+
 import msgspec
 
 from r2p.codecs import management
@@ -15,7 +17,7 @@ class Own(msgspec.Struct, frozen=True):
 
     shape: Shape
     params: bytes = NO_PARAMS
-    queue: int = 1
+    queue: int = management.QUEUE
 
     def type(self, topic: str, role: int) -> management.TypeInfo:
         return management.TypeInfo(role, topic, self.shape.fingerprint, self.shape.size)
@@ -31,7 +33,17 @@ class Announcer:
     While `r2p` modules are known on the link, types go before announcements, and endpoints are told.
     """
 
-    def __init__(self, module: str, instance: int, schedule: Schedule, outbox: Outbox, *, observer: bool) -> None:
+    def __init__(
+        self,
+        module: str,
+        instance: int,
+        schedule: Schedule,
+        outbox: Outbox,
+        size_of: Callable[[str], int],
+        *,
+        observer: bool,
+    ) -> None:
+        """`size_of`: what is known of a topic's size (bytes, 0: nothing) from others."""
         self.flags = 0
         self.publishers: dict[str, Own] = {}
         self.subscribers: dict[str, Own] = {}
@@ -43,6 +55,7 @@ class Announcer:
         self._module = module
         self._instance = instance
         self._observer = observer
+        self._size_of = size_of
         self._schedule = schedule
         self._outbox = outbox
         self._endpoints: dict[tuple[str, str, int], int] = {}
@@ -113,8 +126,9 @@ class Announcer:
         """Say what is due."""
         while self._outbox.up and (item := self._schedule.pop(now)) is not None:
             messages = self._messages(item)
-            self._outbox.say(*messages)
-            self._schedule.sent(now, len(messages))
+            if messages:
+                self._outbox.say(*messages)
+                self._schedule.sent(now, len(messages))
 
     def introduction(self, flags: int = 0) -> management.Hello:
         """Our HELLO. Its lease outlasts two lost rounds of repetition."""
@@ -122,10 +136,17 @@ class Announcer:
         lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // 1_000_000
         return management.Hello(self._module, self._instance, flags | tool, 0, lease)
 
-    def request(self, topic: str, own: Own) -> management.SubscribeRequest:
-        """Our request; r2p modules are told whether anybody has answered yet."""
-        unanswered = self.r2p and topic not in self.answered
-        return management.SubscribeRequest(topic, own.shape.size, own.queue, UNANSWERED if unanswered else NO_PARAMS)
+    def requests(self, topic: str, own: Own, size: int = 0) -> list[management.Management]:
+        """Our request; r2p modules are told whether anybody has answered yet.
+
+        There is none while nobody has said the topic's size (`size`: the publisher that is asked): a request of size 0
+        makes firmware's gateways overrun their buffers.
+        """
+        size = own.shape.size or size or self._size_of(topic)
+        if not size:
+            return []
+        params = UNANSWERED if self.r2p and topic not in self.answered else NO_PARAMS
+        return [management.SubscribeRequest(topic, size, management.queue_length(size, own.queue), params)]
 
     def _advertisement(self, topic: str, own: Own) -> management.Advertise:
         """Our advertisement; r2p modules are told whether anybody has subscribed yet."""
@@ -157,10 +178,10 @@ class Announcer:
         match item.kind, item.key:
             case Kind.PUBLISHER, (str(topic),):
                 own = self.publishers[topic]
-                return self._typed(own, topic, ROLE_PUBLISHES, self._advertisement(topic, own))
+                return self._typed(own, topic, ROLE_PUBLISHES, [self._advertisement(topic, own)])
             case Kind.SUBSCRIBER, (str(topic),):
                 own = self.subscribers[topic]
-                return self._typed(own, topic, ROLE_SUBSCRIBES, self.request(topic, own))
+                return self._typed(own, topic, ROLE_SUBSCRIBES, self.requests(topic, own))
             case Kind.UNSUBSCRIBE, (str(topic),):
                 return [management.Unsubscribe(topic, self._instance)]
             case Kind.CONFLICT, (str(module), int(a), int(b)):
@@ -175,8 +196,10 @@ class Announcer:
             case kind, _:
                 return self._presence(management.HELLO_QUERY if kind is Kind.QUERY else 0)
 
-    def _typed(self, own: Own, topic: str, role: int, message: management.Management) -> list[management.Management]:
-        return [own.type(topic, role), message] if self.r2p else [message]
+    def _typed(
+        self, own: Own, topic: str, role: int, messages: list[management.Management]
+    ) -> list[management.Management]:
+        return [own.type(topic, role), *messages] if self.r2p else messages
 
     def _presence(self, flags: int) -> list[management.Management]:
         hello = self.introduction(flags)

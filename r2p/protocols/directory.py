@@ -158,6 +158,11 @@ class Directory:
         known = self._starts.get(name)
         return known is not None and known.previous == instance
 
+    def size_of(self, topic: str) -> int:
+        """Bytes of the topic's messages; 0: not heard yet."""
+        info = self.topics.get(topic)
+        return 0 if info is None else info.size
+
     def topic(self, name: str) -> TopicInfo:
         """The entry of a topic that was just heard of."""
         info = self.topics.get(name) or TopicInfo(name)

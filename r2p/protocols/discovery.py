@@ -102,9 +102,11 @@ class Discovery:
         self._instance = instance
         self._outbox = Outbox()
         self._schedule = Schedule(rate, burst, round(quiet * _SECOND))
-        self._announcer = Announcer(module, instance, self._schedule, self._outbox, observer=observer)
         self._timers = Timers()
         self._directory = Directory(self._timers, self.counts)
+        self._announcer = Announcer(
+            module, instance, self._schedule, self._outbox, self._directory.size_of, observer=observer
+        )
         self._exchange = Exchange(self._announcer, self._outbox, self._directory, self._timers, self.counts)
         self._neighbours = Neighbours(
             module,
@@ -187,10 +189,14 @@ class Discovery:
         return self._go_on(now)
 
     def subscribe(
-        self, now: int, topic: str, size: int = 0, queue: int = 16, fingerprint: bytes = ANY_TYPE
+        self, now: int, topic: str, size: int = 0, queue: int = management.QUEUE, fingerprint: bytes = ANY_TYPE
     ) -> list[Event]:
-        """The module subscribes this topic. Size 0 and no fingerprint: whatever its type is."""
-        own = Own(Shape(size, fingerprint), queue=min(max(queue, 1), 0xFFFF))
+        """The module subscribes this topic. Size 0 and no fingerprint: whatever its type is; it is then not asked for
+        before its size has been heard.
+
+        `queue`: messages that a publisher may have to keep for us, bounded by what firmware bears (`queue_length`).
+        """
+        own = Own(Shape(size, fingerprint), queue=queue)
         if self._announcer.subscribe(topic, own):
             self._exchange.retyped(topic, ROLE_PUBLISHES)
         return self._go_on(now)
@@ -318,6 +324,8 @@ class Discovery:
         match key:
             case ("lease", source, str(topic)):
                 self._exchange.lease_over(source, topic)
+            case ("grace", source, str(topic)):
+                self._exchange.grace_over(source, topic)
             case ("module", str(name)):
                 self._neighbours.expired(now, name)
             case ("demand", str(topic), int(role), source) if self._demand is not None:

@@ -17,6 +17,10 @@ from r2p.protocols.outbox import Outbox
 from r2p.protocols.peers import Peer, Peers
 from r2p.protocols.schedule import Timers
 
+GRACE = 50_000_000
+"""Ns after a SUBSCRIBE_RESPONSE, or a reconnect, in which firmware drops data: the thread that takes the response has
+its lowest priority."""
+
 
 class Exchange:
     """What flows on one link, by peer and topic."""
@@ -30,6 +34,8 @@ class Exchange:
         self._timers = timers
         self._counts = counts
         self._peers = Peers(counts)
+        self._attached: set[str] = set()
+        """The topics of which the link has been told that they have subscribers."""
 
     # What peers say
 
@@ -46,7 +52,7 @@ class Exchange:
                 return  # it knows of subscribers: the next one of our own requests is soon enough
             self._outbox.say(own.type(topic, ROLE_SUBSCRIBES))
         if self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
-            self._outbox.say(self._own.request(topic, own))
+            self._outbox.say(*self._own.requests(topic, own, message.size))
 
     def requested(self, now: int, message: management.SubscribeRequest, source: Source) -> None:
         """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
@@ -65,7 +71,7 @@ class Exchange:
         self._outbox.say(management.SubscribeResponse(topic, own.shape.size, max(message.queue, 1), own.params))
         if self._peers.join(now, peer, topic, unanswered=unanswered):
             self._own.wanted.add(topic)
-            self._outbox.tell(Joined(topic, message.params, message.queue, source))
+            self._join(now, peer, Joined(topic, message.params, message.queue, source))
         self._renew(now, peer, topic)
 
     def responded(self, now: int, message: management.SubscribeResponse, source: Source) -> None:
@@ -169,6 +175,13 @@ class Exchange:
         if peer is not None:
             self._end(peer, topic)
 
+    def grace_over(self, source: Source, topic: str) -> None:
+        """Firmware has taken our response by now: it may get data."""
+        peer = self._peers.get(source)
+        joined = peer.waiting.pop(topic, None) if peer is not None else None
+        if joined is not None:
+            self._attach(joined)
+
     def memory_over(self, source: Source) -> None:
         """What a peer sent before it left can't arrive any more."""
         peer = self._peers.get(source)
@@ -206,6 +219,18 @@ class Exchange:
             self._shut(peer, topic)
         return False
 
+    def _join(self, now: int, peer: Peer, joined: Joined) -> None:
+        """A subscriber is new. Firmware is given time to take the response before the data."""
+        if peer.is_r2p(now) or joined.params == UNANSWERED:  # which only r2p modules send
+            self._attach(joined)
+        else:
+            peer.waiting[joined.topic] = joined
+            self._timers.set(("grace", peer.source, joined.topic), now + GRACE)
+
+    def _attach(self, joined: Joined) -> None:
+        self._attached.add(joined.topic)
+        self._outbox.tell(joined)
+
     def _renew(self, now: int, peer: Peer, topic: str) -> None:
         """A subscription was made or repeated: a lease with r2p peers, for ever with firmware."""
         key = ("lease", peer.source, topic)
@@ -219,9 +244,13 @@ class Exchange:
 
     def _end(self, peer: Peer, topic: str) -> None:
         self._timers.clear(("lease", peer.source, topic))
+        if peer.waiting.pop(topic, None) is not None:
+            self._timers.clear(("grace", peer.source, topic))
         if self._peers.end(peer, topic):
             self._own.wanted.discard(topic)
-            self._outbox.tell(Left(topic))
+            if topic in self._attached:
+                self._attached.remove(topic)
+                self._outbox.tell(Left(topic))
 
     def _shut(self, peer: Peer, topic: str) -> None:
         if peer.opened.pop(topic, None) is not None:

@@ -9,7 +9,7 @@ from collections import Counter
 import msgspec
 
 from r2p.protocols.directory import FOR_EVER
-from r2p.protocols.events import ModuleInfo, Shape, Source
+from r2p.protocols.events import Joined, ModuleInfo, Shape, Source
 
 MOST = 4096
 """Peers on one link."""
@@ -23,8 +23,8 @@ class Peer(msgspec.Struct, eq=False):
 
     `direct`: the r2p modules there, by name (several share an address where a line has more than two ends). `lease` in
     ns, None: as long as the module lives. `requests`: the topics subscribed, and whether the module restarted since;
-    `joined_at`: when that was told last (ns); `permanent`: those that are no leases. The keys of `types` and `refused`
-    are topic and role.
+    `joined_at`: when that was told last (ns); `permanent`: those that are no leases; `waiting`: those to which no data
+    is sent yet. The keys of `types` and `refused` are topic and role.
     """
 
     source: Source
@@ -34,6 +34,7 @@ class Peer(msgspec.Struct, eq=False):
     requests: dict[str, bool] = msgspec.field(default_factory=dict)
     joined_at: dict[str, int] = msgspec.field(default_factory=dict)
     permanent: set[str] = msgspec.field(default_factory=set)
+    waiting: dict[str, Joined] = msgspec.field(default_factory=dict)
     opened: dict[str, tuple[bytes, int]] = msgspec.field(default_factory=dict)
     types: dict[tuple[str, int], Shape] = msgspec.field(default_factory=dict)
     refused: dict[tuple[str, int], Shape] = msgspec.field(default_factory=dict)

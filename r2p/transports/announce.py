@@ -2,21 +2,25 @@
 
 import msgspec
 
-from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.door import Door
 from r2p.protocols.events import Event, Shape
 from r2p.topic import Topic
 
 
 class Told(msgspec.Struct, frozen=True):
-    """What the other ends have been told of a topic; `asked` is the type in which it is subscribed."""
+    """What the other ends have been told of a topic; `asked` is the type in which it is subscribed.
+
+    `queue`: how many messages a publisher keeps, or has on the way, for this module; that has nothing to do with the
+    queues of its own subscribers.
+    """
 
     publishes: bool = False
     subscribes: bool = False
     size: int = 0
     fingerprint: bytes = bytes(8)
     asked: Shape = Shape()
-    queue: int = 1
+    queue: int = QUEUE
     params: bytes = NO_PARAMS
     endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
 
@@ -39,7 +43,6 @@ def wish_of(topic: Topic) -> Told:
         size=shape.size,
         fingerprint=shape.fingerprint,
         asked=shape,
-        queue=min(max((each.limit for each in topic.queues), default=1), 0xFFFF),
         endpoints=publishers | subscribers,
     )
 
@@ -51,7 +54,7 @@ def announce(discovery: Door, now: int, topic: str, told: Told, wish: Told) -> l
         events += discovery.advertise(now, topic, wish.size, wish.fingerprint, wish.params)
     elif told.publishes and not wish.publishes:
         events += discovery.withdraw(now, topic)
-    if wish.subscribes and (wish.asked != told.asked or not told.subscribes):
+    if wish.subscribes and ((wish.asked, wish.queue) != (told.asked, told.queue) or not told.subscribes):
         events += discovery.subscribe(now, topic, wish.asked.size, wish.queue, wish.asked.fingerprint)
     elif told.subscribes and not wish.subscribes:
         events += discovery.unsubscribe(now, topic)

@@ -18,7 +18,7 @@ import msgspec
 
 from r2p.clock import Alarm
 from r2p.codecs.attachment import Clock
-from r2p.codecs.management import NO_PARAMS
+from r2p.codecs.management import NO_PARAMS, QUEUE
 from r2p.messages import Message
 from r2p.names import MANAGEMENT, TOPIC_MAX
 from r2p.protocols.announcer import Relayed
@@ -306,6 +306,10 @@ class Link(abc.ABC):
         """What the others need to know to receive a topic from us. None: it can't be published here."""
         return NO_PARAMS
 
+    def window(self, topic: Topic) -> int:
+        """How many messages a publisher of the topic is to keep for this link."""
+        return QUEUE
+
     async def admission(self, topic: str) -> None:
         """Best effort is admitted at once."""
 
@@ -343,7 +347,8 @@ class Link(abc.ABC):
         if len(topic.name) > self.longest_name:
             wish = NOTHING
         params = self.params(topic.name) if wish.publishes and not self.refusal(wish.size) else None
-        wish = msgspec.structs.replace(wish, publishes=params is not None, params=params or NO_PARAMS)
+        queue = self.window(topic) if wish.subscribes else QUEUE
+        wish = msgspec.structs.replace(wish, publishes=params is not None, params=params or NO_PARAMS, queue=queue)
         if wish != told:
             self._apply(announce(self.discovery, now, topic.name, told, wish))
         if not wish.publishes:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery import Discovery
+from r2p.protocols.discovery import Discovery, Send
+from r2p.protocols.exchange import GRACE
 
 SECOND = 1_000_000_000
 
@@ -70,7 +71,8 @@ def test_who_has_asked_before_joins_at_once() -> None:
     discovery = made()
     hear(discovery, 0, m.SubscribeRequest("leds", 5, 1))
     events = discovery.advertise(SECOND, "leds", 5)
-    assert "Joined" in {type(event).__name__ for event in events}
+    assert m.encode(m.SubscribeResponse("leds", 5, 1)) in [event.data for event in events if isinstance(event, Send)]
+    assert "Joined" in {type(event).__name__ for event in discovery.poll(SECOND + GRACE)}
 
 
 def test_relayed_messages_take_their_turn() -> None:

@@ -43,15 +43,39 @@ class TestStart:
     def test_what_is_new_is_announced_at_once(self) -> None:
         discovery = started()
         assert sent(discovery.advertise(SOON, "odometry", 20)) == [m.Advertise("odometry", 20)]
-        assert sent(discovery.subscribe(SOON, "pose")) == [m.SubscribeRequest("pose", 0, 16)]
+        assert sent(discovery.subscribe(SOON, "pose", 20)) == [m.SubscribeRequest("pose", 20, 5)]
         assert sent(discovery.set_flags(SOON, m.FLAG_STOPPED))[1:] == [m.Alive("PC1", m.FLAG_STOPPED)]
         assert sent(discovery.advertise(SOON, "odometry", 20)) == []
         assert sent(discovery.set_flags(SOON, m.FLAG_STOPPED)) == []
 
-    @pytest.mark.parametrize(("queue", "told"), [(0, 1), (1, 1), (70000, 0xFFFF)])
-    def test_a_queue_of_zero_would_halt_firmware(self, queue: int, told: int) -> None:
+    @pytest.mark.parametrize(
+        ("size", "queue", "told"),
+        [(20, 0, 1), (20, 1, 1), (20, 5, 5), (20, 70000, 16), (120, 16, 8), (121, 16, 7), (1016, 5, 1), (1024, 5, 1)],
+    )
+    def test_queues_that_firmware_can_hold(self, size: int, queue: int, told: int) -> None:
+        """A queue of 0 halts it; one that its heap can't hold makes it write to NULL."""
         discovery = started()
-        assert sent(discovery.subscribe(SOON, "pose", 20, queue)) == [m.SubscribeRequest("pose", 20, told)]
+        assert sent(discovery.subscribe(SOON, "pose", size, queue)) == [m.SubscribeRequest("pose", size, told)]
+
+    def test_a_topic_of_unknown_size_is_not_asked_for(self) -> None:
+        discovery = started()
+        assert sent(discovery.subscribe(SOON, "pose")) == []
+        said = [message for _, event in run(discovery, SOON, 60 * S) for message in sent([event])]
+        assert not any(isinstance(each, m.SubscribeRequest) and each.topic == "pose" for each in said)
+        assert sent(hear(discovery, 60 * S, m.Advertise("pose", 120))) == [m.SubscribeRequest("pose", 120, 5)]
+        said = [message for _, event in run(discovery, 60 * S, 62 * S) for message in sent([event])]
+        assert m.SubscribeRequest("pose", 120, 5) in said, "it is repeated"
+
+    def test_a_size_that_has_been_heard_before_will_do(self) -> None:
+        discovery = started()
+        hear(discovery, SOON, m.Advertise("pose", 250))
+        assert sent(discovery.subscribe(2 * SOON, "pose")) == [m.SubscribeRequest("pose", 250, 3)]
+
+    def test_to_r2p_modules_an_unknown_size_is_told_as_a_type(self) -> None:
+        discovery = started()
+        hear(discovery, SOON, PC2)
+        discovery.poll(SOON)
+        assert sent(discovery.subscribe(SOON, "pose")) == [m.TypeInfo(m.ROLE_SUBSCRIBES, "pose", m.ANY_TYPE, 0)]
 
     def test_good_bye_is_the_last_word(self) -> None:
         discovery = started()
@@ -135,7 +159,7 @@ class TestRepetition:
     def test_a_quiet_line_is_not_waited_for_with_what_is_new(self) -> None:
         discovery = started(quiet=0.033)
         assert sent(hear(discovery, SOON, m.Advertise("cmd", 12))) == [m.SubscribeRequest("cmd", 12, 5)]
-        assert sent(discovery.subscribe(SOON, "new")) == [m.SubscribeRequest("new", 0, 16)]
+        assert sent(discovery.subscribe(SOON, "new", 5)) == [m.SubscribeRequest("new", 5, 5)]
 
     def test_presence_is_not_drowned_by_ten_thousand_topics(self) -> None:
         discovery = Discovery("PC1", ME)

@@ -14,6 +14,7 @@ from r2p.protocols.discovery import (
     Shape,
     Shut,
 )
+from r2p.protocols.exchange import GRACE
 from tests.protocols.wire import (
     ME,
     ONE,
@@ -39,7 +40,8 @@ class TestHandshake:
         params = b"\xaa" * 10
         first = hear(discovery, S, m.SubscribeRequest("leds", 99, 8, params))
         assert sent(first) == [m.SubscribeResponse("leds", 5, 8)]
-        assert news(first) == [Joined("leds", params, 8)]
+        assert news(first) == []
+        assert news(discovery.poll(S + GRACE)) == [Joined("leds", params, 8)]
         again = hear(discovery, S, m.SubscribeRequest("leds", 5, 0 + 3))
         assert sent(again) == [m.SubscribeResponse("leds", 5, 3)]
         assert news(again) == []
@@ -104,12 +106,56 @@ class TestHandshake:
 
     def test_withdrawn_and_back_starts_afresh(self) -> None:
         discovery = started()
-        hear(discovery, S, REQUEST, RESPONSE)
+        assert joined(discovery, S)
+        hear(discovery, S, RESPONSE)
         assert news(discovery.withdraw(S, "leds")) == [Left("leds")]
         assert news(discovery.unsubscribe(S, "cmd")) == [Shut("cmd", None)]
         assert hear(discovery, S, REQUEST, RESPONSE) == []
         discovery.advertise(S, "leds", 5)
         assert joined(discovery, S)
+
+
+class TestGrace:
+    """Data that follow a SUBSCRIBE_RESPONSE too soon are lost at firmware: its management has the lowest priority."""
+
+    def joins(self, discovery: Discovery, start: int) -> list[int]:
+        return [now - start for now, event in run(discovery, start, start + S) if isinstance(event, Joined)]
+
+    def test_firmware_takes_the_response_before_the_data(self) -> None:
+        discovery = started()
+        assert news(hear(discovery, S, REQUEST)) == []
+        assert news(hear(discovery, S + GRACE // 2, REQUEST)) == [], "a repeat"
+        assert self.joins(discovery, S) == [GRACE]
+
+    def test_after_a_restart_again(self) -> None:
+        discovery = started()
+        hear(discovery, S, m.Alive("IMU1"))
+        assert joined(discovery, S)
+        hear(discovery, 2 * S, m.Alive("IMU1", m.FLAG_REBOOTED))
+        assert news(hear(discovery, 3 * S, REQUEST)) == []
+        assert self.joins(discovery, 3 * S) == [GRACE]
+
+    def test_r2p_takes_both_at_once(self) -> None:
+        discovery = started()
+        hear(discovery, S, PC2)
+        assert news(hear(discovery, S, REQUEST)) == [Joined("leds", bytes(10), 8)]
+
+    def test_what_only_r2p_sends_tells_it_from_firmware(self) -> None:
+        """Its HELLO may have been lost."""
+        unanswered = m.SubscribeRequest("leds", 5, 8, m.UNANSWERED)
+        assert news(hear(started(), S, unanswered)) == [Joined("leds", m.UNANSWERED, 8)]
+
+    def test_who_leaves_before_its_data_never_joined(self) -> None:
+        discovery = started()
+        hear(discovery, S, REQUEST)
+        assert news(discovery.withdraw(S, "leds")) == []
+        assert self.joins(discovery, S) == []
+        discovery.advertise(2 * S, "leds", 5)
+        assert news(hear(discovery, 2 * S, REQUEST, source=2)) == []
+        hear(discovery, 2 * S, PC2, REQUEST)
+        leaving = hear(discovery, 2 * S, m.Hello("PC2", PEER, m.HELLO_LEAVING))
+        assert not any(isinstance(event, Left) for event in leaving), "firmware is still there"
+        assert self.joins(discovery, 2 * S) == [GRACE]
 
 
 class TestLeases:

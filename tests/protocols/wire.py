@@ -18,6 +18,7 @@ from r2p.protocols.discovery import (
     Send,
     Shut,
 )
+from r2p.protocols.exchange import GRACE
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -161,5 +162,6 @@ def started(*, observer: bool = False, quiet: float = 0.0) -> Discovery:
 
 
 def joined(discovery: Discovery, now: int, source: object = None) -> bool:
-    """Whether a request for `leds` makes a subscriber that is new, or as good as new."""
-    return any(isinstance(event, Joined) for event in hear(discovery, now, REQUEST, source=source))
+    """Whether a request for `leds` makes a subscriber that is new, or as good as new; of firmware: after its grace."""
+    events = hear(discovery, now, REQUEST, source=source) + discovery.poll(now + GRACE)
+    return any(isinstance(event, Joined) for event in events)

@@ -128,7 +128,7 @@ async def test_what_waits_for_a_blocked_line_is_bounded() -> None:
 async def test_one_turn_may_bring_more_than_the_buffer_holds() -> None:
     async with scripted() as (script, _, node):
         publisher = node.advertise("text", Text)
-        script.hear(manage(m.SubscribeRequest("text", 64, 1)))
+        script.hear(manage(m.SubscribeRequest("text", 64, 1, m.UNANSWERED)))
         assert all(publisher.publish_nowait(Text()) for _ in range(1000))
         await asyncio.sleep(0)
         assert len(script.topics("text")) == 1000
@@ -306,6 +306,7 @@ async def test_the_outage_is_told() -> None:
         events = module.events()
         publisher = node.advertise("leds", Led)
         script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
         script.link.disconnected("broken")
         for _ in range(3):
             await publisher.publish(Led())

@@ -69,7 +69,7 @@ async def test_garbage_of_every_kind_and_then_a_good_line() -> None:
             writer.write(b"\r\n" + SUBSCRIBE + manage(m.SubscribeResponse("cmd", 5, 1)))
             writer.write(line("cmd", Led(led=len(rubbish)).encode()))
             assert await subscriber.fetch() == Led(led=len(rubbish))
-            assert publisher.subscribers == 1
+            await until(lambda: publisher.subscribers == 1)
             (link,) = module.links
             assert isinstance(link, LineLink)
             assert len(link._reader._held) < 600

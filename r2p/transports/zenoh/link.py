@@ -160,8 +160,9 @@ class ZenohLink(Link):
             self.senders.undeclare(topic.name)
         if told.subscribes:
             self._streams.begin(topic)
-            now, window = self._clock.monotonic(), self._streams.window(topic)
-            self._apply(self._presence.subscribe(now, topic.name, told.size, window, told.fingerprint))
+
+    def window(self, topic: Topic) -> int:
+        return self._streams.window(topic)
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         session = self._session
