@@ -9,7 +9,8 @@ import random
 from collections.abc import Callable
 
 from r2p.bridge import Bridge, BridgeOptions, Standby
-from r2p.codecs.management import DENIED_READ_ONLY
+from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY
+from r2p.errors import Error
 from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.network import describe_mismatch
 from r2p.printable import get_logger
@@ -28,7 +29,7 @@ from r2p.protocols.events import (
 )
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.intake import LinkStats
-from r2p.transports.link import Link
+from r2p.transports.link import Link, is_booting
 
 logger = get_logger("r2p.module")
 
@@ -37,6 +38,11 @@ _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
 _ANSWERED = 5_000_000_000  # ns after an order in which gateways may say that it does not pass
 _APART = 1_000_000_000  # ns between two lines about one topic whose types differ
 _REFUSED_APART = 60_000_000_000  # ns between two lines about connections that one URL refuses, or is refused
+
+_DENIED = {
+    DENIED_READ_ONLY: "it is read-only there",
+    DENIED_BOOT: "the module is in its boot loader, where a STOP hangs its management until its power is cut",
+}
 
 
 class ModuleHub:
@@ -87,7 +93,12 @@ class ModuleHub:
             link.set_flags(flags)
 
     def order(self, command: Command, module: str) -> None:
-        """Send an order to another module, by all links."""
+        """Send an order to another module, by all links. Raises Error for one that would do harm."""
+        if command is Command.STOP and any(is_booting(link, module) for link in self.links):
+            raise Error(
+                f"module {module} is in its boot loader, where a STOP hangs its management until its power is cut: "
+                f"there is nothing to stop; reboot it (r2p module reboot {module})"
+            )
         self._ordered[command, module] = self.space.clock.monotonic()
         for link in self.links:
             link.command(command, module)
@@ -203,8 +214,8 @@ class ModuleHub:
         """To whoever ordered it."""
         if self.space.clock.monotonic() - self._ordered.get((event.command, event.module), -_ANSWERED) < _ANSWERED:
             what = f"{event.command.name} of {event.module}"
-            missing = "it is read-only there" if event.reason == DENIED_READ_ONLY else "it lacks --allow-control"
-            text = f"gateway {event.gateway} does not let {what} through: {missing}"
+            reason = _DENIED.get(event.reason, "it lacks --allow-control")
+            text = f"gateway {event.gateway} does not let {what} through: {reason}"
             self.link_notice(link, f"{event.command.name} denied", text, trouble=True)
 
     def _log_mismatch(self, link: Link, event: Mismatched) -> None:

@@ -311,7 +311,8 @@ class Module:
     def command(self, command: Command, module: str) -> None:
         """Send STOP, REBOOT or BOOTLOAD to another module, by all links. None of them is an emergency stop.
 
-        Raises NameTooLong or InvalidName, and Closed if this module is not open.
+        Raises NameTooLong or InvalidName, Error for a STOP of a module in boot mode (it would hang its management until
+        its power is cut), and Closed if this module is not open.
         """
         self._running()
         self._opened.order(command, module_name(module))

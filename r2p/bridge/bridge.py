@@ -16,7 +16,7 @@ from r2p.printable import get_logger
 from r2p.protocols.bridging.tree import MOST_PORTS, Changed, Port, Probe, Say, State, Tree
 from r2p.topic import Topic, TopicSpace, Waker
 from r2p.transports.announce import Told
-from r2p.transports.link import Link
+from r2p.transports.link import Link, is_booting
 from r2p.transports.losses import TRY_AGAIN, internal_error_of
 
 logger = get_logger("r2p.bridge")
@@ -25,6 +25,11 @@ _ORDERS = (0x12, 0x13, 0x14)
 _DENIED = 0x55
 _DENIED_ORDER = 15  # its place
 _DENIED_APART = 200_000_000  # ns between two answers on one link to orders that do not pass
+_REFUSALS = {
+    management.DENIED_CONTROL: "see --allow-control",
+    management.DENIED_READ_ONLY: "see --read-only",
+    management.DENIED_BOOT: "the module is in boot mode, where a STOP hangs it",
+}
 _ALIVE = 0x11
 _HELLO = 0x50
 _HELLO_FLAGS = 12  # its place
@@ -188,17 +193,24 @@ class Bridge:
             return
         if not isinstance(order, management.Stop | management.Reboot | management.Bootload):
             return
-        harmless = isinstance(order, management.Stop)
         for other in self._open_from(port):
-            reason = self._policy.order_denied(port.name, other.name, harmless=harmless)
+            reason = self._order_denied(port, other, order)
             if not reason:
                 other.link.write_management(data, urgent=True)
                 continue
             port.dropped["order refused"] += 1
-            option = "--read-only" if reason == management.DENIED_READ_ONLY else "--allow-control"
-            logger.warning("%s from %s is refused: see %s", type(order).__name__.upper(), port.name, option)
+            logger.warning("%s from %s is refused: %s", type(order).__name__.upper(), port.name, _REFUSALS[reason])
             if order.module in other.link.discovery.modules:
                 self._deny(port, management.Denied(self.name, order.module, data[-1], reason))
+
+    def _order_denied(
+        self, port: BridgePort, other: BridgePort, order: management.Stop | management.Reboot | management.Bootload
+    ) -> int:
+        """Why an order may not go from one link to the other (DENIED_..., 0: it may)."""
+        stops = isinstance(order, management.Stop)
+        if stops and is_booting(other.link, order.module):
+            return management.DENIED_BOOT
+        return self._policy.order_denied(port.name, other.name, harmless=stops)
 
     def _deny(self, port: BridgePort, message: management.Denied) -> None:
         """Tell who gave the order, if not just done."""

@@ -71,6 +71,7 @@ QUEUE_ENTRY = 8
 DENIED_CONTROL = 1  # the gateway takes it from nobody on this link
 DENIED_READ_ONLY = 2  # nothing goes onto the link of the module
 DENIED_CLIENTS = 3  # the server of a debug line serves as many clients as it may: `order` is 0
+DENIED_BOOT = 4  # STOP would hang a module in boot mode
 
 # Claim.flags
 CLAIM_FIXED = 1  # the module can't take another id8

@@ -65,6 +65,11 @@ class Announcer:
         """Announce a publisher of the topic. Says whether that is news."""
         return self._enter(self.publishers, Kind.PUBLISHER, topic, own)
 
+    def advertise_again(self, topic: str) -> None:
+        """Say as soon as possible that we publish the topic."""
+        if topic in self.publishers:
+            self._add(Kind.PUBLISHER, topic)
+
     def withdraw(self, topic: str) -> bool:
         return self._remove(self.publishers, Kind.PUBLISHER, topic)
 

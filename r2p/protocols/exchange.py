@@ -176,11 +176,17 @@ class Exchange:
             self._end(peer, topic)
 
     def grace_over(self, source: Source, topic: str) -> None:
-        """Firmware has taken our response by now: it may get data."""
+        """Firmware has taken our response by now: it may get data.
+
+        On a line we advertise once more: it may be the one of a gateway of firmware, which passes data on only after a
+        second round of request and response.
+        """
         peer = self._peers.get(source)
         joined = peer.waiting.pop(topic, None) if peer is not None else None
         if joined is not None:
             self._attach(joined)
+            if source is None:
+                self._own.advertise_again(topic)
 
     def memory_over(self, source: Source) -> None:
         """What a peer sent before it left can't arrive any more."""

@@ -93,12 +93,13 @@ async def bootload(session: Session, module: Name, *, timeout: Timeout = None) -
 class _Watch(msgspec.Struct):
     """What was heard of a module: its flags one after the other, and how long (s) after the order firmware spoke.
 
-    `denied`: why a gateway does not let the order through, in words.
+    `denied`: why a gateway does not let the order through, in words; `refused`: why it is not given at all.
     """
 
     flags: list[int]
     delay: float | None = None
     denied: str = ""
+    refused: r2p.Error | None = None
 
 
 def _has_rebooted(watch: _Watch) -> bool:
@@ -135,6 +136,8 @@ async def _order(
                 follower.cancel()
         except TimeoutError:
             raise TimedOut(_what_was_seen(session, command, name, timeout or TIMEOUT)) from None
+    if watch.refused:
+        raise watch.refused
     if watch.denied:
         raise TimedOut(watch.denied)
     session.say(f"{name}: {_DONE[command]}, after {loop.time() - started:.1f} s")
@@ -164,7 +167,11 @@ async def _confirmed(
         return bool(watch.denied) or (bool(watch.flags) and done(watch))
 
     while not watch.denied:
-        session.module.command(command, name)
+        try:
+            session.module.command(command, name)
+        except r2p.Error as error:
+            watch.refused = error
+            return
         ordered = loop.time()
         if await _until(is_done, _REPEAT):
             return

@@ -272,6 +272,12 @@ class Session:
         modules = self.module.network.modules()
         return any(view.instance is None for view in modules) or bool(self._heard() - self._answering())
 
+    def may_have_firmware(self) -> bool:
+        """Whether firmware was heard, or may be at the other end of a link on which no r2p module is."""
+        there = {view.link for view in self.module.network.modules() if view.instance is None}
+        silent = {link.name for link in self.module.links if link.up and link.passes_probes} - self._answering()
+        return bool(there | silent)
+
     def _heard(self) -> set[str]:
         """Links on which there are topics."""
         views = self.module.network.topics().values()

@@ -104,7 +104,7 @@ class _Reader:
 
     async def records(self) -> AsyncIterator[tuple[dict[str, Any], r2p.Sample]]:
         """Each message as a record, with its sample."""
-        async for sample in watched(self._session, self._subscriber):
+        async for sample in watched(self._session, self._subscriber, typed=self._cls is not None):
             yield await self._record(sample), sample
 
     def tell_losses(self) -> None:

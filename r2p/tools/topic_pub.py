@@ -11,7 +11,7 @@ from r2p.tools.options import ClassChoice, Count, Once, Rate, Topic, TypeName, c
 from r2p.tools.session import PATIENCE, Session, TimedOut, Timeout, Usage
 from r2p.tools.types import find
 from r2p.tools.values import parse, parse_line
-from r2p.tools.watching import hint, meant, subscribed
+from r2p.tools.watching import hint, meant, passed_on, subscribed
 
 STDIN = "-"
 DEFAULT_RATE = 1.0
@@ -149,6 +149,7 @@ class _Job:
             try:
                 async with asyncio.timeout(self._timeout):
                     await publisher.wait_subscriber()
+                    await passed_on(self._session, publisher.topic)
             except TimeoutError:
                 raise TimedOut(f"nobody subscribed {self._topic} for {self._timeout:g} s") from None
 

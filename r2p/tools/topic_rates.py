@@ -1,4 +1,4 @@
-"""`r2p topic hz`, `bw` and `delay`: measure a topic, without decoding it.
+"""`r2p topic hz`, `bw` and `delay`: measure a topic, without decoding it unless its type is stated.
 
 Each reports once a second on the last `--window` messages. What is measured, and where, is kept apart: the publisher
 stamps and counts its messages where the link carries that (the debug line does not), the tool counts what its own queue
@@ -14,9 +14,11 @@ from typing import Annotated, Any, Protocol
 import typer
 
 import r2p
-from r2p.tools.options import Count, Once, Topic
+from r2p.names import topic_name
+from r2p.tools.options import Count, Once, Topic, TypeName
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, Timeout
+from r2p.tools.types import Types
 from r2p.tools.watching import patience, watched
 
 QUEUE = 4096
@@ -38,6 +40,7 @@ async def hz(
     session: Session,
     topic: Topic,
     *,
+    type: TypeName = None,
     window: Window = 1000,
     count: Count = None,
     once: Once = False,
@@ -49,13 +52,14 @@ async def hz(
     Reports once a second. Periods (s) are the publisher's where it stamps its messages, else those of reception; `gaps`
     are pauses of the publisher; `lost_on_way` is known where messages are numbered. -n and --once count reports.
     """
-    await _measure(session, topic, _Rate(window), 1 if once else count, timeout, Output(format))
+    await _measure(session, topic, type, _Rate(window), 1 if once else count, timeout, Output(format))
 
 
 async def bw(
     session: Session,
     topic: Topic,
     *,
+    type: TypeName = None,
     window: Window = 1000,
     count: Count = None,
     once: Once = False,
@@ -66,13 +70,14 @@ async def bw(
 
     Reports bytes of payload, once a second. -n and --once count reports.
     """
-    await _measure(session, topic, _Bandwidth(window), 1 if once else count, timeout, Output(format))
+    await _measure(session, topic, type, _Bandwidth(window), 1 if once else count, timeout, Output(format))
 
 
 async def delay(
     session: Session,
     topic: Topic,
     *,
+    type: TypeName = None,
     window: Window = 1000,
     count: Count = None,
     once: Once = False,
@@ -84,7 +89,7 @@ async def delay(
     Reports the time from publish() to this tool, once a second. Needs a link that carries stamps, and clocks that
     agree. -n and --once count reports.
     """
-    await _measure(session, topic, _Delay(window), 1 if once else count, timeout, Output(format))
+    await _measure(session, topic, type, _Delay(window), 1 if once else count, timeout, Output(format))
 
 
 class _Meter(Protocol):
@@ -101,14 +106,21 @@ class _Meter(Protocol):
 
 
 async def _measure(
-    session: Session, topic: str, meter: _Meter, reports: int | None, timeout: float | None, output: Output
+    session: Session,
+    topic: str,
+    given: str | None,
+    meter: _Meter,
+    reports: int | None,
+    timeout: float | None,
+    output: Output,
 ) -> None:
-    subscriber = session.node.subscribe(topic, None, queue=QUEUE, lossy=True)
+    cls = Types(session.settings).stated(topic_name(topic), given)
+    subscriber: r2p.Subscriber[Any] = session.node.subscribe(topic, cls, queue=QUEUE, lossy=True)
     fresh = 0
 
     async def read() -> None:
         nonlocal fresh
-        async for sample in watched(session, subscriber):
+        async for sample in watched(session, subscriber, typed=cls is not None):
             heard()
             fresh += 1
             meter.note(sample, session.node.now())

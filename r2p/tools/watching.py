@@ -11,25 +11,44 @@ from r2p.tools.session import Session, TimedOut, later
 
 _LOOK = 0.5  # seconds between two looks whether there is a publisher
 
+_GRACE = 0.05  # seconds that firmware takes to see to a response
+_SECOND_ROUND = 2.0  # seconds in which all that we advertise has been repeated, and answered
+
 HINT_AFTER = 2.0
 """Seconds without anybody at the other end after which a tool names topics that the user may have meant."""
 
 
-async def watched(session: Session, subscriber: r2p.Subscriber[Any]) -> AsyncIterator[r2p.Sample]:
-    """The samples of a subscription; says what it waits for until there is a first one."""
+async def watched(
+    session: Session, subscriber: r2p.Subscriber[Any], *, typed: bool = True
+) -> AsyncIterator[r2p.Sample]:
+    """The samples of a subscription; says what it waits for until there is a first one.
+
+    Where its type is not known (`typed`), firmware that advertises nothing can't be asked for it: that is said, too.
+    """
 
     def missing() -> str:
         return ("the first message" if subscriber.publishers else "a publisher") + f" of {subscriber.topic}"
 
+    def unadvertised() -> None:
+        if not typed:
+            _tell_unadvertised(session, subscriber.topic)
+
     samples = subscriber.samples()
     nobody = f"nobody publishes {subscriber.topic}"
-    with session.waiting(missing), hint(session, nobody, subscriber.topic, published):
+    waiting, hints = session.waiting(missing), hint(session, nobody, subscriber.topic, published)
+    with waiting, hints, later(HINT_AFTER, unadvertised):
         first = await anext(samples, None)
     if first is not None:
         yield first
     with _departures(session, subscriber):
         async for sample in samples:
             yield sample
+
+
+def _tell_unadvertised(session: Session, topic: str) -> None:
+    view = session.module.network.topics().get(topic)
+    if session.may_have_firmware() and not (view and published(view)):
+        session.say(f"nothing has advertised {topic}: firmware may announce nothing, then give --type to subscribe it")
 
 
 def meant(session: Session, topic: str, fits: Callable[[r2p.TopicView], bool]) -> str:
@@ -64,6 +83,31 @@ def hint(session: Session, text: str, topic: str, fits: Callable[[r2p.TopicView]
 
     with later(HINT_AFTER, tell):
         yield
+
+
+async def passed_on(session: Session, topic: str) -> None:
+    """Wait until messages of a topic that firmware subscribes at the end of a line get through.
+
+    What is there may be a gateway of firmware, which passes them on only after a second request (PROTOCOL.md 4).
+    """
+    lines = [link for link in session.module.links if link.lone and link.up and not _is_r2p(link)]
+    asked = {link: _requested_at(link, topic) for link in lines}
+    end = asyncio.get_running_loop().time() + _SECOND_ROUND
+    while any(at is not None and link.up and _requested_at(link, topic) == at for link, at in asked.items()):
+        if asyncio.get_running_loop().time() >= end:
+            return  # firmware of a build that repeats nothing, or its answer is lost
+        await asyncio.sleep(_GRACE)
+    if any(at is not None for at in asked.values()):
+        await asyncio.sleep(_GRACE)
+
+
+def _requested_at(link: Any, topic: str) -> int | None:
+    info = link.discovery.topics.get(topic)
+    return None if info is None else info.requested_at
+
+
+def _is_r2p(link: Any) -> bool:
+    return any(info.r2p and not info.hops for info in link.discovery.modules.values())
 
 
 @contextlib.contextmanager

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, ClassVar
 from r2p.codecs import debug
 from r2p.codecs.management import FLAG_BOOT
 from r2p.names import LOADER_PREFIX, MANAGEMENT
+from r2p.protocols.exchange import GRACE
 from r2p.room import LINK_DOWN
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Advertised, Topic
 from r2p.transports.announce import NOTHING
-from r2p.transports.link import Hub, Link
+from r2p.transports.link import Hub, Link, is_booting
 from r2p.transports.sources import Sources
 
 if TYPE_CHECKING:
@@ -114,7 +115,8 @@ class LineLink(Link):
         self._waiting = 0
         self._corked = False
         self._blocked = False
-        self._limit = buffer
+        self._limit = self._buffer = buffer
+        self._grace: asyncio.TimerHandle | None = None
         self._piecemeal = piecemeal
         self._stamp = 0
         self._held: tuple[str, Sample] | None = None
@@ -132,11 +134,13 @@ class LineLink(Link):
         self._reader = debug.Reader(self.stats.lost)
         self._send(OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
+            self._begin_grace()
             self.went_up()
 
     def disconnected(self, reason: str) -> None:
         """Bytes do not flow any more."""
         self._carrier = None
+        self._end_grace()
         self.went_down(reason)
         self._lose_held()
 
@@ -178,7 +182,9 @@ class LineLink(Link):
         return self._waiting >= self._limit
 
     def takes(self, sample: Sample) -> bool:
-        return self._waiting < self._limit if sample.publisher_class == _NRT else not self._blocked
+        if sample.publisher_class == _NRT:
+            return self._waiting < self._limit
+        return not self._blocked and self._limit >= 0
 
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
@@ -238,12 +244,28 @@ class LineLink(Link):
             self._carrier.resume()
 
     def close(self) -> None:
+        self._end_grace()
         self._flush(last_words=True)  # the carrier gets all that waits, and after it our good-bye
         super().close()
         self._flush(last_words=True)
         carrier, self._carrier = self._carrier, None
         if carrier is not None:
             carrier.close()
+
+    # Firmware drops what comes too soon after a new connection (PROTOCOL.md 4): its subscriptions last, but data wait.
+
+    def _begin_grace(self) -> None:
+        if self._outlets.keys() - self._lapsed:
+            self._limit = -1
+            self._grace = self._space.loop.call_later(GRACE / _SECOND, self._end_grace)
+
+    def _end_grace(self) -> None:
+        if self._grace is not None:
+            self._grace.cancel()
+            self._grace = None
+            self._limit = self._buffer
+            if self.up:
+                self.made_room()
 
     def _send_at_once(self, line: bytes) -> None:
         if not self._corked:
@@ -344,5 +366,4 @@ class LineLink(Link):
     def _in_boot_mode(self, module: str) -> bool:
         if module == self._space.module:
             return bool(self.discovery.flags & FLAG_BOOT)
-        info = self.discovery.modules.get(module)
-        return info is not None and bool(info.flags & FLAG_BOOT)
+        return is_booting(self, module)

@@ -18,7 +18,7 @@ import msgspec
 
 from r2p.clock import Alarm
 from r2p.codecs.attachment import Clock
-from r2p.codecs.management import NO_PARAMS, QUEUE
+from r2p.codecs.management import FLAG_BOOT, NO_PARAMS, QUEUE
 from r2p.messages import Message
 from r2p.names import MANAGEMENT, TOPIC_MAX
 from r2p.protocols.announcer import Relayed
@@ -425,6 +425,12 @@ class Link(abc.ABC):
         topic = self._space.topics.get(name)
         if topic is not None and topic.wanted:
             self._intake.open(topic, topic.layout.size if topic.layout is not None else size, sender)
+
+
+def is_booting(link: Link, module: str) -> bool:
+    """Whether a module that is heard on the link is in boot mode, where a STOP does lasting harm."""
+    info = link.discovery.modules.get(module)
+    return info is not None and bool(info.flags & FLAG_BOOT)
 
 
 def _unlike(name: str, taken: set[str]) -> str:

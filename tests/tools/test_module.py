@@ -12,11 +12,12 @@ import msgspec
 import pytest
 
 import r2p
+from r2p.codecs import management
 from r2p.msg import Led, Velocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
 from r2p.tools.module import bootload, list_, reboot, stop
 from r2p.tools.session import Session, Settings, TimedOut, Usage
-from r2p.transports.memory import network
+from r2p.transports.memory import Frame, network
 from tests.tools.rig import printed, robot, tool
 
 if TYPE_CHECKING:
@@ -160,6 +161,32 @@ async def test_orders_to_firmware() -> None:
         assert power.module.flags == 6
         await reboot(session, "IMU1")
         assert power.module.flags == 2
+
+
+async def test_a_module_in_its_boot_loader_is_not_stopped() -> None:
+    """That would hang it until its power is cut."""
+    async with board() as (power, session):
+        await bootload(session, "IMU1")
+        with pytest.raises(r2p.Error, match=r"IMU1 is in its boot loader, .* reboot it"):
+            await stop(session, "IMU1")
+        assert not power.module.fault
+        await reboot(session, "IMU1")
+        await stop(session, "IMU1")
+
+
+async def test_a_gateway_does_not_stop_a_module_in_its_boot_loader() -> None:
+    """Whoever orders it may not know."""
+    async with Powered(FirmwareModule("IMU1")) as power:
+        power.reset(boot_mode=True)
+        gateway = r2p.Module("GW", via=["memory:lab", power.wire()], bridge=True)
+        async with gateway, tool() as session:
+            await asyncio.sleep(3)
+            network("lab").send(Frame(99, b"R2P", management.encode(management.Stop("IMU1"))))
+            await asyncio.sleep(3)
+            assert not power.module.fault
+            assert gateway.gateway_statistics().ports[0].dropped == {"order refused": 1}
+            with pytest.raises(r2p.Error, match="IMU1 is in its boot loader"):
+                await stop(session, "IMU1")
 
 
 async def test_firmware_that_repeats_nothing_confirms_a_new_start() -> None:

@@ -316,6 +316,40 @@ async def test_the_outage_is_told() -> None:
         assert told == [r2p.LinkDown("script", "broken"), r2p.LinkUp("script", 2.5, 3)]
 
 
+async def test_firmware_has_time_after_a_reconnect() -> None:
+    """It drops what comes before its management thread has run; its subscription is still there."""
+    async with scripted() as (script, _, node):
+        leds, event = node.advertise("leds", Led), node.advertise("event", Led, r2p.Sporadic(deadline=0.2))
+        script.hear(manage(SUBSCRIBE) + manage(m.SubscribeRequest("event", 5, 1)))
+        await asyncio.sleep(1)
+        for _ in range(2):
+            script.link.disconnected("broken")
+            await asyncio.sleep(10)
+            script.said.clear()
+            script.link.connected(script)
+            connected = asyncio.get_running_loop().time()
+            assert leds.subscribers == 1
+            await event.publish(Led(led=1))
+            await leds.publish(Led(led=2))
+            assert asyncio.get_running_loop().time() - connected == pytest.approx(0.05)
+            await asyncio.sleep(0)
+            assert [each.topic for each in script.said if each.topic != "R2P"] == ["event", "leds"]
+            assert any(each.topic == "R2P" for each in script.said if each.ms < connected * 1000 + 1)
+        assert not script.link.losses
+
+
+async def test_an_r2p_peer_needs_no_time() -> None:
+    async with scripted() as (script, _, node):
+        leds = node.advertise("leds", Led)
+        for _ in range(2):
+            script.hear(manage(m.Hello("PC2", 7)) + manage(SUBSCRIBE))
+            assert leds.publish_nowait(Led())
+            await asyncio.sleep(0)
+            script.link.disconnected("broken")
+            script.link.connected(script)
+        assert len(script.topics("leds")) == 2
+
+
 async def test_closing_sends_what_waits_and_then_the_good_bye() -> None:
     async with scripted() as (script, _, node):
         publisher = node.advertise("leds", Led)

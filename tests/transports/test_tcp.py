@@ -32,7 +32,7 @@ pytestmark = pytest.mark.anyio
 
 SOAK = int(os.environ.get("R2P_SOAK", "2000"))
 """Connects and disconnects of a client."""
-SUBSCRIBE = manage(m.SubscribeRequest("leds", 5, 1))
+SUBSCRIBE = manage(m.SubscribeRequest("leds", 5, 1, m.UNANSWERED))
 
 
 def listen() -> TcpListenTransport:

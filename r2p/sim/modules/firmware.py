@@ -4,6 +4,10 @@ It says what the recorded firmware says, in the same order: the boot marker, ALI
 a second later, then one step of repetition each half second; it has no r2p extensions. Three things are not firmware's:
 a line with a wrong checksum is dropped and counted (firmware does not look), bad lines do it no lasting harm, and in
 boot mode there is no loader.
+
+It breaks where firmware breaks, and `fault` says why: at a SUBSCRIBE_REQUEST of queue length 0, of a queue that its
+heap can't hold, or of size 0 (as gateways of firmware do; the others do not look at the size), and at STOP in boot
+mode. It drops data that follow a SUBSCRIBE_RESPONSE within 50 ms.
 """
 
 from collections import Counter
@@ -28,6 +32,10 @@ _STEP_AFTER_TRAFFIC = 500 * _MS
 _QUIET = 33 * _MS
 _MARKER = b"\r\n\r\n"
 _NO_DEADLINE = 0x7FFFFFFF
+_SLUGGISH = 50 * _MS  # what the thread of management takes, which has the lowest priority
+
+HEAP = 20_000
+"""Bytes of RAM in which a module keeps its queues."""
 
 Answer = Iterable[tuple[str, Message]]
 
@@ -67,12 +75,17 @@ class FirmwareModule:
         publishers: Iterable[Publishes] = (),
         subscribers: Iterable[Subscribes] = (),
         repeats: bool = True,
+        heap: int = HEAP,
+        behind_gateway: bool = False,
     ) -> None:
+        """`heap`: bytes for queues. `behind_gateway`: one of firmware, which lets data in after a second response."""
         self.name = module_name(name)
         self.flags = 0
         """As in its ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
-        self.halted = False
-        """Whether a SUBSCRIBE_REQUEST with queue length 0 has halted it, as it does firmware; only power helps."""
+        self.fault = ""
+        """What has broken it, in words; only power helps."""
+        self.heap = 0
+        """Bytes that are still free for queues."""
         self.sent: Counter[str] = Counter()
         """Messages by topic, since it was made."""
         self.received: Counter[str] = Counter()
@@ -83,6 +96,9 @@ class FirmwareModule:
         self._publishers = {topic_name(each.topic): _Publisher(each) for each in publishers}
         self._subscribers = {topic_name(each.topic): _Subscriber(each) for each in subscribers}
         self._repeats = repeats
+        self._memory = heap
+        self._rounds = 2 if behind_gateway else 1
+        self._hung = False  # its management
         self._reader = debug.Reader(self.drops)
         self._out: list[bytes] = []
         self._booted = 0
@@ -94,11 +110,17 @@ class FirmwareModule:
         self._heard = 0  # the last management message
         self._running = False  # its nodes
 
+    @property
+    def halted(self) -> bool:
+        """Whether it does nothing any more; see `fault`. After a STOP in boot mode only its management hangs."""
+        return bool(self.fault) and not self._hung
+
     # Input
 
     def power_on(self, now: int, *, boot_mode: bool = False) -> bytes:
         """Start, or start again after a cut of its power."""
-        self.halted = False
+        self.fault = ""
+        self._hung = False
         self._boot(now, FLAG_BOOT if boot_mode else 0, _FIRST_STEP)
         return self._take()
 
@@ -112,7 +134,8 @@ class FirmwareModule:
             return b""
         topic = line.topic.decode()
         if topic == MANAGEMENT:
-            self._manage(now, line.data)
+            if not self._hung:
+                self._manage(now, line.data)
         else:
             self._deliver(now, topic, line.data)
         return self._take()
@@ -158,11 +181,14 @@ class FirmwareModule:
         self._boot_at = None
         self._running = False
         self._reader = debug.Reader(self.drops)
+        own = (_bytes(each.layout.size, each.request.queue) for each in self._subscribers.values())
+        self.heap = self._memory - sum(own)
         for publisher in self._publishers.values():
             publisher.next = None
             publisher.joined = False
         for subscriber in self._subscribers.values():
-            subscriber.opened = False
+            subscriber.opened_at = None
+            subscriber.responses = 0
         self._out.append(_MARKER)
         self._say(now, management.Alive(self.name, flags))
         self._nodes_at = now + _NODES
@@ -181,6 +207,11 @@ class FirmwareModule:
 
     def _stop(self, now: int) -> None:
         """The nodes end; of the round of repetition, what the node at hand has is still said."""
+        if self.flags & FLAG_BOOT:
+            self.fault = "STOP in boot mode: its management hangs"
+            self._hung = True
+            self._step_at = self._nodes_at = None
+            return
         self._end_nodes()
         self.flags |= FLAG_STOPPED
         self._steps = self._steps[-1:] if self._steps and self._steps[-1] is None else self._steps[-2:]
@@ -238,7 +269,7 @@ class FirmwareModule:
             case management.SubscribeRequest():
                 self._requested(now, message)
             case management.SubscribeResponse() if message.topic in self._subscribers:
-                self._subscribers[message.topic].opened = self._running
+                self._opened(now, self._subscribers[message.topic])
             case management.Stop() if message.module == self.name:
                 self._stop(now)
             case management.Reboot() if message.module == self.name:
@@ -251,21 +282,43 @@ class FirmwareModule:
         if subscriber is not None and self._running:
             self._say(now, subscriber.request)
 
+    def _opened(self, now: int, subscriber: "_Subscriber") -> None:
+        """A publisher's data may come in, once the response has been seen to."""
+        subscriber.responses += 1
+        if not self._running:
+            subscriber.opened_at = None
+        elif subscriber.opened_at is None and subscriber.responses >= self._rounds:
+            subscriber.opened_at = now + _SLUGGISH
+
     def _requested(self, now: int, message: management.SubscribeRequest) -> None:
+        if not message.size:
+            self.fault = f"SUBSCRIBE_REQUEST of {message.topic} with size 0: its buffers are overrun"
+            return
         publisher = self._publishers.get(message.topic)
         if publisher is None or not self._running:
             return
-        if not publisher.joined and not message.queue:
-            self.halted = True
+        if not publisher.joined and not self._allocate(publisher, message):
             return
         publisher.joined = True
         self._say(now, management.SubscribeResponse(message.topic, publisher.layout.size))
+
+    def _allocate(self, publisher: "_Publisher", message: management.SubscribeRequest) -> bool:
+        """The queue of a remote subscriber; False if that is the end."""
+        if not message.queue:
+            self.fault = f"SUBSCRIBE_REQUEST of {message.topic} with queue length 0: an assertion fails"
+            return False
+        needed = _bytes(publisher.layout.size, message.queue)
+        if needed > self.heap:
+            self.fault = f"SUBSCRIBE_REQUEST of {message.topic}: {needed} bytes of {self.heap}, so it writes to NULL"
+            return False
+        self.heap -= needed
+        return True
 
     # Data
 
     def _deliver(self, now: int, topic: str, data: bytes) -> None:
         subscriber = self._subscribers.get(topic)
-        if subscriber is None or not subscriber.opened or not self._running:
+        if subscriber is None or not subscriber.is_open(now) or not self._running:
             self.drops["not subscribed"] += 1
         elif len(data) != subscriber.layout.size:
             self.drops["wrong size"] += 1
@@ -340,4 +393,13 @@ class _Subscriber:
         self.layout: Layout[Any] = layout(what.type)
         self.request = management.SubscribeRequest(topic_name(what.topic), self.layout.size, what.queue)
         self.answer = what.answer
-        self.opened = False
+        self.opened_at: int | None = None
+        self.responses = 0
+
+    def is_open(self, now: int) -> bool:
+        return self.opened_at is not None and now >= self.opened_at
+
+
+def _bytes(size: int, queue: int) -> int:
+    """What a queue takes of the heap."""
+    return queue * (size + management.QUEUE_ENTRY)

@@ -10,8 +10,9 @@ import pytest
 import r2p
 from r2p.codecs import debug, management
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
-from r2p.msg import Float32, Led, Velocity3
+from r2p.msg import Float32, Led, Text, Velocity3
 from r2p.sim.modules import FirmwareModule, Publishes, Subscribes
+from r2p.sim.modules.firmware import HEAP
 from tests.vectors import FROM_NODE, TO_NODE, Case, cases
 
 if TYPE_CHECKING:
@@ -189,6 +190,7 @@ def test_nothing_flows_before_the_handshake() -> None:
     assert line.module.received == {}
     assert line.module.drops == {"not subscribed": 1}
     line.say(management.SubscribeResponse("cmd", 12), management.SubscribeRequest("leds", 5, 1))
+    line.until(1250)
     line.publish("cmd", Velocity3(x=2.0))
     line.until(1600)
     assert line.module.last == {"cmd": Velocity3(x=2.0)}
@@ -230,9 +232,61 @@ def test_a_queue_of_nothing_halts_it_until_its_power_is_cut() -> None:
     assert not line.module.halted
 
 
+def test_a_topic_of_no_size_overruns_its_buffers() -> None:
+    line = booted()
+    line.say(management.SubscribeRequest("leds", 0, 5))
+    line.until(9000)
+    assert line.told() == []
+    assert "size 0" in line.module.fault
+
+
+def test_queues_come_from_a_small_heap() -> None:
+    module = FirmwareModule("IMU1", publishers=[Publishes("leds", Led), Publishes("text", Text)])
+    line = booted(module)
+    line.say(management.SubscribeRequest("leds", 5, 5), management.SubscribeRequest("leds", 5, 1024))
+    assert module.heap == HEAP - 5 * (5 + 8), "a repeat takes no more"
+    assert not module.fault
+    line.say(management.SubscribeRequest("text", r2p.layout(Text).size, 1024))
+    assert "NULL" in module.fault
+    assert module.halted
+    module.power_on(line.now)
+    assert module.heap == HEAP
+    assert not module.fault
+
+
+def test_its_own_subscribers_take_of_the_heap() -> None:
+    assert booted(FirmwareModule("IMU1", subscribers=[Subscribes("cmd", Velocity3, 5)])).module.heap == HEAP - 5 * 20
+
+
+def test_a_stop_in_boot_mode_hangs_its_management() -> None:
+    line = Line(recorded_nodes())
+    line.say(management.Bootload("IMU1"))
+    line.until(2000)
+    line.told()
+    line.say(management.Stop("IMU1"), management.Reboot("IMU1"))
+    line.until(9000)
+    assert line.told() == []
+    assert "boot mode" in line.module.fault
+    assert not line.module.halted
+    line.module.power_on(line.now)
+    line.until(line.now / MS + 2000)
+    assert set(alive(line)) == {0}
+
+
+def test_data_that_follow_a_response_too_soon_are_lost() -> None:
+    line = booted()
+    line.say(management.SubscribeResponse("cmd", 12))
+    for ms in (500, 549, 550):
+        line.until(ms)
+        line.publish("cmd", Velocity3(x=float(ms)))
+    assert line.module.drops == {"not subscribed": 2}
+    assert line.module.last == {"cmd": Velocity3(x=550.0)}
+
+
 def test_a_wrong_size_is_dropped_and_counted() -> None:
     line = booted()
     line.say(management.SubscribeResponse("cmd", 12))
+    line.until(550)
     line.publish("cmd", Led())
     line.send(debug.encode(b"R2P", b"short", 0))
     assert line.module.drops == {"wrong size": 1, "undecodable": 1}
@@ -258,6 +312,7 @@ def test_answers_are_published_at_once() -> None:
     line = booted(module)
     line.say(*(management.SubscribeResponse(topic, 0) for topic in ("cmd", "off")))
     line.say(management.SubscribeRequest("speed", 4, 1))
+    line.until(550)
     line.told()
     line.publish("cmd", Velocity3(x=2.0))
     line.publish("off", Led())
