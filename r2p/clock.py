@@ -93,14 +93,29 @@ def _running() -> asyncio.AbstractEventLoop | None:
         return None
 
 
+def in_background(timer: asyncio.TimerHandle, background: bool | Callable[[], bool] = True) -> None:
+    """Mark a timer that only repeats itself, or says so when it is asked: under virtual time it keeps nothing going."""
+    if hasattr(timer, "background"):
+        timer.background = background
+
+
 class Alarm:
     """One timer that can be moved: calls `callback()` in the loop once the deadline is reached, never before it.
 
     It comes up to about a millisecond late on a real loop, and at the very nanosecond under virtual time.
+
+    `background` is what only repeats itself, such as announcements: under virtual time it keeps no program going.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], object]) -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        callback: Callable[[], object],
+        *,
+        background: bool | Callable[[], bool] = False,
+    ) -> None:
         self._loop = loop
+        self._background = background
         self._clock = clock_of(loop)
         self._callback = callback
         self._deadline: int | None = None
@@ -125,6 +140,7 @@ class Alarm:
         self._armed = deadline
         if self._clock.virtual:  # the instant itself: a sum of floats may miss it by a nanosecond
             self._timer = self._loop.call_at(deadline / _SECOND, self._fire)
+            in_background(self._timer, self._background)
         else:
             self._timer = self._loop.call_later(delay / _SECOND, self._fire)
 
@@ -200,16 +216,21 @@ class Ticker:
     """
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, period: int, callback: Callable[[int, int, int], object]
+        self,
+        loop: asyncio.AbstractEventLoop,
+        period: int,
+        callback: Callable[[int, int, int], object],
+        *,
+        background: bool = False,
     ) -> None:
-        """`period` in ns, at least 1000. Raises ValueError below that."""
+        """`period` in ns, at least 1000; `background` as of an Alarm. Raises ValueError for a shorter period."""
         if period < _SHORTEST_PERIOD:
             raise ValueError(f"a period of {period} ns is too short: the shortest is {_SHORTEST_PERIOD} ns")
         self._loop = loop
         self._period = period
         self._callback = callback
         self._clock = clock_of(loop)
-        self._alarm = Alarm(loop, self._tick)
+        self._alarm = Alarm(loop, self._tick, background=background)
         self._fd: int | None = None
         self._start = 0
         self._next = 1

@@ -100,7 +100,7 @@ class Subscriber(Generic[T]):
         self._credit = 0
         self._timeout = 0 if timeout is None else round(timeout * _SECOND)
         self._heard = space.clock.monotonic()
-        self._alarm = Alarm(space.loop, self._check_silence)
+        self._alarm = Alarm(space.loop, self._check_silence, background=self._unattended)
         if timeout is not None:
             self._sink.queue = _GuardedQueue(self._note)
             self._alarm.set(self._heard + self._timeout)
@@ -311,6 +311,10 @@ class Subscriber(Generic[T]):
             if self._silent:
                 self._silent = False
                 self._alarm.set(self._heard + self._timeout)
+
+    def _unattended(self) -> bool:
+        """Whether nothing comes of a time-out now: nobody waits for a message, and there is nothing to call."""
+        return self._sink.waiter is None and self._on_timeout is None
 
     def _check_silence(self) -> None:
         now = self._space.clock.monotonic()

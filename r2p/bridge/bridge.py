@@ -62,7 +62,7 @@ class Bridge:
         self._clock = space.clock
         self._told = told
         self._by_number: dict[int, BridgePort] = {}
-        self._alarm = Alarm(space.loop, self._poll)
+        self._alarm = Alarm(space.loop, self._poll, background=True)
 
     def make_topic(self, name: str, waker: Waker) -> Topic:
         """For the module's topic space."""

@@ -56,7 +56,7 @@ class Presences:
         self._policy = policy
         self._repeating = repeating
         self._told: dict[int, dict[_Key, _Told]] = {}
-        self._alarm = Alarm(space.loop, self._due)
+        self._alarm = Alarm(space.loop, self._due, background=True)
         self._refresh_at = 0
         self._met: dict[int, set[int]] = {}
         self._asked: set[int] = set()

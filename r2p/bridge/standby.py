@@ -65,7 +65,7 @@ class Standby:
         self._without: dict[str, frozenset[int]] = {}
         self._unable: dict[tuple[int, int], frozenset[int]] = {}
         self._guarding = False
-        self._alarm = Alarm(space.loop, self._poll)
+        self._alarm = Alarm(space.loop, self._poll, background=True)
 
     # Links
 

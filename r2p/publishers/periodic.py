@@ -34,7 +34,7 @@ class PeriodicPublisher(BasePublisher[M]):
         self._own_period = klass.period
         self._driver: object = None
         self._waiting: _Period[M] | None = None
-        self._ticker = Ticker(space.loop, round(klass.period * _SECOND), self.tick)
+        self._ticker = Ticker(space.loop, round(klass.period * _SECOND), self.tick, background=True)
 
     def start(self) -> None:
         """Start the clock: the first message follows one period later."""

@@ -15,14 +15,17 @@ in asyncio that goes through the loop works unchanged. What virtual time can't s
 from __future__ import annotations
 
 import asyncio
+import gc
+import inspect
 import itertools
 import random
 import selectors
 from collections.abc import Callable, Coroutine
 from heapq import heappush
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar, TypeVarTuple, Unpack
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
+from r2p.clock import SystemClock
 from r2p.errors import Deadlock
 
 if TYPE_CHECKING:
@@ -36,21 +39,32 @@ Ts = TypeVarTuple("Ts")
 _SECOND: Final = 1_000_000_000
 _EPOCH: Final = 1_356_998_400 * _SECOND  # 2013-01-01T00:00:00Z
 _HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two floats to each nanosecond
+_PATIENCE: Final = 20 * _SECOND  # for which only what repeats itself goes on at least, and half a second of real time
+_MOST_PATIENCE: Final = 300 * _SECOND  # ... and at most
+_REAL_PATIENCE: Final = _SECOND // 2
+_LOOK: Final = 5 * _SECOND  # between two looks whether it has woken a task
 _BUSY: Final = 100_000  # turns of the loop at one instant
 _END: Final = 2**22 * _SECOND  # the same in ns
 _AHEAD: Final = 1000  # events; then the loop has its turn, for signals and real file descriptors
 _OFTEN: Final = 64  # turns of the loop; so often it looks for signals
+_REAL: Final = SystemClock()  # only tells how long a program without hope may take
 _RESOLUTION: Final = 0.4e-9  # seconds; tells nanoseconds apart, and is more than rounding error at the horizon
 
 
-def run(main: Coroutine[Any, Any, T] | Callable[[], Coroutine[Any, Any, T]], *, seed: int = 0) -> T:
+def run(
+    main: Coroutine[Any, Any, T] | Callable[[], Coroutine[Any, Any, T]], *, seed: int = 0, limit: float | None = None
+) -> T:
     """Run `main` (a coroutine, or a function that makes one) under virtual time, and return its result.
 
     Virtual time starts at 2013-01-01 UTC and lasts 48 days at most. `seed` goes to the loop's random numbers,
     `loop.random`. Tasks that `main` leaves behind are cancelled, as by `asyncio.run`. Raises what `main` raises, and
     `Deadlock` when it waits for something that can't happen any more; KeyboardInterrupt on Ctrl-C.
+
+    What only repeats itself (announcements, periodic publishers, time-outs for which nobody waits) keeps no program
+    going: Deadlock comes when it has woken no task for half a second of real time and 20 seconds of virtual time. Where
+    nodes talk to each other for ever, only `limit` ends that: Deadlock comes after so many seconds of virtual time.
     """
-    with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed=seed)) as runner:
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed=seed, limit=limit)) as runner:
         return runner.run(main() if callable(main) else main)
 
 
@@ -86,8 +100,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     _scheduled: list[asyncio.TimerHandle]  # asyncio's heap of timers; when it polls, the first one is not cancelled
     _clock_resolution: float  # asyncio runs timers that are due this much later, too
 
-    def __init__(self, *, seed: int = 0) -> None:
+    def __init__(self, *, seed: int = 0, limit: float | None = None) -> None:
         super().__init__(_Selector(self._idle, self._turn))
+        self._end = _HORIZON if limit is None else min(limit, _HORIZON)  # s
+        self._looked = 0  # ns; when it was last seen whether there is more than what repeats itself
+        self._waited_for: dict[asyncio.Task[Any], object] | None = None  # what each task waited for then, if not
+        self._alive = self._alive_really = 0  # ns; since when nothing has changed in that, and the same in real time
         self.clock = VirtualClock()
         self.random = random.Random(seed)
         self.task_numbers = itertools.count(1)
@@ -183,19 +201,57 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         """Nothing is left to do at this instant: go on to the next timer, or say True: wait for a job in a thread."""
         if self._jobs:
             return True
-        when = self._scheduled[0].when() if self._scheduled else _HORIZON
-        if when >= _HORIZON:
-            raise Deadlock(self._who_waits())
-        self.clock.move_to(_nanoseconds(when))
+        timer = self._scheduled[0] if self._scheduled else None
+        if timer is None or timer.when() >= self._end:
+            self._give_up(timer is not None)
+        instant = _nanoseconds(timer.when())
+        if not _in_background(timer):
+            self._looked, self._waited_for = instant, None
+        elif instant - self._looked >= _LOOK:
+            self._look_for_life(instant)
+        self.clock.move_to(instant)
         return False
 
-    def _who_waits(self) -> str:
-        lines = ["virtual time stands still: nothing is scheduled that could wake a task"]
-        if self._scheduled:
-            lines = ["virtual time is over: the next timer is more than 48 days after the start"]
+    def _give_up(self, later: bool) -> NoReturn:
+        if not later:
+            raise Deadlock(self._who_waits("virtual time stands still: nothing is scheduled that could wake a task"))
+        if self._end == _HORIZON:
+            raise Deadlock(self._who_waits("virtual time is over: the next timer is more than 48 days after the start"))
+        text = f"virtual time is over: its limit of {self._end:g} s is reached"
+        self._end = min(self._end + _MOST_PATIENCE / _SECOND, _HORIZON)  # for clean-up
+        raise Deadlock(self._who_waits(text))
+
+    def _look_for_life(self, instant: int) -> None:
+        """Only what repeats itself has come for a while. Raise Deadlock if that has woken no task for long."""
+        before, waits = self._waited_for, {task: _future_of(task) for task in asyncio.all_tasks(self)}
+        self._looked, self._waited_for = instant, waits
+        if before is None or not _same(before, waits) or not all(_in_background(timer) for timer in self._scheduled):
+            self._alive, self._alive_really = instant, _REAL.monotonic()
+        elif instant - self._alive >= _MOST_PATIENCE or (
+            instant - self._alive >= _PATIENCE and _REAL.monotonic() - self._alive_really >= _REAL_PATIENCE
+        ):
+            repeated = "only announcements and the like go on, and wake no task"
+            raise Deadlock(self._who_waits(f"virtual time leads nowhere: {repeated}"))
+
+    def _who_waits(self, why: str) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=hash)
-        lines += [f"  {task.get_name()}: {_where(task.get_coro())}" for task in tasks]
-        return "\n".join(lines)
+        waiting = [(task.get_name(), _where(task.get_coro())) for task in tasks]
+        return "\n".join([why, *(f"  {name}: {place}" for name, place in waiting if not name.endswith(" guard"))])
+
+
+def _future_of(task: asyncio.Task[Any]) -> object:
+    """What the task waits for: another one each time that it has been woken."""
+    return task._fut_waiter  # type: ignore[attr-defined]  # noqa: SLF001 - asyncio's own
+
+
+def _same(before: dict[asyncio.Task[Any], object], now: dict[asyncio.Task[Any], object]) -> bool:
+    return before.keys() == now.keys() and all(before[task] is waits for task, waits in now.items())
+
+
+def _in_background(timer: asyncio.TimerHandle) -> bool:
+    """Whether it only repeats itself; what is cancelled comes to nothing."""
+    background = getattr(timer, "background", False)
+    return timer.cancelled() or bool(background() if callable(background) else background)
 
 
 class _Selector(selectors.DefaultSelector):
@@ -225,6 +281,8 @@ class _Timer(asyncio.TimerHandle):
     def __init__(self, when: float, number: int, callback: Any, args: Any, loop: VirtualLoop, context: Any) -> None:
         super().__init__(when, callback, args, loop, context)
         self.order = (when, number)
+        self.background: bool | Callable[[], bool] = False
+        """Set by `r2p.clock.in_background`."""
         self._scheduled = True  # how asyncio marks what is in its heap
 
     def __lt__(self, other: object) -> bool:
@@ -263,12 +321,21 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def _where(awaitable: object) -> str:
-    """The chain of calls in which a task waits, outermost first: `blink (app.py:12) > Queue.get (queues.py:158)`."""
-    steps = []
-    while isinstance(awaitable, Coroutine):
-        frame = getattr(awaitable, "cr_frame", None)
+    """The chain of calls in which a task waits, outermost first, and for which topic.
+
+    Such as `blink (app.py:12) > Subscriber.fetch (subscriber.py:166), topic leds`.
+    """
+    steps: list[str] = []
+    topic: object = ""
+    while awaitable is not None:
+        if type(awaitable).__name__ == "async_generator_asend":  # what `async for` waits for
+            awaitable = next((each for each in gc.get_referents(awaitable) if inspect.isasyncgen(each)), None)
+        kind = "ag" if inspect.isasyncgen(awaitable) else "cr"
+        frame = getattr(awaitable, f"{kind}_frame", None)
         if frame is not None:
             code = frame.f_code
             steps.append(f"{code.co_qualname} ({Path(code.co_filename).name}:{frame.f_lineno})")
-        awaitable = getattr(awaitable, "cr_await", None)
-    return " > ".join(steps) or "not started"
+            topic = getattr(frame.f_locals.get("self"), "topic", topic)
+        awaitable = getattr(awaitable, f"{kind}_await", None)
+    waits = " > ".join(steps) or "not started"
+    return f"{waits}, topic {topic}" if isinstance(topic, str) and topic else waits

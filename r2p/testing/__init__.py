@@ -7,7 +7,9 @@ Mark a test, a class or a module, and its `async def` tests run under virtual ti
         ...
         await asyncio.sleep(3600)       # takes no time
 
-`@pytest.mark.virtual_time(seed=7)` gives `r2p.clock.random_of()` another seed. An exception that nobody awaits, in a
+`@pytest.mark.virtual_time(seed=7)` gives `r2p.clock.random_of()` another seed. A test that can't go on fails within
+about a second with `r2p.Deadlock`, which lists what each task waits for; where nodes wake each other for ever, give it
+a `limit=` in seconds of virtual time. An exception that nobody awaits, in a
 callback or in a forgotten task, fails the test. Works with hypothesis, and next to the plugins of anyio and of
 pytest-asyncio.
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "virtual_time(*, seed=0): run this async test under virtual time (r2p.sim.run)")
+    text = "virtual_time(*, seed=0, limit=None): run this async test under virtual time (r2p.sim.run)"
+    config.addinivalue_line("markers", text)
 
 
 @pytest.fixture

@@ -139,7 +139,7 @@ class Link(abc.ABC):
         self._hub = hub
         self._space = hub.space
         self._clock = hub.space.clock
-        self._alarm = Alarm(hub.space.loop, self._poll)
+        self._alarm = Alarm(hub.space.loop, self._poll, background=True)
         self._outlets: dict[str, LinkOutlet] = {}
         self._intake: Inlets = Intake(self, hub.space.loop, self.stats)
         self._told: dict[str, Told] = {}

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from r2p.clock import random_of
+from r2p.clock import in_background, random_of
 from r2p.codecs.attachment import Clock
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
@@ -153,7 +153,7 @@ class MemoryNetwork:
         loop = asyncio.get_running_loop()
         self._in_flight += 1
         if delay:
-            loop.call_later(delay, self._arrive, address, frame)
+            in_background(loop.call_later(delay, self._arrive, address, frame))
         else:
             loop.call_soon(self._arrive, address, frame)
 

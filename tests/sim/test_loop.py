@@ -12,9 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import r2p
 import r2p.sim.loop
 from r2p.clock import clock_of, random_of
 from r2p.errors import Deadlock
+from r2p.msg import Led
 from r2p.sim import run
 
 if TYPE_CHECKING:
@@ -229,6 +231,88 @@ def test_a_deadlock_cleans_up() -> None:
 def test_time_has_an_end(delay: float) -> None:
     with pytest.raises(Deadlock, match="48 days"):
         run(asyncio.sleep(delay))
+
+
+async def robot() -> None:
+    """A test that can't go on: announcements, a periodic publisher and a time-out repeat themselves all the same."""
+    async with r2p.Module("A", via="memory:lab") as module, r2p.Module("B", via="memory:lab") as other:
+        node, reader = module.start(idle, name="pub"), other.start(idle, name="sub")
+        node.advertise("state", Led, r2p.Periodic(0.1, Led))
+        unread = reader.subscribe("state", Led, timeout=1.0)
+        await unread.wait_publisher()
+        async for _ in reader.subscribe("leds", Led):
+            raise AssertionError
+
+
+async def idle(_node: r2p.Node) -> None:
+    await forever()
+
+
+def test_what_only_repeats_itself_keeps_no_program_going() -> None:
+    with pytest.raises(Deadlock, match="leads nowhere") as caught:
+        run(robot)
+    lines = str(caught.value).splitlines()
+    assert lines[1].startswith("  Task-1: robot (test_loop.py:")
+    assert "> Subscriber._iterate (subscriber.py:" in lines[1]
+    assert lines[1].endswith(", topic leds")
+    assert not any("guard" in line for line in lines)
+
+
+def test_a_gateway_and_its_modules_keep_no_program_going() -> None:
+    async def main() -> None:
+        async with (
+            r2p.Module("GW", via=["memory:a", "memory:b"], bridge=True),
+            r2p.Module("A", via="memory:a") as module,
+            r2p.Module("B", via="memory:b"),
+        ):
+            module.start(idle)
+            await module.wait()
+
+    with pytest.raises(Deadlock, match=r"Module\.wait"):
+        run(main)
+
+
+def test_a_simulated_bus_keeps_no_program_going() -> None:
+    async def main() -> None:
+        async with r2p.Module("A", via="sim:lab") as module, r2p.Module("B", via="sim:lab"):
+            await module.start(idle).subscribe("leds", Led).wait_publisher()
+
+    with pytest.raises(Deadlock, match=r"wait_publisher .*, topic leds"):
+        run(main)
+
+
+def test_what_is_going_to_happen_some_day_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        async with r2p.Module("A", via="memory:lab") as module, r2p.Module("B", via="memory:lab"):
+            timed_out: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            module.start(idle).subscribe("a", Led, timeout=60, on_timeout=lambda: timed_out.set_result(None))
+            await timed_out
+            with pytest.raises(TimeoutError):
+                await module.nodes["idle"].node.subscribe("b", Led, timeout=60).fetch()
+            await asyncio.sleep(60)
+
+    monkeypatch.setattr("r2p.sim.loop._MOST_PATIENCE", 20 * SECOND)
+    run(main)
+
+
+def test_a_program_that_repeats_itself_has_the_time_of_its_limit() -> None:
+    async def repeat(node: r2p.Node) -> None:
+        async for _ in node.every(1.0):
+            pass
+
+    async def main() -> None:
+        async with r2p.Module("A", via=[]) as module:
+            module.start(repeat)
+            try:
+                await module.wait()
+            finally:
+                await asyncio.sleep(1.0)
+                ended.append(clock_of().monotonic())
+
+    ended: list[int] = []
+    with pytest.raises(Deadlock, match="its limit of 100 s is reached"):
+        run(main, limit=100)
+    assert ended == [100 * SECOND]  # its last second was the 99th
 
 
 def test_a_finished_job_wakes_nobody_else() -> None:

@@ -56,7 +56,7 @@ class Timeline:
         self.clock = clock_of(loop)
         self._events: list[Event] = []  # sorted: there are a few for each node, so few that a heap takes longer
         self._number = 0
-        self._alarm = Alarm(loop, self._run)
+        self._alarm = Alarm(loop, self._run, background=True)
         self._virtual = loop if isinstance(loop, VirtualLoop) and loop.clock.virtual else None
         self._running = False
         self._now = 0

@@ -30,7 +30,7 @@ class Plant:
         self._ticker: Ticker | None = None
 
     async def __aenter__(self) -> Self:
-        self._ticker = Ticker(asyncio.get_running_loop(), round(self.dt * _SECOND), self._tick)
+        self._ticker = Ticker(asyncio.get_running_loop(), round(self.dt * _SECOND), self._tick, background=True)
         self._ticker.start()
         return self
 

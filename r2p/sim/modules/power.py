@@ -53,7 +53,7 @@ class Powered:
     async def __aenter__(self) -> Self:
         self._loop = asyncio.get_running_loop()
         self._clock = clock_of(self._loop)
-        self._alarm = Alarm(self._loop, self._poll)
+        self._alarm = Alarm(self._loop, self._poll, background=True)
         self.reset()
         return self
 
