@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Self
 
 from r2p.clock import clock_of
 from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.durations import SHORTEST, seconds
 from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import Mailbox, Outcome
@@ -151,7 +152,11 @@ class BusMonitor:
             await self._arrived.wait()
 
     async def loads(self, period: float) -> AsyncIterator[BusLoad]:
-        """What the bus carried, every `period` seconds; by the time at which it did, also when this program is late."""
+        """What the bus carried, every `period` seconds; by the time at which it did, also when this program is late.
+
+        Raises MessageError for what is not a number of seconds.
+        """
+        seconds("the period of loads", period, least=SHORTEST)
         length = round(period * _SECOND)
         end = self._now()
         self._monitor.begin(end, length)
@@ -181,7 +186,11 @@ class BusMonitor:
         return late
 
     async def cycles(self, count: int, patience: float) -> bool:
-        """Watch so many whole cycles. False: there was no sync for `patience` seconds."""
+        """Watch so many whole cycles. False: there was no sync for `patience` seconds.
+
+        Raises MessageError for what is not a number of seconds.
+        """
+        seconds("the patience of cycles", patience, least=0.0)
         self._monitor.reset(self._now())
         while self._monitor.cycles < count:
             self._synced.clear()

@@ -5,14 +5,13 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import msgspec
 
+from r2p.durations import SHORTEST, seconds
 from r2p.errors import MessageError
 from r2p.messages import Message
 from r2p.sample import PublisherClass
-from r2p.topic import number, seconds
+from r2p.topic import number
 
 M = TypeVar("M", bound=Message)
-
-_SHORTEST = 1e-6  # s
 
 
 class Missed(msgspec.Struct, frozen=True):
@@ -80,15 +79,15 @@ def check_class(topic: str, klass: NonRealTime | Sporadic | Periodic[Any]) -> No
     """Raise MessageError for a class value without sense."""
     match klass:
         case NonRealTime():
-            seconds(topic, "stall", klass.stall, least=0.0)
+            seconds(f"topic {topic}: stall", klass.stall, least=0.0)
         case Sporadic():
-            seconds(topic, "deadline", klass.deadline, least=_SHORTEST)
+            seconds(f"topic {topic}: deadline", klass.deadline, least=SHORTEST)
             number(topic, "pending", klass.pending)
             if klass.late not in ("drop", "send"):
                 raise MessageError(f"topic {topic}: late is 'drop' or 'send', not {klass.late!r}")
         case Periodic():
-            seconds(topic, "period", klass.period, least=_SHORTEST)
-            seconds(topic, "lead", klass.lead, least=0.0)
+            seconds(f"topic {topic}: period", klass.period, least=SHORTEST)
+            seconds(f"topic {topic}: lead", klass.lead, least=0.0)
             if not callable(klass.fill):
                 raise MessageError(f"topic {topic}: fill is a function that gives the message, not {klass.fill!r}")
         case _:

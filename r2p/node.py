@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar, overload
 
 from r2p.classes import NonRealTime, Periodic, Sporadic, check_class
 from r2p.clock import Ticker
+from r2p.durations import SHORTEST, seconds, timeout_or_none
 from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.events import EventHub, ModuleEvent
 from r2p.messages import Message, layout
@@ -243,8 +244,10 @@ class Node:
         Callbacks run in this node's task, one at a time; a coroutine function is awaited. False also when one of the
         subscriptions has a time-out of its own, no `on_timeout`, and its time is up.
         A node of periodic publishers spins, too: their `fill` is called meanwhile.
-        Raises Error if there is neither: nothing would ever be called.
+        Raises Error if there is neither: nothing would ever be called; MessageError for a time-out that is not a number
+        of seconds.
         """
+        timeout_or_none("the time-out of spin", timeout)
         deadline = None if timeout is None else self._space.loop.time() + timeout
         while not await self._serve():
             try:
@@ -258,11 +261,15 @@ class Node:
         await pause()
         return True
 
-    async def every(self, period: float) -> AsyncIterator[Tick]:
+    def every(self, period: float) -> AsyncIterator[Tick]:
         """Tick each `period` seconds on absolute phase, first after one period; a slow body skips periods, counted.
 
-        Raises ValueError for a period under 1 us.
+        Raises MessageError at once for what is not a number of seconds, of 1e-6 or more.
         """
+        seconds("the period of every()", period, least=SHORTEST)
+        return self._tick(period)
+
+    async def _tick(self, period: float) -> AsyncIterator[Tick]:
         loop, clock = self._space.loop, self._space.clock
         waiter: asyncio.Future[None] | None = None
         due = skipped = 0

@@ -10,10 +10,11 @@ from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from r2p.clock import Alarm
+from r2p.durations import LONGEST, SHORTEST, seconds, timeout_or_none
 from r2p.errors import Closed, DecodeError, MessageError
 from r2p.messages import Layout
 from r2p.sample import Sample
-from r2p.topic import BURST, Owner, QueueSink, Topic, TopicSpace, number, pause, seconds
+from r2p.topic import BURST, Owner, QueueSink, Topic, TopicSpace, number, pause
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -26,7 +27,6 @@ Callback = Callable[[T], object]
 Keep = Literal["newest", "oldest"]
 
 _SECOND = 1_000_000_000
-_SHORTEST = 1e-6  # s
 
 
 def check_options(
@@ -42,7 +42,7 @@ def check_options(
         raise MessageError(f"topic {topic}: on_timeout is a function, called after a timeout= without messages")
     for option, value in (("max_age", max_age), ("timeout", timeout)):
         if value is not None:
-            seconds(topic, option, value, least=_SHORTEST)
+            seconds(f"topic {topic}: {option}", value, least=SHORTEST)
 
 
 class _GuardedQueue(deque[Sample]):
@@ -168,7 +168,12 @@ class Subscriber(Generic[T]):
                     break
 
     async def fetch(self, timeout: float | None = None) -> T:
-        """Wait for one message. Raises TimeoutError after `timeout` seconds, Closed if the subscription is closed."""
+        """Wait for one message. Raises TimeoutError after `timeout` seconds, Closed if the subscription is closed.
+
+        Raises MessageError for a time-out that is not a number of seconds.
+        """
+        if timeout is not None and (timeout.__class__ is not float or not timeout <= LONGEST):
+            timeout_or_none(f"topic {self.topic}: the time-out of fetch", timeout)
         if self.queue:
             await self._use_credit()
         message = self._next()

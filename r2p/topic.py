@@ -27,7 +27,6 @@ from r2p.sample import PublisherClass, Sample
 BURST = 16
 """Messages that publish() or an iteration handles before it lets the event loop run once."""
 
-_LONGEST = 1e9  # s
 _NRT = PublisherClass.NON_REAL_TIME
 
 PATIENCE = 4
@@ -391,12 +390,6 @@ def number(topic: str, option: str, value: object) -> None:
     """Raise MessageError for what is no number of messages."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise MessageError(f"topic {topic}: {option} is a number of messages, 1 or more, not {value!r}")
-
-
-def seconds(topic: str, option: str, value: object, *, least: float) -> None:
-    """Raise MessageError for what is no duration that a clock can count."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= _LONGEST:
-        raise MessageError(f"topic {topic}: {option} is in seconds, {least:g} to {_LONGEST:g}, not {value!r}")
 
 
 class TopicSpace:

@@ -8,6 +8,7 @@ from typing import Generic, NoReturn, TypeVar
 from msgspec import structs
 
 from r2p.classes import Missed, Signal
+from r2p.durations import timeout_or_none
 from r2p.errors import Closed, MessageError
 from r2p.messages import Layout, Message
 from r2p.room import LINK_DOWN, Sink
@@ -88,8 +89,10 @@ class BasePublisher(Generic[M]):
     async def ready(self, timeout: float | None = None) -> None:
         """Wait until every link that is up has admitted the topic.
 
-        Raises TimeoutError after `timeout` seconds. Links that give best effort admit at once.
+        Raises TimeoutError after `timeout` seconds, and MessageError for a time-out that is not a number of seconds.
+        Links that give best effort admit at once.
         """
+        timeout_or_none(f"topic {self.topic}: the time-out of ready", timeout)
         async with asyncio.timeout(timeout):
             for link in list(self._space.links):
                 await link.admission(self.topic)

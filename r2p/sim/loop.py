@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
 from r2p.clock import SystemClock
+from r2p.durations import timeout_or_none
 from r2p.errors import Deadlock
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def run(
     going: Deadlock comes when it has woken no task for half a second of real time and 20 seconds of virtual time. Where
     nodes talk to each other for ever, only `limit` ends that: Deadlock comes after so many seconds of virtual time.
     """
+    timeout_or_none("the limit", limit)
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed=seed, limit=limit)) as runner:
         return runner.run(main() if callable(main) else main)
 

@@ -6,13 +6,13 @@ packages add theirs through the entry-point group `r2p.transports`.
 
 import difflib
 import importlib
-import math
 import re
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import msgspec
 
+from r2p.durations import duration as duration  # for the options of URLs
 from r2p.errors import TransportError
 from r2p.transports.link import Transport
 
@@ -36,7 +36,6 @@ GROUP = "r2p.transports"
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")
 _CLOSE = 0.65  # how much of a name must be right (difflib): of can and rtcan it is 0.75
-_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
 
 
 class Url(msgspec.Struct, frozen=True):
@@ -96,17 +95,6 @@ def open_transport(text: str) -> Transport:
 def schemes() -> list[str]:
     """All schemes that can be used, the ones of other packages included."""
     return sorted({*BUILT_IN, *(entry.name for entry in _added())})
-
-
-def duration(text: str) -> float:
-    """Seconds from "10ms", "20us", "1.5s" or "1.5"."""
-    match = re.fullmatch(r"([0-9.eE+-]+)\s*(ns|us|ms|s|)", text.strip())
-    if match is None:
-        raise ValueError(f"{text!r} is no duration: use 10ms, 20us or seconds")
-    seconds = float(match[1]) * _UNITS[match[2]]
-    if not 0.0 <= seconds < math.inf:
-        raise ValueError(f"{text!r} is no duration: it can't be negative or endless")
-    return seconds
 
 
 def _factory(url: Url) -> Callable[[Url], Transport]:

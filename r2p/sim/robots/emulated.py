@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from r2p.bridge import BridgeOptions
+from r2p.durations import timeout_or_none
 from r2p.msg import Speed3
 from r2p.publishers import AnyPublisher
 from r2p.sim.modules.board import Board
@@ -148,8 +149,9 @@ class Triskar2:
     async def ready(self, timeout: float | None = None) -> None:
         """Wait until its network has admitted all that its modules publish, and has settled (who is RTCAN's master?).
 
-        Raises TimeoutError after `timeout` seconds.
+        Raises TimeoutError after `timeout` seconds, and MessageError for a time-out that is not a number of seconds.
         """
+        timeout_or_none("the time-out of ready", timeout)
         time = asyncio.get_running_loop().time
         async with asyncio.timeout(timeout):
             since = time()
