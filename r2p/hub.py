@@ -12,6 +12,7 @@ from r2p.bridge import Bridge, BridgeOptions, Standby
 from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY
 from r2p.errors import Error
 from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
+from r2p.logs import LineLimit
 from r2p.network import describe_mismatch
 from r2p.printable import get_logger
 from r2p.protocols.events import (
@@ -78,6 +79,7 @@ class ModuleHub:
         self._suspected: set[str] = set()
         self._ordered: dict[tuple[Command, str], int] = {}
         self._mismatches: dict[tuple[str, str], int] = {}
+        self._limits: dict[Link, LineLimit] = {}
         self._refused: dict[str, tuple[int, int]] = {}
         space.changed = self._topic_changed
         if bridging is not None:
@@ -112,6 +114,7 @@ class ModuleHub:
     def attach(self, link: Link) -> None:
         """A transport has a link, up or not yet."""
         self.links.append(link)
+        self._limits[link] = LineLimit()
         self.space.links.append(link)
         self._joints.attach(link)
         for topic in list(self.space.topics.values()):
@@ -123,6 +126,7 @@ class ModuleHub:
         self.links.remove(link)
         self.space.links.remove(link)
         self._joints.detach(link)
+        del self._limits[link]
         self.closed_links.add(link.stats, link.losses)
 
     def link_waits(self, link: Link, reason: str) -> None:
@@ -200,7 +204,8 @@ class ModuleHub:
             case ConnectionDenied():
                 self._connection_denied(link, event)
             case NameConflict():
-                logger.error("link %s: two modules carry the name %s: rename one (--module)", link.title, event.module)
+                text = f"two modules carry the name {event.module}: rename one (--module)"
+                self._log_limited(link, logging.ERROR, "names", text)
                 self._events.tell(event)
             case Echoes():
                 logger.error("link %s gives back what we send: switch off local echo at the other end", link.title)
@@ -218,6 +223,12 @@ class ModuleHub:
             text = f"gateway {event.gateway} does not let {what} through: {reason}"
             self.link_notice(link, f"{event.command.name} denied", text, trouble=True)
 
+    def _log_limited(self, link: Link, level: int, kind: str, text: str) -> None:
+        """What the other end can make happen any number of times a second."""
+        more = self._limits[link].suffix(kind, self.space.clock.monotonic()) if link in self._limits else ""
+        if more is not None:
+            logger.log(level, "link %s: %s%s", link.title, text, more)
+
     def _log_mismatch(self, link: Link, event: Mismatched) -> None:
         """At most once a second: another type in each message would fill the log."""
         now = self.space.clock.monotonic()
@@ -231,7 +242,7 @@ class ModuleHub:
         if link.up and not info.observer and not info.hops:
             silence = f": nothing heard of it for {info.lease / 1e9:.0f} s; does it hang?" if event.silent else ""
             level = logging.WARNING if event.silent else logging.INFO
-            logger.log(level, "link %s: module %s is gone%s", link.title, info.name, silence)
+            self._log_limited(link, level, "gone", f"module {info.name} is gone{silence}")
         self._events.tell(event)
 
     # Names

@@ -21,6 +21,24 @@ _SECOND = 1_000_000_000
 _TEXT = 128
 
 
+class LineLimit:
+    """At most RATE lines a second of one kind; the next one after them says how many were left out."""
+
+    RATE = 10
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, tuple[int, int]] = {}  # when it began, and how many lines there would have been
+
+    def suffix(self, kind: str, now: int) -> str | None:
+        """What to append to one more line (monotonic `now` in ns); None: leave it out."""
+        began, count = self._seconds.get(kind, (now - _SECOND, 0))
+        if now - began >= _SECOND:
+            self._seconds[kind] = now, 1
+            return f" ({count - self.RATE} more since the last such line)" if count > self.RATE else ""
+        self._seconds[kind] = began, count + 1
+        return "" if count < self.RATE else None
+
+
 class LogTopic:
     """Publishes log records; those beyond the rate are counted in `suppressed`, and the next one says so."""
 

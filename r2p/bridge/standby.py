@@ -143,8 +143,7 @@ class Standby:
         """Discovery may have learnt who is at the other end, or how long messages are of which we did not know it."""
         if port.link.lone and port.link.discovery.generation != port.generation:
             port.generation = port.link.discovery.generation
-            ends = [info.instance for info in port.link.discovery.modules.values() if info.r2p and not info.hops]
-            self.homes.ended(self._now(), port.number, ends[0] if len(ends) == 1 else None)
+            self.homes.ended(self._now(), port.number, port.link.discovery.end)
             self._act()
         if len(self._used[_ALL]) == len(self.homes.by_number):
             return

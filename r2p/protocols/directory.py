@@ -90,7 +90,10 @@ class Directory:
         """Another number means that modules or endpoints have changed."""
         self._timers = timers
         self._counts = counts
+        self.ends: dict[str, int] = {}
+        """The instances of the r2p modules on the link itself, not behind a gateway."""
         self._names: dict[int, str] = {}
+        self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._starts: dict[str, _Starts] = {}
 
     @property
@@ -133,6 +136,10 @@ class Directory:
         forgotten = self._put(self.modules, info.name, info, "modules forgotten")
         if info.instance is not None:
             self._names[info.instance] = info.name
+        if info.instance is not None and not info.hops:
+            self.ends[info.name] = info.instance
+        else:
+            self.ends.pop(info.name, None)
         if forgotten is not None:
             self._forget(forgotten)
         return forgotten
@@ -194,8 +201,9 @@ class Directory:
         info = EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
         self.generation += self.endpoints.get(key) != info
         old = self._put(self.endpoints, key, info, "endpoints forgotten")
+        self._endpoints_of.setdefault(message.instance, {})[key] = None
         if old is not None:
-            self._timers.clear(("endpoint", (old.instance, old.node, old.topic, old.role)))
+            self._drop_endpoint((old.instance, old.node, old.topic, old.role))
         known = self.modules.get(module)
         if known is None:  # a stranger, who may never say hello
             self._timers.set(("endpoint", key), now + LEASE)
@@ -205,8 +213,17 @@ class Directory:
             self._timers.clear(("endpoint", key))
 
     def forget_endpoint(self, key: EndpointKey) -> None:
+        if self.endpoints.pop(key, None) is not None:
+            self.generation += 1
+            self._drop_endpoint(key)
+
+    def _drop_endpoint(self, key: EndpointKey) -> None:
+        """It is not in the table any more."""
         self._timers.clear(("endpoint", key))
-        self.generation += self.endpoints.pop(key, None) is not None
+        keys = self._endpoints_of[key[0]]
+        del keys[key]
+        if not keys:
+            del self._endpoints_of[key[0]]
 
     def forget_endpoints(self) -> None:
         for key in list(self.endpoints):
@@ -224,12 +241,13 @@ class Directory:
 
     def _forget(self, info: ModuleInfo) -> None:
         self._starts.pop(info.name, None)
+        self.ends.pop(info.name, None)
         if info.instance is not None:
             self._forget_instance(info.instance)
 
     def _forget_instance(self, instance: int) -> None:
         self._names.pop(instance, None)
-        for key in [key for key in self.endpoints if key[0] == instance]:
+        for key in list(self._endpoints_of.get(instance, ())):
             self.forget_endpoint(key)
 
 

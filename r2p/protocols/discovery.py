@@ -159,6 +159,12 @@ class Discovery:
         return self._directory.endpoints
 
     @property
+    def end(self) -> int | None:
+        """The instance of the one r2p module on the link itself; None if there is none, or more than one."""
+        ends = self._directory.ends
+        return next(iter(ends.values())) if len(ends) == 1 else None
+
+    @property
     def generation(self) -> int:
         """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
         return self._directory.generation

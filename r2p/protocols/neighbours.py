@@ -18,6 +18,8 @@ from r2p.protocols.schedule import Schedule, Timers
 _SECOND = 1_000_000_000
 _TELL_AGAIN = 5 * _SECOND
 """Conflicts and echoes are told at most this often."""
+_TOLD = 64
+"""... and of so many names at a time."""
 _ECHO_MEMORY = 10 * _SECOND
 """A line that echoed is expected to do so for this long."""
 _SWAPS = 3
@@ -182,7 +184,11 @@ class Neighbours:
     def _may_tell(self, now: int, what: str) -> bool:
         if now < self._silent_until.get(what, now):
             return False
-        self._silent_until = {each: until for each, until in self._silent_until.items() if until > now}
+        if len(self._silent_until) >= _TOLD:
+            self._silent_until = {each: until for each, until in self._silent_until.items() if until > now}
+            if len(self._silent_until) >= _TOLD:
+                self._counts["conflicts not told"] += 1
+                return False
         self._silent_until[what] = now + _TELL_AGAIN
         return True
 

@@ -45,7 +45,7 @@ class Peer(msgspec.Struct, eq=False):
     def meet(self, now: int, info: ModuleInfo) -> None:
         """The HELLO of an r2p module at this address."""
         lease = None if info.lease >= FOR_EVER else info.lease
-        shared = bool(self.direct - {info.name})
+        shared = len(self.direct) > (info.name in self.direct)
         if shared and lease is not None:  # the longest lease counts, and that only ends with them all
             lease = max(lease, self.lease) if self.lease is not None else None
         self.lease = lease

@@ -86,6 +86,11 @@ class Presence:
         return self._census.endpoints
 
     @property
+    def end(self) -> int | None:
+        """None: there may always be more than one module."""
+        return None
+
+    @property
     def generation(self) -> int:
         """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
         return self._census.generation

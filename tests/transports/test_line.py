@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -514,3 +515,26 @@ async def test_a_line_whose_reading_raises_does_not_stop_the_others(monkeypatch:
         script.hear(lines[-5:])
         assert [sample.data for sample in subscriber._sink.queue] == [b"0", b"2", b"3", b"4"]
         assert script.link.losses == {"internal error": 1}
+
+
+async def test_a_flood_of_modules_that_come_and_go_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "r2p")
+    async with scripted() as (script, module, _):
+        for second in range(2):
+            for number in range(1000):
+                script.hear(manage(m.Hello(f"M{number}", number + 1, 0, 0, 5000)))
+                script.hear(manage(m.Hello(f"M{number}", number + 1, m.HELLO_LEAVING, 0, 5000)))
+            assert caplog.text.count("is gone") == 10 * (second + 1)
+            await asyncio.sleep(1)
+        assert "module M0 is gone (990 more since the last such line)" in caplog.text
+        assert not script.link.discovery.modules
+        assert len(module.links) == 1
+
+
+async def test_a_flood_of_conflicts_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    async with scripted() as (script, _, __):
+        for number in range(200):
+            for swap in range(8):
+                script.hear(manage(m.Hello(f"M{number}", 2 * number + swap % 2 + 1, 0, 0, 5000)))
+        assert caplog.text.count("two modules carry the name") == 10
+        assert script.link.losses["conflicts not told"] >= 136
