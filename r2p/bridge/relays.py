@@ -23,7 +23,11 @@ from r2p.transports.losses import internal_error_of
 
 logger = get_logger("r2p.bridge")
 
-_NAME = re.compile(r"[A-Za-z0-9_/]+")
+_NAME = re.compile(r"[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)?")
+LONG_NAMES = 64
+"""Names too long for a link that are remembered, so that each is told once; beyond that one a second is told."""
+
+_SECOND = 1_000_000_000
 _BUSES = frozenset({"rtcan", "sim"})
 
 
@@ -38,7 +42,8 @@ class Relays:
         self._dirty: dict[str, None] = {}
         self._reviewing = False
         self._shapes: dict[tuple[str, str], tuple[Shape, Shape]] = {}
-        self._too_long: set[str] = set()
+        self._too_long: dict[str, None] = {}
+        self._told_at = 0
 
     # What has changed
 
@@ -194,12 +199,22 @@ class Relays:
     def _carries(self, topic: str, port: BridgePort) -> bool:
         """Whether the topic's name fits there."""
         name = self._policy.called(topic, port.name)
+        if not _NAME.fullmatch(name):
+            return False  # a namespace within that of a prefix
         if len(name) <= port.link.longest_name:
             return True
         if name not in self._too_long:
-            self._too_long.add(name)
-            logger.warning("link %s carries no name as long as %s: the topic is not relayed there", port.name, name)
+            self._tell_too_long(name, port)
         return False
+
+    def _tell_too_long(self, name: str, port: BridgePort) -> None:
+        now = self._space.clock.monotonic()
+        if len(self._too_long) < LONG_NAMES or now >= self._told_at + _SECOND:
+            self._told_at = now
+            logger.warning("link %s carries no name as long as %s: the topic is not relayed there", port.name, name)
+        if len(self._too_long) >= LONG_NAMES:
+            del self._too_long[next(iter(self._too_long))]
+        self._too_long[name] = None
 
     def _shaper(self, topic: str, source: str, target: BridgePort) -> Shaper | None:
         policy = self._policy

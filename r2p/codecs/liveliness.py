@@ -5,8 +5,8 @@
 
 The first part is the version. `SESSION` is the instance of the r2p module that declares the token, in hex; `INSTANCE`
 is that of the module concerned, another one where `HOPS` (gateways in between) is not 0, and `-` for firmware. `-`
-stands also for a node or a fingerprint that is not known; `%` for the slash of a topic in a namespace. Tokens of
-another version mean nothing to us.
+stands also for a node or a fingerprint that is not known; `%` for the slash of a topic in a namespace. `SIZE` is that
+of a message, so 1024 at most. Tokens of another version mean nothing to us.
 """
 
 import re
@@ -16,6 +16,7 @@ import msgspec
 from r2p.codecs import UnknownType
 from r2p.codecs.management import ANY_TYPE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
+from r2p.messages import SIZE_MAX
 
 VERSION = "1"
 
@@ -27,6 +28,9 @@ _TOPIC = re.compile(
     r"/([0-9]{1,3})/([0-9]{1,6})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
 )
 _OBSERVER = 0x80
+FLAGS = 0x7F
+"""The flags of ALIVE for which there is a place."""
+
 _ROLES = {"pub": ROLE_PUBLISHES, "sub": ROLE_SUBSCRIBES}
 _ROLE_NAMES = {role: name for name, role in _ROLES.items()}
 
@@ -89,7 +93,7 @@ def decode(key: str) -> Token:
         return ModuleToken(
             int(session, 16), name, _instance(instance), bits & ~_OBSERVER, bool(bits & _OBSERVER), int(hops)
         )
-    if found := _TOPIC.fullmatch(rest):
+    if (found := _TOPIC.fullmatch(rest)) and int(found[7]) <= SIZE_MAX:
         session, role, topic, instance, node, publisher_class, size, fingerprint, window, hops = found.groups()
         return TopicToken(
             int(session, 16),
@@ -104,6 +108,16 @@ def decode(key: str) -> Token:
             int(hops),
         )
     raise DecodeError(f"{key[:80]!r} is no token")
+
+
+def is_carried(token: Token) -> bool:
+    """Whether the key says what the token says. Names that came in by another link may hold what means something else
+    in a key, or in a key expression of zenoh, such as `/` and `*`.
+    """
+    try:
+        return decode(encode(token)) == token
+    except DecodeError:
+        return False
 
 
 def is_module(key: str) -> bool:

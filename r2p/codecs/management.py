@@ -27,6 +27,7 @@ Gateways agree on their tree (`r2p.protocols.bridging`) with three more, which s
 
 import msgspec
 
+from r2p.codecs import UnknownType
 from r2p.codecs._records import Codec, Record
 from r2p.errors import MessageError
 
@@ -46,6 +47,7 @@ HELLO_LEAVING = 4
 ROLE_PUBLISHES = 1
 ROLE_SUBSCRIBES = 2
 ROLE_GONE = 128  # added to an Endpoint's role: withdrawn
+_ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
 
 # Endpoint.publisher_class
 CLASS_NONE = 0
@@ -410,5 +412,10 @@ def encode(message: Management) -> bytes:
 
 
 def decode(data: bytes) -> Management:
-    """The message in these 32 bytes. Raises `UnknownType` for a type or version to ignore, else `DecodeError`."""
-    return _CODEC.decode(data)
+    """The message in these 32 bytes. Raises `UnknownType` for a type, role or version to ignore, else `DecodeError`."""
+    message = _CODEC.decode(data)
+    if isinstance(message, TypeInfo | Endpoint):
+        gone = ROLE_GONE if isinstance(message, Endpoint) else 0
+        if message.role & ~gone not in _ROLES:
+            raise UnknownType(f"role {message.role} of {type(message).__name__}")
+    return message

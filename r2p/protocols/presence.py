@@ -157,18 +157,27 @@ class Presence:
                 before = self._own.relayed(("module", name))
                 if isinstance(before, ModuleToken):
                     token = msgspec.structs.replace(token, flags=before.flags)
-                self._own.relay(("module", name), None if flags & management.HELLO_LEAVING else token)
+                self._relay(("module", name), token, gone=bool(flags & management.HELLO_LEAVING))
             case management.Alive(name, flags):
                 known = self._own.relayed(("module", name))
                 if isinstance(known, ModuleToken):
-                    self._own.relay(("module", name), msgspec.structs.replace(known, flags=flags))
+                    token = msgspec.structs.replace(known, flags=flags & liveliness.FLAGS)
+                    self._relay(("module", name), token, gone=False)
                 else:
                     self._say(message)
             case management.Endpoint(role, instance, node, topic, publisher_class):
                 key = (instance, node, topic, role & ~management.ROLE_GONE)
                 endpoint = TopicToken(self._instance, key[3], topic, instance, node, publisher_class, hops=1)
-                self._own.relay(key, None if role & management.ROLE_GONE else endpoint)
+                self._relay(key, endpoint, gone=bool(role & management.ROLE_GONE))
         return self._take()
+
+    def _relay(self, key: tuple[str | int, ...], token: liveliness.Token, *, gone: bool) -> None:
+        if gone:
+            self._own.relay(key, None)
+        elif liveliness.is_carried(token):
+            self._own.relay(key, token)
+        else:
+            self.counts["name not carried"] += 1
 
     # What a person or the shell wants
 

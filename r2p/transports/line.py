@@ -107,7 +107,7 @@ class LineLink(Link):
         super().__init__(name, hub, management_rate=management_rate)
         self._reader = debug.Reader(self.stats.lost)
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
-        self._sources = Sources(self.discovery, name)
+        self._sources = Sources(self.discovery, self.name)
         self._carrier: Carrier | None = None
         self._urgent: deque[bytes] = deque()
         self._management: deque[bytes] = deque()

@@ -126,7 +126,7 @@ class Link(abc.ABC):
     """Whether it has only one other end."""
 
     def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: Door | None = None) -> None:
-        self.name = _unlike(name, {each.name for each in hub.space.links})
+        self.name = name = unique_name(name, hub)
         self.title = self.name.removesuffix(":")
         """The name as it stands in texts."""
         self.up = False
@@ -433,8 +433,9 @@ def is_booting(link: Link, module: str) -> bool:
     return info is not None and bool(info.flags & FLAG_BOOT)
 
 
-def _unlike(name: str, taken: set[str]) -> str:
-    """A name that tells two links apart that lead to the same place."""
+def unique_name(name: str, hub: Hub) -> str:
+    """A name that tells links apart that lead to the same place. All that a link makes calls it by this one."""
+    taken = {each.name for each in hub.space.links}
     names = itertools.chain((name,), (f"{name}#{n}" for n in itertools.count(2)))
     return next(each for each in names if each not in taken)
 

@@ -40,6 +40,7 @@ TOKENS = st.one_of(
 def test_what_is_encoded_is_decoded(token: liveliness.Token) -> None:
     key = liveliness.encode(token)
     assert liveliness.decode(key) == token
+    assert liveliness.is_carried(token)
     assert not set(key) & set("*$#?")  # what zenoh keeps for itself
 
 
@@ -65,6 +66,8 @@ def test_keys_as_people_see_them() -> None:
         "1/ab/pub/le ds/ab/blink/1/5/-/0/0",
         "1/ab/both/leds/ab/blink/1/5/-/0/0",
         "1/ab/pub/leds/ab/blink/1/-5/-/0/0",
+        "1/ab/pub/leds/ab/blink/1/1025/-/0/0",
+        "1/ab/sub/leds/ab/blink/1/100000/-/0/0",
         "1/ab/module/PC\n/ab/0/0",
     ],
 )
@@ -86,3 +89,19 @@ def test_any_text_is_a_token_or_counted(key: str) -> None:
 def test_another_version_is_left_alone() -> None:
     with pytest.raises(UnknownType, match="version 2"):
         liveliness.decode("2/ab/module/PC1/ab/0/0")
+
+
+@pytest.mark.parametrize("name", ["a#b", "a*b", "a//b", "$*", "a/b", "a-b", "a%b", "-", " ", "a?b", "123456789"])
+def test_names_that_no_key_carries(name: str) -> None:
+    assert not liveliness.is_carried(ModuleToken(7, name, 7))
+    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, name))
+
+
+@pytest.mark.parametrize("topic", ["a#b", "a*b", "a//b", "$*", "a/b/c", "/a", "a-b", "a%b", "-", "a" * 17])
+def test_topics_that_no_key_carries(topic: str) -> None:
+    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, topic, 7))
+
+
+def test_sizes_and_hops_that_no_key_carries() -> None:
+    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, size=1025))
+    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, hops=100))

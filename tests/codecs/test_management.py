@@ -152,12 +152,13 @@ def test_any_bytes_decode_or_raise_decode_error(body: bytes, code: int) -> None:
 
 names = st.text(st.characters(min_codepoint=33, max_codepoint=126), min_size=1, max_size=7)
 u8, u16, u32 = (st.integers(0, (1 << bits) - 1) for bits in (8, 16, 32))
+roles = st.sampled_from([m.ROLE_PUBLISHES, m.ROLE_SUBSCRIBES])
 messages: st.SearchStrategy[m.Management] = st.one_of(
     st.builds(m.Alive, names, u8),
     st.builds(m.SubscribeRequest, names, u16, st.integers(1, 0xFFFF), st.binary(min_size=10, max_size=10)),
     st.builds(m.Hello, names, u32, u8, u8, u16),
-    st.builds(m.TypeInfo, u8, names, st.binary(min_size=8, max_size=8), u16),
-    st.builds(m.Endpoint, u8, u32, st.just("") | names, names, u8),
+    st.builds(m.TypeInfo, roles, names, st.binary(min_size=8, max_size=8), u16),
+    st.builds(m.Endpoint, roles | roles.map(lambda role: role | m.ROLE_GONE), u32, st.just("") | names, names, u8),
     st.builds(m.Conflict, names, u32, u32),
 )
 
@@ -167,3 +168,17 @@ def test_what_is_encoded_decodes(message: m.Management) -> None:
     data = m.encode(message)
     assert len(data) == m.SIZE
     assert m.decode(data) == message
+
+
+@pytest.mark.parametrize("role", [0, 3, 4, 127, 128, 131, 255])
+def test_roles_to_ignore(role: int) -> None:
+    for message in (m.Endpoint(role, 7, "n", "leds"), m.TypeInfo(role, "leds", m.ANY_TYPE, 5)):
+        with pytest.raises(UnknownType, match=f"role {role} of"):
+            m.decode(m.encode(message))
+
+
+def test_an_endpoint_that_is_gone_has_its_role() -> None:
+    message = m.Endpoint(m.ROLE_SUBSCRIBES | m.ROLE_GONE, 7, "n", "leds")
+    assert m.decode(m.encode(message)) == message
+    with pytest.raises(UnknownType):
+        m.decode(m.encode(m.TypeInfo(m.ROLE_SUBSCRIBES | m.ROLE_GONE, "leds", m.ANY_TYPE, 5)))

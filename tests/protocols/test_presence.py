@@ -437,3 +437,20 @@ def test_any_order_of_tokens_leaves_what_is_there(steps: list[tuple[int, bool]])
     assert not a.modules
     assert not a.topics
     assert not a.endpoints
+
+
+@pytest.mark.parametrize("name", ["a#b", "a*b", "a//b", "$*", "a/b"])
+def test_names_behind_a_gateway_that_no_token_carries(name: str) -> None:
+    """They are counted, and the others are told as ever."""
+    gateway = Presence("GW", 1)
+    gateway.link_up(0)
+    for message in (
+        management.Hello(name, 98, 0, 1),
+        management.Endpoint(ROLE_PUBLISHES, 98, name, "tilt"),
+        management.Endpoint(ROLE_PUBLISHES, 98, "imu", f"{name}*"),
+        management.Hello("ROBOT", 99, 0, 1),
+        management.Alive("ROBOT", 0xFF),
+    ):
+        gateway.relay(0, message)
+    assert gateway.poll(0) == [Declare("1/1/module/ROBOT/63/7f/1")]
+    assert gateway.counts == {"name not carried": 3}

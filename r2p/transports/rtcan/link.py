@@ -36,7 +36,7 @@ from r2p.protocols.rtcan.settings import Settings
 from r2p.protocols.rtcan.topics import HighBytes
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Topic
-from r2p.transports.link import Hub, Link
+from r2p.transports.link import Hub, Link, unique_name
 from r2p.transports.rtcan import origins
 from r2p.transports.rtcan.arrivals import Arrived, Samples
 from r2p.transports.rtcan.departures import Departures, Response
@@ -59,6 +59,7 @@ class RtcanLink(Link):
     longest: ClassVar[int] = rtcan.PAYLOAD_MAX
 
     def __init__(self, name: str, hub: Hub, port: CanPort, settings: Settings, utc_error: int | None = None) -> None:
+        name = unique_name(name, hub)
         discovery = discovery_on(hub, name)
         super().__init__(name, hub, discovery=discovery)
         self._paced = discovery

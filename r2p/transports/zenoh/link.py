@@ -24,7 +24,7 @@ from r2p.protocols.presence import Presence
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Topic
 from r2p.transports.announce import NOTHING
-from r2p.transports.link import Hub, Link
+from r2p.transports.link import Hub, Link, unique_name
 from r2p.transports.losses import Losses
 from r2p.transports.zenoh.burst import Burst
 from r2p.transports.zenoh.credits import Credits
@@ -73,6 +73,7 @@ class ZenohLink(Link):
         """What all keys of the network begin with."""
         self._connects = connects
         self.instance = hub.instance
+        name = unique_name(name, hub)
         presence = Presence(hub.space.module, hub.instance, observer=hub.observer, counts=Losses(name, hub.space.clock))
         super().__init__(name, hub, discovery=presence)
         self._presence = presence
