@@ -7,6 +7,10 @@ The first part is the version. `SESSION` is the instance of the r2p module that 
 is that of the module concerned, another one where `HOPS` (gateways in between) is not 0, and `-` for firmware. `-`
 stands also for a node or a fingerprint that is not known; `%` for the slash of a topic in a namespace. `SIZE` is that
 of a message, so 1024 at most. Tokens of another version mean nothing to us.
+
+In front of each token stands `live/*`, or `live`, behind the name of the network. zenoh gives each key that it passes
+on a number at every session that hears of it, up to its first wildcard, and keeps that for as long as the session
+lives: so a key without one would stay in the memory of every router, for each module that has ever been there.
 """
 
 import re
@@ -19,6 +23,11 @@ from r2p.errors import DecodeError
 from r2p.messages import SIZE_MAX
 
 VERSION = "1"
+
+PLACE = "live"
+"""What tokens are watched under."""
+
+_WILD = "*/"
 
 _NONE = "-"
 _HEX32 = r"[0-9a-f]{1,8}"
@@ -118,6 +127,16 @@ def is_carried(token: Token) -> bool:
         return decode(encode(token)) == token
     except DecodeError:
         return False
+
+
+def place(token: str) -> str:
+    """The key under which a token is declared."""
+    return f"{PLACE}/{_WILD}{token}"
+
+
+def token_at(place: str) -> str:
+    """The token of a key under PLACE."""
+    return place.removeprefix(_WILD)
 
 
 def is_module(key: str) -> bool:

@@ -105,3 +105,10 @@ def test_topics_that_no_key_carries(topic: str) -> None:
 def test_sizes_and_hops_that_no_key_carries() -> None:
     assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, size=1025))
     assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, hops=100))
+
+
+def test_keys_have_a_wildcard_so_that_zenoh_forgets_them_and_may_lack_it() -> None:
+    token = liveliness.encode(ModuleToken(1, "PC1", 1))
+    assert liveliness.place(token) == f"live/*/{token}"
+    assert liveliness.token_at(liveliness.place(token).removeprefix("live/")) == token
+    assert liveliness.token_at(token) == token

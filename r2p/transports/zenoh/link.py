@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from r2p.codecs import schemas
+from r2p.codecs import liveliness, schemas
 from r2p.codecs.attachment import Credit, encode_credit
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
@@ -111,7 +111,7 @@ class ZenohLink(Link):
         if not self._connects:
             self.went_up()
         session.watch(self._funnel(self._transport_changed))
-        session.watch_tokens(f"{self.prefix}/live", self._funnel(self._token_changed))
+        session.watch_tokens(f"{self.prefix}/{liveliness.PLACE}", self._funnel(self._token_changed))
         session.listen(f"{self.prefix}/control/*", self._funnel(self._controlled))
         session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema, functools.partial(self._funnel, most=_QUERIES))
         self.credits.connect(session, f"{self.prefix}/credit/{hexed}")
@@ -207,10 +207,10 @@ class ZenohLink(Link):
         match event:
             case Declare(key):
                 if self._session is not None:
-                    self._session.declare(f"{self.prefix}/live/{key}")
+                    self._session.declare(f"{self.prefix}/{liveliness.place(key)}")
             case Undeclare(key):
                 if self._session is not None:
-                    self._session.undeclare(f"{self.prefix}/live/{key}")
+                    self._session.undeclare(f"{self.prefix}/{liveliness.place(key)}")
             case Joined(topic, _, window, int(session)):
                 self._welcome(topic, session, window)
             case Parted(topic, int(session)):

@@ -182,7 +182,8 @@ class Session:
         start = len(prefix) + 1
 
         def changed(sample: zenoh.Sample) -> None:
-            funnel.put((str(sample.key_expr)[start:], sample.kind == zenoh.SampleKind.PUT))
+            token = liveliness.token_at(str(sample.key_expr)[start:])
+            funnel.put((token, sample.kind == zenoh.SampleKind.PUT))
 
         tokens: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
@@ -295,17 +296,18 @@ class Session:
     async def networks(self, *, tools: bool) -> set[str]:
         """The names of the r2p networks on which there are modules, or else a publisher, or else `tools` that look."""
 
-        def tokens(kind: str) -> list[list[str]]:
+        def tokens(kind: str) -> list[tuple[str, str]]:
             replies: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
-            found = self._session.liveliness().get(f"r2p/*/live/*/*/{kind}/**", replies, timeout=1.0)
+            found = self._session.liveliness().get(f"r2p/*/{liveliness.PLACE}/**/{kind}/**", replies, timeout=1.0)
             keys = [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
-            return [key for key in keys if is_network_name(key[1])]
+            found_at = [(network, liveliness.token_at(key)) for _, network, _, key in keys if is_network_name(network)]
+            return [(network, token) for network, token in found_at if token.split("/")[2:3] == [kind]]
 
         def ask() -> set[str]:
             everybody = tokens("module")
-            found = {network for _, network, _, token in everybody if liveliness.is_module(token)}
-            found = found or {network for _, network, *_ in tokens("pub")}
-            return found or {network for _, network, *_ in everybody if tools}
+            found = {network for network, token in everybody if liveliness.is_module(token)}
+            found = found or {network for network, _ in tokens("pub")}
+            return found or {network for network, _ in everybody if tools}
 
         return await _in_thread(ask)
 
