@@ -19,7 +19,10 @@ def load_module(where: str) -> ModuleType:
     """
     if where.endswith(".py") or "/" in where:
         return _load_file(where)
-    _look_in(Path.cwd())
+    try:
+        _look_in(Path.cwd())
+    except FileNotFoundError as error:
+        raise Usage("the working directory does not exist any more: go to another one") from error
     try:
         return importlib.import_module(where)
     except ModuleNotFoundError as error:
@@ -32,8 +35,10 @@ def load_module(where: str) -> ModuleType:
 
 
 def _load_file(where: str) -> ModuleType:
-    path = Path(where).resolve()
-    if not path.is_file():
+    path = Path(where)
+    if path.is_file():
+        path = path.resolve()
+    else:
         raise Usage(f"there is no file {where}")
     for known in list(sys.modules.values()):
         if getattr(known, "__file__", None) == str(path):

@@ -17,9 +17,11 @@ with the options `Via`, `Verbose`, `Quiet`.
 
 import asyncio
 import contextlib
+import errno
 import functools
 import inspect
 import os
+import stat
 import string
 import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -42,6 +44,7 @@ CONFIG = "r2p.toml"
 PATIENCE = 1.0
 """Seconds that a tool waits before it says what for."""
 
+_DESCRIPTORS = 12  # that are free: an event loop, its wake-ups, and a link
 _SETTLED = 0.3  # seconds without news, after which an r2p peer has told everything
 _FIRMWARE = 1.5  # seconds in which a module that repeats itself each half second should have said something
 _SETTLED_ON_BUS = 0.6  # ... on a bus, where all speak in turn
@@ -117,9 +120,9 @@ def settings(via: list[str] | None = None, directory: Path | None = None, *, too
     """The settings; precedence for `via`: argument, R2P_VIA, r2p.toml in the directory (default: working directory).
 
     The last two tell how the robot's program joins. Where that listens, a `tool` beside it connects to it.
-    Raises Usage for an r2p.toml that can't be read.
+    Raises Usage for an r2p.toml that can't be read, or that other users may write.
     """
-    file = _read((directory or Path.cwd()) / CONFIG)
+    file = _read(directory)
     from_file = [file.via] if isinstance(file.via, str) else file.via
     shared = os.environ.get("R2P_VIA", "").split() or from_file
     return Settings(via or [_beside(url) if tool else url for url in shared], file.types, file.remap, file.module)
@@ -147,15 +150,61 @@ def _beside(url: str) -> str:
     return f"tcp:{_LOOPBACK.get(host, host)}:{port}"
 
 
-def _read(path: Path) -> _File:
+def _read(directory: Path | None) -> _File:
     try:
-        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
+        path = (directory or Path.cwd()) / CONFIG
+    except FileNotFoundError:  # the working directory has been removed
+        return _File()
+    try:
+        with path.open(encoding="utf-8") as file:
+            check_owned(path, os.fstat(file.fileno()))
+            return msgspec.convert(tomllib.loads(file.read()), _File)
     except FileNotFoundError:
         return _File()
+    except RecursionError as error:
+        raise Usage(f"{path}: it is nested too deeply") from error
     except msgspec.ValidationError as error:
         raise Usage(f"{path}: {error}; it knows {', '.join(_File.__struct_fields__)}") from error
     except (OSError, ValueError) as error:  # unreadable, or no TOML
         raise Usage(f"{path}: {error}") from error
+
+
+def check_owned(path: Path, status: os.stat_result) -> None:
+    """Raises Usage for a configuration that another user, who is not root, may write: it can name code to run."""
+    if os.name != "posix":
+        return
+    owners = {0, os.geteuid()}
+    if os.geteuid() == 0:  # by way of sudo, whoever has called that
+        owners.add(int(os.environ.get("SUDO_UID", "0")))
+    if status.st_uid not in owners:
+        raise Usage(f"{path} belongs to another user, and it can name code to run: chown it, or work elsewhere")
+    if status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and not _is_private(status)):
+        raise Usage(f"{path} can be written by other users, and it can name code to run: chmod go-w {path}")
+
+
+def _is_private(status: os.stat_result) -> bool:
+    """Whether the group of a file is its owner's own, of the same name and without other members."""
+    import grp
+    import pwd
+
+    try:
+        group, owner = grp.getgrgid(status.st_gid), pwd.getpwuid(status.st_uid).pw_name
+    except KeyError:
+        return False
+    return group.gr_name == owner and set(group.gr_mem) <= {owner}
+
+
+def _check_descriptors() -> None:
+    """Raises r2p.Error where so few files may be open that not even an event loop can run."""
+    opened: list[int] = []
+    try:
+        for _ in range(_DESCRIPTORS):
+            opened.append(os.open(os.devnull, os.O_RDONLY))  # noqa: PERF401 - what was opened is closed
+    except OSError as error:
+        raise r2p.Error(f"{error.strerror}: r2p needs {_DESCRIPTORS} more at least (ulimit -n 1024)") from error
+    finally:
+        for each in opened:
+            os.close(each)
 
 
 @contextlib.contextmanager
@@ -365,6 +414,7 @@ def execute(
     """Run a command until it ends or a signal ends it; errors become exit codes. `run`: how, else `r2p.run_main`."""
     with log_to_stderr(verbose - quiet):
         try:
+            _check_descriptors()
             (run or r2p.run_main)(main)
         except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - sorted out by _explain, or raised again
             _explain(error)
@@ -382,11 +432,16 @@ def _explain(error: BaseException) -> None:
         if isinstance(leaf, TimedOut):
             say(str(leaf))
             raise typer.Exit(3) from leaf
-    if not all(isinstance(leaf, r2p.Error | Unwritable) for leaf in leaves):
+    if not all(isinstance(leaf, r2p.Error | Unwritable) or _is_exhausted(leaf) for leaf in leaves):
         raise error
     for leaf in leaves:
         say(leaf.message if isinstance(leaf, r2p.NodeCrashed) else str(leaf))
     raise typer.Exit(1) from error
+
+
+def _is_exhausted(error: BaseException) -> bool:
+    """Whether there were too many open files, in this process or on this computer."""
+    return isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE)
 
 
 def _leaves(error: BaseException) -> Iterator[BaseException]:

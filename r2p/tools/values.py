@@ -19,6 +19,10 @@ M = TypeVar("M", bound=Message)
 META = "_"
 """The key of what is not part of a message: its topic, stamp, source."""
 
+DEPTH = 32
+"""Levels of mappings and lists in what is given; no message has as many."""
+
+_EXCERPT = 80  # characters of a text in an error
 _PAIR = re.compile(r"([A-Za-z_][\w.]*)=(.*)", re.DOTALL)
 _STEP = re.compile(r"[^.\[\]]+")
 _TRUE = {"true", "yes", "on", "1"}
@@ -29,7 +33,8 @@ _SMALLEST_NORMAL = 2.0**-126
 def parse(cls: type[M], texts: Iterable[str]) -> M:
     """A message from YAML or JSON mappings and `x=1.5` pairs, the later ones winning; what is left out is zero.
 
-    A pair's name may lead into a nested message (`stamp.sec=5`). Raises MessageError.
+    A pair's name may lead into a nested message (`stamp.sec=5`). Raises MessageError, also for what would take more
+    memory than it has characters: YAML's aliases.
     """
     plain: dict[str, Any] = {}
     shape = layout(cls)
@@ -48,7 +53,7 @@ def parse_line(cls: type[M], line: str) -> M:
     if line.lstrip().startswith("{"):
         try:
             plain = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             return parse(cls, [line])
         return from_plain(cls, plain)
     return parse(cls, [line])
@@ -77,7 +82,7 @@ def pick(plain: Mapping[str, Any], path: str) -> Any:
         elif isinstance(value, list) and step.isdecimal() and int(step) < len(value):
             value = value[int(step)]
         else:
-            raise KeyError(f"no field {path}: there are {', '.join(_names(plain))}")
+            raise KeyError(f"no field {path[:_EXCERPT]}: there are {', '.join(_names(plain))}")
     return value
 
 
@@ -94,19 +99,36 @@ def _names(plain: Mapping[str, Any]) -> list[str]:
 
 
 def _yaml(text: str) -> Any:
-    """YAML, all scalars as texts."""
+    """YAML, all scalars as texts. Its events are looked at first: building it could take all memory, or the stack."""
     import yaml
 
+    loader: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+    depth = 0
     try:
-        return yaml.load(text, Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))
-    except yaml.YAMLError as error:
-        raise MessageError(f"{text!r} is no YAML: {getattr(error, 'problem', None) or error}") from error
+        for event in yaml.parse(text, Loader=loader):
+            if isinstance(event, yaml.AliasEvent):
+                raise MessageError(f"{_excerpt(text)} has an alias, *{event.anchor}: write out what it stands for")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEPTH:
+                raise _too_deep(text)
+        return yaml.load(text, Loader=loader)
+    except (yaml.YAMLError, UnicodeError) as error:
+        raise MessageError(f"{_excerpt(text)} is no YAML: {getattr(error, 'problem', None) or error}") from error
+
+
+def _excerpt(text: str) -> str:
+    """A text for an error."""
+    return repr(text if len(text) <= _EXCERPT else f"{text[:_EXCERPT]}...")
+
+
+def _too_deep(text: str) -> MessageError:
+    return MessageError(f"{_excerpt(text)} is nested more than {DEPTH} levels deep: no message is")
 
 
 def _mapping(text: str) -> dict[str, Any]:
     value = _yaml(text)
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise MessageError(f"{text!r} is no message: write '{{x: 1.5, w: 0.25}}' or x=1.5 w=0.25")
+        raise MessageError(f"{_excerpt(text)} is no message: write '{{x: 1.5, w: 0.25}}' or x=1.5 w=0.25")
     return value
 
 
@@ -121,10 +143,13 @@ def _is_text(shape: Layout[Any], path: str) -> bool:
     return isinstance(kind, Chars)
 
 
-def _merge(into: dict[str, Any], plain: Mapping[str, Any]) -> None:
-    """Add values, paths as keys taken apart."""
+def _merge(into: dict[str, Any], plain: Mapping[str, Any], depth: int = 0) -> None:
+    """Add values, paths as keys taken apart; `depth` is that of `into`."""
     for path, value in plain.items():
         *parents, name = path.split(".")
+        inside = depth + len(parents) + 1
+        if inside > DEPTH:
+            raise _too_deep(path)
         place = into
         for parent in parents:
             inner = place.setdefault(parent, {})
@@ -132,7 +157,7 @@ def _merge(into: dict[str, Any], plain: Mapping[str, Any]) -> None:
                 raise MessageError(f"{path}: {parent} is given as a value already")
             place = inner
         if isinstance(value, Mapping) and isinstance(place.get(name, {}), dict):
-            _merge(place.setdefault(name, {}), value)
+            _merge(place.setdefault(name, {}), value, inside)
         else:
             place[name] = value
 

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
+import grp
 import itertools
 import logging
+import os
+import pwd
 import re
+import stat
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import pytest
@@ -16,13 +22,13 @@ from typer.testing import CliRunner
 import r2p
 from r2p.msg import Led
 from r2p.tools import session
+from r2p.tools.loading import load_module
 from r2p.tools.output import PipeClosed
-from r2p.tools.session import Session, Settings, TimedOut, Usage, execute, join, settings
+from r2p.tools.session import Session, Settings, TimedOut, Usage, check_owned, execute, join, settings
 from tests.tools.rig import Firmware, robot, tool
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 
 @pytest.fixture(autouse=True)
@@ -76,7 +82,9 @@ def test_what_the_file_holds(tmp_path: Path) -> None:
     assert settings() == Settings(["tcp:a", "tcp:b"], {"leds": "r2p.msg:Led"}, {"encoder": "enc1"}, "PC1")
 
 
-@pytest.mark.parametrize("text", ["via = 5", "via", "modul = 'PC1'", "[types]\nleds = 5"])
+@pytest.mark.parametrize(
+    "text", ["via = 5", "via", "modul = 'PC1'", "[types]\nleds = 5", f"via = {'[' * 5000}", f"x{'.x' * 1000} = 1"]
+)
 def test_a_bad_file_is_told_with_its_name(text: str, tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text(text)
     with pytest.raises(Usage, match=re.escape(str(tmp_path / "r2p.toml"))):
@@ -87,6 +95,83 @@ def test_a_key_that_is_unknown_is_told_with_those_that_are_known(tmp_path: Path)
     (tmp_path / "r2p.toml").write_text('vai = "tcp:there"')
     with pytest.raises(Usage, match="unknown field `vai`; it knows via, module, types, remap"):
         settings()
+
+
+def test_a_working_directory_that_is_gone_has_no_file(tmp_path: Path) -> None:
+    (gone := tmp_path / "gone").mkdir()
+    os.chdir(gone)
+    gone.rmdir()
+    try:
+        assert settings() == Settings()
+        with pytest.raises(Usage, match="the working directory does not exist any more"):
+            load_module("robot")
+        with pytest.raises(Usage, match=re.escape("there is no file robot.py")):
+            load_module("robot.py")
+    finally:
+        os.chdir(tmp_path)
+
+
+def status(mode: int = 0o644, user: int | None = None, group: int = 4711) -> os.stat_result:
+    return os.stat_result((stat.S_IFREG | mode, 1, 1, 1, os.geteuid() if user is None else user, group, 1, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("file", "refused"),
+    [
+        (status(), ""),
+        (status(user=0), ""),
+        (status(user=4711), "belongs to another user, and it can name code to run: chown it"),
+        (status(0o646), "can be written by other users, and it can name code to run: chmod go-w"),
+        (status(0o664), "can be written by other users"),
+    ],
+)
+def test_a_file_that_others_may_write_is_refused(file: os.stat_result, refused: str) -> None:
+    with pytest.raises(Usage, match=refused) if refused else contextlib.nullcontext():
+        check_owned(Path("r2p.toml"), file)
+
+
+def test_the_group_of_its_owner_alone_may_write_it() -> None:
+    owner = pwd.getpwuid(os.geteuid())
+    group = grp.getgrgid(owner.pw_gid)
+    alone = group.gr_name == owner.pw_name and set(group.gr_mem) <= {owner.pw_name}
+    with contextlib.nullcontext() if alone else pytest.raises(Usage):
+        check_owned(Path("r2p.toml"), status(0o664, group=owner.pw_gid))
+
+
+def test_root_by_way_of_sudo_reads_the_file_of_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setenv("SUDO_UID", "4711")
+    check_owned(Path("r2p.toml"), status(user=4711))
+    with pytest.raises(Usage):
+        check_owned(Path("r2p.toml"), status(user=4712))
+
+
+def test_the_file_itself_is_looked_at(tmp_path: Path) -> None:
+    (tmp_path / "r2p.toml").write_text('via = "tcp:there"')
+    (tmp_path / "r2p.toml").chmod(0o666)
+    with pytest.raises(Usage, match="can be written by other users"):
+        settings()
+
+
+def test_too_few_files_may_be_open(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    async def main() -> None:
+        raise AssertionError
+
+    async def exhausted() -> None:
+        full()
+
+    with pytest.raises(typer.Exit):
+        execute(exhausted)
+    monkeypatch.setattr(os, "open", full)
+    with pytest.raises(typer.Exit) as ended:
+        execute(main)
+    assert ended.value.exit_code == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "r2p: [Errno 24] Too many open files"
+    assert second == "r2p: Too many open files: r2p needs 12 more at least (ulimit -n 1024)"
 
 
 # On the network

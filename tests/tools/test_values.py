@@ -149,6 +149,38 @@ def test_any_text_is_a_message_or_a_message_error(text: str) -> None:
         parse_line(Grid, text)
 
 
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{led: &a 1, value: *a}", r"'\{led: &a 1, value: \*a\}' has an alias, \*a: write out what it stands for"),
+        ("{a: &a {x: 1}" + "".join(f", a{i}: &a{i} [*a, *a]" for i in range(30)) + "}", r"has an alias, \*a"),
+        ("led: " + "[" * 30_000, "is nested more than 32 levels deep"),
+        ("{led: " * 200 + "1" + "}" * 200, "is nested more than 32 levels deep"),
+        ("led=" + "[" * 100 + "]" * 100, "is nested more than 32 levels deep"),
+        ("led" + ".x" * 30_000 + "=1", "is nested more than 32 levels deep"),
+        ("{led" + ".x" * 100 + ": 1}", "is nested more than 32 levels deep"),
+        ("{led.a.b.c.d.e.f.g.h: " * 8 + "1" + "}" * 8, "is nested more than 32 levels deep"),
+        ("led: \udcff", "is no YAML"),
+        ("x" * 1000, r"'x{80}\.\.\.' is no message"),
+    ],
+)
+def test_what_would_take_all_memory_or_the_stack_is_a_mistake(text: str, complaint: str) -> None:
+    with pytest.raises(r2p.MessageError, match=complaint) as caught:
+        parse(Led, [text])
+    assert len(str(caught.value)) < 300
+    with pytest.raises(r2p.MessageError, match=complaint):
+        parse_line(Led, text)
+
+
+def test_json_that_is_nested_too_deeply() -> None:
+    complaint = r"is nested more than 32 levels deep|led takes"
+    for depth in (100, 900, 100_000):
+        with pytest.raises(r2p.MessageError, match=complaint):
+            parse_line(Led, '{"led": ' * depth + "1" + "}" * depth)
+        with pytest.raises(r2p.MessageError, match=complaint):
+            parse_line(Led, '{"led": ' + "[" * depth + "]" * depth + "}")
+
+
 def test_not_a_number_goes_through_as_a_text() -> None:
     plain = to_plain(IMU(roll=math.nan, pitch=math.inf, yaw=-math.inf))
     assert [plain[name] for name in ("roll", "pitch", "yaw")] == ["nan", "inf", "-inf"]
