@@ -37,9 +37,10 @@ class Source(msgspec.Struct, frozen=True):
 class Sample(msgspec.Struct, gc=False):
     """One published message.
 
-    `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none). `stamped` says whether the stamp is the
-    sender's, or else the reception's. `sequence` counts the messages of one publisher from 1; 0 where the link
-    does not carry it.
+    `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none), by the clock of the computer that stamped it,
+    which may show another time than this one's. `expires` is the deadline by the clock here (`protocols.time_left`); 0:
+    it is `deadline`. `stamped` says whether the stamp is the sender's, or else the reception's. `sequence` counts the
+    messages of one publisher from 1; 0 where the link does not carry it.
     `message` is None until somebody decodes a sample that came over a link. `drop_late`: a link that could not send it
     by its deadline gives it up, and does not send it late. `hops` counts the gateways that it has crossed.
 
@@ -58,3 +59,4 @@ class Sample(msgspec.Struct, gc=False):
     drop_late: bool = True
     hops: int = 0
     clock: Clock | None = None
+    expires: int = 0

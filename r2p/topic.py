@@ -334,7 +334,9 @@ class Topic:
         sink.room().dismiss(sink)
 
     def publisher_of(self, sample: Sample) -> "Advertised | None":
-        """Who published this sample here: for late news of it."""
+        """Who published this sample here: for late news of it. None for one that came by a link."""
+        if sample.source.link:
+            return None
         for publisher in self.publishers:
             if publisher.node.name == sample.source.node and publisher.publisher_class == sample.publisher_class:
                 return publisher

@@ -125,14 +125,14 @@ class BridgedTopic(Topic):
             return _put(way, sample, blocked)
         if sample.hops >= MOST_HOPS:
             way.dropped["too many hops"] += 1
-        elif sample.deadline and sample.drop_late and way.port.now() > sample.deadline:
+        elif sample.deadline and sample.drop_late and way.port.now() > (sample.expires or sample.deadline):
             way.dropped["late"] += 1
         elif way.shaper is None:
             return _put(way, sample, blocked)
         elif way.shaper.reserved is not None and way.shaper.reserved.take(sample):
             way.forwarded += 1
         else:
-            return _put_shaped(way, way.shaper.shape(sample, now), sample, blocked)
+            return _put_shaped(way, way.shaper.shape(sample, now, way.port.now()), sample, blocked)
         return blocked
 
     def _send(self, sample: Sample, blocked: list[Sink] | None, driver: object) -> list[Sink] | None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from r2p.bridge.options import ClassOf
+from r2p.protocols.time_left import TimesLeft
 from r2p.sample import PublisherClass, Sample
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ class Shaper:
         self._soften = soften
         self._free_at = 0
         self._periods: dict[tuple[str, str], _Period] = {}
+        self._times_left = TimesLeft()
 
     @classmethod
     def of(
@@ -45,8 +47,8 @@ class Shaper:
         """None where there is nothing to change."""
         return cls(rate=rate, klass=klass, soften=soften, learnt=learnt) if rate or klass or soften else None
 
-    def shape(self, sample: Sample, now: int) -> Sample | None:
-        """The message to forward (monotonic `now`); None: it is one too many."""
+    def shape(self, sample: Sample, now: int, utc: int) -> Sample | None:
+        """The message to forward at `now` (monotonic ns; the same in UTC); None: it is one too many."""
         if self._gap is not None:
             if now < self._free_at:
                 return None
@@ -54,18 +56,27 @@ class Shaper:
         if self._class is not None and not sample.deadline:
             sample = _classed(sample, self._class)
         if self._soften and sample.publisher_class is PublisherClass.PERIODIC:
-            period = self._period(sample)
-            deadline = sample.deadline or sample.stamp + period
-            return msgspec.structs.replace(
-                sample, publisher_class=PublisherClass.SPORADIC, deadline=deadline, drop_late=False
-            )
+            return self._softened(sample, now, utc)
         return sample
+
+    def _softened(self, sample: Sample, now: int, utc: int) -> Sample:
+        period, deadline, expires = self._period(sample), sample.deadline, sample.expires
+        if not deadline:
+            deadline = sample.stamp + period
+            source = sample.source
+            expires = utc + self._times_left.of((source.module, source.node)).left(now, sample.stamp, deadline)
+        sporadic = PublisherClass.SPORADIC
+        return msgspec.structs.replace(
+            sample, publisher_class=sporadic, deadline=deadline, expires=expires, drop_late=False
+        )
 
     def _period(self, sample: Sample) -> int:
         """The publisher's period, as its stamps show it."""
         source = sample.source
         known = self._periods.get((source.module, source.node))
         if known is None:
+            if len(self._periods) >= TimesLeft.MOST:
+                self._periods.clear()
             self._periods[source.module, source.node] = _Period(sample.stamp, len(sample.data))
             return _UNKNOWN_PERIOD
         since = sample.stamp - known.stamp

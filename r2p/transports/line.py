@@ -188,7 +188,8 @@ class LineLink(Link):
 
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
-        deadline = sample.deadline // 1000 if sample.deadline else sample.stamp // 1000 + _NO_DEADLINE
+        due = sample.expires or sample.deadline
+        deadline = due // 1000 if due else sample.stamp // 1000 + _NO_DEADLINE
         try:
             encode = self._encoders[topic]
         except KeyError:

@@ -18,6 +18,7 @@ from r2p.clock import in_background, random_of
 from r2p.codecs.attachment import Clock
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
+from r2p.protocols.time_left import TimesLeft
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.transports.link import Hub, Link, Transport
 from r2p.transports.url import Url, duration
@@ -191,6 +192,7 @@ class MemoryLink(Link):
         self.network = network
         self._address = network.new_address()
         self._port = Port(network, self._receive, self.made_room)
+        self._times_left = TimesLeft()
 
     def connect(self) -> None:
         """Plug in."""
@@ -241,7 +243,14 @@ class MemoryLink(Link):
             stamped=arrival.stamped,
             hops=arrival.hops,
             clock=arrival.clock,
+            expires=self._expiry(arrival) if arrival.deadline else 0,
         )
+
+    def _expiry(self, arrival: Frame) -> int:
+        """The deadline by the clock here."""
+        publisher = (arrival.port, arrival.module, arrival.node)
+        left = self._times_left.of(publisher).left(self._clock.monotonic(), arrival.stamp, arrival.deadline)
+        return self._clock.now() + left
 
     def sender(self, arrival: Frame) -> Hashable:
         return arrival.port

@@ -195,7 +195,7 @@ def test_what_a_debug_line_brings_gets_the_class_that_it_can_not_say() -> None:
     assert policy.class_of("encoder", "zenoh:") is None
     shaper = Shaper.of(rate=None, klass=klass, soften=False)
     assert shaper is not None
-    shaped = shaper.shape(sample(), 0)
+    shaped = shaper.shape(sample(), 0, 0)
     assert shaped is not None
     assert (shaped.publisher_class, shaped.deadline) == (PublisherClass.SPORADIC, SECOND + SECOND // 50)
     assert not shaped.drop_late  # nobody who published it has said so
@@ -205,11 +205,11 @@ def test_periodic_messages_are_due_within_their_period() -> None:
     shaper = Shaper.of(rate=None, klass=None, soften=True)
     assert shaper is not None
     periodic = [sample(n * SECOND // 100, PublisherClass.PERIODIC) for n in range(1, 5)]
-    last = [shaper.shape(each, 0) for each in periodic][-1]
+    last = [shaper.shape(each, 0, 0) for each in periodic][-1]
     assert last is not None
     assert (last.publisher_class, last.deadline - last.stamp) == (PublisherClass.SPORADIC, SECOND // 100)
     plain = sample()
-    assert shaper.shape(plain, 0) is plain
+    assert shaper.shape(plain, 0, 0) is plain
 
 
 def test_nothing_to_change() -> None:

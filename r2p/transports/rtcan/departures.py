@@ -79,7 +79,7 @@ class Departures:
 
     def _time_left(self, topic: str, sample: Sample, publisher: Advertised | None) -> int:
         """Ns until the deadline; a latched value that is sent once more has a new one."""
-        left = sample.deadline - self._clock.now() if sample.deadline else 0
+        left = (sample.expires or sample.deadline) - self._clock.now() if sample.deadline else 0
         if left > 0 or (sample.deadline and not (publisher is not None and publisher.latch)):
             return left
         slotted = self._periodics.by_topic.get(topic)

@@ -17,6 +17,7 @@ from r2p.codecs.attachment import SERIAL_WRAP, Origin, Reader
 from r2p.errors import DecodeError
 from r2p.protocols.events import Shape
 from r2p.protocols.flow import Inflow
+from r2p.protocols.time_left import TimeLeft
 from r2p.room import Claim, Sink
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.topic import PATIENCE, Heard, Topic
@@ -57,6 +58,7 @@ class _Lane(msgspec.Struct, eq=False):
     heard: Heard
     usual: int = -1
     sequence: int = 0
+    time_left: TimeLeft = msgspec.field(default_factory=TimeLeft)
 
 
 class _Held(Claim):
@@ -192,6 +194,8 @@ class Stream:
                 Sample(part, source, stamp, deadline, sequence, publisher_class, None, stamped, True, hops, clock)
             )
             sequence += step
+        if deadline:
+            self._expire(lane, samples)
         first = samples[0]
         if (
             len(first.data) == lane.usual
@@ -205,6 +209,13 @@ class Stream:
                 if self._is_good(lane, number, sample):
                     self._hand_out(lane, number, sample)
         return len(samples)
+
+    def _expire(self, lane: _Lane, samples: list[Sample]) -> None:
+        """Work out their deadline by the clock here."""
+        clock = self._streams.clock
+        now, utc = clock.monotonic(), clock.now()
+        for sample in samples:
+            sample.expires = utc + lane.time_left.left(now, sample.stamp, sample.deadline)
 
     def _take(self, lane: _Lane, serial: int, samples: list[Sample]) -> None:
         """What was expected next, and nobody lacks room yet: as `_is_good` and `_hand_out`, at once for all."""

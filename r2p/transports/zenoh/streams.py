@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable, Hashable, Iterable
 from typing import TYPE_CHECKING, Any, Protocol
 
+from r2p.clock import clock_of
 from r2p.sample import Source
 from r2p.topic import QueueSink, Topic
 from r2p.transports.intake import LinkStats
@@ -50,6 +51,7 @@ class Streams:
     ) -> None:
         self.link = link
         self.loop = loop
+        self.clock = clock_of(loop)
         self.stats = stats
         self.longest = longest
         self.credit = credit

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from r2p.clock import clock_of
 from r2p.codecs import attachment
 from r2p.codecs.attachment import Header, Origin
 from r2p.messages import layout
@@ -73,11 +74,20 @@ class Ring:
         self._idle = True
         self._ring.clear()
 
-    def put(self, serial: int, count: int = 1, *, publisher_class: int = 1, size: int = SIZE, sender: int = 7) -> None:
+    def put(
+        self,
+        serial: int,
+        count: int = 1,
+        *,
+        publisher_class: int = 1,
+        size: int = SIZE,
+        sender: int = 7,
+        deadline: int = 0,
+    ) -> None:
         """So many messages in one packet; sequences are as the serials, stamps ten times as much."""
         origin = Origin(publisher_class, sender, sender, bytes(8), "A", "node")
         stamps = [10 * (serial + at) for at in range(count)]
-        header = attachment.encode(Header(origin, serial, serial, stamps[0], more=tuple(stamps[1:])))
+        header = attachment.encode(Header(origin, serial, serial, stamps[0], deadline, more=tuple(stamps[1:])))
         data = b"".join([(serial + at).to_bytes(size, "little") for at in range(count)])
         sample = SimpleNamespace(
             payload=SimpleNamespace(to_bytes=lambda: data), attachment=SimpleNamespace(to_bytes=lambda: header)
@@ -105,6 +115,22 @@ async def test_events_of_one_packet_stay_in_order_where_there_is_no_room() -> No
     await turns()
     assert numbers(ring.sink) == [3, 4]
     assert ring.sink.lost == 2
+
+
+async def test_a_deadline_is_told_by_the_clock_here() -> None:
+    """The sender's clock shows 1970; the second packet was held up for a second, if the stamps are right."""
+    clock = clock_of()
+    ring = Ring(queue=10)
+    ring.put(1, 2, publisher_class=2, deadline=5_000_000_020)
+    await turns()
+    arrived = clock.now()
+    await asyncio.sleep(1)
+    ring.put(3, publisher_class=2, deadline=5_000_000_030)
+    ring.put(4)
+    await turns()
+    assert [each.deadline for each in ring.sink.queue] == [5_000_000_020] * 2 + [5_000_000_030, 0]
+    expected = [arrived + 5_000_000_010, arrived + 5_000_000_000, arrived + 5_000_000_000, 0]
+    assert [each.expires for each in ring.sink.queue] == pytest.approx(expected, abs=2_000_000)
 
 
 async def test_the_rest_of_a_packet_waits_with_the_message_that_has_no_room() -> None:
