@@ -23,11 +23,16 @@ _OURS: dict[str, object] = {
     "transport/link/tx/queue/size/real_time": 16,
 }
 
-_AT_THE_USUAL_PORT: dict[str, object] = {  # the first one on this computer; so clients find it without a router
-    "listen/endpoints": ["tcp/[::]:7447", "tcp/[::]:0"],
+_USUAL = ["tcp/[::]:7447"]
+"""Where the first peer on a computer listens, so that clients find it without a router."""
+
+_ANY_PORT: dict[str, object] = {  # the others; where there is no IPv6, not even that
+    "listen/endpoints": ["tcp/[::]:0"],
     "listen/exit_on_failure": False,
 }
 
+_LOOPBACK = re.compile(r"(unix|serial|vsock)|[a-z]+/(localhost|127\.[0-9.]+|\[::1\]):")
+"""Endpoints that other computers do not reach by a network."""
 
 _LISTENS: dict[str, object] = {
     # This session's own, which tells where it listens. Not for clients: zenoh keeps 37 kB for ever of each session that
@@ -45,6 +50,26 @@ def config_of(options: Options) -> zenoh.Config:
     except zenoh.ZError as error:
         raise options.error(f"zenoh does not take this: {_words(error)}") from error
     return config
+
+
+def take_any_port(config: zenoh.Config, options: Options) -> bool:
+    """Listen at any port, as the usual one can't be had. False where a place was asked for, or it was tried already."""
+    if not _may_choose(options) or json.loads(config.get_json("listen/endpoints")) != _USUAL:
+        return False
+    for key, value in _ANY_PORT.items():
+        config.insert_json5(key, json.dumps(value))
+    return True
+
+
+def open_to_all(config: zenoh.Config) -> list[str]:
+    """The endpoints where it takes connections of other computers without asking who they are."""
+    if (
+        json.loads(config.get_json("mode")) == "client"
+        or json.loads(config.get_json("transport/auth/usrpwd"))["dictionary_file"]
+    ):
+        return []
+    certified = ("tls/", "quic/") if json.loads(config.get_json("transport/link/tls"))["enable_mtls"] else ()
+    return [each for each in way_of(config).listens if not each.startswith(certified) and not _LOOPBACK.match(each)]
 
 
 def way_of(config: zenoh.Config) -> Way:
@@ -90,11 +115,16 @@ def _stated(options: Options) -> dict[str, object]:
         stated["connect/endpoints"] = [options.connect]
     if options.listen is not None:
         stated["listen/endpoints"] = [options.listen]
-    elif options.mode == "peer" and options.config is None:
-        stated |= _AT_THE_USUAL_PORT
+    elif _may_choose(options):
+        stated["listen/endpoints"] = _USUAL
     if options.scouting is not None:
         stated["scouting/multicast/enabled"] = options.scouting
     return stated
+
+
+def _may_choose(options: Options) -> bool:
+    """Whether it is left to us where to listen."""
+    return options.listen is None and options.mode == "peer" and options.config is None
 
 
 def _words(error: Exception) -> str:

@@ -28,6 +28,9 @@ _LOOK = 1.0
 _ALONE = 3.0
 """Seconds without anybody else after which a module looks whether they are on other networks; then ever more rarely."""
 
+_RESTRICT = "zenoh:?listen=tcp/127.0.0.1:7447 keeps to this one, docs/how-to/zenoh.md has TLS and passwords"
+"""What to do about a port that is open to all."""
+
 _TOOL_ALONE = 0.3
 _RARELY = 60.0
 
@@ -41,7 +44,7 @@ class ZenohTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         try:  # in a thread: loading zenoh takes longer than a loop should be blocked
             await asyncio.to_thread(importlib.import_module, "r2p.transports.zenoh.link")
-            from r2p.transports.zenoh.config import config_of, way_of
+            from r2p.transports.zenoh.config import config_of, open_to_all, way_of
             from r2p.transports.zenoh.link import ZenohLink
         except ImportError as error:
             if (error.name or "").partition(".")[0] != "zenoh":
@@ -57,7 +60,7 @@ class ZenohTransport(Transport):
             session = await self._open(config, link, Backoff(hub.random, longest=0.5), opened)
             network = await self._network(session, hub)
             link.use(session, f"r2p/{network}")
-            await self._tell_addresses(session, hub)
+            await self._tell_addresses(session, link, hub, open_to_all(config))
             opened()
             async with asyncio.TaskGroup() as tasks:  # neither ends but by being cancelled
                 tasks.create_task(self._watch(config, link))
@@ -71,13 +74,15 @@ class ZenohTransport(Transport):
     async def _open(
         self, config: "zenoh.Config", link: "ZenohLink", backoff: Backoff, opened: Callable[[], object]
     ) -> "Session":
-        from r2p.transports.zenoh.config import way_of
+        from r2p.transports.zenoh.config import take_any_port, way_of
         from r2p.transports.zenoh.session import Unreachable, open_session
 
         while True:
             try:
                 return await open_session(config)
             except TransportError as error:
+                if take_any_port(config, self._options):
+                    continue
                 reason = await asyncio.to_thread(why_not_listening, way_of(config))
                 raise self._options.error(reason or str(error)) from error
             except Unreachable:
@@ -100,10 +105,16 @@ class ZenohTransport(Transport):
         except ValueError as error:
             raise self._options.error(str(error)) from error
 
-    async def _tell_addresses(self, session: "Session", hub: Hub) -> None:
+    async def _tell_addresses(self, session: "Session", link: "ZenohLink", hub: Hub, exposed: list[str]) -> None:
+        """Where it takes connections. That it does not ask of whom is no news for the user of a tool."""
+        addresses = await session.listening() if self._options.listen is not None or exposed else []
         if self._options.listen is not None:
-            for address in await session.listening():
+            for address in addresses:
                 hub.listening(self._options.name, address)
+        if exposed and addresses and not hub.observer:
+            ports = ", ".join(sorted({each.rpartition(":")[2] for each in addresses}))
+            text = f"takes connections of other computers at port {ports}, and does not ask who they are: "
+            hub.link_notice(link, "open to all", f"{text}{_RESTRICT}", trouble=True)
 
     async def _watch(self, config: "zenoh.Config", link: "ZenohLink") -> None:
         """For ever: say what is wrong while the link is down."""
@@ -129,7 +140,7 @@ class ZenohTransport(Transport):
         pause = _TOOL_ALONE if hub.observer else _ALONE
         while True:
             await asyncio.sleep(pause)
-            others = sorted(await session.networks(tools=False) - {network}) if link.up else []
+            others = await self._others(session, link, network)
             if _has_company(link):
                 return
             if others:
@@ -139,6 +150,13 @@ class ZenohTransport(Transport):
                 hub.link_notice(link, "elsewhere", text, trouble=not hub.observer)
                 return
             pause = min(2 * pause, _RARELY)
+
+    async def _others(self, session: "Session", link: "ZenohLink", network: str) -> list[str]:
+        try:
+            return sorted(await session.networks(tools=False) - {network}) if link.up else []
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
+            link.stats.lost.internal_error(error)
+            return []
 
 
 def _has_company(link: "ZenohLink") -> bool:

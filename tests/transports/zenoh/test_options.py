@@ -1,6 +1,8 @@
 """What a `zenoh:` URL may say."""
 
 import json
+import re
+import socket
 from pathlib import Path
 
 import pytest
@@ -131,3 +133,82 @@ def test_only_sessions_that_listen_have_an_admin_space(url: str, listens: bool) 
     from r2p.transports.zenoh.config import config_of
 
     assert json.loads(config_of(options(url)).get_json("adminspace/enabled")) is listens
+
+
+def test_a_peer_listens_at_one_port() -> None:
+    from r2p.transports.zenoh.config import config_of, take_any_port, way_of
+
+    peer = options("zenoh:")
+    config = config_of(peer)
+    assert way_of(config).listens == ["tcp/[::]:7447"]
+    assert take_any_port(config, peer)
+    assert way_of(config).listens == ["tcp/[::]:0"]
+    assert not take_any_port(config, peer)
+
+
+@pytest.mark.parametrize("listen", ["tcp/[::]:7447", "tcp/127.0.0.1:0"])
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_it_listens_where_it_is_told_and_nowhere_else(mode: str, listen: str) -> None:
+    from r2p.transports.zenoh.config import config_of, take_any_port, way_of
+
+    told = options(f"zenoh:?mode={mode}&listen={listen}")
+    config = config_of(told)
+    assert not take_any_port(config, told)
+    assert way_of(config).listens == [listen]
+
+
+@pytest.mark.parametrize(
+    ("url", "endpoints"),
+    [
+        ("zenoh:", ["tcp/[::]:7447"]),
+        ("zenoh:?mode=router", ["tcp/[::]:7447"]),
+        ("zenoh:?listen=tcp/192.168.0.10:7447", ["tcp/192.168.0.10:7447"]),
+        ("zenoh:?listen=tcp/127.0.0.1:7447", []),
+        ("zenoh:?listen=tcp/[::1]:7447", []),
+        ("zenoh:?listen=tcp/localhost:7447", []),
+        ("zenoh:?listen=unixsock-stream//tmp/robot", []),
+        ("zenoh:tcp/robot:7447", []),
+    ],
+)
+def test_where_it_is_open_to_all(url: str, endpoints: list[str]) -> None:
+    from r2p.transports.zenoh.config import config_of, open_to_all
+
+    assert open_to_all(config_of(options(url))) == endpoints
+
+
+@pytest.mark.parametrize(
+    ("text", "endpoints"),
+    [
+        ("transport: {link: {tls: {enable_mtls: true}}}", ["tcp/[::]:1"]),
+        ("transport: {link: {tls: {enable_mtls: false}}}", ["tls/[::]:1", "tcp/[::]:1"]),
+        ("transport: {auth: {usrpwd: {user: 'a', password: 'b', dictionary_file: 'users'}}}", []),
+        ("transport: {auth: {usrpwd: {user: 'a', password: 'b'}}}", ["tls/[::]:1", "tcp/[::]:1"]),
+    ],
+)
+def test_where_a_file_leaves_it_open_to_all(tmp_path: Path, text: str, endpoints: list[str]) -> None:
+    from r2p.transports.zenoh.config import config_of, open_to_all
+
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{mode: 'router', listen: {endpoints: ['tls/[::]:1', 'tcp/[::]:1']}, " + text + "}")
+    assert open_to_all(config_of(options(f"zenoh:?config={file}"))) == endpoints
+
+
+@pytest.mark.anyio
+async def test_the_usual_port_is_in_use(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """Then any other one does, which a program says at its start where all computers can reach it."""
+    from r2p.transports.zenoh import config
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(config, "_USUAL", [f"tcp/127.0.0.1:{port}"])
+        monkeypatch.setitem(config._ANY_PORT, "listen/endpoints", ["tcp/127.0.0.1:0"])
+        monkeypatch.setattr(config, "_LOOPBACK", re.compile("unix"))
+        for observer in (True, False):
+            caplog.clear()
+            async with r2p.Module("A", via="zenoh:?scouting=off&network=lab", watchdog=False, observer=observer):
+                told = re.search(
+                    r"zenoh: takes connections of other computers at port (\d+), and does not", caplog.text
+                )
+                assert bool(told) is not observer
+        assert told is not None
+        assert int(told[1]) != port
