@@ -1,8 +1,10 @@
 """The gateway of a module: its ports, the tree that they are part of, and what passes between them besides topics."""
 
+import itertools
 from collections.abc import Callable
 
 from r2p.bridge import probes
+from r2p.bridge.held import Held
 from r2p.bridge.options import BridgeOptions, Policy
 from r2p.bridge.port import BridgePort
 from r2p.bridge.presences import Presences
@@ -13,13 +15,17 @@ from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management
 from r2p.errors import DecodeError
 from r2p.printable import get_logger
-from r2p.protocols.bridging.tree import MOST_PORTS, Changed, Port, Probe, Say, State, Tree
+from r2p.protocols.bridging.base import MOST_PORTS, Changed, Port, Probe, Say, SayToClients, State
+from r2p.protocols.bridging.clients import FIRST
+from r2p.protocols.bridging.tree import Tree
 from r2p.topic import Topic, TopicSpace, Waker
 from r2p.transports.announce import Told
 from r2p.transports.link import Link, is_booting
 from r2p.transports.losses import TRY_AGAIN, internal_error_of
 
 logger = get_logger("r2p.bridge")
+
+_Order = management.Stop | management.Reboot | management.Bootload
 
 _ORDERS = (0x12, 0x13, 0x14)
 _DENIED = 0x55
@@ -34,6 +40,8 @@ _ALIVE = 0x11
 _HELLO = 0x50
 _HELLO_FLAGS = 12  # its place
 _TREE = (0x60, 0x61, 0x62)
+_SELDOM = 1_000_000_000  # ns between two lines of the log on one link about orders that do not pass
+_NO_GATEWAY = "no gateway may be there: nothing passes; listen with ?gateways=yes where gateways are to join"
 _WORDS = {
     State.ALONE: "forwards",
     State.FORWARDING: "forwards, in agreement with {gateways}",
@@ -41,6 +49,7 @@ _WORDS = {
     State.CONVERGING: "is silent until it agrees with {gateways}",
     State.LISTENING: "listens for other gateways",
     State.LOOP: "is blocked: what we send on another link comes back here, through a gateway that is not one of r2p",
+    State.REFUSED: _NO_GATEWAY,
 }
 
 
@@ -62,47 +71,64 @@ class Bridge:
         self._clock = space.clock
         self._told = told
         self._by_number: dict[int, BridgePort] = {}
+        self._numbers = itertools.count(FIRST)
+        self._held = Held()
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
     def make_topic(self, name: str, waker: Waker) -> Topic:
         """For the module's topic space."""
-        return BridgedTopic(name, waker, self.ports, self._clock.monotonic)
+        return BridgedTopic(name, waker, self.ports, self._clock.monotonic, self._held)
 
     # Links
 
     def attach(self, link: Link) -> None:
         """The module has a link, up or not yet."""
         number = next((each for each in range(MOST_PORTS) if each not in self._by_number), None)
-        if number is None:
-            self._told(link, "too many links", f"a gateway joins {MOST_PORTS} links: this one is not", True)
-            return
+        if not link.admits_gateways or number is None:
+            number = next(self._numbers)
         port = self.ports[link.name] = self._by_number[number] = BridgePort(self, link, number, self._clock.now)
         link.gate = port
+        if link.admits_gateways and number >= FIRST:
+            port.state = port.place.state = State.REFUSED
+            self._told(link, "too many links", f"a gateway joins {MOST_PORTS} links: this one is not", True)
 
     def detach(self, link: Link) -> None:
         """It does not have it any more."""
-        port = self.ports.pop(link.name, None)
-        if port is not None:
-            del self._by_number[port.number]
-            self.tree.shut(self._clock.monotonic(), port.number)
-            self.presences.forget(port)
-            self.relays.all_changed()
-            self._act()
+        port = self.ports.pop(link.name)
+        del self._by_number[port.number]
+        self._shut(port)
+        self._port_changed(port)
 
     def link_changed(self, link: Link) -> None:
         """It went up or down."""
-        port = self.ports.get(link.name)
-        if port is None:
-            return
-        now = self._clock.monotonic()
+        port = self.ports[link.name]
         if link.up:
-            self.tree.open(now, port.number)
-            port.place = self.tree.ports[port.number]
+            self._open(port)
         else:
+            self._shut(port)
+        self._port_changed(port)
+
+    def _open(self, port: BridgePort) -> None:
+        now = self._clock.monotonic()
+        if port.client:
+            port.place = self.tree.clients.open(now, port.number)
+        elif port.number < FIRST:
+            self.tree.open(now, port.number, private=port.link.private)
+            port.place = self.tree.ports[port.number]
+        port.place.lost = port.link.stats.lost
+
+    def _shut(self, port: BridgePort) -> None:
+        now = self._clock.monotonic()
+        if port.client:
+            self.tree.clients.shut(port.number)
+            port.place = Port(port.number, now)
+        elif port.number < FIRST:
             self.tree.shut(now, port.number)
             port.place = Port(port.number, now)
-            self.presences.forget(port)
-        self.relays.all_changed()
+        self.presences.forget(port)
+
+    def _port_changed(self, port: BridgePort) -> None:
+        self.relays.port_changed(port)
         self._act()
 
     def close(self) -> None:
@@ -120,8 +146,8 @@ class Bridge:
     def demand_changed(self, port: BridgePort, topics: set[str]) -> None:
         self.relays.changed(topics, port)
 
-    def modules_changed(self) -> None:
-        self.presences.changed()
+    def modules_changed(self, port: BridgePort) -> None:
+        self.presences.changed(port)
 
     # What comes in
 
@@ -131,8 +157,8 @@ class Bridge:
         if kind in _TREE:
             self._heard_gateway(port, data)
             return True
-        if kind in _ORDERS:
-            self._pass_order(port, data)
+        if kind in _ORDERS and self._pass_order(port, data):
+            return True
         if kind == _DENIED and data[_DENIED_ORDER]:
             self._pass_on(port, data)
         if kind in (_ALIVE, _HELLO) and self._is_our_own(port, data):
@@ -140,10 +166,16 @@ class Bridge:
         if kind == _HELLO and data[_HELLO_FLAGS] & management.HELLO_QUERY:
             self.presences.asked(port)
         if kind == _ALIVE and (probe := probes.decode(data)) is not None:
-            self.tree.probed(self._clock.monotonic(), port.number, *probe)
-            self._act()
+            self._probed(port, *probe)
             return True
         return False
+
+    def _probed(self, port: BridgePort, gateway: int, its_port: int) -> None:
+        if not port.client:
+            self.tree.probed(self._clock.monotonic(), port.number, gateway, its_port)
+        elif self.tree.knows(gateway):
+            self.tree.clients.refuse(port.place, State.LOOP)
+        self._act()
 
     def _is_our_own(self, port: BridgePort, data: bytes) -> bool:
         """Whether one of our other links said it, on the same network; an echo of this one is for discovery to find."""
@@ -164,7 +196,9 @@ class Bridge:
             port.link.stats.lost["undecodable"] += 1
             return
         now = self._clock.monotonic()
-        if isinstance(message, management.Bridge):
+        if port.client:
+            self._heard_client(now, port, message)
+        elif isinstance(message, management.Bridge):
             self.tree.bridge(now, port.number, message)
         elif isinstance(message, management.Mesh):
             self.tree.mesh(now, port.number, message)
@@ -172,11 +206,18 @@ class Bridge:
             self.tree.leaf(now, port.number, message)
         self._act()
 
+    def _heard_client(self, now: int, port: BridgePort, message: management.Management) -> None:
+        if isinstance(message, management.Leaf):
+            self.tree.clients.leaf(now, port.place, message)
+        else:
+            port.link.stats.lost["gateway refused"] += 1
+            self.tree.clients.refuse(port.place, State.REFUSED)
+
     def _open_from(self, port: BridgePort) -> list[BridgePort]:
         """Where what came in here may go on to now."""
         now = self._clock.monotonic()
         if now >= port.place.until:
-            port.dropped["converging"] += 1
+            port.lose("converging")
             return []
         others = [each for each in self.ports.values() if each is not port and each.link.up]
         return [each for each in others if now < each.place.until]
@@ -185,23 +226,42 @@ class Bridge:
         for other in self._open_from(port):
             other.link.write_management(data)
 
-    def _pass_order(self, port: BridgePort, data: bytes) -> None:
-        """STOP, REBOOT or BOOTLOAD for a module that may be anywhere."""
+    def _pass_order(self, port: BridgePort, data: bytes) -> bool:
+        """STOP, REBOOT or BOOTLOAD for a module that may be anywhere; True: for this one, which does not obey."""
         try:
             order = management.decode(data)
         except (DecodeError, UnknownType):
-            return
+            return False
         if not isinstance(order, management.Stop | management.Reboot | management.Bootload):
-            return
+            return False
+        if order.module == self.name and (
+            reason := self._policy.own_order_denied(port.name, harmless=isinstance(order, management.Stop))
+        ):
+            self._refuse_order(port, order, data[-1], reason, known=True)
+            return True
         for other in self._open_from(port):
             reason = self._order_denied(port, other, order)
             if not reason:
                 other.link.write_management(data, urgent=True)
-                continue
-            port.dropped["order refused"] += 1
-            logger.warning("%s from %s is refused: %s", type(order).__name__.upper(), port.name, _REFUSALS[reason])
-            if order.module in other.link.discovery.modules:
-                self._deny(port, management.Denied(self.name, order.module, data[-1], reason))
+            else:
+                self._refuse_order(port, order, data[-1], reason, known=order.module in other.link.discovery.modules)
+        return False
+
+    def _refuse_order(self, port: BridgePort, order: _Order, kind: int, reason: int, *, known: bool) -> None:
+        """Count it, log it once in a while, and answer if it is for a module that is `known`."""
+        port.lose("order refused")
+        now = self._clock.monotonic()
+        if now >= port.refusal_logged_at + _SELDOM:
+            port.refusal_logged_at = now
+            logger.warning(
+                "%s from %s is refused: %s (%d orders refused so far)",
+                type(order).__name__.upper(),
+                port.name,
+                _REFUSALS[reason],
+                port.dropped["order refused"],
+            )
+        if known:
+            self._deny(port, management.Denied(self.name, order.module, kind, reason))
 
     def _order_denied(
         self, port: BridgePort, other: BridgePort, order: management.Stop | management.Reboot | management.Bootload
@@ -234,6 +294,9 @@ class Bridge:
     def _act(self) -> None:
         changed: set[int] = set()
         for action in self.tree.take():
+            if isinstance(action, SayToClients):
+                self._say_to_clients(management.encode(action.message))
+                continue
             port = self._by_number.get(action.port)
             if port is None or not port.link.up:
                 continue
@@ -244,9 +307,10 @@ class Bridge:
         for number in changed:
             port = self._by_number[number]
             port.link.stats.lost.guard(self._state_changed, port)
-        if changed:
-            self.relays.all_changed()
-            self.presences.changed()
+            self.relays.port_changed(port)
+            self.presences.changed(port)
+        if self._held and not any(port.place.resumes for port in self.ports.values()):
+            self._held.release()
         self._alarm.set(self.tree.next_deadline())
 
     def _send(self, port: BridgePort, action: Say | Probe) -> None:
@@ -254,6 +318,11 @@ class Bridge:
             port.link.write_management(management.encode(action.message), urgent=True)
         elif port.link.passes_probes:
             port.link.write_management(probes.encode(self.tree.gateway, port.number))
+
+    def _say_to_clients(self, data: bytes) -> None:
+        for port in self.ports.values():
+            if port.client and port.link.up:
+                port.link.stats.lost.guard(port.link.write_management, data, urgent=True)
 
     def _state_changed(self, port: BridgePort) -> None:
         state = port.place.state
@@ -265,7 +334,9 @@ class Bridge:
             port.link.stats.lost["converging"] += port.link.discard()
         count = len(port.place.gateways)
         gateways = "another gateway" if count == 1 else f"{count} other gateways" if count else "modules there"
-        self._told(port.link, state.value, _WORDS[state].format(gateways=gateways), state is State.LOOP)
+        self._told(
+            port.link, state.value, _WORDS[state].format(gateways=gateways), state in (State.LOOP, State.REFUSED)
+        )
         if state in (State.ALONE, State.FORWARDING):
             port.link.query()
 

@@ -13,6 +13,8 @@ from r2p.sample import PublisherClass
 
 T = TypeVar("T")
 
+_CACHED = 1024  # names of links, of which clients bring ever new ones
+
 _PREFIX = re.compile(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_")
 
 IP = frozenset({"tcp", "tcp-listen", "zenoh"})
@@ -86,6 +88,7 @@ class Policy:
     def __init__(self, options: BridgeOptions) -> None:
         """Raises Error for rules and a prefix without sense."""
         self._options = options
+        self._prefixes: dict[str, str] = {}
         check_prefix(options.prefix)
         self._allow = [rule(each) for each in options.allow]
         self._deny = [rule(each) for each in options.deny]
@@ -100,10 +103,20 @@ class Policy:
             return False
         return not self._allow or any(each.matches(topic, source, target) for each in self._allow)
 
+    def allows_nowhere(self, topic: str) -> bool:
+        """Whether a topic can't go from any link to any other one."""
+        if any(each.source == each.target == "*" and fnmatchcase(topic, each.topic) for each in self._deny):
+            return True
+        return bool(self._allow) and not any(fnmatchcase(topic, each.topic) for each in self._allow)
+
     def order_denied(self, source: str, target: str, *, harmless: bool) -> int:
         """Why an order for a module may not go this way (DENIED_..., 0: it may); STOP is harmless."""
         if any(is_link(target, each) for each in self._options.read_only):
             return DENIED_READ_ONLY
+        return 0 if harmless or self._may_control(source) else DENIED_CONTROL
+
+    def own_order_denied(self, source: str, *, harmless: bool) -> int:
+        """Why the gateway itself does not obey an order that came in by this link (DENIED_..., 0: it does)."""
         return 0 if harmless or self._may_control(source) else DENIED_CONTROL
 
     def rate_limit(self, topic: str) -> float | None:
@@ -127,8 +140,24 @@ class Policy:
         prefix = self._prefix(link)
         return name.removeprefix(prefix) if name.startswith(prefix) else None
 
+    def module_called(self, name: str, link: str, *, foreign: bool) -> str | None:
+        """What a module is called on a link; None: it is not to be seen there. `foreign` ones are not the robot's."""
+        return name
+
+    def module_meant(self, name: str, link: str) -> tuple[str, bool] | None:
+        """The module that has this name on the link, and whether it is foreign: on the network, and not the robot's.
+        None: another robot's.
+        """
+        return name, False
+
     def _prefix(self, link: str) -> str:
-        return self._options.prefix if any(is_link(link, each) for each in self._options.prefix_on) else ""
+        prefix = self._prefixes.get(link)
+        if prefix is None:
+            if len(self._prefixes) >= _CACHED:
+                self._prefixes.clear()
+            here = any(is_link(link, each) for each in self._options.prefix_on)
+            prefix = self._prefixes[link] = self._options.prefix if here else ""
+        return prefix
 
     def _may_control(self, source: str) -> bool:
         return self._options.allow_control or source.partition(":")[0] not in IP

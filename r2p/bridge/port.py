@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
-from r2p.protocols.bridging.tree import Port, State
+from r2p.protocols.bridging.base import Port, State
 from r2p.topic import Topic
 from r2p.transports.announce import Told
 from r2p.transports.link import Link
@@ -26,8 +26,8 @@ class Owner(Protocol):
     def demand_changed(self, port: "BridgePort", topics: set[str]) -> None:
         """Others offer or want these topics there, or don't any more."""
 
-    def modules_changed(self) -> None:
-        """Modules or nodes came or went."""
+    def modules_changed(self, port: "BridgePort") -> None:
+        """Modules or nodes came or went there."""
 
 
 class BridgePort:
@@ -37,6 +37,8 @@ class BridgePort:
         self.link = link
         self.number = number
         self.place = Port(number, 0)
+        self.client = not link.admits_gateways
+        """Whether it is a client's: no gateway may be at its other end."""
         self.now = now
         """UTC in ns."""
         self.state = State.LISTENING
@@ -46,6 +48,8 @@ class BridgePort:
         self.demand = link.discovery.demand()
         self.denied_at = -(1 << 62)
         """When it was told last that an order does not pass (monotonic ns)."""
+        self.refusal_logged_at = -(1 << 62)
+        """When that was logged last (monotonic ns)."""
         self._owner = owner
         self._generation = -1
 
@@ -56,6 +60,16 @@ class BridgePort:
     @property
     def in_tree(self) -> bool:
         return self.place.in_tree
+
+    @property
+    def resumes(self) -> bool:
+        """Whether it forwards nothing just because this program stood still, and is likely to go on."""
+        return self.place.resumes or self.place.state is State.ALONE
+
+    def lose(self, reason: str) -> None:
+        """Count a message that does not pass."""
+        self.dropped[reason] += 1
+        self.link.stats.lost[reason] += 1
 
     # Gate
 
@@ -79,4 +93,4 @@ class BridgePort:
             self._owner.demand_changed(self, changed)
         if self.link.discovery.generation != self._generation:
             self._generation = self.link.discovery.generation
-            self._owner.modules_changed()
+            self._owner.modules_changed(self)

@@ -3,9 +3,14 @@
 Whoever is new on a link, or asks, gets all of it at once. r2p modules are passed on with one hop more, and taken back
 when they are gone. Of firmware only what it says itself is passed on, so that its age can be seen everywhere; it does
 not answer, so whoever asks is told of what was heard lately.
+
+`_facts` is what each link has told, by key; where something has changed on a link, only that is looked at, and told on
+the others. Links on which much comes and goes are looked at ROUNDS times a second. What is told again is spread over
+more time the more there is of it.
 """
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 
 import msgspec
 
@@ -16,28 +21,62 @@ from r2p.clock import Alarm
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_GONE, ROLE_PUBLISHES
 from r2p.protocols.announcer import Relayed
+from r2p.protocols.directory import EndpointInfo
 from r2p.protocols.events import ModuleInfo
 from r2p.topic import TopicSpace
+from r2p.transports.losses import TRY_AGAIN, internal_error_of
 
+ROUNDS = 5
+"""Looks at what has changed in a second, at most."""
+
+_SECOND = 1_000_000_000
 _REFRESH = 1_500_000_000
+_REFRESH_MOST = 20_000_000_000  # ns; a HELLO is believed for 65 s at most
+_REPEATED = 4_000  # messages a second that only repeat what was told before
+_SLICE = 250  # facts that are told again at once
+_SLICE_APART = 20_000_000  # ns between two of them
+_REST = 10  # times as long as a look took before the next one
 _SOON = 2_000_000  # ns; so that what comes together is looked at together
 _APART = 200_000_000  # ns between two answers on one link
 _LATELY = 2_000_000_000  # ns; of firmware that was heard since
 _Key = tuple[object, ...]
 
 
-class _Told(msgspec.Struct, frozen=True):
-    """What was passed on, and when it was heard."""
+class _Module(msgspec.Struct, frozen=True):
+    """A module as a link tells it, by its name on the robot; `foreign`: it is not the robot's."""
 
-    message: Relayed
+    name: str
+    foreign: bool
+    info: ModuleInfo
+
+    @property
+    def rank(self) -> tuple[bool, int]:
+        """Of several links the one with the lowest rank tells the truth."""
+        return self.foreign, self.info.hops
+
+
+class _Node(msgspec.Struct, frozen=True):
+    """A publisher or subscriber as a link tells it; `topic` is its name on the robot."""
+
+    topic: str
+    info: EndpointInfo
+    rank: tuple[bool, int] = (False, 0)
+
+
+_Fact = _Module | _Node
+
+
+class _Told(msgspec.Struct, frozen=True):
+    """What was passed on of a fact, and when the module was heard."""
+
+    messages: tuple[Relayed, ...]
     heard: int
-    hops: int
 
 
 class Presences:
     """What each link has been told of the modules on the others; `name` and `instance` are the gateway's own.
 
-    `repeating` is called whenever everything is told again.
+    `repeating` is called whenever something is told again.
     """
 
     def __init__(
@@ -55,126 +94,273 @@ class Presences:
         self._clock = space.clock
         self._policy = policy
         self._repeating = repeating
-        self._told: dict[int, dict[_Key, _Told]] = {}
+        self._facts: dict[str, dict[_Key, _Fact]] = {}
+        """By link, then by key."""
+        self._sources: dict[_Key, dict[str, _Fact]] = {}
+        """The same by key, then by link."""
+        self._told: dict[str, dict[_Key, _Told]] = {}
         self._alarm = Alarm(space.loop, self._due, background=True)
-        self._refresh_at = 0
-        self._met: dict[int, set[int]] = {}
-        self._asked: set[int] = set()
-        self._answered_at: dict[int, int] = {}
+        self._dirty: set[str] = set()
+        self._asked: set[str] = set()
+        self._met: dict[str, set[int]] = {}
+        self._answered_at: dict[str, int] = {}
+        self._refresh_at: dict[str, int] = {}
+        self._again: dict[str, deque[_Key]] = {}
+        """What is to be told again, by link."""
+        self._answering: set[str] = set()
+        """The links where that is an answer."""
+        self._rounds: deque[int] = deque(maxlen=ROUNDS)
+        self._next_round_at = 0
+        self._repeated_at = 0
 
     def asked(self, port: BridgePort) -> None:
         """Somebody on the link wants to know everything."""
-        self._asked.add(port.number)
-        self.changed()
+        self._asked.add(port.name)
+        self._set_alarm(self._clock.monotonic())
 
-    def changed(self) -> None:
-        """A module or a node came or went, or a link."""
-        self._alarm.set(self._clock.monotonic() + _SOON)
+    def changed(self, port: BridgePort) -> None:
+        """A module or a node came or went there, or the link has another place in the tree."""
+        self._dirty.add(port.name)
+        self._set_alarm(self._clock.monotonic())
 
     def forget(self, port: BridgePort) -> None:
         """The link is gone."""
-        for known in (self._told, self._met, self._answered_at):
-            known.pop(port.number, None)
-        self._asked.discard(port.number)
-        self.changed()
+        for known in (self._told, self._met, self._answered_at, self._refresh_at, self._again):
+            known.pop(port.name, None)
+        self._asked.discard(port.name)
+        self._answering.discard(port.name)
+        self.changed(port)
 
     def close(self) -> None:
         self._alarm.close()
 
+    # When
+
+    def _set_alarm(self, now: int) -> None:
+        dues = [now + _REFRESH, *self._refresh_at.values()]
+        if self._dirty:
+            dues.append(max(now + _SOON, self._next_round_at))
+        if self._again:
+            dues.append(now + _SLICE_APART)
+        dues += [max(now + _SOON, self._answered_at.get(name, -_APART) + _APART) for name in self._asked]
+        self._alarm.set(min(dues))
+
     def _due(self) -> None:
         now = self._clock.monotonic()
-        refresh = now >= self._refresh_at
-        if refresh:
-            self._refresh_at = now + _REFRESH
-            self._repeating()
-        ports = [port for port in self._ports.values() if port.link.up]
-        for port in ports:
-            port.link.stats.lost.guard(self._tell, port, ports, now, refresh=refresh)
-        waits = any(port.number in self._asked for port in ports)
-        self._alarm.set(min(self._refresh_at, now + _APART) if waits else self._refresh_at)
+        try:
+            self._do_due(now)
+        except Exception as error:  # noqa: BLE001 - counted and logged
+            internal_error_of((port.link.stats.lost for port in self._ports.values()), error)
+            self._alarm.set(now + TRY_AGAIN)
+        else:
+            self._set_alarm(now)
 
-    def _answers(self, port: BridgePort, now: int) -> bool:
-        """Whether the link is to be told everything, for it was asked for or somebody is new there."""
-        here = {info.instance for info in port.link.discovery.modules.values() if info.instance and not info.hops}
-        if not here <= self._met.get(port.number, set()):
-            self._asked.add(port.number)
-        self._met[port.number] = here
-        if port.number not in self._asked or now < self._answered_at.get(port.number, -_APART) + _APART:
-            return False
-        self._asked.discard(port.number)
-        self._answered_at[port.number] = now
-        return True
-
-    def _tell(self, port: BridgePort, ports: list[BridgePort], now: int, *, refresh: bool) -> None:
-        told = self._told.setdefault(port.number, {})
-        if port.in_tree and now >= port.place.until:
-            return  # it has to wait until the gateways agree
-        answers = self._answers(port, now)
-        news = self._news(port, ports, now) if port.in_tree else {}
-        for key, new in news.items():
-            before = told.get(key)
-            again = refresh and before is not None and (new.heard > before.heard or not _is_alive(new.message))
-            again |= answers and (now < new.heard + _LATELY or not _is_alive(new.message))
-            if before is None or before.message != new.message or again:
-                told[key] = new
-                port.link.stats.lost.guard(port.link.relay, new.message)
-        for key in [key for key in told if key not in news]:
-            gone = _gone(told.pop(key).message)
-            if gone is not None:
-                port.link.stats.lost.guard(port.link.relay, gone)
-
-    def _news(self, port: BridgePort, ports: list[BridgePort], now: int) -> dict[_Key, _Told]:
-        """What this link should know."""
-        news: dict[_Key, _Told] = {}
-        for other in ports:
-            if other is port or not other.in_tree:
+    def _do_due(self, now: int) -> None:
+        if self._dirty and now >= self._next_round_at:
+            self._rounds.append(now)
+            self._look(now)
+            took = self._clock.monotonic() - now
+            fifth = self._rounds[0] + _SECOND if len(self._rounds) == ROUNDS else 0
+            self._next_round_at = max(fifth, now + _REST * took)
+        period = self._period()
+        for port in list(self._ports.values()):
+            if not port.link.up or not self._is_open(port, now):
+                self._put_off(port, now)
                 continue
-            if now >= other.place.until:
-                return dict(self._told[port.number])
-            for info in list(other.link.discovery.modules.values()):
-                self._add_module(news, info, port)
-            for key, endpoint in list(other.link.discovery.endpoints.items()):
-                topic = self._passing(endpoint.topic, endpoint.role, other, port)
-                if topic is None or endpoint.instance == self._instance:
-                    continue
-                there = (endpoint.instance, endpoint.node, topic, endpoint.role)
-                if there not in port.link.discovery.endpoints:  # else it is on both links, and uses both
-                    message = management.Endpoint(
-                        endpoint.role, endpoint.instance, endpoint.node, topic, endpoint.publisher_class
-                    )
-                    news["endpoint", *key] = _Told(message, now, 0)
-        return news
+            self._meet(port)
+            if port.name in self._asked and now >= self._answered_at.get(port.name, -_APART) + _APART:
+                self._asked.discard(port.name)
+                self._answered_at[port.name] = now
+                self._answering.add(port.name)
+                self._again[port.name] = deque(self._told.get(port.name, ()))
+            if now >= self._refresh_at.setdefault(port.name, now + period):
+                self._refresh_at[port.name] = now + period
+                self._again.setdefault(port.name, deque(self._told.get(port.name, ())))
+            if port.name in self._again:
+                self._tell_again(port, now)
+        if now >= self._repeated_at + _REFRESH:
+            self._repeated_at = now
+            self._repeating()
 
-    def _add_module(self, news: dict[_Key, _Told], info: ModuleInfo, port: BridgePort) -> None:
-        known = port.link.discovery.modules.get(info.name)
-        hops = info.hops + 1
-        if hops > MOST_HOPS or info.name == self._name:
-            return  # of our name: our last start, of which others still tell
-        if known is not None and known.instance == info.instance:
-            return  # it is on both links
-        alive = ("alive", info.name)
-        if alive in news and news[alive].hops <= hops:
+    def _put_off(self, port: BridgePort, now: int) -> None:
+        """It can't be told anything now: look again soon."""
+        for when, gap in ((self._refresh_at, _APART), (self._answered_at, 0)):
+            if port.name in when or port.name in self._asked:
+                when[port.name] = max(when.get(port.name, 0), now + gap)
+
+    def _period(self) -> int:
+        """The time (ns) in which everything is told again."""
+        count = len(self._sources) * max(len(self._ports) - 1, 1)
+        return min(max(_REFRESH, count * _SECOND // _REPEATED), _REFRESH_MOST)
+
+    def _meet(self, port: BridgePort) -> None:
+        """See whether somebody is new there, who is to be told everything."""
+        if port.name in self._met and port.name not in self._facts:
             return
+        here = {info.instance for info in port.link.discovery.modules.values() if info.instance and not info.hops}
+        if not here <= self._met.get(port.name, set()):
+            self._asked.add(port.name)
+        self._met[port.name] = here
+
+    def _is_open(self, port: BridgePort, now: int) -> bool:
+        """Whether it has not to wait until the gateways agree."""
+        return not port.in_tree or now < port.place.until
+
+    # What is there
+
+    def _look(self, now: int) -> None:
+        """See what has changed on the links, and tell it on the others."""
+        dirty, self._dirty = self._dirty, set()
+        changed: dict[_Key, None] = {}
+        again: list[BridgePort] = []
+        for name in dirty:
+            port = self._ports.get(name)
+            if port is not None and port.link.up and not self._is_open(port, now):
+                continue  # what it has told holds until the gateways agree: then it has another place in the tree
+            self._collect(name, port, changed)
+            if port is not None and port.link.up and not (port.in_tree and name in self._told):
+                again.append(port)
+        for port in self._ports.values():
+            if port.link.up and self._is_open(port, now):
+                keys: Iterable[_Key] = [*self._sources, *self._told.get(port.name, ())] if port in again else changed
+                for key in list(dict.fromkeys(keys)):
+                    port.link.stats.lost.guard(self._tell, port, key)
+
+    def _collect(self, name: str, port: BridgePort | None, changed: dict[_Key, None]) -> None:
+        """Read what a link tells now."""
+        before = self._facts.pop(name, {})
+        facts = {} if port is None or not port.link.up or not port.in_tree else self._facts_of(port)
+        for key in before.keys() - facts.keys():
+            changed[key] = None
+            self._sources[key].pop(name)
+            if not self._sources[key]:
+                del self._sources[key]
+        for key, fact in facts.items():
+            if not _is_same(before.get(key), fact):
+                changed[key] = None
+            self._sources.setdefault(key, {})[name] = fact
+        if facts:
+            self._facts[name] = facts
+
+    def _facts_of(self, port: BridgePort) -> dict[_Key, _Fact]:
+        facts: dict[_Key, _Fact] = {}
+        hidden: set[int | None] = set()
+        for info in port.link.discovery.modules.values():
+            meant = self._policy.module_meant(info.name, port.name)
+            if meant is None:
+                hidden.add(info.instance)
+            elif meant[0] != self._name:  # of our name: our last start, of which others still tell
+                facts["module", meant[0]] = _Module(*meant, info)
+        for endpoint in port.link.discovery.endpoints.values():
+            topic = self._policy.meant(endpoint.topic, port.name)
+            if topic is not None and endpoint.instance != self._instance and endpoint.instance not in hidden:
+                facts["endpoint", endpoint.instance, endpoint.node, topic, endpoint.role] = _Node(topic, endpoint)
+        return facts
+
+    # What is told
+
+    def _tell_again(self, port: BridgePort, now: int) -> None:
+        """Tell a link a part of everything again: what lives, and of firmware what was heard since, or as an answer
+        what was heard lately.
+        """
+        keys, told = self._again[port.name], self._told.setdefault(port.name, {})
+        answers = port.name in self._answering
+        for key in [keys.popleft() for _ in range(min(len(keys), _SLICE))]:
+            before = told.get(key)
+            new = None if before is None else self._tell(port, key)
+            if before is None or new is None or new.messages != before.messages:
+                continue  # it has just been told
+            told[key] = new
+            for message in new.messages:
+                is_alive = isinstance(message, management.Alive)
+                if not is_alive or new.heard > before.heard or (answers and now < new.heard + _LATELY):
+                    self._say(port, message)
+        if not keys:
+            del self._again[port.name]
+            self._answering.discard(port.name)
+
+    def _tell(self, port: BridgePort, key: _Key) -> _Told | None:
+        """Tell a link what has changed of a fact; gives back what it should know."""
+        told = self._told.setdefault(port.name, {})
+        before = told.get(key)
+        new = self._news(port, key) if port.in_tree else None
+        if new is not None:
+            for message in new.messages:
+                if before is None or message not in before.messages:
+                    self._say(port, message)
+        if before is not None:
+            kept = {_subject(message) for message in new.messages} if new is not None else set()
+            for message in before.messages:
+                gone = _gone(message)
+                if gone is not None and _subject(message) not in kept:
+                    self._say(port, gone)
+        if new is None:
+            told.pop(key, None)
+        elif before is None or new.messages != before.messages:
+            told[key] = new
+        return new
+
+    def _say(self, port: BridgePort, message: Relayed) -> None:
+        port.link.stats.lost.guard(port.link.relay, message)
+
+    def _news(self, port: BridgePort, key: _Key) -> _Told | None:
+        """What this link should know of a fact."""
+        sources = self._sources.get(key, {})
+        names = [name for name in sources if name != port.name]
+        if not names:
+            return None
+        name = min(names, key=lambda each: sources[each].rank)
+        fact = sources[name]
+        if isinstance(fact, _Module):
+            return self._module_news(fact, self._ports[name], port)
+        return self._node_news(fact, self._ports[name], port)
+
+    def _module_news(self, module: _Module, source: BridgePort, port: BridgePort) -> _Told | None:
+        info = source.link.discovery.modules.get(module.info.name, module.info)  # as it was heard last
+        called = self._policy.module_called(module.name, port.name, foreign=module.foreign)
+        if called is None or info.hops + 1 > MOST_HOPS:
+            return None
+        known = port.link.discovery.modules.get(called)
+        if known is not None and known.instance == info.instance:
+            return None  # it is on both links
+        messages: list[Relayed] = []
         if info.r2p and info.instance is not None:
             flags = management.HELLO_TOOL if info.observer else 0
-            lease = min(info.lease // 1_000_000, 0xFFFF)
-            hello = management.Hello(info.name, info.instance, flags, hops, lease)
-            news["hello", info.name] = _Told(hello, info.last_heard, hops)
+            lease = min(max(info.lease, 3 * self._period()) // 1_000_000, 0xFFFF)
+            messages.append(management.Hello(called, info.instance, flags, info.hops + 1, lease))
         if not info.observer:
-            news[alive] = _Told(management.Alive(info.name, info.flags), info.last_heard, hops)
+            messages.append(management.Alive(called, info.flags))
+        return _Told(tuple(messages), info.last_heard)
 
-    def _passing(self, name: str, role: int, source: BridgePort, target: BridgePort) -> str | None:
-        """What a node's topic is called on another link; None where its messages may not pass."""
-        topic = self._policy.meant(name, source.name)
-        ways = (source, target) if role == ROLE_PUBLISHES else (target, source)
-        if topic is None or not self._policy.allows(topic, ways[0].name, ways[1].name):
+    def _node_news(self, node: _Node, source: BridgePort, port: BridgePort) -> _Told | None:
+        info = node.info
+        publishes = info.role == ROLE_PUBLISHES
+        ways = (source, port) if publishes else (port, source)
+        called = self._policy.called(node.topic, port.name)
+        if not self._policy.allows(node.topic, ways[0].name, ways[1].name) or len(called) > port.link.longest_name:
             return None
-        called = self._policy.called(topic, target.name)
-        return called if len(called) <= target.link.longest_name else None
+        if (info.instance, info.node, called, info.role) in port.link.discovery.endpoints:
+            return None  # it is on both links, and uses both
+        return _Told((management.Endpoint(info.role, info.instance, info.node, called, info.publisher_class),), 0)
 
 
-def _is_alive(message: Relayed) -> bool:
-    return isinstance(message, management.Alive)
+def _is_same(before: _Fact | None, now: _Fact) -> bool:
+    """Whether a fact is as it was, but for when it was heard."""
+    if isinstance(before, _Module) and isinstance(now, _Module):
+        return before == msgspec.structs.replace(
+            now, info=msgspec.structs.replace(now.info, last_heard=before.info.last_heard)
+        )
+    return before == now
+
+
+def _subject(message: Relayed) -> object:
+    """Whom a message tells of."""
+    match message:
+        case management.Hello(_, instance):
+            return instance
+        case management.Endpoint(role, instance, node, topic):
+            return role & ~ROLE_GONE, instance, node, topic
+    return None
 
 
 def _gone(message: Relayed) -> Relayed | None:

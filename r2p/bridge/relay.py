@@ -4,10 +4,12 @@
 asks the clock whether its two ports may still forward: a gateway that was stopped must not go on with an old tree.
 """
 
+import functools
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, cast
 
+from r2p.bridge.held import Held
 from r2p.bridge.port import BridgePort
 from r2p.bridge.seen import Seen
 from r2p.bridge.shaping import Shaper
@@ -43,7 +45,9 @@ class Way:
 class BridgedTopic(Topic):
     """A topic of a module that is a gateway."""
 
-    def __init__(self, name: str, waker: Waker, ports: dict[str, BridgePort], monotonic: Callable[[], int]) -> None:
+    def __init__(
+        self, name: str, waker: Waker, ports: dict[str, BridgePort], monotonic: Callable[[], int], held: Held
+    ) -> None:
         super().__init__(name, waker)
         self.relay: Relay | None = None
         """Set while it is relayed."""
@@ -54,6 +58,7 @@ class BridgedTopic(Topic):
         self._ports = ports
         self._monotonic = monotonic
         self._seen = Seen()
+        self._held = held
 
     @property
     def slotted(self) -> Sequence[object]:
@@ -78,10 +83,11 @@ class BridgedTopic(Topic):
         now = self._monotonic()
         port = self._ports[link]
         if now >= port.place.until:
-            port.dropped["converging"] += 1
+            if not (port.resumes and self._held.keep(sample, functools.partial(self.deliver, sample))):
+                port.lose("converging")
             return None
         if sample.sequence and self._seen.again(sample) and not port.link.latched(self.name):
-            port.dropped["seen before"] += 1
+            port.lose("seen before")
             return None
         ways = self.open.get(link)
         if ways is None and not self.queues:  # not yet, or not any more, as its publisher will soon know
@@ -119,7 +125,9 @@ class BridgedTopic(Topic):
 
     def _forward(self, way: Way, sample: Sample, now: int, blocked: list[Sink] | None) -> list[Sink] | None:
         if now >= way.port.place.until:
-            way.dropped["converging"] += 1
+            if not (way.port.resumes and self._held.keep(sample, functools.partial(self._go_on, way, sample))):
+                way.dropped["converging"] += 1
+                way.port.link.stats.lost["converging"] += 1
             return blocked
         if way.shaper is None and not sample.deadline and sample.hops < MOST_HOPS:
             return _put(way, sample, blocked)
@@ -135,6 +143,9 @@ class BridgedTopic(Topic):
             return _put_shaped(way, way.shaper.shape(sample, now, way.port.now()), sample, blocked)
         return blocked
 
+    def _go_on(self, way: Way, sample: Sample) -> list[Sink] | None:
+        return None if way.outlet is None else self._forward(way, sample, self._monotonic(), None)
+
     def _send(self, sample: Sample, blocked: list[Sink] | None, driver: object) -> list[Sink] | None:
         """What is published here goes where we forward, and nowhere else: elsewhere another gateway brings it."""
         now = self._monotonic()
@@ -142,32 +153,59 @@ class BridgedTopic(Topic):
         if not silent:
             return super()._send(sample, blocked, driver)
         for outlet in silent:
-            outlet.lost += 1
-            self._ports[outlet.link].dropped["converging"] += 1
+            port = self._ports[outlet.link]
+            if not (port.resumes and self._held.keep(sample, functools.partial(self._send_held, outlet, sample))):
+                outlet.lost += 1
+                port.lose("converging")
         outlets, self.outlets = self.outlets, [each for each in self.outlets if each not in silent]
         try:
             return super()._send(sample, blocked, driver)
         finally:
             self.outlets = outlets
 
+    def _send_held(self, outlet: Outlet, sample: Sample) -> list[Sink] | None:
+        port = self._ports.get(outlet.link)
+        if port is None or self._monotonic() >= port.place.until:
+            outlet.lost += 1
+            if port is not None:
+                port.lose("converging")
+            return None
+        return None if not outlet.room().line(sample) and outlet.offer(sample) else [outlet]
+
 
 class Relay:
     """A topic of the robot, on all links: `topics` by name, one unless it is called otherwise on some links.
 
-    `ways` are by the names of the two links; they stay for their counters.
+    `ways` are by the names of the two links, from those that have offered it to those that have wanted it; they stay
+    for their counters. `offering` and `wanting` are the ports where that is so now.
     """
 
     def __init__(self) -> None:
         self.topics: dict[str, BridgedTopic] = {}
         self.ways: dict[tuple[str, str], Way] = {}
+        self.offering: list[BridgePort] = []
+        self.wanting: list[BridgePort] = []
+
+    def keep(self, links: set[str]) -> None:
+        """Forget the ways from and to other links."""
+        for key in [key for key in self.ways if key[0] not in links or key[1] not in links]:
+            del self.ways[key]
+
+    def forget(self, link: str) -> bool:
+        """Forget the ways from and to a link; says whether there were any."""
+        keys = [key for key in self.ways if link in key]
+        for key in keys:
+            del self.ways[key]
+        return bool(keys)
 
     def route(self) -> None:
         """Somebody joined or left, or the ways have changed."""
+        outlets: dict[tuple[str, object], Outlet] = {}
         for topic in self.topics.values():
             topic.open = {}
+            outlets |= {(topic.name, each.carrier): each for each in topic.outlets}
         for (source, _), way in self.ways.items():
-            outlet = next((each for each in way.target.outlets if each.carrier is way.port.link), None)
-            way.outlet = outlet
+            way.outlet = outlet = outlets.get((way.target.name, way.port.link))
             if outlet is None:
                 continue
             for topic in self.topics.values():

@@ -15,6 +15,7 @@ from r2p.bridge.relay import BridgedTopic, Relay, Way
 from r2p.bridge.reserving import RelayedPeriodic
 from r2p.bridge.shaping import Shaper
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.names import LOADER_PREFIX
 from r2p.printable import get_logger
 from r2p.protocols.events import Shape
 from r2p.topic import Topic, TopicSpace
@@ -40,6 +41,8 @@ class Relays:
         self._space = space
         self._policy = policy
         self._dirty: dict[str, None] = {}
+        self._idle: set[str] = set()
+        """Topics that are offered or wanted, and may go nowhere as long as no other link comes."""
         self._reviewing = False
         self._shapes: dict[tuple[str, str], tuple[Shape, Shape]] = {}
         self._too_long: dict[str, None] = {}
@@ -51,17 +54,27 @@ class Relays:
         """The demand for these topics has changed on a link."""
         self._mark(topic for name in names if (topic := self._meant(name, port)) is not None)
 
-    def all_changed(self) -> None:
-        """The tree, or the links, have changed."""
-        ports = self._ports.values()
-        heard = {topic for port in ports for name in port.demand.topics() if (topic := self._meant(name, port))}
-        self._mark(heard | self.by_name.keys())
+    def port_changed(self, port: BridgePort) -> None:
+        """The link is new, or gone, or has another place in the tree: what it offers and wants is looked at anew, and
+        what others do is told to this link only.
+        """
+        heard = {topic for name in port.demand.topics() if (topic := self._meant(name, port))}
+        self._mark(heard | self._idle)
+        there = port.in_tree and self._ports.get(port.name) is port
+        for topic, relay in list(self.by_name.items()):
+            if topic in heard or self.by_name.get(topic) is not relay:
+                continue
+            if there and self._carries(topic, port):
+                self._enter(relay, topic, port)
+            elif relay.forget(port.name):
+                relay.route()
+            self._tell_port(topic, port)
 
     def retyped(self) -> None:
         """See whether other types, or sizes, are told than before."""
         for (topic, link), shape in list(self._shapes.items()):
             port = self._ports.get(link)
-            if port is not None and self._types(topic, port) != shape:
+            if port is not None and topic in self.by_name and self._types(topic, port) != shape:
                 self._mark((topic,))
 
     def _mark(self, topics: Iterable[str]) -> None:
@@ -83,39 +96,56 @@ class Relays:
 
     def _review(self, topic: str) -> None:
         ports = [port for port in self._ports.values() if port.in_tree and self._carries(topic, port)]
-        if any(self._uses(topic, source, target) for source, target in _pairs(ports)):
-            self._relay(topic, ports)
+        offering = [port for port in ports if self._offers(topic, port)]
+        wanting = [port for port in ports if self._wants(topic, port)]
+        if self._is_used(topic, ports, offering, wanting):
+            self._idle.discard(topic)
+            self._relay(topic, ports, offering, wanting)
+            return
+        self._end(topic)
+        if (offering or wanting) and not self._policy.allows_nowhere(topic):
+            self._idle.add(topic)
         else:
-            self._end(topic)
+            self._idle.discard(topic)
 
-    def _uses(self, topic: str, source: BridgePort, target: BridgePort) -> bool:
-        """Whether messages flow this way, or would if there were any."""
-        asked = self._offers(topic, source) or self._wants(topic, target)
-        return asked and self._policy.allows(topic, source.name, target.name)
+    def _is_used(
+        self, topic: str, ports: list[BridgePort], offering: list[BridgePort], wanting: list[BridgePort]
+    ) -> bool:
+        """Whether messages flow anywhere, or would if there were any."""
+        if self._policy.allows_nowhere(topic):
+            return False
+        return any(self._allows(topic, *each) for each in _pairs(offering, ports)) or any(
+            self._allows(topic, *each) for each in _pairs(ports, wanting)
+        )
+
+    def _allows(self, topic: str, source: BridgePort, target: BridgePort) -> bool:
+        return self._policy.allows(topic, source.name, target.name)
 
     # Relays
 
-    def _relay(self, topic: str, ports: list[BridgePort]) -> None:
+    def _relay(
+        self, topic: str, ports: list[BridgePort], offering: list[BridgePort], wanting: list[BridgePort]
+    ) -> None:
         relay = self.by_name.get(topic)
         if relay is None:
             relay = self.by_name[topic] = Relay()
+        relay.offering, relay.wanting = offering, wanting
         for port in ports:
-            here = self._topic(topic, port)
-            here.relay = relay
-            relay.topics[here.name] = here
-        pairs = {
-            (source.name, target.name): target
-            for source, target in _pairs(ports)
-            if self._policy.allows(topic, source.name, target.name)
-        }
-        for key in relay.ways.keys() - pairs.keys():
-            del relay.ways[key]
-        for (source_name, _), target in pairs.items():
-            key = source_name, target.name
-            if key not in relay.ways:
-                relay.ways[key] = Way(target, self._topic(topic, target), self._shaper(topic, source_name, target))
+            self._enter(relay, topic, port)
+        if topic.startswith(LOADER_PREFIX):
+            offering = wanting = ports  # it flows without being offered or wanted
+        for source, target in _pairs(offering, wanting):
+            key = source.name, target.name
+            if key not in relay.ways and self._allows(topic, source, target):
+                relay.ways[key] = Way(target, self._topic(topic, target), self._shaper(topic, source.name, target))
+        relay.keep({port.name for port in ports})
         relay.route()
         self._tell(topic)
+
+    def _enter(self, relay: Relay, topic: str, port: BridgePort) -> None:
+        here = self._topic(topic, port)
+        here.relay = relay
+        relay.topics[here.name] = here
 
     def _end(self, topic: str) -> None:
         relay = self.by_name.pop(topic, None)
@@ -131,25 +161,28 @@ class Relays:
 
     def _tell(self, topic: str, topics: dict[str, BridgedTopic] | None = None) -> None:
         for port in list(self._ports.values()):
-            name = self._policy.called(topic, port.name)
-            here = (topics or self._space.topics).get(name)
-            if here is not None:
-                self._shapes[topic, port.name] = self._types(topic, port)
-                port.link.stats.lost.guard(port.link.topic_changed, here)
-            if topics is not None:
-                self._shapes.pop((topic, port.name), None)
+            self._tell_port(topic, port, topics)
+
+    def _tell_port(self, topic: str, port: BridgePort, topics: dict[str, BridgedTopic] | None = None) -> None:
+        """Tell one link of a topic; `topics`: those of a relay that has ended."""
+        here = (topics or self._space.topics).get(self._policy.called(topic, port.name))
+        if topics is not None:
+            self._shapes.pop((topic, port.name), None)
+        elif here is not None:
+            self._shapes[topic, port.name] = self._types(topic, port)
+        if here is not None:
+            port.link.stats.lost.guard(port.link.topic_changed, here)
 
     def wish(self, port: BridgePort, topic: Topic, own: Told) -> Told:
         """What a link is to be told of a topic that this module itself has as `own`."""
         if not port.in_tree:
             return NOTHING
         name = self._policy.meant(topic.name, port.name)
-        if name is None or name not in self.by_name:
+        relay = None if name is None else self.by_name.get(name)
+        if name is None or relay is None:
             return own
-        others = [each for each in self._ports.values() if each is not port and each.in_tree]
-        allows = self._policy.allows
-        publishes = any(self._offers(name, each) and allows(name, each.name, port.name) for each in others)
-        subscribes = any(self._wants(name, each) and allows(name, port.name, each.name) for each in others)
+        publishes = any(self._allows(name, each, port) for each in relay.offering if each is not port)
+        subscribes = any(self._allows(name, port, each) for each in relay.wanting if each is not port)
         if not publishes and not subscribes:
             return own
         shape, asked = (own.asked, own.asked) if topic.layout is not None else self._types(name, port)
@@ -167,13 +200,15 @@ class Relays:
 
         Those that it has itself are asked for what they have, so that one of another type elsewhere does not end it.
         """
-        others = [each for each in self._ports.values() if each is not port and each.in_tree]
+        relay = self.by_name[topic]
+        others = [each for each in self._ports.values() if each.in_tree] if not relay.offering else relay.offering
+        wanting = [each for each in self._ports.values() if each.in_tree] if not relay.wanting else relay.wanting
         here = self._told(topic, [port], ROLE_PUBLISHES)
-        published = self._told(topic, others, ROLE_PUBLISHES)
-        asked = self._told(topic, others, ROLE_SUBSCRIBES)
+        published = self._told(topic, (each for each in others if each is not port), ROLE_PUBLISHES)
+        asked = self._told(topic, (each for each in wanting if each is not port), ROLE_SUBSCRIBES)
         return published or asked or Shape(), here or asked or published or Shape()
 
-    def _told(self, topic: str, ports: list[BridgePort], role: int) -> Shape | None:
+    def _told(self, topic: str, ports: Iterable[BridgePort], role: int) -> Shape | None:
         """The type that the first link tells."""
         infos = (each.link.discovery.topics.get(self._policy.called(topic, each.name)) for each in ports)
         return next((info.shapes[role] for info in infos if info is not None and role in info.shapes), None)
@@ -237,5 +272,5 @@ class Relays:
         return shaper
 
 
-def _pairs(ports: list[BridgePort]) -> Iterator[tuple[BridgePort, BridgePort]]:
-    return ((source, target) for source in ports for target in ports if source is not target)
+def _pairs(sources: list[BridgePort], targets: list[BridgePort]) -> Iterator[tuple[BridgePort, BridgePort]]:
+    return ((source, target) for source in sources for target in targets if source is not target)

@@ -80,6 +80,8 @@ class HeardDemand(Demand):
         super().__init__()
         self._timers = timers
         self._directory = directory
+        self._lasting: dict[Source, dict[_Entry, None]] = {}
+        """What was told without a lease, by who told it."""
 
     def heard(self, now: int, message: management.Management, source: Source) -> None:
         """A management message."""
@@ -99,6 +101,11 @@ class HeardDemand(Demand):
     def expired(self, topic: str, role: int, source: Source) -> None:
         """The lease of an entry is over."""
         self._timers.clear(("demand", topic, role, source))
+        lasting = self._lasting.get(source)
+        if lasting is not None:
+            lasting.pop((topic, role), None)
+            if not lasting:
+                del self._lasting[source]
         self.remove(topic, role, source)
 
     def left(self, source: Source) -> None:
@@ -114,27 +121,25 @@ class HeardDemand(Demand):
 
     def _enter(self, now: int, topic: str, role: int, source: Source) -> None:
         lease = self._lease(source)
-        if self.add(topic, role, source) and lease is not None:
+        if not self.add(topic, role, source):
+            return
+        if lease is not None:
             self._timers.set(("demand", topic, role, source), now + lease)
+            self._lasting.get(source, {}).pop((topic, role), None)
+        elif ("demand", topic, role, source) not in self._timers:
+            self._lasting.setdefault(source, {})[topic, role] = None
 
     def _renew(self, now: int, source: Source) -> None:
         """What was heard before the first HELLO is a lease, too."""
-        lease = self._lease(source)
-        for topic, role in self.of(source) if lease is not None else ():
-            if ("demand", topic, role, source) not in self._timers:
-                self._timers.set(("demand", topic, role, source), now + (lease or 0))
+        lease = self._lease(source) if source in self._lasting else None
+        if lease is not None:
+            for topic, role in self._lasting.pop(source):
+                self._timers.set(("demand", topic, role, source), now + lease)
 
     def _lease(self, source: Source) -> int | None:
-        leases = [
-            info.lease
-            for info in self._directory.modules.values()
-            if info.r2p and info.source == source and info.hops == 0
-        ]
-        return max(leases) if leases and max(leases) < FOR_EVER else None
+        lease = self._directory.lease_of(source)
+        return lease if lease is not None and lease < FOR_EVER else None
 
     def _alone(self, source: Source, instance: int) -> bool:
         """Whether nobody else speaks from this address, as far as that is known."""
-        others = [
-            info for info in self._directory.modules.values() if info.source == source and info.instance != instance
-        ]
-        return not any(info.hops == 0 for info in others)
+        return self._directory.speaks_alone(source, instance)

@@ -92,6 +92,8 @@ class Directory:
         self._counts = counts
         self.ends: dict[str, int] = {}
         """The instances of the r2p modules on the link itself, not behind a gateway."""
+        self._direct: dict[Source, dict[str, ModuleInfo]] = {}
+        self._leases: dict[Source, Counter[int]] = {}
         self._names: dict[int, str] = {}
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._starts: dict[str, _Starts] = {}
@@ -103,6 +105,14 @@ class Directory:
 
     def name_of(self, instance: int) -> str:
         return self._names.get(instance, "")
+
+    def lease_of(self, source: Source) -> int | None:
+        """The longest lease of the r2p modules that speak from an address themselves; None: there are none."""
+        return max(self._leases.get(source, ()), default=None)
+
+    def speaks_alone(self, source: Source, instance: int) -> bool:
+        """Whether no other module than this one is known to speak from an address itself."""
+        return all(info.instance == instance for info in self._direct.get(source, {}).values())
 
     def alive(self, now: int, message: management.Alive, source: Source) -> tuple[ModuleInfo | None, ModuleInfo]:
         """A module's state: what was known before, and what is known now."""
@@ -134,6 +144,9 @@ class Directory:
             self._forget_instance(before.instance)
         self.generation += before is None or _who(before) != _who(info)
         forgotten = self._put(self.modules, info.name, info, "modules forgotten")
+        self._forget_direct(before)
+        self._forget_direct(forgotten)
+        self._enter_direct(info)
         if info.instance is not None:
             self._names[info.instance] = info.name
         if info.instance is not None and not info.hops:
@@ -146,7 +159,9 @@ class Directory:
 
     def remove(self, info: ModuleInfo) -> None:
         """A module is gone, and its endpoints with it."""
-        if self.modules.pop(info.name, None) is not None:
+        known = self.modules.pop(info.name, None)
+        if known is not None:
+            self._forget_direct(known)
             self.generation += 1
             self._forget(info)
 
@@ -238,6 +253,27 @@ class Directory:
             self._counts[reason] += 1
         table[key] = value
         return forgotten
+
+    def _enter_direct(self, info: ModuleInfo) -> None:
+        if info.hops == 0:
+            self._direct.setdefault(info.source, {})[info.name] = info
+            if info.r2p:
+                self._leases.setdefault(info.source, Counter())[info.lease] += 1
+
+    def _forget_direct(self, info: ModuleInfo | None) -> None:
+        if info is None or info.hops:
+            return
+        there = self._direct[info.source]
+        del there[info.name]
+        if not there:
+            del self._direct[info.source]
+        if info.r2p:
+            leases = self._leases[info.source]
+            leases[info.lease] -= 1
+            if not leases[info.lease]:
+                del leases[info.lease]
+            if not leases:
+                del self._leases[info.source]
 
     def _forget(self, info: ModuleInfo) -> None:
         self._starts.pop(info.name, None)

@@ -236,6 +236,10 @@ class LineLink(Link):
             return False  # hellos of gateways that come late would part the tree
         return self._carrier.waits
 
+    @property
+    def private(self) -> bool:
+        return self._carrier is not None and self._carrier.waits
+
     def pause(self) -> None:
         if self._carrier is not None:
             self._carrier.pause()

@@ -130,6 +130,8 @@ class Link(abc.ABC):
         self.title = self.name.removesuffix(":")
         """The name as it stands in texts."""
         self.up = False
+        self.admits_gateways = True
+        """Whether a gateway at its other end takes part in the mesh of ours; else it is for clients."""
         self.gate: Gate | None = None
         """Set by the module: what gateways, and it beside gateways, do with the link."""
         self.stands_by = ""
@@ -251,6 +253,11 @@ class Link(abc.ABC):
     @property
     def waits(self) -> bool:
         """Whether the other end waits while nothing is read, and nothing is lost by that."""
+        return False
+
+    @property
+    def private(self) -> bool:
+        """Whether its other end stays the same for as long as it is up."""
         return False
 
     def pause(self) -> None:

@@ -17,7 +17,7 @@ from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
-from r2p.transports.url import Url
+from r2p.transports.url import Url, yes_or_no
 
 PORT = 2323
 """Where `tcp-listen:` listens, and `tcp:HOST` connects, unless told otherwise."""
@@ -191,10 +191,15 @@ class _Outgoing(_Tcp):
 
 
 class TcpListenTransport(Transport):
-    """`tcp-listen:HOST:PORT`: serves up to `max_clients` clients at once; on loopback unless an address is given."""
+    """`tcp-listen:HOST:PORT`: serves up to `max_clients` clients at once; on loopback unless an address is given.
+
+    With `gateways=yes` gateways among them take part in the mesh of this one, where it is a gateway; else they are
+    refused.
+    """
 
     def __init__(self, url: Url) -> None:
-        options = url.parsed({"max_clients": _client_count})
+        options = url.parsed({"max_clients": _client_count, "gateways": yes_or_no})
+        self._gateways = bool(options.get("gateways", False))
         host, self._port = _host_port(url)
         self._host = host or "127.0.0.1"
         self._url = url
@@ -204,7 +209,7 @@ class TcpListenTransport(Transport):
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         loop = asyncio.get_running_loop()
-        clients = _Clients(hub, str(self._url), self._max_clients)
+        clients = _Clients(hub, str(self._url), self._max_clients, gateways=self._gateways)
         try:
             server = await loop.create_server(lambda: _Incoming(clients), self._host, self._port)
         except OSError as error:
@@ -224,9 +229,10 @@ class TcpListenTransport(Transport):
 class _Clients:
     """The connections of one server: those that are served, and those that are being refused."""
 
-    def __init__(self, hub: Hub, url: str, most: int) -> None:
+    def __init__(self, hub: Hub, url: str, most: int, *, gateways: bool) -> None:
         self.hub = hub
         self.most = most
+        self.gateways = gateways
         self.served: set[_Incoming] = set()
         self.refused: set[_Incoming] = set()
         self.closing = asyncio.Event()
@@ -267,6 +273,7 @@ class _Incoming(_Tcp):
 
     def open_link(self, peer: str) -> LineLink:
         link = LineLink(peer, self._hub)
+        link.admits_gateways = self._clients.gateways
         self._clients.served.add(self)
         self._hub.attach(link)
         return link

@@ -97,6 +97,13 @@ def schemes() -> list[str]:
     return sorted({*BUILT_IN, *(entry.name for entry in _added())})
 
 
+def yes_or_no(text: str) -> bool:
+    """True from "yes", False from "no"."""
+    if text not in ("yes", "no"):
+        raise ValueError("write yes or no")
+    return text == "yes"
+
+
 def _factory(url: Url) -> Callable[[Url], Transport]:
     if url.scheme in BUILT_IN:
         module, _, name = BUILT_IN[url.scheme].partition(":")

@@ -60,3 +60,27 @@ async def test_firmware_that_was_heard_lately_is_told_and_not_one_that_is_silent
             names = {view.name for view in b.network.modules()}
             assert "IMU1" in names
             assert "OLD" not in names
+
+
+async def test_a_link_on_which_much_comes_and_goes_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And each change is told all the same."""
+    async with gateway() as gw, r2p.Module("B", via="memory:b") as b:
+        bridge = gw._hub.bridge if gw._hub is not None else None
+        assert bridge is not None
+        looks = []
+        look = bridge.presences._look
+
+        def count(now: int) -> None:
+            looks.append(now)
+            look(now)
+
+        monkeypatch.setattr(bridge.presences, "_look", count)
+        tap = Tap("a")
+        tap.say(management.Hello("X", 99))
+        for number in range(400):
+            tap.say(management.Endpoint(1, 99, "n", f"t{number}", 1))
+            await asyncio.sleep(0.005)
+        assert len(looks) <= 5 * 3
+        await asyncio.sleep(3.0)
+        (link,) = b.links
+        assert len([each for each in link.discovery.endpoints.values() if each.instance == 99]) == 400

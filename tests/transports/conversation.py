@@ -26,6 +26,8 @@ class Said(msgspec.Struct, frozen=True):
 class Script(Transport, Carrier):
     """A line link of a module, whose other end is the test: `hear` is what comes in, `said` what went out."""
 
+    admits_gateways = True
+
     def __init__(self) -> None:
         self.said: list[Said] = []
         self.blocked = False
@@ -36,6 +38,7 @@ class Script(Transport, Carrier):
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         self.link = link = LineLink("script", hub)
+        link.admits_gateways = self.admits_gateways
         hub.attach(link)
         try:
             link.connected(self)

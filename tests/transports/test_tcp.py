@@ -458,3 +458,19 @@ def test_what_can_not_be_a_host_name_is_said_at_once(
 ) -> None:
     with pytest.raises(TransportError, match="is no host name"):
         transport(parse(f"tcp:{host}:23"))
+
+
+@pytest.mark.parametrize(("option", "admits"), [("", False), ("?gateways=no", False), ("?gateways=yes", True)])
+async def test_gateways_among_clients_are_let_in_on_demand_only(option: str, admits: bool) -> None:
+    transport = TcpListenTransport(parse(f"tcp-listen:127.0.0.1:0{option}"))
+    async with asyncio.timeout(GUARD), r2p.Module("A", via=transport, watchdog=False) as module:
+        client = r2p.Module("B", via=f"tcp:127.0.0.1:{transport.port}", watchdog=False)
+        async with client as other, node_in(module) as node, node_in(other) as there:
+            there.advertise("leds", Led)
+            await node.subscribe("leds", Led).wait_publisher()
+            assert [each.admits_gateways for each in (*module.links, *other.links)] == [admits, True]
+
+
+def test_gateways_is_yes_or_no() -> None:
+    with pytest.raises(r2p.TransportError, match="write yes or no"):
+        TcpListenTransport(parse("tcp-listen:0?gateways=maybe"))

@@ -5,6 +5,13 @@ import msgspec
 from r2p.codecs.management import Mesh
 from r2p.protocols.bridging.mesh import Assembly, Edge, Hearing, Place, digest, edges_from, parts, tree
 
+MOST_RECORDS = 256
+"""Gateways of which it is kept whom they hear."""
+CHANGES = 100
+"""Changes that one gateway may tell in a row ..."""
+CHANGE_FORGIVEN = 5_000_000_000
+"""... and ns until it may tell one more: one that tells another mesh each time would keep all from agreeing."""
+
 _KEPT = 5_000_000_000  # ns for which a record lives on that nobody repeats, of a gateway that is not in the mesh
 
 
@@ -14,6 +21,8 @@ class _Record(msgspec.Struct):
     serial: int
     heard: frozenset[Hearing]
     at: int
+    changes: int = 0
+    changed_at: int = 0
 
 
 class Atlas:
@@ -29,14 +38,21 @@ class Atlas:
         self._gateway = gateway
         self._chosen: frozenset[Place] = frozenset()
         self._records: dict[int, _Record] = {}
+        self._audible: set[int] = set()
         self._assembly = Assembly()
         self._heard: frozenset[Hearing] = frozenset()
         self._serial = 0
+        self._forget_at = 0
 
-    @property
-    def others(self) -> list[int]:
-        """Gateways that have told whom they hear."""
-        return list(self._records)
+    def others(self, turn: int, most: int) -> list[int]:
+        """Gateways of the mesh that have told whom they hear: `most` of them, others each turn."""
+        known = [gateway for gateway in self._records if self.concerns(gateway)]
+        start = turn * most % len(known) if len(known) > most else 0
+        return [*known[start:], *known[:start]][:most]
+
+    def concerns(self, gateway: int) -> bool:
+        """Whether it is in the mesh, or a gateway there says that it hears it: others may be in no mesh of ours."""
+        return gateway in self.members or gateway in self._audible
 
     def chosen(self, place: Place) -> bool:
         """Whether the port is one of those that forward."""
@@ -57,18 +73,45 @@ class Atlas:
         if known is not None and not 0 < (message.serial - known.serial) & 0xFFFF < 0x8000:
             known.at = now
             return False
-        heard = self._assembly.add(message)
-        if heard is None:
+        record = self._record(now, message.gateway, known)
+        heard = self._assembly.add(message) if record is not None else None
+        if record is None or heard is None:
             return False
-        self._records[message.gateway] = _Record(message.serial, heard, now)
-        self._draw()
+        record.serial, record.heard, record.at = message.serial, heard, now
+        record.changes += 1
+        self._records[message.gateway] = record
+        if self.concerns(message.gateway):
+            self._draw()
         return True
+
+    def _record(self, now: int, gateway: int, known: _Record | None) -> _Record | None:
+        """The entry in which to write what a gateway tells; None: not now."""
+        if known is None:
+            if len(self._records) >= MOST_RECORDS and not self._make_room(gateway):
+                return None
+            return _Record(0, frozenset(), now, changed_at=now)
+        forgiven = min(known.changes, (now - known.changed_at) // CHANGE_FORGIVEN)
+        known.changes -= forgiven
+        known.changed_at = known.changed_at + forgiven * CHANGE_FORGIVEN if known.changes else now
+        return known if known.changes < CHANGES else None
+
+    def _make_room(self, gateway: int) -> bool:
+        """Forget what does not concern us, for a gateway that does."""
+        if not self.concerns(gateway):
+            return False
+        idle = next((each for each in self._records if not self.concerns(each)), None)
+        if idle is not None:
+            del self._records[idle]
+        return idle is not None
 
     def forget(self, now: int) -> None:
         """What was told long ago, by those who are not in the mesh."""
-        for gateway in [gateway for gateway, record in self._records.items() if now - record.at >= _KEPT]:
-            if gateway not in self.members:
-                del self._records[gateway]
+        late = now - _KEPT
+        if now >= self._forget_at:
+            self._forget_at = now + _KEPT // 8
+            for gateway in [each for each, record in self._records.items() if record.at <= late]:
+                if gateway not in self.members:
+                    del self._records[gateway]
 
     def told(self, gateway: int) -> list[Mesh]:
         """The messages that tell whom a gateway hears: this one, or one of the others."""
@@ -79,7 +122,10 @@ class Atlas:
 
     def _draw(self) -> None:
         heard = {gateway: record.heard for gateway, record in self._records.items()}
-        edges = edges_from(self._gateway, heard | {self._gateway: self._heard})
+        heard[self._gateway] = self._heard
+        edges = edges_from(self._gateway, heard)
+        members = {place[0] for edge in edges for place in edge} | {self._gateway}
+        self._audible = {there for here in members for _, there, _ in heard.get(here, ())}
         if edges != self.edges:
             self.edges = edges
             self.members = {place[0] for edge in edges for place in edge}

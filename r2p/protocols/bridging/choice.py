@@ -2,8 +2,8 @@
 
 import msgspec
 
+from r2p.protocols.bridging.base import LEASE, SETTLE
 from r2p.protocols.bridging.mesh import Place
-from r2p.protocols.bridging.tree import LEASE, SETTLE
 
 FOR_EVER = 1 << 62
 """An instant (monotonic ns) that never comes; less it: one that never was."""

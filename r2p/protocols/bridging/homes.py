@@ -13,8 +13,7 @@ has only one other end. What was unused until now waits for SETTLE, for what is 
 from collections import Counter, deque
 
 from r2p.codecs.management import Bridge, Leaf
-from r2p.protocols.bridging.choice import FOR_EVER, Choice, Heard, Home
-from r2p.protocols.bridging.tree import (
+from r2p.protocols.bridging.base import (
     APART,
     DEAD,
     LEASE,
@@ -25,6 +24,7 @@ from r2p.protocols.bridging.tree import (
     is_late,
     packed_acks,
 )
+from r2p.protocols.bridging.choice import FOR_EVER, Choice, Heard, Home
 
 TWIN_MEMORY = 7_000_000_000
 """Ns after which two links that led to one network are not believed to do so any more, unless it shows again."""

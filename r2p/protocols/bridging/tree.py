@@ -16,136 +16,45 @@ Modules that are no gateways may have several links, too (`homes`). Those that u
 LEAF; and before a gateway forwards in another mesh than before (its root is another one), they know of it.
 """
 
-import enum
-import struct
 from collections import deque
-
-import msgspec
 
 from r2p.codecs.management import Bridge, Leaf, Mesh
 from r2p.protocols.bridging.atlas import Atlas
-from r2p.protocols.bridging.mesh import Edge, Place, digest
+from r2p.protocols.bridging.base import (
+    APART,
+    BRIDGE_ACKS,
+    DEAD,
+    FLAP_FORGIVEN,
+    FLAPS,
+    FOR_EVER,
+    LEASE,
+    LISTEN,
+    PROBE,
+    PROBE_MEMORY,
+    PROBE_PROVEN,
+    SETTLE,
+    TICK,
+    TICK_ALONE,
+    TICK_LISTENING,
+    Action,
+    Changed,
+    Neighbour,
+    Port,
+    Probe,
+    Say,
+    State,
+    acknowledged,
+    bury_leaves,
+    hear_leaf,
+    is_late,
+    packed_acks,
+    put_off_leaves,
+    see_heeded,
+)
+from r2p.protocols.bridging.clients import Clients
+from r2p.protocols.bridging.mesh import MOST_HEARD, Edge, digest
 
-_MS = 1_000_000
-
-TICK = 80 * _MS
-"""Ns between two BRIDGE where there are other gateways."""
-TICK_ALONE = 200 * _MS
-TICK_LISTENING = 50 * _MS
-LEASE = 600 * _MS
-"""How long an acknowledgement holds, from when what it acknowledges was sent."""
-DEAD = 650 * _MS
-"""A gateway that was silent for so long is gone."""
-LISTEN = 800 * _MS
-"""A new port is silent for so long, but for hellos."""
-SETTLE = 300 * _MS
-"""Between agreement and forwarding; no message may take longer from its publisher to the last gateway."""
-PROBE = 2_000 * _MS
-"""Between two probes for loops through gateways that know nothing of this."""
-PROBE_MEMORY = 7_000 * _MS
-PROBE_PROVEN = 300 * _MS
-"""A gateway of which only a probe was heard for so long is not on this network itself."""
-
-MOST_PORTS = 250
-
-APART = 10 * _MS
-"""Between two hellos at least, for those out of turn."""
-_FOR_EVER = 1 << 62
-ACK = struct.Struct("<IH")
-_ACKS = 2
-_LEAVES = 32  # on one network; more than these use one link only
 _RECORDS_A_TICK = 16
-
-
-class State(enum.Enum):
-    """What a port does."""
-
-    LISTENING = "listening"
-    ALONE = "alone"
-    CONVERGING = "converging"
-    FORWARDING = "forwarding"
-    BLOCKED = "blocked"
-    LOOP = "loop"
-
-
-class Say(msgspec.Struct, frozen=True):
-    """Send this at the port."""
-
-    port: int
-    message: Bridge | Mesh
-
-
-class Probe(msgspec.Struct, frozen=True):
-    """Send a probe at the port: something that any gateway passes on."""
-
-    port: int
-
-
-class Changed(msgspec.Struct, frozen=True):
-    """A port is in another state, or has another place in the tree."""
-
-    port: int
-
-
-Action = Say | Probe | Changed
-
-
-class Neighbour(msgspec.Struct):
-    """Another port on the same network; instants in monotonic ns."""
-
-    heard_at: int
-    count: int
-    agreement: int
-    acked_at: int
-
-
-def is_late(count: int, last: int) -> bool:
-    """Whether a message was overtaken by one with the number `last`."""
-    return (count - last) & 0xFFFF >= 0x8000
-
-
-def acknowledged(acks: bytes, sender: int, sent: deque[tuple[int, int]]) -> int:
-    """When `sender` sent what these acks name; 0: nothing of its that still counts. `sent`: count, instant."""
-    for name, count in ACK.iter_unpack(acks):
-        if name == sender:
-            return next((at for each, at in reversed(sent) if each == count), 0)
-    return 0
-
-
-def packed_acks(acks: list[tuple[int, int]], each: int) -> list[bytes]:
-    """Senders and counts, `each` of them in a message."""
-    starts = range(0, max(len(acks), 1), each)
-    return [b"".join(ACK.pack(*ack) for ack in acks[at : at + each]).ljust(each * ACK.size, b"\0") for at in starts]
-
-
-class Port(msgspec.Struct, eq=False):
-    """A port of this gateway.
-
-    `until`: data may pass before this instant (monotonic ns). `in_tree`: whether it does, has done, or will soon do so;
-    what others want is known by that. `gateways` are those heard on its network. `echoes`: it gives back what we say.
-    `heeded_since`: since when all `leaves` there know our root.
-    """
-
-    number: int
-    opened_at: int
-    until: int = 0
-    state: State = State.LISTENING
-    in_tree: bool = False
-    neighbours: dict[Place, Neighbour] = {}
-    leaves: dict[Place, Neighbour] = {}
-    heeded_since: int | None = 0
-    probes: dict[Place, tuple[int, int]] = {}
-    view: object = None
-    agreement: int = 0
-    agreed_since: int | None = None
-    said_at: int = -_FOR_EVER
-    say_at: int = 0
-    probe_at: int = 0
-    echoes: bool = False
-
-    @property
-    def gateways(self) -> set[int]:
-        return {gateway for gateway, _ in self.neighbours}
 
 
 class Tree:
@@ -165,17 +74,22 @@ class Tree:
         self._sent: deque[tuple[int, int]] = deque()  # count, instant
         self._looked_at = 0
         self._actions: list[Action] = []
+        self.clients = Clients(self.gateway, self._actions)
 
     @property
     def edges(self) -> frozenset[Edge]:
         """The mesh of gateways that this one is part of."""
         return self._atlas.edges
 
+    def knows(self, gateway: int) -> bool:
+        """Whether it is this gateway, or one in its mesh."""
+        return gateway == self.gateway or gateway in self._atlas.members
+
     # Ports
 
-    def open(self, now: int, number: int) -> None:
+    def open(self, now: int, number: int, *, private: bool = False) -> None:
         """A link is up."""
-        self.ports[number] = Port(number, now, say_at=now, probe_at=now)
+        self.ports[number] = Port(number, now, say_at=now, probe_at=now, private=private)
         self._look(now)
 
     def shut(self, now: int, number: int) -> None:
@@ -186,12 +100,15 @@ class Tree:
         self._look(now)
 
     def take(self) -> list[Action]:
-        actions, self._actions = self._actions, []
+        actions = self._actions.copy()
+        self._actions.clear()
         return actions
 
     def next_deadline(self) -> int | None:
         """When to call `poll`."""
-        return min((self._due(port) for port in self.ports.values()), default=None)
+        due = min((self._due(port) for port in self.ports.values()), default=FOR_EVER)
+        due = min(due, self.clients.next_deadline())
+        return due if due < FOR_EVER else None
 
     def poll(self, now: int) -> None:
         """Say what is due, and see who has fallen silent."""
@@ -201,11 +118,17 @@ class Tree:
                 self._say(now, port)
             if port.probe_at <= now:
                 self._probe(now, port)
+        self.clients.poll(now)
 
     def _begin_anew(self, now: int) -> None:
         """We were stopped for so long that others may think we are gone."""
         for port in self.ports.values():
-            port.opened_at = port.say_at = now
+            port.say_at = now
+            if port.private and not port.neighbours:
+                put_off_leaves(port, now)
+                continue
+            port.resumes = port.resumes or port.state is State.ALONE
+            port.opened_at = now
             port.neighbours = {}
             port.leaves = {}
             port.agreed_since = None
@@ -231,6 +154,8 @@ class Tree:
             return
         neighbour = port.neighbours.get(place)
         if neighbour is None:
+            if not self._admits(now, port):
+                return
             neighbour = Neighbour(now, message.count, message.agreement, 0)
             port.probes = {each: at for each, at in port.probes.items() if each[0] != message.gateway}
             port.neighbours = port.neighbours | {place: neighbour}
@@ -243,26 +168,30 @@ class Tree:
         neighbour.acked_at = max(neighbour.acked_at, acknowledged(message.acks, self.gateway, self._sent))
         self._look(now, port)
 
+    def _admits(self, now: int, port: Port) -> bool:
+        """Whether one more gateway may be heard there. While it is not, it hears us and lacks our consent, so it does
+        not forward; gateways that come and go would keep all others from it.
+        """
+        if sum(len(each.neighbours) for each in self.ports.values()) >= MOST_HEARD:
+            port.lost["too many gateways"] += 1
+            return False
+        if port.flaps:
+            forgiven = min(port.flaps, (now - port.flapped_at) // FLAP_FORGIVEN)
+            port.flaps -= forgiven
+            port.flapped_at += forgiven * FLAP_FORGIVEN
+        if port.flaps >= FLAPS:
+            port.lost["gateways come and go"] += 1
+            return False
+        return True
+
     def leaf(self, now: int, number: int, message: Leaf) -> None:
         """A LEAF was heard: it counts from when it knows our root, and has an answer at once."""
         port = self.ports.get(number)
         if port is None or not message.module:
             return
-        place = (message.module, message.port)
         acked_at = acknowledged(message.acks, self.gateway, self._sent)
-        leaf = port.leaves.get(place)
-        if leaf is None:
-            port.say_at = min(port.say_at, max(now, port.said_at + APART))
-            if not acked_at or acked_at < self._rooted_at or len(port.leaves) >= _LEAVES:
-                return
-            port.leaves = port.leaves | {place: Neighbour(now, message.count, 0, acked_at)}
-        elif is_late(message.count, leaf.count):
-            return
-        elif not self._is_heard_by(message):
-            port.leaves = {each: known for each, known in port.leaves.items() if each != place}
-        else:
-            leaf.heard_at, leaf.count, leaf.acked_at = now, message.count, max(leaf.acked_at, acked_at)
-        self._look(now, port)
+        if hear_leaf(port, now, message, self.gateway, acked_at, self._rooted_at):
+            self._look(now, port)
 
     def mesh(self, now: int, number: int, message: Mesh) -> None:
         """A MESH was heard: new things are passed on at once."""
@@ -272,7 +201,7 @@ class Tree:
             return
         self._take_root(now)
         for port in self.ports.values():
-            if port.neighbours and port.number != number:
+            if port.neighbours and port.number != number and self._atlas.concerns(message.gateway):
                 self._say_record(port, message.gateway)
         self._look(now)
 
@@ -283,11 +212,6 @@ class Tree:
         if port is not None and place != (self.gateway, number % 13) and gateway not in port.gateways:
             port.probes = port.probes | {place: (port.probes.get(place, (now, now))[0], now)}
             self._look(now)
-
-    def _is_heard_by(self, message: Leaf) -> bool:
-        """Whether it may hear us: who does not has no consent of ours any more."""
-        names = [name for name, _ in ACK.iter_unpack(message.acks)]
-        return self.gateway in names or 0 not in names
 
     # What follows from it
 
@@ -314,12 +238,18 @@ class Tree:
     def _bury(self, now: int) -> None:
         for port in self.ports.values():
             if any(now - each.heard_at >= DEAD for each in port.neighbours.values()):
+                before = port.gateways
                 port.neighbours = {place: each for place, each in port.neighbours.items() if now - each.heard_at < DEAD}
-            if any(now - each.heard_at >= DEAD for each in port.leaves.values()):
-                port.leaves = {place: each for place, each in port.leaves.items() if now - each.heard_at < DEAD}
+                self._count_flaps(now, port, len(before - port.gateways - {self.gateway}))
+            bury_leaves(port, now)
             if any(now - last >= PROBE_MEMORY for _, last in port.probes.values()):
                 port.probes = {place: at for place, at in port.probes.items() if now - at[1] < PROBE_MEMORY}
         self._atlas.forget(now)
+
+    def _count_flaps(self, now: int, port: Port, gone: int) -> None:
+        if not port.flaps:
+            port.flapped_at = now
+        port.flaps = min(port.flaps + gone, FLAPS)
 
     def _take_root(self, now: int) -> None:
         """The mesh may have another root now."""
@@ -330,6 +260,7 @@ class Tree:
     def _tell_leaves(self, at: int) -> None:
         """What they know of us is wrong: nothing passes before they know better, or are gone."""
         self._rooted_at = at
+        self.clients.root_changed(at, self.root)
         for port in self.ports.values():
             if port.leaves:
                 port.heeded_since = None
@@ -347,11 +278,12 @@ class Tree:
             port.agreed_since = None
         elif port.agreed_since is None:
             port.agreed_since = now
-        if port.heeded_since is None and all(each.acked_at >= self._rooted_at for each in port.leaves.values()):
-            port.heeded_since = now
+        see_heeded(port, now, self._rooted_at)
         state = self._state(now, port)
         in_tree = self._in_tree(port, state)
         port.until = self._until(port, state)
+        if state is not State.LISTENING or port.neighbours:
+            port.resumes = False
         if (state, in_tree) != (port.state, port.in_tree):
             port.state, port.in_tree = state, in_tree
             self._actions.append(Changed(port.number))
@@ -390,7 +322,7 @@ class Tree:
 
     def _until(self, port: Port, state: State) -> int:
         if state is State.ALONE:
-            return port.said_at + LEASE
+            return FOR_EVER if port.private else port.said_at + LEASE
         if state is not State.FORWARDING:
             return 0
         acked = [each.acked_at for (gateway, _), each in port.neighbours.items() if gateway != self.gateway]
@@ -417,13 +349,13 @@ class Tree:
         self._sent.append((self._count, now))
         latest = sorted([*port.neighbours.items(), *port.leaves.items()], key=lambda item: item[1].heard_at)
         acks = list({sender: each.count for (sender, _), each in latest}.items())
-        for packed in packed_acks(acks, _ACKS):
+        for packed in packed_acks(acks, BRIDGE_ACKS):
             bridge = Bridge(self.gateway, port.number, self._count, port.agreement, self.root, packed)
             self._actions.append(Say(port.number, bridge))
         while now - self._sent[0][1] > LEASE:
             self._sent.popleft()
         if port.neighbours and not self._agreed(now, port):
-            for gateway in [self.gateway, *self._atlas.others[:_RECORDS_A_TICK]]:
+            for gateway in [self.gateway, *self._atlas.others(self._count, _RECORDS_A_TICK)]:
                 self._say_record(port, gateway)
         port.said_at = now
         port.say_at = now + self._tick(port)

@@ -8,8 +8,8 @@ import random
 import pytest
 
 from r2p.codecs.management import Bridge, Leaf
+from r2p.protocols.bridging.base import ACK
 from r2p.protocols.bridging.homes import Homes
-from r2p.protocols.bridging.tree import ACK
 from tests.protocols.bridging.test_tree import (
     SECOND,
     STABLE,

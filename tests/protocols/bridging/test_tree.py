@@ -7,7 +7,11 @@ import random
 
 import pytest
 
-from r2p.protocols.bridging.tree import State
+from r2p.codecs.management import Bridge, Mesh, encode
+from r2p.protocols.bridging.atlas import CHANGES, MOST_RECORDS, Atlas
+from r2p.protocols.bridging.base import State
+from r2p.protocols.bridging.mesh import MOST_HEARD, parts
+from r2p.protocols.bridging.tree import Tree
 from tests.protocols.bridging.wires import MS, Gateway, World
 
 SECOND = 1_000 * MS
@@ -172,3 +176,57 @@ def _connected(network: str, gateways: list[Gateway]) -> set[str]:
         if more <= reached:
             return reached
         reached |= more
+
+
+def test_tables_are_bounded() -> None:
+    """Whatever is said, and without work that grows with it."""
+    tree = Tree(1)
+    tree.open(0, 0)
+    tree.poll(0)
+    for number in range(2, 5_000):
+        tree.mesh(SECOND, 0, Mesh(number, 1, 0, bytes(18)))
+        tree.bridge(SECOND, 0, Bridge(number, 1, 1, 0, number, bytes(12)))
+    (port,) = tree.ports.values()
+    assert len(port.neighbours) == MOST_HEARD
+    assert port.lost["too many gateways"] == 4_998 - MOST_HEARD
+    assert len(tree._atlas._records) <= MOST_RECORDS
+
+
+def test_neighbours_that_come_and_go_are_damped() -> None:
+    """The others are stopped by the first ones, and from then on by one in ten seconds."""
+    made, (one, two) = world("AB", "AB")
+    made.run(STABLE)
+    silent = 0
+    for number in range(600):
+        for gateway in (one, two):
+            gateway.hear(0, encode(Bridge(1_000 + number, 1, 1, 0, 1_000 + number, bytes(12))))
+        made.run(200 * MS)
+        silent += one.tree.ports[0].until <= made.now
+    assert silent < 120
+    made.run(15 * SECOND)
+    assert (states(one), states(two)) == (["forwarding"] * 2, ["forwarding", "blocked"])
+
+
+def test_a_gateway_that_tells_another_mesh_each_time_is_damped() -> None:
+    atlas = Atlas(100)
+    atlas.hear(frozenset({(1, 101, 0)}))
+    learnt = 0
+    for serial in range(600):
+        (message,) = parts(101, serial, [(0, 100, 1), (1, 500 + serial, 1)])
+        learnt += atlas.learn(serial * 100 * MS, message)
+    assert atlas.members == {100, 101}
+    assert CHANGES <= learnt <= CHANGES + 60 // 5 + 1
+
+
+def test_a_new_gateway_that_had_to_wait_is_let_in() -> None:
+    made, (one,) = world("AB")
+    made.run(STABLE)
+    for number in range(12):
+        start(made, "A", 1_000 + number).crash()
+        one.hear(0, encode(Bridge(1_000 + number, 0, 1, 0, 1_000 + number, bytes(12))))
+        made.run(SECOND)
+    late = start(made, "AC", 50)
+    made.run(SECOND)
+    assert "converging" in states(late)
+    made.run(20 * SECOND)
+    assert (states(one), states(late)) == (["forwarding", "alone"], ["forwarding", "alone"])

@@ -14,8 +14,9 @@ from collections import Counter, defaultdict
 from typing import TYPE_CHECKING, Any
 
 from r2p.codecs import management
+from r2p.protocols.bridging.base import Say
 from r2p.protocols.bridging.homes import Homes
-from r2p.protocols.bridging.tree import Say, Tree
+from r2p.protocols.bridging.tree import Tree
 
 if TYPE_CHECKING:
     import random

@@ -1,0 +1,252 @@
+"""Clients of a gateway: many connections that share one port of the tree, and take part in no mesh."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+
+import pytest
+
+import r2p
+from r2p.codecs import management
+from r2p.msg import Led
+from r2p.testing.network import node_in
+from tests.bridge.test_bridge import CONVERGED, Tap, drain, gateway, node
+from tests.transports.conversation import Script, line, manage
+
+pytestmark = pytest.mark.virtual_time
+
+
+class Client(Script):
+    """The line of a client; its other end is the test."""
+
+    waits = True
+    admits_gateways = False
+
+
+class Peer(Script):
+    """A line that gateways may join by."""
+
+    waits = True
+
+
+def state(module: r2p.Module, link: str) -> str:
+    return next(each.state for each in module.gateway_statistics().ports if each.link == link)
+
+
+def fake(number: int, heard: int, port: int) -> bytes:
+    """A made-up gateway, which says that it hears another one."""
+    hearing = struct.pack("<BIB", 1, heard, port).ljust(18, b"\0")
+    return manage(management.Bridge(number, 1, 1, 0, number, bytes(12))) + manage(
+        management.Mesh(number, 1, 0, hearing)
+    )
+
+
+async def test_more_clients_than_ports() -> None:
+    """All of them get what they want, and what the gateway's own nodes publish."""
+    clients = [Client() for _ in range(300)]
+    async with r2p.Module("GW", via=["memory:a", *clients], bridge=True) as gw, node_in(gw, name="own") as own:
+        await asyncio.sleep(CONVERGED)
+        leds = own.advertise("leds", Led)
+        for each in (clients[0], clients[-1]):
+            each.hear(manage(management.SubscribeRequest("leds", 5, 5)))
+        await asyncio.sleep(0.1)
+        await leds.publish(Led(led=7))
+        own.log.info("hello")
+        await asyncio.sleep(0.1)
+        assert [each.topics("leds") for each in (clients[0], clients[-1])] == [[Led(led=7).encode()]] * 2
+        assert len(gw.links) == 301
+
+
+async def test_clients_reach_each_other_and_the_rest() -> None:
+    one, other = Client(), Client()
+    async with r2p.Module("GW", via=["memory:a", one, other], bridge=True), node("A", "a") as a:
+        leds = a.subscribe("leds", Led)
+        await asyncio.sleep(CONVERGED)
+        other.hear(manage(management.SubscribeRequest("leds", 5, 5)))
+        one.hear(manage(management.Advertise("leds", 5)))
+        one.hear(manage(management.SubscribeResponse("leds", 5, 5)))
+        await asyncio.sleep(0.1)
+        one.hear(line("leds", Led(led=3).encode()))
+        await asyncio.sleep(0.1)
+        assert drain(leds) == [3]
+        assert other.topics("leds") == [Led(led=3).encode()]
+        assert one.topics("leds") == []
+
+
+async def test_a_client_that_plays_gateways_stops_nobody_else(caplog: pytest.LogCaptureFixture) -> None:
+    client = Client()
+    async with (
+        r2p.Module("G1", via=["memory:a", "memory:b", client], bridge=True) as gw,
+        gateway(name="G2", networks="bc"),
+        node("A", "a") as a,
+        node("C", "c") as c,
+    ):
+        leds, far = a.advertise("leds", Led), c.subscribe("leds", Led, queue=1000)
+        await leds.wait_subscriber()
+        await asyncio.sleep(2)
+        for number in range(50):
+            client.hear(fake(1000 + number, gw.instance, 250))
+            await leds.publish(Led(led=number))
+            await asyncio.sleep(0.2)
+        assert drain(far) == list(range(50))
+        assert state(gw, "script") == "refused"
+        assert client.link.losses["gateway refused"] == 100
+        assert "?gateways=yes" in caplog.text
+
+
+async def test_a_gateway_may_join_where_it_is_allowed() -> None:
+    """A hostile one is damped: what it says keeps the others silent now and then only."""
+    peer = Peer()
+    async with (
+        r2p.Module("G1", via=["memory:a", "memory:b", peer], bridge=True) as gw,
+        gateway(name="G2", networks="bc"),
+        node("A", "a") as a,
+        node("C", "c") as c,
+    ):
+        leds, far = a.advertise("leds", Led), c.subscribe("leds", Led, queue=1000)
+        await leds.wait_subscriber()
+        await asyncio.sleep(2)
+        peer.hear(fake(1, gw.instance, 2))
+        await asyncio.sleep(0.01)
+        assert state(gw, "script") == "converging"
+        for number in range(500):
+            peer.hear(fake(1000 + number, gw.instance, 2))
+            await leds.publish(Led(led=number))
+            await asyncio.sleep(0.2)
+        assert len(drain(far)) > 400
+        assert peer.link.losses["gateways come and go"] > 400
+
+
+async def test_a_client_by_which_a_probe_comes_back_is_a_gateway_of_firmware() -> None:
+    client, other = Client(), Client()
+    async with r2p.Module("GW", via=["memory:a", client, other], bridge=True) as gw:
+        tap = Tap("a")
+        await asyncio.sleep(2.5)
+        for message in tap.heard:
+            if isinstance(message, management.Alive) and message.module.startswith("_"):
+                client.hear(manage(message))
+        assert [state(gw, each) for each in ("memory:a", "script", "script#2")] == ["alone", "loop", "alone"]
+
+
+async def test_orders_that_are_refused_are_logged_once_a_second(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"script"}))
+    client = Client()
+    caplog.set_level(logging.WARNING)
+    async with r2p.Module("GW", via=["memory:a", client], bridge=True) as gw:
+        await asyncio.sleep(CONVERGED)
+        before = len(caplog.records)
+        for _ in range(1000):
+            client.hear(manage(management.Reboot("ZZ")) + manage(management.Bootload("GW")))
+            await asyncio.sleep(0.001)
+        assert len(caplog.records) - before <= 3
+        assert client.link.losses["order refused"] == 2000
+        assert not gw.refused
+
+
+@pytest.mark.parametrize(("allowed", "obeys"), [(False, False), (True, True)])
+async def test_a_gateway_obeys_what_it_lets_through(
+    allowed: bool, obeys: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"script"}))
+    client = Client()
+    async with r2p.Module("GW", via=["memory:a", client], bridge=r2p.BridgeOptions(allow_control=allowed)) as gw:
+        await asyncio.sleep(CONVERGED)
+        client.hear(manage(management.Reboot("GW")))
+        await asyncio.sleep(0.1)
+        assert gw.rebooted is obeys
+        denied = management.Denied("GW", "GW", 0x13, management.DENIED_CONTROL)
+        assert (management.encode(denied) in client.topics("R2P")) is not obeys
+        client.hear(manage(management.Stop("GW")))
+        await asyncio.sleep(0.1)
+        assert gw.stopped
+
+
+async def test_orders_to_a_module_are_logged_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+    script = Script()
+    async with r2p.Module("A", via=script) as module:
+        for _ in range(1000):
+            script.hear(manage(management.Bootload("A")))
+            await asyncio.sleep(0.001)
+        assert module.refused == {"BOOTLOAD": 1000}
+        assert len([each for each in caplog.records if each.name == "r2p.module"]) <= 6
+
+
+# A gateway whose event loop stands still
+
+
+async def test_nothing_is_lost_where_a_gateway_stood_still_and_is_alone() -> None:
+    """Non real-time messages wait until it knows that no other has begun to forward; events would be stale."""
+    async with gateway() as gw, node("A", "a") as a, node("B", "b") as b, node_in(gw, name="own") as own:
+        leds, bumper, text = (
+            a.advertise("leds", Led),
+            a.advertise("bumper", Led, r2p.Sporadic(0.1)),
+            own.advertise("own", Led),
+        )
+        far, bumps, owns = (b.subscribe(each, Led, queue=100) for each in ("leds", "bumper", "own"))
+        for each in (leds, bumper, text):
+            await each.wait_subscriber()
+        await asyncio.sleep(0.1)
+        stand_still(gw, 0.7)
+        for number in range(10):
+            await leds.publish(Led(led=number))
+            await text.publish(Led(led=number))
+            await bumper.publish(Led(led=number))
+        await asyncio.sleep(CONVERGED)
+        await leds.publish(Led(led=10))
+        await asyncio.sleep(0.1)
+        assert (drain(far), drain(owns), drain(bumps)) == (list(range(11)), list(range(10)), [])
+        lost = {link.name: link.losses["converging"] for link in gw.links}
+        assert lost == {"memory:a": 10, "memory:b": 0}
+        assert {each.link: each.dropped for each in gw.gateway_statistics().ports} == {
+            "memory:a": {"converging": 10},
+            "memory:b": {},
+        }
+
+
+def stand_still(gateway: r2p.Module, seconds: float) -> None:
+    """As if its event loop had not run for so long, in which nobody else said anything."""
+    bridge = gateway._hub.bridge if gateway._hub is not None else None
+    assert bridge is not None
+    tree = bridge.tree
+    tree._looked_at -= round(seconds * 1e9)
+    for port in tree.ports.values():
+        port.said_at -= round(seconds * 1e9)
+        port.until -= round(seconds * 1e9)
+
+
+async def test_what_a_gateway_kept_is_dropped_where_another_one_forwards() -> None:
+    """It was forwarded by that one."""
+    async with gateway() as gw, node("A", "a") as a, node("B", "b") as b:
+        leds, far = a.advertise("leds", Led), b.subscribe("leds", Led, queue=100)
+        await leds.wait_subscriber()
+        await asyncio.sleep(0.1)
+        stand_still(gw, 0.7)
+        await leds.publish(Led(led=1))
+        await asyncio.sleep(0.01)
+        tap = Tap("a")
+        for count in range(30):
+            tap.say(management.Bridge(7, 0, count, 0, 7, bytes(12)))
+            await asyncio.sleep(0.08)
+        assert drain(far) == []
+        assert gw.links[0].losses["converging"] == 1
+
+
+async def test_a_line_without_a_gateway_goes_on_at_once() -> None:
+    one, other = Peer(), Peer()
+    async with r2p.Module("GW", via=[one, other], bridge=True) as gw:
+        other.hear(manage(management.SubscribeRequest("leds", 5, 5)))
+        one.hear(manage(management.Advertise("leds", 5)))
+        await asyncio.sleep(CONVERGED)
+        one.hear(manage(management.SubscribeResponse("leds", 5, 5)))
+        bridge = gw._hub.bridge if gw._hub is not None else None
+        assert bridge is not None
+        bridge.tree._looked_at -= 5_000_000_000
+        one.hear(line("leds", Led(led=3).encode()))
+        await asyncio.sleep(0.3)
+        one.hear(line("leds", Led(led=4).encode()))
+        assert other.topics("leds") == [Led(led=3).encode(), Led(led=4).encode()]
+        assert [state(gw, each) for each in ("script", "script#2")] == ["alone", "alone"]
