@@ -365,6 +365,7 @@ Management = (
     | Leaf
 )
 
+NETWORK = 0x40
 RTCAN_TYPES = range(0x40, 0x50)
 """Type bytes of what concerns the RTCAN bus itself, and no gateway."""
 
@@ -379,7 +380,7 @@ _CODEC = Codec[Management](
     Record(SubscribeRequest, 0x22, _PUBSUB),
     Record(SubscribeResponse, 0x23, _PUBSUB),
     Record(Path, 0x31, "7s 8s 16s", may_be_empty=("module", "node", "topic")),
-    Record(Network, 0x40, "B B I Q B I q H", version=_VERSION),
+    Record(Network, NETWORK, "B B I Q B I q H", version=_VERSION),
     Record(Claim, 0x41, "B Q B B", version=_VERSION),
     Record(Reserve, 0x42, "H B B I I B", version=_VERSION),
     Record(Grant, 0x43, "H B B I I Q I H", version=_VERSION),

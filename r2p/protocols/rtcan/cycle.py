@@ -1,8 +1,12 @@
 """Slots and cycles: where this node is in which cycle, by its own clock (PROTOCOL.md 6, thesis 4.3.3).
 
-The reference is the start of frame of the sync in slot 0. The master places it on a grid of its own clock; a slave
-takes it from each sync it hears: the reception's stamp, less the exact length of the frame with its stuff bits, less
-its own calibrated latency. A sync that does not come is made up for by the slave's own clock, for at most three cycles.
+The reference is the start of frame of the sync in slot 0. The master plans it on a grid of its own clock, and takes it
+from the confirmation of its own frame, which may have left a bit later; a slave takes it from each sync it hears: the
+reception's stamp, less the exact length of the frame with its stuff bits, less its own calibrated latency. A sync that
+does not come is made up for by the slave's own clock, for at most three cycles.
+
+The first sync of a master that goes on with a network may leave late: then its grid begins where that sync did, and
+moves back from cycle to cycle, so that network time catches up.
 """
 
 import enum
@@ -18,6 +22,9 @@ HOLDOVER = 3
 """Cycles without a sync that a slave bridges."""
 NO_SLOT = 1 << 16
 """Behind every slot of a cycle."""
+_CATCH_UP = 64  # part of a slot by which a cycle is shortened while network time catches up
+_AMBIGUOUS = 128  # cycles: half of what 8 bits tell
+_DELAYED = 16  # cycles that NETWORK may be ahead of a sync
 _MICROSECOND = 1000
 _SECOND = 1_000_000_000
 
@@ -84,6 +91,8 @@ class Cycle:
         self.free, self.next_free = _free(None, timing.slots)
         self.missed = 0
         self.anchored = False
+        self._grid = 0  # the reference as it was planned
+        self._behind = 0  # how far the grid is behind that of the network's first master (ns)
         self._slot = timing.slot
         self._latency = receive_latency
         self._first = 0
@@ -150,12 +159,13 @@ class Cycle:
         self.state = State.HOLDING
         self.counter += 1
         self.reference += self.timing.cycle
+        self._grid = self.reference
         self._reserve(None)
         return True
 
     def anchor(self, counter: int) -> bool:
         """NETWORK told a whole counter, of this cycle or a bit earlier. Says whether ours was another one."""
-        whole = _nearest(counter, self.counter)
+        whole = _nearest(counter, self.counter, _DELAYED)
         changed = self.anchored and whole != self.counter
         self._first += whole - self.counter
         self.counter = whole
@@ -174,13 +184,23 @@ class Cycle:
         """Start and count of the next cycle: the grid and the counter of before go on, if there were any."""
         if not self.anchored:
             return now, 1
-        cycles = -(-(now - self.reference) // self.timing.cycle)
-        return self.reference + cycles * self.timing.cycle, self.counter + cycles
+        cycles = -(-(now - self._grid) // self.timing.cycle)
+        return self._grid + cycles * self.timing.cycle, self.counter + cycles
 
-    def lead(self, start: int, counter: int, mask: int | None) -> None:
-        """Be the master, from the cycle on that began there."""
+    def late(self, by: int) -> bool:
+        """The first sync of a network that goes on has left `by` ns late. False: too late for its count.
+
+        Then network time can't catch up any more.
+        """
+        self._behind += by
+        return 2 * self._behind < self.timing.cycle
+
+    def lead(self, start: int, counter: int, mask: int | None, *, anew: bool = False) -> None:
+        """Be the master, from the cycle on that began there; `anew`: of a network that was not there before."""
         self.state = State.LEADING
-        self.reference = start
+        self.reference = self._grid = start
+        if anew:
+            self._behind = 0
         self.counter = counter
         self._reserve(mask)
         self.anchored = True
@@ -189,22 +209,36 @@ class Cycle:
     def advance(self, mask: int) -> Frame:
         """The next cycle begins: its sync frame."""
         self.counter += 1
-        self.reference += self.timing.cycle
+        self.reference = self.end
+        self._behind -= self._grid + self.timing.cycle - self.reference
+        self._grid = self.reference
         self._reserve(mask)
         return rtcan.encode_sync(self.counter, mask)
+
+    @property
+    def end(self) -> int:
+        """When the master's next cycle begins."""
+        return self._grid + self.timing.cycle - min(self._behind, self._slot // _CATCH_UP)
+
+    def left(self, frame: Frame, at: int) -> None:
+        """The master's sync was on the bus until `at`: all take its start for the reference, and so does the master."""
+        start = at - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
+        if 0 <= start - self._grid <= self._slot and frame.id >> 7 == self.counter & 0xFF:
+            self.reference = start
 
     def _start(self, start: int, low: int, mask: int) -> Alignment:
         cycles, off = self._distance(start)
         counter = self.counter + cycles
         resumed = self.anchored and counter & 0xFF == low and abs(off) <= self.timing.slot
-        self.counter = _nearest(counter, low) if self.anchored else low
+        self.counter = _nearest(counter, low, _AMBIGUOUS) if self.anchored else low
         self._follow(start, mask)
         self._first, self._first_at, self._widest = self.counter, start, 0
         return Alignment.RESUMED if resumed else Alignment.STARTED
 
     def _follow(self, start: int, mask: int) -> None:
         self.state = State.FOLLOWING
-        self.reference = start
+        self.reference = self._grid = start
+        self._behind = 0
         self._reserve(mask)
         self.missed = 0
 
@@ -234,7 +268,7 @@ def _free(mask: int | None, slots: int) -> tuple[frozenset[int], list[int]]:
     return free, following(free, slots)
 
 
-def _nearest(counter: int, low: int) -> int:
-    """The counter with the low 8 bits of `low` that is next to this one: up to 16 before it, or else after it."""
-    nearest = counter + ((low - counter + 16) & 0xFF) - 16
+def _nearest(counter: int, low: int, before: int) -> int:
+    """The counter with the low 8 bits of `low` that is next to this one: up to `before` it, or else after it."""
+    nearest = counter + ((low - counter + before) & 0xFF) - before
     return nearest if nearest >= 0 else nearest + 256

@@ -9,7 +9,7 @@ Laxity is computed anew at every try: `take` moves nothing, only `sent` does.
 
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 
 import msgspec
 
@@ -194,12 +194,13 @@ class LaxityQueue:
             lane.busy = False
         self._remove(lane, [message])
 
-    def withdraw(self, message: int) -> list[Outgoing]:
-        """Remove and return what waits of a topic, but for a message that has started."""
+    def withdraw(self, message: int, which: Callable[[Outgoing], bool] = lambda each: True) -> list[Outgoing]:
+        """Remove and return what waits of a topic, all or these of it, but for a message that has started."""
         lane = self._lanes.get(message)
         if lane is None:
             return []
-        gone = [each for each in lane.waiting if not each.sent and not (lane.busy and each is lane.waiting[0])]
+        first = lane.waiting[0] if lane.busy else None
+        gone = [each for each in lane.waiting if not each.sent and each is not first and which(each)]
         if gone:
             self._remove(lane, gone)
         return gone

@@ -106,7 +106,7 @@ class Network:
             case Alignment.STARTED | Alignment.RESUMED as alignment:
                 self._join(now, resumed=alignment is Alignment.RESUMED)
             case _:
-                self._sender.kick(now)
+                self._sender.aligned(now)
         if not self.verified:
             self._verify_by_length(now)
 
@@ -170,6 +170,7 @@ class Network:
         if self._election.role is not Role.MASTER or self.epoch is None:
             return
         self._told = now
+        self._sender.withdraw_management(self._identity.id8, management.NETWORK)  # it would tell an old counter
         self._timers.set("network", now + REPEAT)
         timing, counter = self._cycle.timing, self._cycle.counter
         offset, error = self.utc_offset, self.utc_error
@@ -294,6 +295,7 @@ class Network:
 
     def _abdicate(self, now: int, reason: str) -> None:
         self._reign.end()
+        self._sender.withdraw_management(self._identity.id8, management.NETWORK)
         self._timers.clear("network")
         self._forget_master(now, reason)
         self._out.append(LostSync(reason))

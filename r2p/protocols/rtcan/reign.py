@@ -2,6 +2,8 @@
 
 The first one may start when the bus lets it, and the cycle begins where it did: as long as there are no slots the bus
 may be full, and a sync that had to hit an instant would not get through for a while; others would take over as well.
+One that leaves half a cycle late or more has a count that is over: from there on it is another network, of a new epoch,
+as its time would be behind for good.
 """
 
 from collections.abc import Callable
@@ -36,21 +38,22 @@ class Reign:
         self._grants = grants
         self._crowned = crowned
         self._again = again
-        self._first: tuple[rtcan.Frame, int, int] | None = None  # the first sync on its way: its count and mask
+        self._first: tuple[rtcan.Frame, int, int, int] | None = None  # the first sync on its way: start, count, mask
         self._tries = 0
         self._collecting = 0
+        self._inherits = False
 
     def found(self, now: int, *, inherits: bool) -> None:
         """Send the first sync. What was before goes on if it `inherits`: the grid, the count, the leases."""
         self._grants.clear()
-        self._cycle.anchored = inherits
+        self._inherits = self._cycle.anchored = inherits
         self._collecting = _COLLECTING if inherits else 0
         self._grants.collecting = inherits
         start, counter = self._cycle.upcoming(now)
         mask = self._grants.calendar.mask(counter)
         frame = rtcan.encode_sync(counter, mask)
         if self._sender.found(FirstSync(self._sent), frame, start):
-            self._first = frame, counter, mask
+            self._first = frame, start, counter, mask
         else:
             self._again(now)
 
@@ -80,10 +83,13 @@ class Reign:
         """What became of the first sync."""
         if self._first is None:
             return
-        frame, counter, mask = self._first
+        frame, planned, counter, mask = self._first
         self._first = None
         if outcome is Outcome.SENT:
             start = at - rtcan.frame_bits(frame.id, frame.data) * self._cycle.timing.bit
+            if self._inherits and not self._cycle.late(max(0, start - planned)):
+                self._inherits = self._grants.collecting = False
+                self._collecting = 0
             self._lead(now, start, counter, mask)
         elif outcome is not Outcome.UNKNOWN and self._tries < _TRIES:
             self._tries += 1
@@ -94,6 +100,6 @@ class Reign:
 
     def _lead(self, now: int, start: int, counter: int, mask: int | None) -> None:
         self._tries = 0
-        self._cycle.lead(start, counter, mask)
-        self._crowned(now, self._collecting > 0)
+        self._cycle.lead(start, counter, mask, anew=not self._inherits)
+        self._crowned(now, self._inherits)
         self._sender.turned(now)

@@ -28,6 +28,7 @@ class Mode(enum.Enum):
 
 
 _FREE, _SLOTTED = Mode.FREE, Mode.SLOTTED  # Python 3.11 takes its time to find a member of an enum
+_LEADING = State.LEADING
 _HRT = Mailbox.HRT
 _SENT, _UNKNOWN = Outcome.SENT, Outcome.UNKNOWN
 _ALL_SENT = Fate.SENT
@@ -68,7 +69,8 @@ class Sender:
         self._periodics: list[Periodic] = []
         self._done = 0
         self._tried = 0  # the last slot in which nothing more can be tried
-        self._last = 0
+        self._end = 0  # of the cycle: for a slave when no sync can come any more that would begin the next one
+        self._sync = Frame(0, b"")
         bit = self._bit
         # A try now would come too late for the slots before `now + ahead`; a coarse port may still try in that one.
         self._ahead = latency - (self._slot if coarse else bit)
@@ -80,6 +82,10 @@ class Sender:
     def add(self, periodic: Periodic) -> None:
         """There is one more periodic message."""
         self._periodics.append(periodic)
+
+    def withdraw_management(self, id8: int, kind: int) -> None:
+        """Management of this type that waits is not true any more."""
+        self._queue.withdraw(rtcan.message_id(rtcan.MANAGEMENT, id8), lambda each: each.payload[-1] == kind)
 
     def remove(self, periodic: Periodic) -> None:
         """There is one less."""
@@ -101,7 +107,12 @@ class Sender:
         """A cycle has begun, at `Cycle.reference`; nothing of it is done yet."""
         self._done = self._tried = 0
         self._agenda.turn(self._cycle.counter, self._periodics)
-        self._last = self._slots + (self._cycle.state is not State.LEADING)
+        self.aligned(now)
+
+    def aligned(self, now: int) -> None:
+        """`Cycle.reference` is another instant than before; the cycle is the same."""
+        cycle = self._cycle
+        self._end = cycle.end if cycle.state is _LEADING else cycle.reference + (self._slots + 1) * self._slot
         self._plan(now)
 
     def kick(self, now: int) -> None:
@@ -121,6 +132,7 @@ class Sender:
         if now + self._latency > last or self._post.boxes[_HRT] is not None:
             self._counts["syncs not sent"] += 1
             return
+        self._sync = frame
         self._post.put(SYNC, frame, _HRT, start, last)
 
     def found(self, first: FirstSync, frame: Frame, start: int) -> bool:
@@ -150,7 +162,7 @@ class Sender:
                 self.kick(now)
                 return
             current = (now + self._latency - self._cycle.reference) // self._slot
-            if current >= self._last:
+            if now + self._latency >= self._end:
                 self._run(now, self._slots, current)
                 self._turn(now)
                 if not self._cycle.running:  # a node that is silent stays so: nothing else has moved `due`
@@ -171,7 +183,11 @@ class Sender:
         elif isinstance(item, Periodic):
             self._confirm_periodic(now, item, outcome, at)
         elif item is SYNC:
-            if outcome is not _SENT:
+            if outcome is _SENT:
+                if self._cycle.state is _LEADING:
+                    self._cycle.left(self._sync, at)
+                    self._plan(now)
+            else:
                 self._counts["syncs not sent"] += 1
         elif isinstance(item, FirstSync):
             item.done(now, outcome, at)
@@ -192,9 +208,10 @@ class Sender:
                 over = self._tried
             if over < self._slots and cycle.next_free[over] < slot:
                 slot = cycle.next_free[over]
-        if slot > self._last:
-            slot = self._last
-        self.due = cycle.reference + slot * self._slot - self._latency
+        at = cycle.reference + slot * self._slot
+        if at > self._end:
+            at = self._end
+        self.due = at - self._latency
 
     def _run(self, now: int, upto: int, current: int) -> None:
         """Do what is to be done in the slots up to one; it is slot `current` now."""

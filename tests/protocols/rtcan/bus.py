@@ -20,7 +20,10 @@ T = TypeVar("T")
 
 
 class Node:
-    """An engine with its controller and its clock, which is `offset` ns ahead of the bus and gains `ppm`."""
+    """An engine with its controller and its clock, which is `offset` ns ahead of the bus and gains `ppm`.
+
+    Its computer hands a frame over `late` ns after its time.
+    """
 
     def __init__(self, bus: "Bus", settings: Settings, *, offset: int, ppm: int, one_shot: bool) -> None:
         self.engine = Engine(settings)
@@ -31,6 +34,7 @@ class Node:
         self.fill: Callable[[Due], bytes | None] = lambda due: None
         self.on_ready: Callable[[], Sequence[Action]] = lambda: ()
         self.deaf: Callable[[Frame], bool] = lambda frame: False
+        self.late: Callable[[Frame], int] = lambda frame: 0
         self.bus = bus
         self._offset = offset
         self._ppm = ppm
@@ -58,9 +62,10 @@ class Node:
         for action in actions:
             self.actions.append((self.bus.now, action))
             match action:
-                case Transmit(_, mailbox, not_before):
+                case Transmit(frame, mailbox, not_before):
                     assert mailbox not in self.boxes, "the mailbox is full"
-                    self.boxes[mailbox] = (max(self.bus.now, self.true(not_before)), action)
+                    ready = max(self.bus.now, self.true(not_before)) + self.late(frame)
+                    self.boxes[mailbox] = (ready, action)
                 case Withdraw(mailbox):
                     if mailbox in self.boxes and not self.bus.is_sending(self, mailbox):
                         self.bus.report(self, mailbox, Outcome.LATE)
