@@ -148,7 +148,11 @@ class Standby:
         if len(self._used[_ALL]) == len(self.homes.by_number):
             return
         for topic in list(self._space.topics.values()):
-            if topic.layout is None and self._without.get(topic.name, _ALL) != self._unable_for(topic):
+            if (
+                topic.layout is None
+                and not topic.idle
+                and self._without.get(topic.name, _ALL) != self._unable_for(topic)
+            ):
                 self._retell_topic(topic)
 
     # Topics
@@ -157,7 +161,11 @@ class Standby:
         """Whether the topic takes this link; one that is down keeps what it had, until it is up again."""
         if port.number not in self.homes.by_number:
             return True
-        without = self._without[topic.name] = self._unable_for(topic)
+        without = self._unable_for(topic)
+        if topic.idle:
+            self._without.pop(topic.name, None)
+        else:
+            self._without[topic.name] = without
         topic.guard = self._guard_of(topic) if self._guarding else None
         return port.number in without or port.number in self.homes.used(self._now(), without)
 

@@ -90,6 +90,9 @@ class Inlets(Protocol):
     def take(self, arrivals: Iterable[Arrival]) -> None:
         """Hand out what came in."""
 
+    def take_first(self, arrival: Arrival) -> None:
+        """Hand out something that came before its inlet was open, ahead of what came in since."""
+
     def close(self) -> None:
         """Forget what was not handed out yet, and take no more."""
 
@@ -108,6 +111,9 @@ class Receiver(Protocol):
 
     def take_other(self, arrival: Any) -> None:
         """Something came in for which there is no inlet."""
+
+    def take_unexpected(self, arrival: Any) -> None:
+        """Something came in for a topic from a sender that does not publish it, as far as is known."""
 
     @property
     def waits(self) -> bool:
@@ -209,6 +215,13 @@ class Intake:
         elif self._paused:
             self._link.pause()  # the line has been connected anew
 
+    def take_first(self, arrival: Arrival) -> None:
+        """Hand out something that came before its inlet was open, ahead of what came in since."""
+        if not self._closed:
+            self._backlog.appendleft(arrival)
+            if not self._busy:
+                self._hand_out()
+
     def _hand_out(self) -> None:
         self._busy = True
         link, backlog, inlets, lost = self._link, self._backlog, self._inlets, self._stats.lost
@@ -225,7 +238,7 @@ class Intake:
                     continue
                 size = inlet.senders.get(link.sender(arrival))
                 if size is None:
-                    lost["not subscribed"] += 1
+                    link.take_unexpected(arrival)
                 elif size and len(arrival.data) != size:
                     lost["wrong size"] += 1
                 else:

@@ -177,6 +177,10 @@ class LineLink(Link):
 
     # Link
 
+    def _detach(self, name: str) -> None:
+        super()._detach(name)
+        self._encoders.pop(name, None)
+
     @property
     def full(self) -> bool:
         return self._waiting >= self._limit

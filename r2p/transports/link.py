@@ -35,6 +35,9 @@ from r2p.transports.outlet import LinkOutlet
 
 _SECOND = 1_000_000_000
 _MANAGEMENT = MANAGEMENT.encode()
+_EARLY = _SECOND  # ns by which a message may come before the answer to its subscription
+_MOST_EARLY = 256  # of those
+_NOT_SUBSCRIBED = "not subscribed"
 
 
 class Hub(Protocol):
@@ -146,6 +149,7 @@ class Link(abc.ABC):
         self._intake: Inlets = Intake(self, hub.space.loop, self.stats)
         self._told: dict[str, Told] = {}
         self._lapsed: set[str] = set()
+        self._early: dict[tuple[bytes, Hashable], tuple[Arrival, int]] = {}  # the last message, and when it came (ns)
         self._events: deque[Event] = deque()
         self._acting = False
         self.room = Room()
@@ -182,6 +186,7 @@ class Link(abc.ABC):
         self.up = False
         self._down_at = self._clock.monotonic()
         self._lost_at_down = self.stats.lost["link down"]
+        self._early.clear()
         lost = self.discard()  # which counts, too, what waited for room
         self.stats.lost["link down"] += lost
         self._hub.link_changed(self, reason, 0.0, 0)
@@ -216,7 +221,19 @@ class Link(abc.ABC):
         if arrival.topic == _MANAGEMENT:
             self.manage(arrival.data, self.sender(arrival))
         else:
-            self.stats.lost["not subscribed"] += 1
+            self.take_unexpected(arrival)
+
+    def take_unexpected(self, arrival: Arrival) -> None:
+        """Count it; what is wanted may be announced by what comes next: keep the last message for that."""
+        self.stats.lost[_NOT_SUBSCRIBED] += 1
+        topic = self._space.topics.get(arrival.topic.decode("ascii", "replace"))
+        if topic is None or not topic.wanted:
+            return
+        key = arrival.topic, self.sender(arrival)
+        self._early.pop(key, None)
+        if len(self._early) >= _MOST_EARLY:
+            del self._early[next(iter(self._early))]
+        self._early[key] = arrival, self._clock.monotonic()
 
     def manage(self, data: bytes, source: Hashable) -> None:
         """A management message came in from this address."""
@@ -362,7 +379,7 @@ class Link(abc.ABC):
             self._detach(topic.name)
         if not wish.subscribes:
             self._intake.shut_all(topic.name)
-        if wish != NOTHING:
+        if wish.publishes or wish.subscribes or wish.endpoints:
             self._told[topic.name] = wish
 
     # Discovery
@@ -432,6 +449,14 @@ class Link(abc.ABC):
         topic = self._space.topics.get(name)
         if topic is not None and topic.wanted:
             self._intake.open(topic, topic.layout.size if topic.layout is not None else size, sender)
+            self._admit_early(name.encode(), sender)
+
+    def _admit_early(self, name: bytes, sender: Hashable) -> None:
+        """A message may overtake the answer that announces it; a latched one would not come again."""
+        arrival, at = self._early.pop((name, sender), (None, 0))
+        if arrival is not None and self._clock.monotonic() - at <= _EARLY:
+            self.stats.lost[_NOT_SUBSCRIBED] -= 1
+            self._intake.take_first(arrival)
 
 
 def is_booting(link: Link, module: str) -> bool:

@@ -71,6 +71,9 @@ class End:
     def take_other(self, arrival: Arrival) -> None:
         raise AssertionError(arrival)
 
+    def take_unexpected(self, arrival: Arrival) -> None:
+        raise AssertionError(arrival)
+
     def pause(self) -> None:
         self.reads = False
 

@@ -389,6 +389,17 @@ async def test_nothing_happens_after_closing() -> None:
     assert not link.up
 
 
+async def test_a_line_keeps_nothing_of_a_topic_that_was_closed() -> None:
+    script = Script()
+    async with r2p.Module("PC1", via=script) as module, node_in(module) as node:
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE))
+        await publisher.publish(Led())
+        assert set(script.link._encoders) == {"leds"}
+        publisher.close()
+        assert not script.link._encoders
+
+
 async def test_a_slow_reader_does_not_stop_the_line() -> None:
     """Its own messages are lost, counted; the others' come."""
     async with scripted() as (script, _, node):

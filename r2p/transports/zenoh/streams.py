@@ -112,6 +112,9 @@ class Streams:
     def take(self, arrivals: Iterable[Any]) -> None:
         """Each stream takes what comes by itself."""
 
+    def take_first(self, arrival: Any) -> None:
+        """Nothing comes before its stream is open."""
+
     def open(self, topic: Topic, size: int, sender: Hashable) -> None:
         """A publisher is there."""
         stream = self._streams.get(topic.name)

@@ -1,0 +1,110 @@
+"""What a link keeps: messages that come before what announces them, for a moment, and nothing of closed topics."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from r2p.msg import Led
+from r2p.names import MANAGEMENT
+from r2p.testing.network import Network, node_in
+from r2p.transports.memory import Frame
+from tests.bench import led, settle
+
+if TYPE_CHECKING:
+    import r2p
+
+pytestmark = pytest.mark.virtual_time
+
+
+class SlowManagement(Network):
+    """What is published overtakes what announces it, by `lead` seconds."""
+
+    def __init__(self, lead: float) -> None:
+        super().__init__()
+        self.lead = lead
+
+    def _schedule(self, delay: float, address: int, frame: Frame) -> None:
+        super()._schedule(self.lead if frame.topic == MANAGEMENT.encode() else delay, address, frame)
+
+
+async def test_a_latched_value_may_overtake_the_answer_that_announces_it() -> None:
+    net = SlowManagement(0.1)
+    async with net.module("A") as a, net.module("B") as b, node_in(a) as one, node_in(b) as other:
+        publishers = [one.advertise("leds", Led, latch=True), one.advertise("more", Led, latch=True)]
+        for number, publisher in enumerate(publishers):
+            await publisher.publish(led(number))
+        await asyncio.sleep(10.0)
+        leds, more = other.subscribe("leds", Led), other.subscribe("more", Led)
+        assert [await each.fetch(1.0) for each in (leds, more)] == [led(0), led(1)]
+        await publishers[0].publish(led(2))
+        await settle(5.0)
+        assert [sample.sequence for sample in leds.queue] == [2]
+        assert b.links[0].losses == {}
+
+
+async def test_what_came_long_before_is_stale() -> None:
+    async with Network().module("B") as b, node_in(b) as other:
+        leds, link = other.subscribe("leds", Led), b.links[0]
+        link.take([frame(port, b"leds") for port in (1, 2)])
+        assert link.losses == {"not subscribed": 2}
+        await asyncio.sleep(0.9)
+        link._open("leds", 5, 1)
+        await asyncio.sleep(0.2)
+        link._open("leds", 5, 2)
+        assert len(leds.queue) == 1
+        assert link.losses == {"not subscribed": 1}
+
+
+async def test_what_comes_unasked_is_kept_for_few_senders_and_for_no_other_topic(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("r2p.transports.link._MOST_EARLY", 2)
+    net = Network()
+    async with net.module("B") as b, node_in(b) as other:
+        other.subscribe("leds", Led)
+        link: Any = b.links[0]
+        for port in range(5):
+            for topic in (b"leds", b"other", b"\xff"):
+                link.take([frame(port, topic)])
+        assert [sender for _, sender in link._early] == [3, 4]
+        assert link.losses == {"not subscribed": 15}
+        net.disconnect(b)
+        assert not link._early
+
+
+def frame(port: int, topic: bytes) -> Frame:
+    return Frame(port, topic, Led().encode())
+
+
+async def test_nothing_is_kept_of_topics_that_were_closed() -> None:
+    net = Network()
+    async with net.module("A") as a, net.module("B") as b, node_in(a) as one, node_in(b) as other:
+        for number in range(50):
+            publisher, leds = one.advertise(f"n{number}", Led), other.subscribe(f"n{number}", Led)
+            await publisher.wait_subscriber()
+            await publisher.publish(led(number))
+            assert await leds.fetch(1.0) == led(number)
+            publisher.close()
+            leds.close()
+        await asyncio.sleep(5.0)
+        for module in (a, b):
+            assert grown(module, 50) == {"discovery._directory.topics"}  # which has a limit of its own
+
+
+def grown(module: r2p.Module, size: int) -> set[str]:
+    """The tables behind a module and its link that hold so many things."""
+    found: set[str] = set()
+    seen: set[int] = set()
+    waiting: list[tuple[str, Any]] = [("", module.links[0]), ("space", module.space), ("module", module)]
+    while waiting:
+        path, owner = waiting.pop()
+        for name, value in vars(owner).items():
+            if isinstance(value, dict | set | list) and len(value) >= size:
+                found.add(f"{path}.{name}".lstrip("."))
+            elif type(value).__module__.startswith("r2p") and hasattr(value, "__dict__") and id(value) not in seen:
+                seen.add(id(value))
+                waiting.append((f"{path}.{name}", value))
+    return found
