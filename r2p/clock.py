@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import logging
 import os
 import random
 import sys
@@ -21,7 +22,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+logger = logging.getLogger("r2p.clock")
+
 _SECOND: Final = 1_000_000_000
+_WORTH_TELLING: Final = _SECOND // 10  # ns by which UTC is set back
 _SHORTEST_PERIOD: Final = 1_000
 _NO_TIMERFD: Final = (OSError, AttributeError)  # AttributeError: a C library, or a Python, without it
 _RETRY: Final = 1_000_000  # ns; uvloop's timers have whole milliseconds, and may go off half a one early
@@ -43,7 +47,10 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The computer's clock. When UTC is set back, `now()` goes on at half speed until UTC has caught up with it."""
+    """The computer's clock. When UTC is set back, `now()` goes on at half speed until UTC has caught up with it.
+
+    That takes twice as long as UTC was set back by; the log says so. Meanwhile `now()` is ahead of other computers'.
+    """
 
     virtual = False
 
@@ -52,6 +59,7 @@ class SystemClock:
         self._utc = utc
         self._last = 0  # what now() said last
         self._slowed = -1  # ... and what it said last at half speed
+        self._ahead = 0  # by how much it was ahead of UTC when the log last said so
         self._anchor = (0, 0)  # where half speed began: what now() had said, and the monotonic instant
 
     def now(self) -> int:
@@ -59,15 +67,29 @@ class SystemClock:
         if utc >= self._last:
             self._last = utc
             return utc
-        return self._half_speed()
+        return self._half_speed(utc)
 
-    def _half_speed(self) -> int:
+    def _half_speed(self, utc: int) -> int:
         monotonic = self.monotonic()
+        ahead = self._last - utc
         if self._last != self._slowed:  # full speed in between: UTC was set back again
             self._anchor = (self._last, monotonic)
+            self._ahead = 0
+        if ahead > self._ahead + _WORTH_TELLING:
+            _tell_set_back(ahead)
+            self._ahead = ahead
         began, at = self._anchor
         self._last = self._slowed = began + (monotonic - at) // 2
         return self._last
+
+
+def _tell_set_back(ahead: int) -> None:
+    logger.warning(
+        "the computer's clock was set back by %.1f s: r2p's goes on at half speed for %.0f s, until both agree again; "
+        "meanwhile what other computers stamp looks too old here (max_age= drops and counts it)",
+        ahead / _SECOND,
+        2 * ahead / _SECOND,
+    )
 
 
 _SYSTEM: Final = SystemClock()

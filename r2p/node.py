@@ -204,8 +204,9 @@ class Node:
 
         `queue` messages are held. When it is full, non real-time publishers wait for it, up to their stall time, unless
         it is `lossy`; whoever does not wait drops its oldest message, or with `keep="oldest"` the new one, counted in
-        `lost`. Messages older than `max_age` seconds are skipped. When nothing comes for `timeout` seconds,
-        `on_timeout` is called once; without it, the iteration raises TimeoutError.
+        `lost`. Messages older than `max_age` seconds are skipped, counted in `stale`: by the publisher's stamp and this
+        computer's clock, so the two have to agree, and a clock that is set makes messages look too old. When nothing
+        comes for `timeout` seconds, `on_timeout` is called once; without it, the iteration raises TimeoutError.
         A `callback` is called, in this node's task, from `spin()`.
         Raises InvalidName or NameTooLong, MessageError (a type without a layout, an option without sense),
         TypeMismatch, and Closed once the node has ended.

@@ -44,6 +44,27 @@ def test_utc_goes_on_at_half_speed_after_it_was_set_back() -> None:
     assert hands.wait(1 * SECOND) == before + 11 * SECOND == hands.utc
 
 
+def test_a_clock_that_is_set_back_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    hands = Hands()
+    hands.clock.now()
+    hands.utc -= SECOND // 20  # what a time server does all day
+    hands.clock.now()
+    assert not caplog.messages
+    hands.utc -= 3600 * SECOND
+    hands.clock.now()
+    for _ in range(10):
+        hands.wait(SECOND)
+    (message,) = caplog.messages
+    assert message.startswith("the computer's clock was set back by 3600.1 s: r2p's goes on at half speed for 7200 s")
+    hands.utc -= 60 * SECOND
+    hands.clock.now()
+    assert caplog.messages[1].startswith("the computer's clock was set back by 3655.1 s")
+    hands.wait(8000 * SECOND)
+    hands.utc -= SECOND
+    hands.clock.now()
+    assert "set back by 1.0 s" in caplog.messages[2]
+
+
 def test_utc_may_be_set_back_again_and_again() -> None:
     hands = Hands()
     told = [hands.clock.now()]

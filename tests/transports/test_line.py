@@ -394,6 +394,7 @@ async def test_a_line_keeps_nothing_of_a_topic_that_was_closed() -> None:
     async with r2p.Module("PC1", via=script) as module, node_in(module) as node:
         publisher = node.advertise("leds", Led)
         script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
         await publisher.publish(Led())
         assert set(script.link._encoders) == {"leds"}
         publisher.close()
