@@ -106,8 +106,8 @@ class ModuleHub:
             link.command(command, module)
 
     def _topic_changed(self, topic: Topic) -> None:
-        for link in self.links:
-            link.topic_changed(topic)
+        for link in self.links:  # a mistake in one of them is neither the user's nor that of the others
+            link.stats.lost.guard(link.topic_changed, topic)
 
     # For transports
 
@@ -118,7 +118,7 @@ class ModuleHub:
         self.space.links.append(link)
         self._joints.attach(link)
         for topic in list(self.space.topics.values()):
-            link.topic_changed(topic)
+            link.stats.lost.guard(link.topic_changed, topic)
         link.set_flags(self.flags)
 
     def detach(self, link: Link) -> None:

@@ -242,12 +242,12 @@ class Standby:
     def _retell(self, links: list[Link]) -> None:
         for topic in list(self._space.topics.values()):
             for link in links:
-                link.topic_changed(topic)
+                link.stats.lost.guard(link.topic_changed, topic)
 
     def _retell_topic(self, topic: Topic) -> None:
         for port in list(self._by_number.values()):
             if port.link.up:
-                port.link.topic_changed(topic)
+                port.link.stats.lost.guard(port.link.topic_changed, topic)
 
     def _tell_used(self, link: Link) -> None:
         if link.stands_by:

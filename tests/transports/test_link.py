@@ -106,3 +106,22 @@ async def test_a_message_that_raises_when_there_is_room_for_it_does_not_stop_the
         assert [len(each.queue) for each in subscribers] == [0, 1, 1]
         assert [each.missed for each in publishers] == [1, 0, 0]
         assert link.losses == {"internal error": 1}
+
+
+async def test_an_announcement_that_raises_stops_neither_the_program_nor_other_links(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one, other = Network(), Network()
+    async with (
+        r2p.Module("A", via=[one.transport(), other.transport()]) as a,
+        r2p.Module("B", via=other.transport()) as b,
+        node_in(a) as alice,
+        node_in(b) as bob,
+    ):
+        first, second = a.links
+        monkeypatch.setattr(first.discovery, "advertise", once(first.discovery.advertise))
+        publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
+        await publisher.wait_subscriber()
+        await publisher.publish(Led(1))
+        assert await subscriber.fetch(timeout=1.0) == Led(1)
+        assert (first.losses["internal error"], second.losses["internal error"]) == (1, 0)

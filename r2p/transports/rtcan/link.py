@@ -142,7 +142,7 @@ class RtcanLink(Link):
 
     def _announce(self) -> None:
         for topic in list(self._space.topics.values()):
-            self.topic_changed(topic)
+            self.stats.lost.guard(self.topic_changed, topic)
         self.went_up()
 
     # In
