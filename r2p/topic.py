@@ -134,8 +134,11 @@ class QueueSink(Sink):
         return True
 
     def waits_for(self, sample: Sample) -> bool:
-        """Who made no room for what does not expire is lossy for that only: events wait until their deadline."""
-        return not self.lossy and sample.publisher_class != _NRT
+        """Who made no room for what does not expire is lossy for that only: events wait until their deadline.
+
+        A publisher of this module gets the queue back, too, and counts what is lost there.
+        """
+        return not self.lossy and (sample.publisher_class != _NRT or not sample.source.link)
 
     def force(self, sample: Sample) -> None:
         if self.offer(sample):
@@ -267,6 +270,8 @@ class Topic:
     def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
         """Queue the sample wherever there is room; the sinks that are worth waiting for come back.
 
+        With what is published here those come back, too, that are not any more (`patient` is false): its publisher
+        counts what they lose.
         `own` is the publishing node: its own queues never make it wait. `driver` is a link that gets it another way.
         """
         if self.guard is not None and self.guard(sample.source.link):
@@ -301,9 +306,7 @@ class Topic:
             queues = (lines.events or lines.claims) and lines.line(sample)
             if outlet.carrier is driver or (not queues and outlet.offer(sample)):
                 continue
-            if not outlet.patient and sample.publisher_class == PublisherClass.NON_REAL_TIME:
-                outlet.force(sample)
-            elif blocked is None:
+            if blocked is None:
                 blocked = [outlet]
             else:
                 blocked.append(outlet)

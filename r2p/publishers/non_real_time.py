@@ -51,13 +51,27 @@ class Publisher(BasePublisher[M]):
         """Publish without waiting: for callbacks. False if somebody had no room and lost a message (counted)."""
         sample = self._sample(message)
         blocked = self._topic.deliver(sample, self.node)
-        if blocked is not None:
-            for sink in blocked:
-                sink.force(sample)
-            self._miss(sample.sequence, NO_ROOM, where(blocked))
-        return blocked is None
+        return blocked is None or self._force(sample, blocked)
+
+    def _force(self, sample: Sample, sinks: list[Sink]) -> bool:
+        """Give it to those for whom nobody waits; False if any of them loses a message by that."""
+        without = []
+        for sink in sinks:
+            lost = sink.lost
+            sink.force(sample)
+            if sink.lost > lost:
+                without.append(sink)
+        if without:
+            self._miss(sample.sequence, NO_ROOM, where(without))
+        return not without
 
     async def _wait_for_room(self, sample: Sample, blocked: list[Sink]) -> None:
+        given_up = [sink for sink in blocked if not sink.patient]
+        if given_up:
+            self._force(sample, given_up)
+            blocked = [sink for sink in blocked if sink.patient and sink not in given_up]
+            if not blocked:
+                return
         loop = self._space.loop
         wait = _Wait(sample, blocked, loop.create_future())
         timer = loop.call_later(self._stall, wait.expire, f"no room for {self._stall} s")

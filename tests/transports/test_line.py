@@ -126,6 +126,31 @@ async def test_what_waits_for_a_blocked_line_is_bounded() -> None:
         assert len(script.topics("text")) == sent
 
 
+async def test_what_a_slow_line_does_not_get_is_missed_by_its_publisher(caplog: pytest.LogCaptureFixture) -> None:
+    """With and without waiting, each once, however many others have it; the log tells the same number."""
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("text", Text, r2p.NonRealTime(stall=0.01))
+        kept = node.subscribe("text", Text, queue=1, lossy=True)
+        script.hear(manage(m.SubscribeRequest("text", 64, 1)))
+        await asyncio.sleep(1)
+        script.blocked = True
+        while not publisher.missed:
+            await publisher.publish(Text())
+        for _ in range(500):
+            await publisher.publish(Text())
+            assert not publisher.publish_nowait(Text())
+        await asyncio.sleep(1)
+        await publisher.publish(Text())
+        assert publisher.missed == script.link.losses["send buffer full"] == 1002
+        assert "(missed 1002, late 0 so far)" in caplog.text
+        script.unblock()
+        await asyncio.sleep(0)
+        assert len(script.topics("text")) + publisher.missed == publisher.sent
+        await publisher.publish(Text())
+        assert publisher.missed == 1002
+        assert kept.lost
+
+
 async def test_one_turn_may_bring_more_than_the_buffer_holds() -> None:
     async with scripted() as (script, _, node):
         publisher = node.advertise("text", Text)
