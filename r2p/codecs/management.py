@@ -25,6 +25,8 @@ Gateways agree on their tree (`r2p.protocols.bridging`) with three more, which s
 | 0x62 | LEAF | `u32 module; u8 port; u16 count; 3 x {u32 gateway; u16 count} acks` (0: none) |
 """
 
+import functools
+
 import msgspec
 
 from r2p.codecs import UnknownType
@@ -59,6 +61,8 @@ CLASS_LATCHES = 128  # added to the others: new subscribers get its last message
 NO_PARAMS = bytes(10)
 UNANSWERED = bytes(9) + b"\1"
 """Params of a SUBSCRIBE_REQUEST between r2p modules: no SUBSCRIBE_RESPONSE has been heard yet."""
+ANSWERED = bytes(9) + b"\2"
+"""The same, after a SUBSCRIBE_RESPONSE: so a publisher knows an r2p module whose HELLO it has not heard yet."""
 ANY_TYPE = bytes(8)
 
 QUEUE = 5
@@ -414,6 +418,12 @@ def encode(message: Management) -> bytes:
 
 def decode(data: bytes) -> Management:
     """The message in these 32 bytes. Raises `UnknownType` for a type, role or version to ignore, else `DecodeError`."""
+    return _decode(bytes(data))
+
+
+@functools.lru_cache(maxsize=4096)
+def _decode(data: bytes) -> Management:
+    """Modules repeat themselves byte by byte, and all modules of a process hear the same: most was decoded before."""
     message = _CODEC.decode(data)
     if isinstance(message, TypeInfo | Endpoint):
         gone = ROLE_GONE if isinstance(message, Endpoint) else 0

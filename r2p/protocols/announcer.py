@@ -5,7 +5,7 @@ from collections.abc import Callable
 import msgspec
 
 from r2p.codecs import management
-from r2p.codecs.management import NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
+from r2p.codecs.management import ANSWERED, NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.directory import FOR_EVER, LEASE
 from r2p.protocols.events import Shape
 from r2p.protocols.outbox import Outbox
@@ -150,7 +150,7 @@ class Announcer:
         size = own.shape.size or size or self._size_of(topic)
         if not size:
             return []
-        params = UNANSWERED if self.r2p and topic not in self.answered else NO_PARAMS
+        params = NO_PARAMS if not self.r2p else ANSWERED if topic in self.answered else UNANSWERED
         return [management.SubscribeRequest(topic, size, management.queue_length(size, own.queue), params)]
 
     def _advertisement(self, topic: str, own: Own) -> management.Advertise:

@@ -103,6 +103,11 @@ class Directory:
         """Whether any r2p module is known on the link."""
         return bool(self._names)
 
+    @property
+    def r2p_modules(self) -> int:
+        """How many r2p modules are known on the link."""
+        return len(self._names)
+
     def name_of(self, instance: int) -> str:
         return self._names.get(instance, "")
 

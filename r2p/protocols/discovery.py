@@ -330,6 +330,8 @@ class Discovery:
         match key:
             case ("lease", source, str(topic)):
                 self._exchange.lease_over(source, topic)
+            case ("answer", int(role), str(topic)):
+                self._exchange.answer(now, role, topic)
             case ("grace", source, str(topic)):
                 self._exchange.grace_over(source, topic)
             case ("module", str(name)):

@@ -1,21 +1,24 @@
 """Who may exchange what: both sides of ADVERTISE, SUBSCRIBE_REQUEST and SUBSCRIBE_RESPONSE (PROTOCOL.md 4).
 
-Firmware is answered every time; between r2p modules what only repeats itself brings no more than a response, for both
-sides repeat. Only what a message changes becomes an event. A type that does not fit is refused by both sides because
-each tells its own, with every repetition and as the answer to what it refuses. A TYPE is never answered, so two that
-disagree don't argue.
+Firmware is answered every time. Between r2p modules what only repeats itself brings no more than a response, for both
+sides repeat; and where many of them ask at once they share an answer (`Answers`). Only what a message changes becomes
+an event. A type that does not fit is refused by both sides because each tells its own, with every repetition and as the
+answer to what it refuses. A TYPE is never answered, so two that disagree don't argue.
 """
 
 from collections import Counter
+from typing import Any
 
 from r2p.codecs import management
-from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
+from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.announcer import Announcer, Own
 from r2p.protocols.directory import LEASE, Directory
 from r2p.protocols.events import Joined, Left, Mismatched, ModuleInfo, Opened, Shape, Shut, Source
 from r2p.protocols.outbox import Outbox
 from r2p.protocols.peers import Peer, Peers
-from r2p.protocols.schedule import Timers
+from r2p.protocols.schedule import Answers, Timers
+
+_SENT_BY_R2P = (UNANSWERED, ANSWERED)
 
 GRACE = 50_000_000
 """Ns after a SUBSCRIBE_RESPONSE, or a reconnect, in which firmware drops data: the thread that takes the response has
@@ -34,6 +37,7 @@ class Exchange:
         self._timers = timers
         self._counts = counts
         self._peers = Peers(counts)
+        self._answers: Answers[Any] = Answers(timers)
         self._attached: set[str] = set()
         """The topics of which the link has been told that they have subscribers."""
 
@@ -47,12 +51,12 @@ class Exchange:
         peer = self._peers.obtain(source) if own is not None else None
         if own is None or peer is None:
             return
-        if peer.is_r2p(now):
-            if peer.opened.get(topic) == (message.params, message.size):
-                return  # it knows of subscribers: the next one of our own requests is soon enough
-            self._outbox.say(own.type(topic, ROLE_SUBSCRIBES))
-        if self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
-            self._outbox.say(*self._own.requests(topic, own, message.size))
+        if peer.is_r2p(now) and (
+            _receives(peer, message)
+            or self._answers.waits(now, (ROLE_PUBLISHES, topic), source, message, self._directory.r2p_modules)
+        ):
+            return
+        self._request(now, topic, own, [(peer, message)])
 
     def requested(self, now: int, message: management.SubscribeRequest, source: Source) -> None:
         """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
@@ -62,17 +66,10 @@ class Exchange:
         peer = self._peers.obtain(source) if own is not None else None
         if own is None or peer is None:
             return
-        unanswered = peer.is_r2p(now) and message.params == UNANSWERED
-        if peer.is_r2p(now) and (unanswered or peer.requests.get(topic) is not False):
-            self._outbox.say(own.type(topic, ROLE_PUBLISHES))
-        theirs = peer.types.get((topic, ROLE_SUBSCRIBES))
-        if theirs is not None and not self._fits(peer, topic, ROLE_SUBSCRIBES, theirs):
-            return
-        self._outbox.say(management.SubscribeResponse(topic, own.shape.size, max(message.queue, 1), own.params))
-        if self._peers.join(now, peer, topic, unanswered=unanswered):
-            self._own.wanted.add(topic)
-            self._join(now, peer, Joined(topic, message.params, message.queue, source))
-        self._renew(now, peer, topic)
+        r2p = peer.is_r2p(now) or message.params in _SENT_BY_R2P
+        modules = self._directory.r2p_modules
+        if not (r2p and self._answers.waits(now, (ROLE_SUBSCRIBES, topic), source, message, modules)):
+            self._respond(now, topic, own, [(peer, message)])
 
     def responded(self, now: int, message: management.SubscribeResponse, source: Source) -> None:
         """A publisher that will send: let its data in."""
@@ -103,6 +100,52 @@ class Exchange:
         else:
             self._counts["unsubscribe left to the lease"] += 1
 
+    # Answers
+
+    def answer(self, now: int, role: int, topic: str) -> None:
+        """Answer all r2p modules that have said since the last answer that they publish or subscribe the topic."""
+        asked = self._answers.take(now, (role, topic), self._directory.r2p_modules)
+        known = [(peer, message) for source, message in asked if (peer := self._peers.get(source)) is not None]
+        own = self._counterpart(role).get(topic)
+        if own is None or not known:
+            return
+        if role == ROLE_PUBLISHES:
+            self._request(now, topic, own, known)
+        else:
+            self._respond(now, topic, own, known)
+
+    def _request(self, now: int, topic: str, own: Own, offers: list[tuple[Peer, management.Advertise]]) -> None:
+        """Ask publishers for their data; those whose data come in by now, at our next request."""
+        r2p = [peer.is_r2p(now) for peer, _ in offers]
+        offers = [each for each, is_r2p in zip(offers, r2p, strict=True) if not (is_r2p and _receives(*each))]
+        if any(r2p) and offers:
+            self._outbox.say(own.type(topic, ROLE_SUBSCRIBES))
+        sizes = [offer.size for peer, offer in offers if self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, offer))]
+        if sizes:
+            self._outbox.say(*self._own.requests(topic, own, sizes[-1]))
+
+    def _respond(
+        self, now: int, topic: str, own: Own, requests: list[tuple[Peer, management.SubscribeRequest]]
+    ) -> None:
+        """Answer subscribers, and attach those that are new."""
+        if any(_needs_type(now, peer, request) for peer, request in requests):
+            self._outbox.say(own.type(topic, ROLE_PUBLISHES))
+        requests = [each for each in requests if self._may_subscribe(each[0], topic)]
+        if not requests:
+            return
+        queue = max(requests[-1][1].queue, 1)
+        self._outbox.say(management.SubscribeResponse(topic, own.shape.size, queue, own.params))
+        for peer, request in requests:
+            unanswered = peer.is_r2p(now) and request.params == UNANSWERED
+            if self._peers.join(now, peer, topic, unanswered=unanswered):
+                self._own.wanted.add(topic)
+                self._join(now, peer, Joined(topic, request.params, request.queue, peer.source))
+            self._renew(now, peer, topic)
+
+    def _may_subscribe(self, peer: Peer, topic: str) -> bool:
+        theirs = peer.types.get((topic, ROLE_SUBSCRIBES))
+        return theirs is None or self._fits(peer, topic, ROLE_SUBSCRIBES, theirs)
+
     # What changed on our side
 
     def retyped(self, topic: str, role: int) -> None:
@@ -115,12 +158,14 @@ class Exchange:
 
     def withdrawn(self, topic: str) -> None:
         """Our last publisher is gone."""
+        self._answers.forget((ROLE_SUBSCRIBES, topic))
         for peer in self._peers.all():
             self._end(peer, topic)
             peer.forget_type(topic, ROLE_SUBSCRIBES)
 
     def unwanted(self, topic: str) -> None:
         """Our last subscriber is gone."""
+        self._answers.forget((ROLE_PUBLISHES, topic))
         for peer in self._peers.all():
             self._shut(peer, topic)
             peer.forget_type(topic, ROLE_PUBLISHES)
@@ -163,6 +208,7 @@ class Exchange:
 
     def interrupted(self) -> None:
         """The link is down. Firmware does not notice a reconnect: its subscriptions stay, leases end."""
+        self._answers.clear()
         for peer in self._peers.all():
             peer.r2p_until = 0
             for topic in [topic for topic in peer.requests if topic not in peer.permanent]:
@@ -195,6 +241,7 @@ class Exchange:
             self._peers.tidy(peer)
 
     def _depart(self, now: int, peer: Peer) -> None:
+        self._answers.drop(peer.source)
         for topic in list(peer.requests):
             self._end(peer, topic)
         for topic in list(peer.opened):
@@ -227,7 +274,7 @@ class Exchange:
 
     def _join(self, now: int, peer: Peer, joined: Joined) -> None:
         """A subscriber is new. Firmware is given time to take the response before the data."""
-        if peer.is_r2p(now) or joined.params == UNANSWERED:  # which only r2p modules send
+        if peer.is_r2p(now) or joined.params in _SENT_BY_R2P:
             self._attach(joined)
         else:
             peer.waiting[joined.topic] = joined
@@ -249,6 +296,7 @@ class Exchange:
             self._timers.set(key, now + peer.lease)
 
     def _end(self, peer: Peer, topic: str) -> None:
+        self._answers.drop(peer.source, (ROLE_SUBSCRIBES, topic))
         self._timers.clear(("lease", peer.source, topic))
         if peer.waiting.pop(topic, None) is not None:
             self._timers.clear(("grace", peer.source, topic))
@@ -263,6 +311,18 @@ class Exchange:
             if not any(topic in each.opened for each in self._peers.all()):
                 self._own.answered.discard(topic)
             self._outbox.tell(Shut(topic, peer.source))
+
+
+def _receives(peer: Peer, message: management.Advertise) -> bool:
+    """Whether what this publisher offers comes in already, and it knows of subscribers."""
+    return peer.opened.get(message.topic) == (message.params, message.size)
+
+
+def _needs_type(now: int, peer: Peer, message: management.SubscribeRequest) -> bool:
+    """Whether an r2p subscriber may not know our type: repeats of its requests only keep its lease."""
+    if not peer.is_r2p(now):
+        return False
+    return message.params == UNANSWERED or peer.requests.get(message.topic) is not False
 
 
 def _theirs(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> Shape:

@@ -137,7 +137,8 @@ class Neighbours:
             self._exchange.met(now, info, is_new=is_new)
         self._keep(now, before, info)
         if is_new or message.flags & management.HELLO_QUERY:
-            self._schedule.repeat(now)
+            tool = bool(message.flags & management.HELLO_TOOL)
+            self._schedule.repeat(now, self._directory.r2p_modules, tool=tool)
 
     def _look_for_namesakes(self, now: int, before: ModuleInfo | None, message: management.Hello) -> None:
         swaps = self._directory.count_swaps(now, before, message.instance)

@@ -9,8 +9,11 @@ import heapq
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from enum import Enum, auto
+from typing import Generic, TypeVar
 
 import msgspec
+
+from r2p.protocols.events import Source
 
 _SECOND = 1_000_000_000
 _STEP = _SECOND // 2
@@ -24,6 +27,15 @@ _QUIET_MOST = _SECOND
 """A step that waits for a quiet line goes out this late at the latest."""
 _MOST = 2
 """Messages of one item at most: an announcement and the type before it."""
+_SHARED = _SECOND // 50
+_AT_ONCE = 3
+_NEWCOMER = _SECOND // 20
+"""Ns for each module on the link between two full repetitions for modules that are new: with those that start meanwhile
+they share one, so that the start of n modules costs each a few repetitions, not n."""
+_TOOL = _SECOND // 5
+"""Ns between two full repetitions for a tool, which shows what it hears to a user."""
+_PRESENCE_EACH = _SECOND // 100
+"""Ns for each module on the link between two presences at least."""
 
 
 class Kind(Enum):
@@ -81,6 +93,9 @@ class Schedule:
         self._step_at = 0
         self._presence_at = 0
         self._presence_sent = -_SECOND
+        self._repeated_at = -_ROUND
+        self._repeat_at: int | None = None
+        self._tool_waits = False
         self._traffic_at = -_SECOND
 
     def pace(self, rate: float, burst: int, quiet: int) -> None:
@@ -121,12 +136,20 @@ class Schedule:
         self._fresh.clear()
         self._relayed.clear()
         self._eager = 0
+        self._repeated_at, self._repeat_at, self._tool_waits = -_ROUND, None, False
 
-    def repeat(self, now: int) -> None:
-        """Somebody is new: say everything once more, presence first."""
-        apart = max(_PRESENCE_APART, _PRESENCE_SHARE * self._bucket.gap)
+    def repeat(self, now: int, modules: int = 1, *, tool: bool = False) -> None:
+        """One of `modules` on the link is new, or a `tool` asks: say everything once more, presence first."""
+        apart = max(_PRESENCE_APART, _PRESENCE_SHARE * self._bucket.gap, modules * _PRESENCE_EACH)
         self._presence_at = min(self._presence_at, max(now, self._presence_sent + apart))
-        self._hurry()
+        apart = modules * _NEWCOMER
+        at = self._repeated_at + min(apart, _TOOL if tool else _ROUND)
+        if at <= now:
+            self._repeat(now)
+        elif apart >= _ROUND and not tool:
+            self._include_seldom()  # the next round is soon enough
+        elif not self._tool_waits:
+            self._repeat_at, self._tool_waits = at, tool
 
     def traffic(self, now: int) -> None:
         """A management message passed by."""
@@ -140,6 +163,10 @@ class Schedule:
         """What to announce now, if anything; say with `sent` what it cost."""
         if self.due() > now:
             return None
+        if self._repeat_at is not None and self._repeat_at <= now:
+            self._repeat(now)
+            if self.due() > now:
+                return None
         if self._fresh:
             item, _ = self._fresh.popitem(last=False)
             if not item.once:
@@ -184,11 +211,20 @@ class Schedule:
     def _presence_period(self) -> int:
         return max(min(_ROUND, _STEP * (self._places + 1)), _PRESENCE_SHARE * self._bucket.gap)
 
+    def _repeat(self, now: int) -> None:
+        self._repeated_at, self._repeat_at, self._tool_waits = now, None, False
+        self._hurry()
+
     def _hurry(self) -> None:
         """Say everything without waiting, and once more in the next round: an answer may be lost."""
+        self._include_seldom()
+        self._eager, self._lap = self._count, 2 * self._count
+
+    def _include_seldom(self) -> None:
+        """The next round says everything."""
         self._ring.update(self._seldom)
         self._seldom.clear()
-        self._eager, self._lap = self._count, 2 * self._count
+        self._lap = max(self._lap, self._count)
 
     def _repetition(self) -> Item:
         """What is next in the ring; so often that all have a turn in `SELDOM` rounds, what is next in the slow one."""
@@ -214,6 +250,8 @@ class Schedule:
     def _turn_at(self) -> int:
         self._eager = min(self._eager, self._count)
         turn = 0 if self._eager else min(self._step_at, self._presence_at)
+        if self._repeat_at is not None:
+            turn = min(turn, self._repeat_at)
         return max(turn, min(self._traffic_at + self._quiet, self._step_at + _QUIET_MOST))
 
 
@@ -222,6 +260,63 @@ def _turned(ring: OrderedDict[Item, None]) -> Item:
     item = next(iter(ring))
     ring.move_to_end(item)
     return item
+
+
+_Asked = tuple[int, str]
+M = TypeVar("M")
+
+
+class Answers(Generic[M]):
+    """Which answers to r2p modules may go at once, and which have to wait for others who ask the same.
+
+    Everybody on a link hears an answer, so it serves all who have asked before it. Of each (role and topic) the first
+    few go at once; then, while many modules start, one for each `_SHARED` and module: else each of n modules would
+    answer each of n others, and each of those answers would be answered. Timers have keys that begin with "answer".
+    """
+
+    def __init__(self, timers: "Timers") -> None:
+        self._timers = timers
+        self._full_at: dict[_Asked, int] = {}
+        self._waiting: dict[_Asked, dict[Source, M]] = {}
+
+    def waits(self, now: int, key: _Asked, source: Source, message: M, modules: int) -> bool:
+        """Whether the answer to this message waits for its timer; `modules` are known on the link."""
+        waiting = self._waiting.get(key)
+        if waiting is not None:
+            waiting[source] = message
+            return True
+        gap = _SHARED * modules
+        ready = self._full_at.get(key, 0) - (_AT_ONCE - 1) * gap
+        if ready <= now:
+            self._count(now, key, gap)
+            return False
+        self._waiting[key] = {source: message}
+        self._timers.set(("answer", *key), ready)
+        return True
+
+    def take(self, now: int, key: _Asked, modules: int) -> list[tuple[Source, M]]:
+        """Its time has come: who is to be answered, and what each said last."""
+        self._count(now, key, _SHARED * modules)
+        return list(self._waiting.pop(key, {}).items())
+
+    def drop(self, source: Source, key: _Asked | None = None) -> None:
+        """This peer is not to be answered any more, about one thing or about all."""
+        for waiting in self._waiting.values() if key is None else [self._waiting.get(key, {})]:
+            waiting.pop(source, None)
+
+    def forget(self, key: _Asked) -> None:
+        """The topic is not ours any more."""
+        self._full_at.pop(key, None)
+        self._waiting.pop(key, None)
+        self._timers.clear(("answer", *key))
+
+    def clear(self) -> None:
+        """Nobody can be answered."""
+        for key in self._full_at.keys() | self._waiting.keys():
+            self.forget(key)
+
+    def _count(self, now: int, key: _Asked, gap: int) -> None:
+        self._full_at[key] = max(self._full_at.get(key, 0), now) + gap
 
 
 class Timers:

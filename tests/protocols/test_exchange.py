@@ -5,6 +5,7 @@ import pytest
 from r2p.codecs import management as m
 from r2p.protocols.discovery import (
     Discovery,
+    Event,
     Joined,
     Left,
     Mismatched,
@@ -17,6 +18,7 @@ from r2p.protocols.discovery import (
 from r2p.protocols.exchange import GRACE
 from tests.protocols.wire import (
     ME,
+    MS,
     ONE,
     PC2,
     PEER,
@@ -140,10 +142,10 @@ class TestGrace:
         hear(discovery, S, PC2)
         assert news(hear(discovery, S, REQUEST)) == [Joined("leds", bytes(10), 8)]
 
-    def test_what_only_r2p_sends_tells_it_from_firmware(self) -> None:
+    @pytest.mark.parametrize("params", [m.UNANSWERED, m.ANSWERED])
+    def test_what_only_r2p_sends_tells_it_from_firmware(self, params: bytes) -> None:
         """Its HELLO may have been lost."""
-        unanswered = m.SubscribeRequest("leds", 5, 8, m.UNANSWERED)
-        assert news(hear(started(), S, unanswered)) == [Joined("leds", m.UNANSWERED, 8)]
+        assert news(hear(started(), S, m.SubscribeRequest("leds", 5, 8, params))) == [Joined("leds", params, 8)]
 
     def test_who_leaves_before_its_data_never_joined(self) -> None:
         discovery = started()
@@ -349,7 +351,8 @@ class TestLostAnswers:
         unanswered = m.SubscribeRequest("cmd", 12, 5, m.UNANSWERED)
         assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == unanswered
         hear(discovery, S, RESPONSE)
-        assert sent(hear(discovery, S, m.Advertise("cmd", 12, 0, m.UNANSWERED)))[-1] == plain
+        answered = m.SubscribeRequest("cmd", 12, 5, m.ANSWERED)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12, 0, m.UNANSWERED)))[-1] == answered
         discovery.unsubscribe(S, "cmd")
         discovery.subscribe(S, "cmd", 12, 5)
         assert sent(hear(discovery, S, m.Advertise("cmd", 12)))[-1] == unanswered
@@ -372,7 +375,8 @@ class TestRepeats:
     def test_a_publisher_without_subscribers_is_asked_at_once(self) -> None:
         discovery = started()
         hear(discovery, S, PC2, RESPONSE)
-        assert sent(hear(discovery, S, m.Advertise("cmd", 12, 0, m.UNANSWERED)))[-1] == m.SubscribeRequest("cmd", 12, 5)
+        answered = m.SubscribeRequest("cmd", 12, 5, m.ANSWERED)
+        assert sent(hear(discovery, S, m.Advertise("cmd", 12, 0, m.UNANSWERED)))[-1] == answered
 
     def test_another_address_of_the_data_is_asked_for(self) -> None:
         discovery = started()
@@ -398,6 +402,76 @@ class TestRepeats:
         assert set(told(3 * S)) == {m.NO_PARAMS}
         hear(discovery, 5 * S, m.Unsubscribe("leds", PEER))
         assert set(told(5 * S)) == {m.UNANSWERED}
+
+
+class TestShared:
+    """On a bus everybody hears an answer: where many ask at once, they share one."""
+
+    PEERS = range(30)
+
+    def beside_many(self) -> Discovery:
+        discovery = started()
+        for n in self.PEERS:
+            hear(discovery, S, m.Hello(f"M{n}", n), source=n)
+        run(discovery, S, 3 * S)
+        return discovery
+
+    def answers(self, discovery: Discovery, now: int, kind: type[m.Management]) -> list[int]:
+        later = [(at, event) for at, event in run(discovery, now, now + 2 * S) if isinstance(event, Send)]
+        return [at - now for at, event in later if isinstance(m.decode(event.data), kind)]
+
+    def test_many_subscribers_share_responses(self) -> None:
+        discovery = self.beside_many()
+        events: list[Event] = []
+        for n in self.PEERS:
+            events += hear(discovery, 3 * S, REQUEST, source=n)
+        said = [event for event in sent(events) if isinstance(event, m.SubscribeResponse)]
+        assert len(said) == 3
+        assert sum(isinstance(event, Joined) for event in events) == 3
+        later = [event for _, event in run(discovery, 3 * S, 5 * S)]
+        responses = [isinstance(event, Send) and event.data[-1] == 0x23 for event in later]
+        assert sum(responses) == 1
+        joined_at = [at for at, event in enumerate(later) if isinstance(event, Joined)]
+        assert len(joined_at) == 27
+        assert min(joined_at) > responses.index(True), "a latched value would find nobody"
+
+    def test_many_publishers_share_requests(self) -> None:
+        discovery = self.beside_many()
+        said: list[m.Management] = []
+        for n in self.PEERS:
+            said += sent(hear(discovery, 3 * S, m.Advertise("cmd", 12, 0, m.UNANSWERED), source=n))
+        assert sum(isinstance(event, m.SubscribeRequest) for event in said) == 3
+        hear(discovery, 3 * S, *(RESPONSE for _ in self.PEERS), source=3)
+        ours = [now for now in self.answers(discovery, 3 * S, m.SubscribeRequest) if now % (S // 2)]
+        assert len(ours) == 1
+
+    def test_who_has_answered_meanwhile_is_not_asked(self) -> None:
+        discovery = self.beside_many()
+        for n in self.PEERS:
+            hear(discovery, 3 * S, m.Advertise("cmd", 12), source=n)
+        for n in self.PEERS:
+            hear(discovery, 3 * S, RESPONSE, source=n)
+        due = run(discovery, 3 * S, 3 * S + 700 * MS)
+        requests = [event for event in sent(event for _, event in due) if isinstance(event, m.SubscribeRequest)]
+        assert len(requests) <= 1, "that is the repetition of our own"
+
+    def test_who_leaves_is_not_answered(self) -> None:
+        discovery = self.beside_many()
+        for n in self.PEERS:
+            hear(discovery, 3 * S, REQUEST, source=n)
+        hear(discovery, 3 * S, m.Unsubscribe("leds", 29), source=29)
+        hear(discovery, 3 * S, m.Hello("M28", 28, m.HELLO_LEAVING), source=28)
+        joined = {event.source for _, event in run(discovery, 3 * S, 5 * S) if isinstance(event, Joined)}
+        assert joined == set(range(3, 28))
+        for n in self.PEERS:
+            hear(discovery, 5 * S, REQUEST, source=n)
+        discovery.withdraw(5 * S, "leds")
+        assert not [event for _, event in run(discovery, 5 * S, 7 * S) if isinstance(event, Joined)]
+
+    def test_firmware_is_answered_each_time_all_the_same(self) -> None:
+        discovery = self.beside_many()
+        for n in range(100, 130):
+            assert len(sent(hear(discovery, 3 * S, REQUEST, m.Advertise("cmd", 12), source=n))) == 2
 
 
 class TestTypes:
