@@ -78,7 +78,7 @@ class ModuleHub:
         self._obey = obey
         self._suspected: set[str] = set()
         self._ordered: dict[tuple[Command, str], int] = {}
-        self._mismatches: dict[tuple[str, str], int] = {}
+        self._mismatches: dict[Link, dict[str, int]] = {}
         self._limits: dict[Link, LineLimit] = {}
         self._refused: dict[str, tuple[int, int]] = {}
         space.changed = self._topic_changed
@@ -127,6 +127,7 @@ class ModuleHub:
         self.space.links.remove(link)
         self._joints.detach(link)
         del self._limits[link]
+        self._mismatches.pop(link, None)
         self.closed_links.add(link.stats, link.losses)
 
     def link_waits(self, link: Link, reason: str) -> None:
@@ -232,8 +233,9 @@ class ModuleHub:
     def _log_mismatch(self, link: Link, event: Mismatched) -> None:
         """At most once a second: another type in each message would fill the log."""
         now = self.space.clock.monotonic()
-        if now - self._mismatches.get((link.name, event.topic), -_APART) >= _APART:
-            self._mismatches[link.name, event.topic] = now
+        logged = self._mismatches.setdefault(link, {})
+        if now - logged.get(event.topic, -_APART) >= _APART:
+            logged[event.topic] = now
             logger.error("link %s: topic %s is refused: %s", link.title, event.topic, describe_mismatch(event))
 
     def _tell_gone(self, link: Link, event: ModuleGone) -> None:

@@ -474,3 +474,20 @@ async def test_gateways_among_clients_are_let_in_on_demand_only(option: str, adm
 def test_gateways_is_yes_or_no() -> None:
     with pytest.raises(r2p.TransportError, match="write yes or no"):
         TcpListenTransport(parse("tcp-listen:0?gateways=maybe"))
+
+
+async def test_nothing_is_kept_of_types_that_clients_had() -> None:
+    transport = listen()
+    async with (
+        asyncio.timeout(GUARD),
+        r2p.Module("A", via=transport, watchdog=False) as module,
+        node_in(module) as node,
+    ):
+        node.advertise("leds", Led)
+        for _ in range(3):
+            _, writer = await dial(transport)
+            writer.write(manage(m.TypeInfo(m.ROLE_SUBSCRIBES, "leds", b"abcdefgh", 9)))
+            await until(lambda: bool(module._opened._mismatches))
+            writer.close()
+            await until(lambda: not module.links)
+            assert not module._opened._mismatches
