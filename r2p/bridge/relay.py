@@ -30,12 +30,11 @@ class Way:
     `shaper` changes messages on this way, or drops some; None: they pass as they are.
     """
 
-    __slots__ = ("dropped", "forwarded", "longest", "outlet", "port", "shaper", "target")
+    __slots__ = ("dropped", "forwarded", "outlet", "port", "shaper", "target")
 
     def __init__(self, port: BridgePort, target: "BridgedTopic", shaper: Shaper | None) -> None:
         self.port = port
         self.target = target
-        self.longest = port.link.longest
         self.shaper = shaper
         self.outlet: Outlet | None = None
         self.forwarded = 0
@@ -230,9 +229,6 @@ class _Reminder:
 
 
 def _put(way: Way, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
-    if not 0 < len(sample.data) <= way.longest:
-        way.dropped["impossible size"] += 1
-        return blocked
     outlet = cast("Outlet", way.outlet)
     way.forwarded += 1
     if not outlet.room().line(sample) and outlet.offer(sample):

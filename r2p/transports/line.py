@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from r2p.codecs import debug
 from r2p.codecs.management import FLAG_BOOT
+from r2p.errors import MessageError
 from r2p.names import LOADER_PREFIX, MANAGEMENT
 from r2p.protocols.exchange import GRACE
 from r2p.room import LINK_DOWN
@@ -191,14 +192,18 @@ class LineLink(Link):
         return not self._blocked and self._limit >= 0
 
     def write(self, topic: str, sample: Sample) -> None:
-        self.stats.sent += 1
         due = sample.expires or sample.deadline
         deadline = due // 1000 if due else sample.stamp // 1000 + _NO_DEADLINE
         try:
             encode = self._encoders[topic]
         except KeyError:
             encode = self._encoders[topic] = debug.encoder(topic.encode())
-        line = encode(sample.data, deadline & _WRAP)
+        try:
+            line = encode(sample.data, deadline & _WRAP)
+        except MessageError:  # only from another link, with a topic of any size
+            self.stats.lost["impossible message"] += 1
+            return
+        self.stats.sent += 1
         real_time = sample.publisher_class != _NRT
         if self._blocked or (self._corked and not real_time):
             self._samples.append(line)
