@@ -12,6 +12,7 @@ import r2p.sim
 from r2p.bus import BusMonitor
 from r2p.msg import Led
 from r2p.sim.robots.emulated import Triskar2
+from r2p.testing.network import Network
 from tests.bench import local, pair
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ async def test_each_duration_is_refused_at_once(wrong: Any, text: str) -> None:
             lambda: node.subscribe("a", Led, timeout=wrong),
             lambda: node.every(wrong),
             lambda: r2p.sim.run(local().wait, limit=wrong),
+            lambda: Network(delay=wrong),
+            lambda: Network(jitter=wrong),
         ]
         for call in calls:
             with pytest.raises(r2p.MessageError, match=text):

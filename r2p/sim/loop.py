@@ -207,7 +207,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         if timer is None or timer.when() >= self._end:
             self._give_up(timer is not None)
         instant = _nanoseconds(timer.when())
-        if not _in_background(timer):
+        background = getattr(timer, "background", False)
+        if background is False or (background is not True and not background()):
             self._looked, self._waited_for = instant, None
         elif instant - self._looked >= _LOOK:
             self._look_for_life(instant)

@@ -16,6 +16,7 @@ import msgspec
 
 from r2p.clock import in_background, random_of
 from r2p.codecs.attachment import Clock
+from r2p.durations import seconds
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
@@ -80,6 +81,8 @@ class MemoryNetwork:
         jitter: float = 0.0,
         seed: int | None = None,
     ) -> None:
+        seconds("the delay of a memory network", delay, least=0.0)
+        seconds("the jitter of a memory network", jitter, least=0.0)
         self.loss = loss
         self.duplicate = duplicate
         self.reorder = reorder
