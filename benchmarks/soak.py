@@ -37,7 +37,7 @@ _WARM_UP = 0.2
 _MB_PER_HOUR = 3.0
 _MB_NOISE = 1.5
 _SETTLED = 20.0  # s
-_SENDING = ("no credit", "link down", "send buffer full", "unknown at disconnect")
+_SENDING = ("no credit", "link down", "send buffer full")
 _PAGE = 4096 / 1e6  # MB
 
 

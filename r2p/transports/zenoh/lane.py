@@ -65,6 +65,8 @@ class Lane:
                 self._put(data, attachment=self._header(samples, serial))
             except error:
                 stats.lost[LINK_DOWN] += len(samples)
+            except BlockingIOError:  # zenoh is busy with others
+                stats.lost["send buffer full"] += len(samples)
             except Exception as failure:  # noqa: BLE001 - counted and logged; the next packet follows
                 stats.lost.internal_error(failure, len(samples))
             else:

@@ -102,6 +102,7 @@ class ZenohLink(Link):
         """There is a session: take part in the network."""
         self._session = session
         self.prefix = prefix
+        session.outbound.failed = self.stats.lost.internal_error
         self.senders.connect(session, f"{prefix}/topic/")
         self._streams.connect()
         for name, told in self._told.items():
@@ -138,7 +139,9 @@ class ZenohLink(Link):
             outlet.force(sample)
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        if self._session is not None:
+        if self._session is not None and self._session.outbound.full and not urgent:
+            self.stats.lost["management, send buffer full"] += 1
+        elif self._session is not None:
             self._session.put(f"{self.prefix}/control/{self.instance:x}", data, urgent=urgent)
 
     def sample(self, topic: str, arrival: Any) -> Sample:

@@ -9,7 +9,7 @@ from r2p.room import LINK_DOWN, Room
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Topic
 from r2p.transports.outlet import LinkOutlet
-from r2p.transports.zenoh.lane import MOST, Lane, nowhere
+from r2p.transports.zenoh.lane import MOST, Lane
 
 if TYPE_CHECKING:
     from r2p.protocols.flow import Outflow
@@ -133,7 +133,6 @@ class ZenohOutlet(LinkOutlet):
     def _prepare(self, lane: Lane, sample: Sample) -> None:
         """Another publisher than before."""
         self._burst.send(lane)
-        sender = self._zenoh.senders.publisher(self.topic.name, sample.publisher_class)
         layout, instance, source = self.topic.layout, self._zenoh.instance, sample.source
         origin = Origin(
             sample.publisher_class,
@@ -143,4 +142,4 @@ class ZenohOutlet(LinkOutlet):
             source.module,
             source.node,
         )
-        lane.prepare(source, origin, nowhere if sender is None else sender.put)
+        lane.prepare(source, origin, self._zenoh.senders.put(self.topic.name, sample.publisher_class))

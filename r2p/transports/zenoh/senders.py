@@ -1,10 +1,13 @@
 """What zenoh sends the messages of a link with, and how far each topic has come; both outlast the outlets."""
 
+import functools
 from typing import TYPE_CHECKING
 
 from r2p.protocols.flow import Outflow
 from r2p.sample import PublisherClass
 from r2p.topic import Topic
+from r2p.transports.zenoh.lane import Put, nowhere
+from r2p.transports.zenoh.outbound import MOST, MOST_URGENT
 
 if TYPE_CHECKING:
     import zenoh
@@ -19,6 +22,8 @@ class Senders:
         self._session: Session | None = None
         self._prefix = ""
         self._senders: dict[tuple[str, int], zenoh.Publisher] = {}
+        self._asked: set[str] = set()
+        self._answers: dict[str, bool] = {}
         self._flows: dict[tuple[str, int], Outflow] = {}
 
     def connect(self, session: "Session", prefix: str) -> None:
@@ -44,9 +49,30 @@ class Senders:
                 self._session.ends(sender)
 
     def reach(self, topic: str) -> bool:
-        """Whether zenoh knows of somebody whom messages of the topic reach."""
+        """Whether zenoh knows of a subscriber that messages of the topic reach. False while zenoh has yet to say it."""
         senders = [sender for (name, _), sender in self._senders.items() if name == topic]
-        return bool(senders) and all(_reaches(sender) for sender in senders)
+        if not senders or self._session is None:
+            return False
+        outbound = self._session.outbound
+        if not outbound.by_thread:
+            return all(_reaches(sender) for sender in senders)
+        answer = self._answers.pop(topic, None)
+        if answer is None and topic not in self._asked:
+            self._asked.add(topic)
+            outbound.ask(lambda: all(_reaches(sender) for sender in senders), functools.partial(self._answer, topic))
+        return bool(answer)
+
+    def _answer(self, topic: str, reached: bool | None) -> None:
+        self._asked.discard(topic)
+        self._answers[topic] = bool(reached)
+
+    def put(self, topic: str, publisher_class: int) -> Put:
+        """What sends packets of the topic."""
+        sender = self.publisher(topic, publisher_class)
+        if sender is None or self._session is None:
+            return nowhere
+        most = MOST if publisher_class == PublisherClass.NON_REAL_TIME else MOST_URGENT
+        return functools.partial(self._session.outbound.put, sender.put, most)
 
     def publisher(self, topic: str, publisher_class: int) -> "zenoh.Publisher | None":
         """What zenoh sends with."""

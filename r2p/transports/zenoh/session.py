@@ -24,6 +24,7 @@ from r2p.transports.intake import TURN
 from r2p.transports.losses import Losses
 from r2p.transports.zenoh import threads
 from r2p.transports.zenoh.options import is_network_name
+from r2p.transports.zenoh.outbound import Outbound
 
 T = TypeVar("T")
 
@@ -164,6 +165,7 @@ class Session:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
+        self.outbound = Outbound(asyncio.get_running_loop())
         self._kept: list[Any] = []
         self._publishers: set[zenoh.Publisher] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
@@ -179,11 +181,14 @@ class Session:
 
     def watch_tokens(self, prefix: str, funnel: Funnel) -> None:
         """Tell of each token under a prefix, also those that are there: (rest of its key, whether it is there)."""
-        start = len(prefix) + 1
+        start, count = len(prefix) + 1, 0
 
         def changed(sample: zenoh.Sample) -> None:
-            token = liveliness.token_at(str(sample.key_expr)[start:])
-            funnel.put((token, sample.kind == zenoh.SampleKind.PUT))
+            nonlocal count
+            there = sample.kind == zenoh.SampleKind.PUT
+            count += 1 if there else -1
+            self.outbound.watch(count)
+            funnel.put((liveliness.token_at(str(sample.key_expr)[start:]), there))
 
         tokens: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
@@ -261,11 +266,12 @@ class Session:
     def ends(self, publisher: zenoh.Publisher) -> None:
         """Send no more with it."""
         self._publishers.discard(publisher)
-        publisher.undeclare()
+        self.outbound.call(publisher.undeclare)
 
     def put(self, key: str, data: bytes, *, urgent: bool = False) -> None:
         """Send something of the protocol's own."""
-        self._session.put(
+        self.outbound.call(
+            self._session.put,
             key,
             data,
             priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
@@ -276,9 +282,15 @@ class Session:
 
     def declare(self, key: str) -> None:
         """Keep a liveliness token."""
-        self._tokens[key] = self._session.liveliness().declare_token(key)
+        self.outbound.call(self._declare, key)
 
     def undeclare(self, key: str) -> None:
+        self.outbound.call(self._undeclare, key)
+
+    def _declare(self, key: str) -> None:
+        self._tokens[key] = self._session.liveliness().declare_token(key)
+
+    def _undeclare(self, key: str) -> None:
         token = self._tokens.pop(key, None)
         if token is not None:
             token.undeclare()
@@ -324,7 +336,15 @@ class Session:
     async def close(self) -> None:
         """Close it; what was put before is sent."""
         publishers, self._publishers = self._publishers, set()
-        await _in_thread(functools.partial(_close, self._session, publishers))
+        await _in_thread(functools.partial(self._close, publishers))
+
+    def _close(self, publishers: Iterable[zenoh.Publisher]) -> None:
+        """zenoh keeps 34 kB for ever of each session that is closed with a publisher in it."""
+        self.outbound.finish()
+        with contextlib.suppress(zenoh.ZError):  # it is closed already
+            for publisher in publishers:
+                publisher.undeclare()
+        self._session.close()
 
 
 _MESSAGE_MAX = 4096
@@ -369,11 +389,7 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
     return await future
 
 
-def _close(session: zenoh.Session, publishers: Iterable[zenoh.Publisher] = ()) -> None:
-    """zenoh keeps 34 kB for ever of each session that is closed with a publisher in it."""
-    with contextlib.suppress(zenoh.ZError):  # it is closed already
-        for publisher in publishers:
-            publisher.undeclare()
+def _close(session: zenoh.Session) -> None:
     session.close()
 
 

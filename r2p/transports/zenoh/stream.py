@@ -6,6 +6,7 @@ A non real-time message waits for as long as its subscribers have no room: its p
 without them, as its class says; that is decided there (r2p.protocols.flow). Others wait a few turns of the loop.
 """
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING
@@ -37,6 +38,9 @@ _MOST = 16_384
 
 Flows = dict[tuple[int, int], Inflow]
 """By session and class."""
+
+_FAREWELLS = 256
+"""Sessions that are told that a topic is not subscribed any more."""
 
 SENDERS = 4096
 """Senders of which a stream, or the link, keeps count."""
@@ -143,8 +147,9 @@ class Stream:
 
     def _take_leave(self) -> None:
         """Tell those who publish that what is still on the way is not wanted any more."""
-        for (session, publisher_class), flow in self.flows.items():
-            if session in self.senders and flow.next >= 0:
+        latest = itertools.islice(reversed(self.flows.items()), _FAREWELLS)  # older ones may be gone for long
+        for (session, publisher_class), flow in latest:
+            if flow.next >= 0:
                 last = (flow.next - 1) & SERIAL_WRAP
                 self._streams.credit(self.topic.name, session, publisher_class, last, leaving=True)
 
