@@ -25,6 +25,8 @@ class Census:
         self._counts = counts
         self._named: dict[str, dict[str, ModuleToken]] = {}
         self._told: Counter[EndpointKey] = Counter()
+        self._names: dict[int, str] = {}  # by instance
+        self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._suspected: dict[str, int] = {}
 
     # Tokens
@@ -45,7 +47,8 @@ class Census:
         if key is None or token.instance == self._instance:
             return
         self._told[key] += 1
-        name = next((each.name for each in self.modules.values() if each.instance == token.instance), "")
+        self._endpoints_of.setdefault(key[0], {})[key] = None
+        name = self._names.get(key[0], "")
         self.endpoints[key] = EndpointInfo(name, *key, token.publisher_class)
         self.generation += 1
 
@@ -56,6 +59,7 @@ class Census:
             self._told[key] -= 1
             if not self._told[key]:
                 del self._told[key], self.endpoints[key]
+                self._forget_endpoint(key)
                 self.generation += 1
 
     # What else is heard
@@ -114,15 +118,28 @@ class Census:
             self._counts["modules forgotten"] += 1
             return
         self.modules[info.name] = info
+        if before is not None and before.instance is not None and before.instance != info.instance:
+            self._names.pop(before.instance, None)
+        if info.instance is not None:
+            self._names[info.instance] = info.name
         if before is None or msgspec.structs.replace(before, last_heard=info.last_heard) != info:
             self.generation += 1
             self._events.append(ModuleChanged(info))
-        for key, endpoint in self.endpoints.items():
-            if endpoint.instance == info.instance and endpoint.module != info.name:
+        for key in () if info.instance is None else self._endpoints_of.get(info.instance, ()):
+            endpoint = self.endpoints[key]
+            if endpoint.module != info.name:
                 self.endpoints[key] = msgspec.structs.replace(endpoint, module=info.name)
+
+    def _forget_endpoint(self, key: EndpointKey) -> None:
+        siblings = self._endpoints_of[key[0]]
+        del siblings[key]
+        if not siblings:
+            del self._endpoints_of[key[0]]
 
     def _gone(self, info: ModuleInfo) -> None:
         del self.modules[info.name]
+        if info.instance is not None:
+            self._names.pop(info.instance, None)
         self.generation += 1
         self._events.append(ModuleGone(info))
 

@@ -35,12 +35,15 @@ class Matching:
         self._sessions: dict[int, _Session] = {}
         self._takers: Counter[str] = Counter()
         self._told: Counter[TopicRole] = Counter()
+        self._telling: dict[TopicRole, dict[int, _Session]] = {}  # those that have tokens of it, by number
+        self._refused: Counter[str] = Counter()  # sessions whose type does not fit, by topic
 
     def appeared(self, now: int, key: str, token: TopicToken) -> None:
         """A publisher or subscriber of some session is there."""
         session = self._sessions.setdefault(token.session, _Session())
         topic_role = token.topic, token.role
         session.tokens.setdefault(topic_role, {})[key] = token
+        self._telling.setdefault(topic_role, {})[token.session] = session
         self._told[topic_role] += 1
         self.demand.add(*topic_role, token.session)
         self._note(now, token)
@@ -54,6 +57,7 @@ class Matching:
         del tokens[key]
         if not tokens:
             del session.tokens[topic_role]
+            del self._telling[topic_role][token.session]
             self.demand.remove(*topic_role, token.session)
         self._review(token.session, session, topic_role)
         if not session.tokens:
@@ -62,13 +66,15 @@ class Matching:
         self._told[topic_role] -= 1
         if not self._told[topic_role]:
             del self._told[topic_role]
+            del self._telling[topic_role]
             self._forget_role(*topic_role)
 
     def changed(self, topic: str, role: int) -> None:
         """Our own side of the topic in this role has changed."""
-        for number, session in list(self._sessions.items()):
-            session.refused.pop((topic, counterpart(role)), None)
-            self._review(number, session, (topic, counterpart(role)))
+        theirs = topic, counterpart(role)
+        for number, session in list(self._telling.get(theirs, {}).items()):
+            self._accept(session, theirs)
+            self._review(number, session, theirs)
 
     def freshen(self, now: int) -> None:
         """What is there is as good as just heard."""
@@ -80,21 +86,28 @@ class Matching:
         tokens = session.tokens.get(key)
         own = self._own.own(topic, counterpart(role))
         if not tokens or own is None:
-            session.refused.pop(key, None)
+            self._accept(session, key)
             self._end(number, session, key)
         else:
             theirs = _shape(tokens)
             if own.shape.fits(theirs):
-                session.refused.pop(key, None)
+                self._accept(session, key)
                 self._match(number, session, key, _detail(tokens, role))
             else:
                 self._end(number, session, key)
                 if session.refused.get(key) != theirs:
+                    self._refused[topic] += key not in session.refused
                     session.refused[key] = theirs
                     self._events.append(Mismatched(topic, number, role, own.shape, theirs))
         if topic in self.topics:
-            refused = any(kept[:1] == (topic,) for each in self._sessions.values() for kept in each.refused)
-            self.topics[topic].mismatch = refused
+            self.topics[topic].mismatch = topic in self._refused
+
+    def _accept(self, session: _Session, key: TopicRole) -> None:
+        """The session's type of the topic is not refused any more."""
+        if session.refused.pop(key, None) is not None:
+            self._refused[key[0]] -= 1
+            if not self._refused[key[0]]:
+                del self._refused[key[0]]
 
     def _match(self, number: int, session: _Session, key: TopicRole, detail: int) -> None:
         if session.matched.get(key) == detail:
@@ -127,8 +140,8 @@ class Matching:
 
     def _retype(self, info: TopicInfo, role: int) -> None:
         """The type of a topic is that of the first session that tells one."""
-        tokens = (session.tokens.get((info.name, role)) for session in self._sessions.values())
-        shapes = (_shape(each) for each in tokens if each)
+        sessions = self._telling.get((info.name, role), {}).values()
+        shapes = (_shape(session.tokens[info.name, role]) for session in sessions)
         info.typed(role, next((shape for shape in shapes if shape != Shape()), None))
 
     def _mark(self, now: int, info: TopicInfo, role: int) -> None:

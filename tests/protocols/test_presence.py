@@ -216,6 +216,38 @@ def test_types_that_do_not_fit_are_told_on_both_sides(world: World, size: int, f
     assert not world.members[2].topics["leds"].mismatch
 
 
+def test_a_topic_has_different_types_until_the_last_other_one_is_gone(world: World) -> None:
+    for instance in (1, 2, 3, 4):
+        world.add(f"M{instance}", instance)
+    advertise(world, 1, "leds")
+    for instance, size in ((2, 8), (3, 9), (4, 5)):
+        subscribe(world, instance, "leds", size)
+    world.settle()
+    topic = world.members[1].topics["leds"]
+    for left in (2, 3):
+        assert topic.mismatch
+        world.crash(left)
+    assert not topic.mismatch
+    world.crash(4)
+    assert not world.members[1].topics
+
+
+def test_nothing_is_kept_of_modules_that_left(world: World) -> None:
+    watcher = world.add("M1", 1)
+    for instance in (2, 3):
+        world.add(f"M{instance}", instance)
+        advertise(world, instance, "leds", instance)
+        world.members[instance].endpoint(0, "node", "leds", ROLE_PUBLISHES, 1)
+    subscribe(world, 1, "leds", 2)
+    world.settle()
+    assert {each.module for each in watcher.endpoints.values()} <= {"M2", "M3"}
+    for instance in (2, 3):
+        world.crash(instance)
+    assert not any([watcher.modules, watcher.endpoints, watcher.topics])
+    census, matching = watcher._census, watcher._matching
+    assert not any([census._names, census._endpoints_of, matching._telling, matching._refused])
+
+
 def test_a_type_that_changes_ends_what_flowed(world: World) -> None:
     world.add("A", 1), world.add("B", 2)
     advertise(world, 1, "leds")
