@@ -141,6 +141,10 @@ class Cycle:
         self._follow(start, sync.mask)
         return Alignment.ALIGNED if cycles else Alignment.LATE
 
+    def doubt(self) -> None:
+        """The mask of this cycle can't be true: it is not known which slots are free, unless another sync tells."""
+        self._reserve(None)
+
     def measured(self) -> tuple[int, int] | None:
         """The length of a cycle by the syncs heard since it started, and how far off that may be as they jitter (ns).
 

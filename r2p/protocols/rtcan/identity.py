@@ -1,7 +1,8 @@
 """Who this node is on the bus: its id8, claimed with a random number (PROTOCOL.md 9).
 
 The node listens first, to learn which ids are taken and how the network works; then it claims one, and may use it when
-nobody objected. Of two claims the lower number wins. A node that uses our id8 without ever claiming it is firmware,
+nobody objected. Of two claims the lower number wins; a node that owns its id8 yields to the second one, as a node that
+has the better claim answers when ours is repeated. A node that uses our id8 without ever claiming it is firmware,
 which can't yield: so we do. Who yielded listens again.
 """
 
@@ -19,6 +20,7 @@ REPEAT = 3_000_000_000
 """Claims are repeated this often (ns)."""
 _YIELDS = 1_000_000_000  # who has claimed our id8 with a higher number has this long to yield
 _APART = 100_000_000
+_INSISTING = 4_000_000_000  # a node that has a better claim repeats it within this (ns)
 _FIRMWARE = 500_000_000
 """Who uses our id8 for this long after our claim, without a claim of its own, is firmware."""
 _NOTICE = 1_000_000_000
@@ -68,6 +70,7 @@ class Identity:
         self._noticed = LONG_AGO
         self._claimed_by_other = LONG_AGO
         self._suspected: int | None = None
+        self._disputed = LONG_AGO  # when somebody claimed our id8 with a lower number
         self._waiting = False  # for a fixed id8 that is taken, which has been told
 
     @property
@@ -138,8 +141,13 @@ class Identity:
             return
         self._claimed_by_other = now
         self._suspected = None
-        if claim.number < self.number:
+        if claim.number < self.number and self._insists(now):
             self._yield(now)
+        elif claim.number < self.number:
+            self._disputed = now
+            self._notice(now, yielded=False)
+            self.announce(now, again=True)
+            self._timers.set("claim", now + _APART + _SPREAD)  # an answer to this one may come at once
         else:
             self._notice(now, yielded=False)
             self.announce(now)
@@ -158,8 +166,12 @@ class Identity:
         elif now >= self._suspected + _FIRMWARE:
             self._yield(now)
 
+    def _insists(self, now: int) -> bool:
+        """Whether a better claim than ours ends it: one alone, which nobody stands up for, may be of a broken node."""
+        return self.stage is not Stage.OWNING or now < self._disputed + _INSISTING
+
     def _yield(self, now: int) -> None:
-        self._noticed = LONG_AGO
+        self._noticed = self._disputed = LONG_AGO
         self._notice(now, yielded=True)
         self._waiting = self.fixed
         taken = self.id8

@@ -55,7 +55,8 @@ _Fills = dict[int, list[tuple[Periodic, int]]]
 class Agenda:
     """What to do in the slots of one cycle. `fills`: messages whose data are wanted now, and how many slots ahead of
     theirs. `sends`: a message, its fragment, and whether its data are wanted only now. `next` has for each slot the
-    first one behind it with something to do. Slot 0 of the next cycle counts as the last one of this.
+    first one behind it with something to do. Slot 0 of the next cycle counts as the last one of this. `own` has a bit
+    for each slot that is ours.
 
     After the least common multiple of all periods, which is the longest of them, all comes again: each cycle up to
     there is worked out once.
@@ -65,9 +66,10 @@ class Agenda:
         self.next = following((), timing.slots)
         self.sends: _Sends = {}
         self.fills: _Fills = {}
+        self.own = 0
         self._timing = timing
         self._stale = True
-        self._cycles: dict[int, tuple[_Sends, _Fills, list[int]]] = {}
+        self._cycles: dict[int, tuple[_Sends, _Fills, list[int], int]] = {}
         self._span = 1  # cycles after which all comes again
 
     def changed(self) -> None:
@@ -81,7 +83,7 @@ class Agenda:
         known = self._cycles.get(cycle % self._span)
         if known is None:
             known = self._cycles[cycle % self._span] = self._work_out(cycle, periodics)
-        self.sends, self.fills, self.next = known
+        self.sends, self.fills, self.next, self.own = known
 
     def _begin(self, cycle: int, periodics: Iterable[Periodic]) -> None:
         """Other messages than before have slots, some perhaps only from a later cycle on."""
@@ -90,13 +92,14 @@ class Agenda:
         self._span = math.lcm(self._timing.slots, *[period for _, period in owners]) // self._timing.slots
         self._cycles.clear()
 
-    def _work_out(self, cycle: int, periodics: Iterable[Periodic]) -> tuple[_Sends, _Fills, list[int]]:
+    def _work_out(self, cycle: int, periodics: Iterable[Periodic]) -> tuple[_Sends, _Fills, list[int], int]:
         sends: _Sends = {}
         fills: _Fills = {}
         for each in periodics:
             if each.active and each.reservation is not None:
                 self._enter(sends, fills, cycle, each, each.reservation)
-        return sends, fills, following(sends.keys() | fills.keys(), self._timing.slots)
+        own = sum(1 << slot for slot in sends)
+        return sends, fills, following(sends.keys() | fills.keys(), self._timing.slots), own
 
     def _enter(self, sends: _Sends, fills: _Fills, cycle: int, each: Periodic, reservation: Reservation) -> None:
         slots = self._timing.slots

@@ -10,12 +10,13 @@ from collections.abc import Callable
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import FRAME_MAX, INTERMISSION, Frame
-from r2p.protocols.rtcan.cycle import NO_SLOT, Cycle, State
+from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, Cycle, State
 from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Action, Due, Fate, Mailbox, Outcome
 from r2p.protocols.rtcan.laxity import LaxityQueue, Outgoing
 from r2p.protocols.rtcan.periodic import Agenda, Periodic
 from r2p.protocols.rtcan.post import GONE, SYNC, FirstSync, Post
 
+_SURE = 10  # cycles
 _CLOSE = 5  # bits between the hand-over and the last moment
 
 
@@ -71,6 +72,8 @@ class Sender:
         self._tried = 0  # the last slot in which nothing more can be tried
         self._end = 0  # of the cycle: for a slave when no sync can come any more that would begin the next one
         self._sync = Frame(0, b"")
+        self._confirmed = 0  # cycles in a row whose mask had our slots
+        self._doubted = 0
         bit = self._bit
         # A try now would come too late for the slots before `now + ahead`; a coarse port may still try in that one.
         self._ahead = latency - (self._slot if coarse else bit)
@@ -107,6 +110,8 @@ class Sender:
         """A cycle has begun, at `Cycle.reference`; nothing of it is done yet."""
         self._done = self._tried = 0
         self._agenda.turn(self._cycle.counter, self._periodics)
+        if self._agenda.own:
+            self._check_mask(self._agenda.own)
         self.aligned(now)
 
     def aligned(self, now: int) -> None:
@@ -197,6 +202,23 @@ class Sender:
             self._counts["confirmed without need"] += 1
 
     # Slots
+
+    def _check_mask(self, own: int) -> None:
+        """A mask without slots that we own, which the last ones had, is rather forged than true.
+
+        Then this cycle is like one without a sync, of which there may be three.
+        """
+        mask = self._cycle.mask
+        if mask is None:
+            return
+        if not own & ~mask:
+            self._confirmed, self._doubted = min(self._confirmed + 1, _SURE), 0
+        elif self._confirmed == _SURE and self._doubted < HOLDOVER:
+            self._doubted += 1
+            self._counts["masks doubted"] += 1
+            self._cycle.doubt()
+        else:
+            self._confirmed = 0
 
     def _plan(self, now: int) -> None:
         """Wake up for the next slot where there is something to do, or to send something, or for the next cycle."""

@@ -96,6 +96,8 @@ def test_the_lower_number_keeps_it() -> None:
     node.identity.claimed(node.now, Claim(11, 0))
     assert node.stage() is Stage.OWNING
     node.identity.claimed(node.now, Claim(10, number - 1))
+    assert node.stage() is Stage.OWNING
+    node.identity.claimed(node.now, Claim(10, number - 1))
     assert node.stage() is Stage.LISTENING
     assert node.conflicts == [IdConflict(10, False), IdConflict(10, True)]
 
@@ -109,15 +111,33 @@ def test_who_can_not_take_another_one_wins_against_who_can() -> None:
 def test_who_can_takes_another_one() -> None:
     node = owner(None)
     before = node.identity.id8
-    node.identity.claimed(node.now, Claim(before, 5))
+    for _ in range(2):
+        node.identity.claimed(node.now, Claim(before, 5))
     node.run(2 * SECOND)
     assert node.stage() is Stage.OWNING
     assert node.identity.id8 != before
 
 
+@pytest.mark.parametrize("wanted", [10, None])
+def test_one_better_claim_that_is_never_repeated_ends_nothing(wanted: int | None) -> None:
+    """A broken node has sent it; a node that has the better claim would answer ours."""
+    node = owner(wanted)
+    for _ in range(3):
+        claims = len(node.claims)
+        node.identity.claimed(node.now, Claim(node.identity.id8, 0))
+        node.run(200 * MS)
+        assert len(node.claims) == claims + 2  # at once, and when the other one may answer again
+        node.run(5 * SECOND)
+    assert node.stages == [Stage.LISTENING, Stage.CLAIMING, Stage.OWNING]
+    node.identity.claimed(node.now, Claim(node.identity.id8, 0))
+    node.identity.claimed(node.now + 150 * MS, Claim(node.identity.id8, 0))
+    assert node.stage() is Stage.LISTENING
+
+
 def test_a_fixed_one_waits_until_it_is_free() -> None:
     node = owner()
-    node.identity.claimed(node.now, Claim(10, 0))
+    for _ in range(2):
+        node.identity.claimed(node.now, Claim(10, 0))
     for _ in range(60):
         node.run(100 * MS)
         node.identity.seen(10)

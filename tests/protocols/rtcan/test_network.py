@@ -349,6 +349,24 @@ def test_nodes_that_start_at_the_same_moment_get_different_ids() -> None:
     assert len(set(ids)) == 8
 
 
+def test_two_that_find_each_other_with_one_id_part_in_no_time() -> None:
+    """Neither heard the other one's claims before: two buses were joined."""
+    bus = Bus()
+    nodes = [bus.add(id8=id8, number=number << 40) for number, id8 in enumerate((10, 10, 20), 1)]
+    for node in nodes[:2]:
+        node.deaf = lambda frame: frame.id >> 7 & 0xFF == 10
+    bus.start(*nodes[::2])
+    bus.run(700 * MS)
+    bus.start(nodes[1])
+    bus.run(2 * SECOND)
+    assert [node.engine.id8 for node in nodes[:2]] == [10, 10]
+    for node in nodes[:2]:
+        node.deaf = lambda frame: False
+    bus.run_until(lambda: any(node.of(IdConflict) for node in nodes))
+    bus.run(300 * MS)
+    assert [node.engine.id8 for node in nodes[:2]] == [10, None]
+
+
 def test_what_waits_is_discarded_when_the_id8_is_lost() -> None:
     engine, now = ready_engine()
     engine.reserve(now, 6, 8, 10 * MS)
@@ -356,7 +374,7 @@ def test_what_waits_is_discarded_when_the_id8_is_lost() -> None:
     engine.publish(now, TOPIC, b"2", handle=2)
     claim = management.encode(management.Claim(10, 0))
     actions: list[Action] = []
-    for left, data in rtcan.fragments(claim):
+    for left, data in rtcan.fragments(claim) * 2:
         actions += engine.receive(now, Frame(rtcan.encode_identifier(1, 0x010A, left), data), now)
     assert [(done.handle, done.fate) for done in actions if isinstance(done, Done)] == [
         (1, Fate.DISCARDED),

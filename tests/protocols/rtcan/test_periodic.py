@@ -226,3 +226,38 @@ def test_what_waits_for_its_slot_when_the_slots_are_given_back_is_counted() -> N
     assert fates[-1] is Fate.ABANDONED
     assert fates.count(Fate.SENT) == len(told) - 1
     assert owner.engine.counts["hrt slots given back"] == 1
+
+
+@pytest.mark.parametrize("mask", [0, 1])
+def test_a_forged_sync_without_our_slots_does_not_end_them(mask: int) -> None:
+    """A broken node is a bit earlier than the master. What the last ten syncs said is believed for three cycles."""
+    bus = Bus()
+    _master, owner, listener = network(bus, 1, 0, 0)
+    told = counted(owner)
+    listener.engine.subscribe(rtcan.message_id(TOPIC, 11), 8)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 5 * MS, handle="hrt"))
+    bus.run(SECOND)
+    missed, got = owner.engine.counts["missed"], len(told)
+    for _ in range(10):
+        reference, counter = owner.engine._core.cycle.reference, owner.engine.cycle
+        assert counter is not None
+        forged = rtcan.encode_sync(counter + 1, mask)
+        bus.run(reference + CYCLE + 120_000 - bus.now)  # the master's has not ended yet
+        owner.act(owner.engine.receive(owner.now, forged, owner.now))
+        bus.run(200 * MS)
+    assert owner.engine.counts["masks doubted"] == 10
+    assert owner.engine.counts["missed"] == missed
+    assert len(listener.received(TOPIC)) >= len(told) - 1
+    assert len(told) > got
+
+
+def test_a_mask_that_stays_without_our_slots_is_believed() -> None:
+    bus = Bus()
+    master, owner, _ = network(bus, 1, 0, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 5 * MS, handle="hrt"))
+    bus.run(SECOND)
+    master.engine._core.grants.calendar.mask = lambda counter: 1  # type: ignore[method-assign]
+    bus.run(20 * CYCLE)
+    assert owner.engine.counts["masks doubted"] == 3
+    assert owner.engine.counts["hrt not in the mask"] > 0
