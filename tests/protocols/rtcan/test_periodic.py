@@ -257,7 +257,7 @@ def test_a_mask_that_stays_without_our_slots_is_believed() -> None:
     counted(owner)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 5 * MS, handle="hrt"))
     bus.run(SECOND)
-    master.engine._core.grants.calendar.mask = lambda counter: 1  # type: ignore[method-assign]
+    master.engine._core.grants.calendar.mask = lambda cycle: 1  # type: ignore[method-assign]
     bus.run(20 * CYCLE)
     assert owner.engine.counts["masks doubted"] == 3
     assert owner.engine.counts["hrt not in the mask"] > 0
