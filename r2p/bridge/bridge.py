@@ -286,10 +286,13 @@ class Bridge:
         try:
             self.tree.poll(now)
         except Exception as error:  # noqa: BLE001 - counted and logged
-            internal_error_of((port.link.stats.lost for port in self.ports.values()), error)
+            self._failed(error)
             self._alarm.set(now + TRY_AGAIN)
         else:
             self._act()
+
+    def _failed(self, error: Exception) -> None:
+        internal_error_of((port.link.stats.lost for port in self.ports.values()), error)
 
     def _act(self) -> None:
         changed: set[int] = set()
@@ -310,7 +313,7 @@ class Bridge:
             self.relays.port_changed(port)
             self.presences.changed(port)
         if self._held and not any(port.place.resumes for port in self.ports.values()):
-            self._held.release()
+            self._held.release(self._failed)
         self._alarm.set(self.tree.next_deadline())
 
     def _send(self, port: BridgePort, action: Say | Probe) -> None:

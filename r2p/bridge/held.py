@@ -30,9 +30,12 @@ class Held:
         self._waiting.append((sample, go_on))
         return True
 
-    def release(self) -> None:
-        """Go on with all of them."""
+    def release(self, failed: Callable[[Exception], object]) -> None:
+        """Go on with all of them; `failed` is called with what one of them raises."""
         waiting, self._waiting = self._waiting, deque()
         for sample, go_on in waiting:
-            for sink in go_on() or ():
-                sink.force(sample)
+            try:
+                for sink in go_on() or ():
+                    sink.force(sample)
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
+                failed(error)

@@ -164,23 +164,27 @@ class Presences:
             self._next_round_at = max(fifth, now + _REST * took)
         period = self._period()
         for port in list(self._ports.values()):
-            if not port.link.up or not self._is_open(port, now):
+            if port.link.up and self._is_open(port, now):
+                port.link.stats.lost.guard(self._repeat, port, now, period)
+            else:
                 self._put_off(port, now)
-                continue
-            self._meet(port)
-            if port.name in self._asked and now >= self._answered_at.get(port.name, -_APART) + _APART:
-                self._asked.discard(port.name)
-                self._answered_at[port.name] = now
-                self._answering.add(port.name)
-                self._again[port.name] = deque(self._told.get(port.name, ()))
-            if now >= self._refresh_at.setdefault(port.name, now + period):
-                self._refresh_at[port.name] = now + period
-                self._again.setdefault(port.name, deque(self._told.get(port.name, ())))
-            if port.name in self._again:
-                self._tell_again(port, now)
         if now >= self._repeated_at + _REFRESH:
             self._repeated_at = now
             self._repeating()
+
+    def _repeat(self, port: BridgePort, now: int, period: int) -> None:
+        """Tell a link again what it asks for, or has not been told for a while."""
+        self._meet(port)
+        if port.name in self._asked and now >= self._answered_at.get(port.name, -_APART) + _APART:
+            self._asked.discard(port.name)
+            self._answered_at[port.name] = now
+            self._answering.add(port.name)
+            self._again[port.name] = deque(self._told.get(port.name, ()))
+        if now >= self._refresh_at.setdefault(port.name, now + period):
+            self._refresh_at[port.name] = now + period
+            self._again.setdefault(port.name, deque(self._told.get(port.name, ())))
+        if port.name in self._again:
+            self._tell_again(port, now)
 
     def _put_off(self, port: BridgePort, now: int) -> None:
         """It can't be told anything now: look again soon."""
@@ -217,7 +221,12 @@ class Presences:
             port = self._ports.get(name)
             if port is not None and port.link.up and not self._is_open(port, now):
                 continue  # what it has told holds until the gateways agree: then it has another place in the tree
-            self._collect(name, port, changed)
+            try:
+                self._collect(name, port, changed)
+            except Exception as error:  # noqa: BLE001 - counted and logged; it is read anew, and the next link follows
+                internal_error_of((each.link.stats.lost for each in self._ports.values()), error)
+                self._dirty.add(name)
+                continue
             if port is not None and port.link.up and not (port.in_tree and name in self._told):
                 again.append(port)
         for port in self._ports.values():

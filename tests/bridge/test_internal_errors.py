@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from typing import TYPE_CHECKING
 
 import pytest
 
 import r2p
 from r2p.bridge import Standby
+from r2p.bridge.held import Held
 from r2p.codecs.management import Endpoint, Hello
 from r2p.msg import Led
+from r2p.sample import Sample, Source
 from tests.bridge.test_bridge import drain, gateway, node
 from tests.faults import once
 
@@ -100,3 +103,26 @@ async def test_the_alarm_of_a_module_with_several_links(monkeypatch: pytest.Monk
         await asyncio.sleep(SETTLED)
         assert errors(module) == [1, 1]
         assert sum(bool(link.stands_by) for link in module.links) == 1
+
+
+@pytest.mark.parametrize("step", ["_collect", "_meet", "_tell"])
+async def test_what_is_read_of_modules(step: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway() as module:
+        presences = bridge_of(module).presences
+        monkeypatch.setattr(presences, step, once(getattr(presences, step)))
+        async with node("A", "a"), r2p.Module("B", via="memory:b") as b:
+            await asyncio.sleep(SETTLED)
+            assert sum(errors(module)) in (1, 2)
+            assert "A" in {each.name for each in b.network.modules()}
+
+
+async def test_what_is_kept_while_a_gateway_listens_anew() -> None:
+    held, failed, taken = Held(), list[str](), list[int]()
+
+    def go_on(number: int) -> None:
+        taken.append(10 // number)
+
+    for number in (1, 0, 2):
+        assert held.keep(Sample(b"", Source(), 0), functools.partial(go_on, number))
+    held.release(lambda error: failed.append(type(error).__name__))
+    assert (taken, failed) == ([10, 5], ["ZeroDivisionError"])
