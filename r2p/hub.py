@@ -6,13 +6,14 @@ they find out. With a bridge it tells that, too.
 
 import logging
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from r2p.bridge import Bridge, BridgeOptions, Standby
 from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY
 from r2p.errors import Error
 from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.logs import LineLimit
+from r2p.names import module_alias
 from r2p.network import describe_mismatch
 from r2p.printable import get_logger
 from r2p.protocols.events import (
@@ -77,7 +78,7 @@ class ModuleHub:
         self._events = events
         self._obey = obey
         self._suspected: set[str] = set()
-        self._ordered: dict[tuple[Command, str], int] = {}
+        self._ordered: dict[tuple[Command, str], tuple[int, str]] = {}
         self._mismatches: dict[Link, dict[str, int]] = {}
         self._limits: dict[Link, LineLimit] = {}
         self._refused: dict[str, tuple[int, int]] = {}
@@ -101,7 +102,7 @@ class ModuleHub:
                 f"module {module} is in its boot loader, where a STOP hangs its management until its power is cut: "
                 f"there is nothing to stop; reboot it (r2p module reboot {module})"
             )
-        self._ordered[command, module] = self.space.clock.monotonic()
+        self._ordered[command, module_alias(module)] = self.space.clock.monotonic(), module
         for link in self.links:
             link.command(command, module)
 
@@ -174,6 +175,8 @@ class ModuleHub:
         if now - self._refused.get(link.name, (-_REFUSED_APART, 0))[0] >= _REFUSED_APART:
             self._refused[link.name] = now, 0
             text = f"{event.server} has no connection left (max_clients= of its tcp-listen:); trying again"
+            if event.gateway:
+                text = f"{event.server} lets no gateway join by this line: have it listen with ?gateways=yes"
             self.link_notice(link, "connection refused", text, trouble=True)
 
     def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
@@ -218,8 +221,9 @@ class ModuleHub:
 
     def _tell_denied(self, link: Link, event: OrderDenied) -> None:
         """To whoever ordered it."""
-        if self.space.clock.monotonic() - self._ordered.get((event.command, event.module), -_ANSWERED) < _ANSWERED:
-            what = f"{event.command.name} of {event.module}"
+        at, name = self._ordered.get((event.command, event.module), (-_ANSWERED, ""))
+        if self.space.clock.monotonic() - at < _ANSWERED:
+            what = f"{event.command.name} of {name}"
             reason = _DENIED.get(event.reason, "it lacks --allow-control")
             text = f"gateway {event.gateway} does not let {what} through: {reason}"
             self.link_notice(link, f"{event.command.name} denied", text, trouble=True)
@@ -251,17 +255,26 @@ class ModuleHub:
 
     def _suspect_namesakes(self, link: Link, info: ModuleInfo) -> None:
         """Two who can't hear each other may have one name, or one came back before its old link was seen to be down."""
-        others = (other.discovery.modules.get(info.name) for other in self.links if other is not link)
+        others = (other for each, other in self._namesakes(link, info.name) if each is not link)
         if info.name in self._suspected:
             return
-        if any(other is not None and other.instance != info.instance for other in others):
+        if any(other.instance != info.instance for other in others):
             self._suspected.add(info.name)
-            self.space.loop.call_later(_CONFIRMED, self._tell_namesakes, info.name, self.space.clock.monotonic())
+            self.space.loop.call_later(_CONFIRMED, self._tell_namesakes, link, info.name, self.space.clock.monotonic())
 
-    def _tell_namesakes(self, name: str, suspected: int) -> None:
+    def _namesakes(self, link: Link, name: str) -> Iterator[tuple[Link, ModuleInfo]]:
+        """The modules of a name that was heard on a link; a gateway's prefix tells those of other robots from them."""
+        for other in self.links:
+            called: str | None = name
+            if self.bridge is not None and other is not link:
+                called = self.bridge.names.same(name, link.name, other.name)
+            if called is not None and (info := other.discovery.modules.get(called)) is not None:
+                yield other, info
+
+    def _tell_namesakes(self, link: Link, name: str, suspected: int) -> None:
         """Whoever has heard both since then (monotonic ns) tells them."""
         self._suspected.discard(name)
-        found = [(link, info) for link in self.links if (info := link.discovery.modules.get(name)) is not None]
+        found = list(self._namesakes(link, name))
         heard = {
             info.instance: link for link, info in found if info.instance is not None and info.last_heard > suspected
         }

@@ -18,7 +18,7 @@ from r2p.errors import Closed, Error, NodeCrashed
 from r2p.events import EventHub, ModuleEvent
 from r2p.hub import ModuleHub
 from r2p.logs import LogTopic
-from r2p.names import module_name, module_name_from, node_name, topic_name
+from r2p.names import module_name, module_name_from, module_path, node_name, topic_name
 from r2p.network import NetworkView
 from r2p.node import Node
 from r2p.orders import Orders
@@ -315,7 +315,7 @@ class Module:
         its power is cut), and Closed if this module is not open.
         """
         self._running()
-        self._opened.order(command, module_name(module))
+        self._opened.order(command, module_path(module))
 
     def query(self) -> None:
         """Ask all others to repeat what they publish and subscribe. Raises Closed if this module is not open."""

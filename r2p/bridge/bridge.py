@@ -3,8 +3,11 @@
 import itertools
 from collections.abc import Callable
 
+import msgspec
+
 from r2p.bridge import probes
 from r2p.bridge.held import Held
+from r2p.bridge.module_names import ModuleNames
 from r2p.bridge.options import BridgeOptions, Policy
 from r2p.bridge.port import BridgePort
 from r2p.bridge.presences import Presences
@@ -14,10 +17,12 @@ from r2p.bridge.statistics import GatewayStatistics, PortStatistics, WayStatisti
 from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management
 from r2p.errors import DecodeError
+from r2p.names import module_alias
 from r2p.printable import get_logger
 from r2p.protocols.bridging.base import MOST_PORTS, Changed, Port, Probe, Say, SayToClients, State
 from r2p.protocols.bridging.clients import FIRST
 from r2p.protocols.bridging.tree import Tree
+from r2p.sample import Source
 from r2p.topic import Topic, TopicSpace, Waker
 from r2p.transports.announce import Told
 from r2p.transports.link import Link, is_booting
@@ -67,6 +72,7 @@ class Bridge:
         self._policy = Policy(options)
         self.relays = Relays(self.ports, space, self._policy)
         self.presences = Presences(self.name, instance, self.ports, space, self._policy, self.relays.retyped)
+        self.names = ModuleNames(self._policy, self.presences.modules)
         self._space = space
         self._clock = space.clock
         self._told = told
@@ -146,6 +152,10 @@ class Bridge:
     def demand_changed(self, port: BridgePort, topics: set[str]) -> None:
         self.relays.changed(topics, port)
 
+    def source_name(self, port: BridgePort, source: Source) -> str:
+        """What the module that published a message is called on a link."""
+        return self._policy.source_called(source.module, source.link, port.name) if source.link else source.module
+
     def modules_changed(self, port: BridgePort) -> None:
         self.presences.changed(port)
 
@@ -160,7 +170,7 @@ class Bridge:
         if kind in _ORDERS and self._pass_order(port, data):
             return True
         if kind == _DENIED and data[_DENIED_ORDER]:
-            self._pass_on(port, data)
+            self._pass_denial(port, data)
         if kind in (_ALIVE, _HELLO) and self._is_our_own(port, data):
             return True
         if kind == _HELLO and data[_HELLO_FLAGS] & management.HELLO_QUERY:
@@ -222,9 +232,19 @@ class Bridge:
         others = [each for each in self.ports.values() if each is not port and each.link.up]
         return [each for each in others if now < each.place.until]
 
-    def _pass_on(self, port: BridgePort, data: bytes) -> None:
+    def _pass_denial(self, port: BridgePort, data: bytes) -> None:
+        """To whoever gave the order, which may be anywhere."""
+        try:
+            denied = management.decode(data)
+        except (DecodeError, UnknownType):
+            return
+        name = self.names.meant(denied.module, port.name) if isinstance(denied, management.Denied) else None
+        if name is None:
+            return
         for other in self._open_from(port):
-            other.link.write_management(data)
+            wire = self.names.wire(name, other.name)
+            if wire is not None:
+                other.link.write_management(management.encode(msgspec.structs.replace(denied, module=wire)))
 
     def _pass_order(self, port: BridgePort, data: bytes) -> bool:
         """STOP, REBOOT or BOOTLOAD for a module that may be anywhere; True: for this one, which does not obey."""
@@ -239,12 +259,19 @@ class Bridge:
         ):
             self._refuse_order(port, order, data[-1], reason, known=True)
             return True
+        name = self.names.meant(order.module, port.name)
+        if name is None:
+            return False
         for other in self._open_from(port):
-            reason = self._order_denied(port, other, order)
+            called = self.names.called(name, other.name)
+            if called is None:
+                continue
+            reason = self._order_denied(port, other, order, called)
             if not reason:
-                other.link.write_management(data, urgent=True)
+                named = msgspec.structs.replace(order, module=module_alias(called))
+                other.link.write_management(management.encode(named), urgent=True)
             else:
-                self._refuse_order(port, order, data[-1], reason, known=order.module in other.link.discovery.modules)
+                self._refuse_order(port, order, data[-1], reason, known=called in other.link.discovery.modules)
         return False
 
     def _refuse_order(self, port: BridgePort, order: _Order, kind: int, reason: int, *, known: bool) -> None:
@@ -263,12 +290,10 @@ class Bridge:
         if known:
             self._deny(port, management.Denied(self.name, order.module, kind, reason))
 
-    def _order_denied(
-        self, port: BridgePort, other: BridgePort, order: management.Stop | management.Reboot | management.Bootload
-    ) -> int:
-        """Why an order may not go from one link to the other (DENIED_..., 0: it may)."""
+    def _order_denied(self, port: BridgePort, other: BridgePort, order: _Order, called: str) -> int:
+        """Why an order may not go to another link, where its module is `called` so (DENIED_..., 0: it may)."""
         stops = isinstance(order, management.Stop)
-        if stops and is_booting(other.link, order.module):
+        if stops and is_booting(other.link, called):
             return management.DENIED_BOOT
         return self._policy.order_denied(port.name, other.name, harmless=stops)
 
@@ -342,6 +367,9 @@ class Bridge:
         )
         if state in (State.ALONE, State.FORWARDING):
             port.link.query()
+        if state is State.REFUSED:
+            denied = management.Denied(self.name, self.name, 0, management.DENIED_GATEWAYS)
+            port.link.write_management(management.encode(denied))
 
     # For people
 

@@ -133,24 +133,38 @@ class Policy:
 
     def called(self, topic: str, link: str) -> str:
         """What a topic of the robot is called on this link."""
-        return self._prefix(link) + topic
+        return self.prefix(link) + topic
 
     def meant(self, name: str, link: str) -> str | None:
         """The topic of the robot that has this name on the link; None: it is not the robot's."""
-        prefix = self._prefix(link)
+        prefix = self.prefix(link)
         return name.removeprefix(prefix) if name.startswith(prefix) else None
 
     def module_called(self, name: str, link: str, *, foreign: bool) -> str | None:
         """What a module is called on a link; None: it is not to be seen there. `foreign` ones are not the robot's."""
-        return name
+        prefix = self.prefix(link)
+        return (None if foreign else prefix + name) if prefix else name
 
     def module_meant(self, name: str, link: str) -> tuple[str, bool] | None:
         """The module that has this name on the link, and whether it is foreign: on the network, and not the robot's.
         None: another robot's.
         """
-        return name, False
+        prefix = self.prefix(link)
+        if not prefix:
+            return name, False
+        if name.startswith(prefix):
+            return name.removeprefix(prefix), False
+        return None if "/" in name else (name, True)
 
-    def _prefix(self, link: str) -> str:
+    def source_called(self, module: str, source: str, target: str) -> str:
+        """What the publisher of a message that goes from one link to another is called there."""
+        before, after = self.prefix(source), self.prefix(target)
+        if after and not before:
+            return after + module if module else module
+        return module.removeprefix(before) if before and not after else module
+
+    def prefix(self, link: str) -> str:
+        """What topics and modules of the robot have before their names on a link; empty: nothing."""
         prefix = self._prefixes.get(link)
         if prefix is None:
             if len(self._prefixes) >= _CACHED:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from r2p.protocols.bridging.base import Port, State
+from r2p.sample import Source
 from r2p.topic import Topic
 from r2p.transports.announce import Told
 from r2p.transports.link import Link
@@ -25,6 +26,9 @@ class Owner(Protocol):
 
     def demand_changed(self, port: "BridgePort", topics: set[str]) -> None:
         """Others offer or want these topics there, or don't any more."""
+
+    def source_name(self, port: "BridgePort", source: Source) -> str:
+        """What the module that published a message is called there."""
 
     def modules_changed(self, port: "BridgePort") -> None:
         """Modules or nodes came or went there."""
@@ -86,6 +90,9 @@ class BridgePort:
     @property
     def shares(self) -> bool:
         return bool(self.place.neighbours)
+
+    def source_name(self, source: Source) -> str:
+        return self._owner.source_name(self, source)
 
     def looked(self) -> None:
         changed = self.demand.changed()

@@ -210,6 +210,15 @@ class Presences:
         """Whether it has not to wait until the gateways agree."""
         return not port.in_tree or now < port.place.until
 
+    def modules(self) -> dict[str, str]:
+        """The modules by their name on the robot, with the link where each is foreign ("": it is the robot's)."""
+        found = {}
+        for key, facts in self._sources.items():
+            if key[0] == "module":
+                link = min(facts, key=lambda each: facts[each].rank)
+                found[str(key[1])] = link if facts[link].rank[0] else ""
+        return found
+
     # What is there
 
     def _look(self, now: int) -> None:

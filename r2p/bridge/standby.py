@@ -12,6 +12,7 @@ from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management
 from r2p.errors import DecodeError
 from r2p.protocols.bridging.homes import Homes
+from r2p.sample import Source
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told
 from r2p.transports.link import Link
@@ -44,6 +45,9 @@ class HomePort:
     @property
     def shares(self) -> bool:
         return self._standby.homes.speaks
+
+    def source_name(self, source: Source) -> str:
+        return source.module
 
     def looked(self) -> None:
         self._standby.looked(self)

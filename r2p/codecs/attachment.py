@@ -53,7 +53,7 @@ PACKET_MOST = 256
 """Messages in one payload."""
 
 _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
-_NAMES = re.compile(rb"([A-Za-z0-9_]{0,7})/([A-Za-z0-9_]{0,8})")
+_NAMES = re.compile(rb"([A-Za-z0-9_]{1,16}/[A-Za-z0-9_]{1,7}|[A-Za-z0-9_]{0,24})/([A-Za-z0-9_]{0,8})")
 _CLASSES = (1, 2, 3)
 _REMEMBERED = 4096  # origins
 

@@ -5,8 +5,8 @@
 
 The first part is the version. `SESSION` is the instance of the r2p module that declares the token, in hex; `INSTANCE`
 is that of the module concerned, another one where `HOPS` (gateways in between) is not 0, and `-` for firmware. `-`
-stands also for a node or a fingerprint that is not known; `%` for the slash of a topic in a namespace. `SIZE` is that
-of a message, so 1024 at most. Tokens of another version mean nothing to us.
+stands also for a node or a fingerprint that is not known; `%` for the slash of a topic or a module in a namespace.
+`SIZE` is that of a message, so 1024 at most. Tokens of another version mean nothing to us.
 
 In front of each token stands `live/*`, or `live`, behind the name of the network. zenoh gives each key that it passes
 on a number at every session that hears of it, up to its first wildcard, and keeps that for as long as the session
@@ -31,7 +31,9 @@ _WILD = "*/"
 
 _NONE = "-"
 _HEX32 = r"[0-9a-f]{1,8}"
-_MODULE = re.compile(rf"({_HEX32})/module/([A-Za-z0-9_]{{1,7}})/({_HEX32}|-)/([0-9a-f]{{1,2}})/([0-9]{{1,2}})")
+_MODULE = re.compile(
+    rf"({_HEX32})/module/((?:[A-Za-z0-9_]{{1,16}}%)?[A-Za-z0-9_]{{1,24}})/({_HEX32}|-)/([0-9a-f]{{1,2}})/([0-9]{{1,2}})"
+)
 _TOPIC = re.compile(
     rf"({_HEX32})/(pub|sub)/([A-Za-z0-9_]{{1,16}}(?:%[A-Za-z0-9_]{{1,16}})?)/({_HEX32}|-)/([A-Za-z0-9_]{{1,8}}|-)"
     r"/([0-9]{1,3})/([0-9]{1,6})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
@@ -82,7 +84,8 @@ def encode(token: Token) -> str:
     instance = _NONE if token.instance is None else f"{token.instance:x}"
     if isinstance(token, ModuleToken):
         flags = token.flags | (_OBSERVER if token.observer else 0)
-        return f"{VERSION}/{token.session:x}/module/{token.name}/{instance}/{flags:x}/{token.hops}"
+        name = token.name.replace("/", "%")
+        return f"{VERSION}/{token.session:x}/module/{name}/{instance}/{flags:x}/{token.hops}"
     fingerprint = _NONE if token.fingerprint == ANY_TYPE else token.fingerprint.hex()
     topic = token.topic.replace("/", "%")
     return (
@@ -99,8 +102,14 @@ def decode(key: str) -> Token:
     if found := _MODULE.fullmatch(rest):
         session, name, instance, flags, hops = found.groups()
         bits = int(flags, 16)
+        name = name.replace("%", "/")
         return ModuleToken(
-            int(session, 16), name, _instance(instance), bits & ~_OBSERVER, bool(bits & _OBSERVER), int(hops)
+            int(session, 16),
+            name.replace("%", "/"),
+            _instance(instance),
+            bits & ~_OBSERVER,
+            bool(bits & _OBSERVER),
+            int(hops),
         )
     if (found := _TOPIC.fullmatch(rest)) and int(found[7]) <= SIZE_MAX:
         session, role, topic, instance, node, publisher_class, size, fingerprint, window, hops = found.groups()

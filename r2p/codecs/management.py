@@ -77,6 +77,7 @@ QUEUE_ENTRY = 8
 DENIED_CONTROL = 1  # the gateway takes it from nobody on this link
 DENIED_READ_ONLY = 2  # nothing goes onto the link of the module
 DENIED_CLIENTS = 3  # the server of a debug line serves as many clients as it may: `order` is 0
+DENIED_GATEWAYS = 5  # no gateway may join by this line: `order` is 0
 DENIED_BOOT = 4  # STOP would hang a module in boot mode
 
 # Claim.flags
@@ -211,6 +212,14 @@ class Denied(msgspec.Struct, frozen=True, gc=False):
     module: str
     order: int
     reason: int
+
+
+class Name(msgspec.Struct, frozen=True, gc=False):
+    """What an alias stands for: a part of the name. `part`: the high four bits number it, the low four the last one."""
+
+    alias: str
+    part: int
+    piece: str
 
 
 class Bridge(msgspec.Struct, frozen=True, gc=False):
@@ -364,6 +373,7 @@ Management = (
     | Endpoint
     | Conflict
     | Denied
+    | Name
     | Bridge
     | Mesh
     | Leaf
@@ -398,6 +408,7 @@ _CODEC = Codec[Management](
     Record(Endpoint, 0x53, "B I 8s 16s B", version=_VERSION, may_be_empty=("node",)),
     Record(Conflict, 0x54, "7s I I", version=_VERSION),
     Record(Denied, 0x55, "7s 7s B B", version=_VERSION),
+    Record(Name, 0x56, "7s B 22s", version=_VERSION),
     Record(Bridge, 0x60, "I B H I I 12s", version=_VERSION),
     Record(Mesh, 0x61, "I H B 18s", version=_VERSION),
     Record(Leaf, 0x62, "I B H 18s", version=_VERSION),

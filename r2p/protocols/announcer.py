@@ -6,6 +6,7 @@ import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
+from r2p.protocols import aliases
 from r2p.protocols.directory import FOR_EVER, LEASE
 from r2p.protocols.events import Shape
 from r2p.protocols.outbox import Outbox
@@ -59,7 +60,7 @@ class Announcer:
         self._schedule = schedule
         self._outbox = outbox
         self._endpoints: dict[tuple[str, str, int], int] = {}
-        self._relayed: dict[tuple[str | int, ...], management.Management] = {}
+        self._relayed: dict[tuple[str | int, ...], Relayed] = {}
 
     def publish(self, topic: str, own: Own) -> bool:
         """Announce a publisher of the topic. Says whether that is news."""
@@ -197,7 +198,7 @@ class Announcer:
             case Kind.ENDPOINT_GONE, (str(node), str(topic), int(role)):
                 return [management.Endpoint(role | ROLE_GONE, self._instance, node, topic)]
             case Kind.RELAY, key:
-                return [self._relayed.pop(key)]
+                return _short(self._relayed.pop(key))
             case kind, _:
                 return self._presence(management.HELLO_QUERY if kind is Kind.QUERY else 0)
 
@@ -209,3 +210,11 @@ class Announcer:
     def _presence(self, flags: int) -> list[management.Management]:
         hello = self.introduction(flags)
         return [hello] if self._observer else [hello, management.Alive(self._module, self.flags)]
+
+
+def _short(message: Relayed) -> list[management.Management]:
+    """A message with an alias in place of a long name, behind what that stands for."""
+    if isinstance(message, management.Endpoint):
+        return [message]
+    names = aliases.told(message.module)
+    return [*names, msgspec.structs.replace(message, module=names[0].alias)] if names else [message]

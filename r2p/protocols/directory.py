@@ -293,4 +293,4 @@ class Directory:
 
 
 def _who(info: ModuleInfo) -> tuple[object, ...]:
-    return (info.instance, info.observer, info.source)
+    return (info.instance, info.observer, info.source, info.flags, info.hops)

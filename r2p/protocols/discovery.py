@@ -12,6 +12,7 @@ from typing import Any
 from r2p.codecs import UnknownType, management
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
+from r2p.names import module_alias
 from r2p.protocols.announcer import Announcer, Own, Relayed
 from r2p.protocols.demand import Demand, HeardDemand
 from r2p.protocols.directory import Directory, EndpointInfo, EndpointKey, TopicInfo
@@ -132,6 +133,7 @@ class Discovery:
             management.TypeInfo: self._exchange.typed,
             management.Unsubscribe: self._exchange.unsubscribed,
             management.Endpoint: self._neighbours.endpoint,
+            management.Name: self._neighbours.named,
             management.Conflict: self._neighbours.conflict,
             management.Denied: self._denied,
         }
@@ -227,7 +229,7 @@ class Discovery:
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         """Order a module to stop, reboot or enter its loader."""
-        self._outbox.say(_ORDERS[command](module), urgent=True)
+        self._outbox.say(_ORDERS[command](module_alias(module)), urgent=True)
         return self._outbox.take()
 
     def query(self, now: int) -> list[Event]:
@@ -237,7 +239,7 @@ class Discovery:
 
     def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
         """Tell the link that two modules, which don't hear each other, carry one name."""
-        self._announcer.once(Kind.CONFLICT, module, instance_a, instance_b)
+        self._announcer.once(Kind.CONFLICT, module_alias(module), instance_a, instance_b)
         return self._go_on(now)
 
     # For gateways
@@ -346,8 +348,8 @@ class Discovery:
     # Orders
 
     def _denied(self, now: int, message: management.Denied, source: Source) -> None:
-        if message.reason == management.DENIED_CLIENTS:
-            self._outbox.tell(ConnectionDenied(message.gateway))
+        if message.reason in (management.DENIED_CLIENTS, management.DENIED_GATEWAYS):
+            self._outbox.tell(ConnectionDenied(message.gateway, message.reason == management.DENIED_GATEWAYS))
         elif message.order in ORDERS:
             denied = OrderDenied(message.gateway, ORDERS[message.order], message.module, message.reason)
             self._outbox.tell(denied)

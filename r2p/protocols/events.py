@@ -140,9 +140,12 @@ class OrderDenied(msgspec.Struct, frozen=True):
 
 
 class ConnectionDenied(msgspec.Struct, frozen=True):
-    """The module at the other end serves as many clients as it may, and closes the connection."""
+    """The module at the other end serves as many clients as it may, and closes the connection; or, if this one is of a
+    `gateway`, lets nothing pass.
+    """
 
     server: str
+    gateway: bool = False
 
 
 class Echoes(msgspec.Struct, frozen=True):

@@ -6,8 +6,12 @@ with the random number of its start (its instance), which tells a restart from a
 
 from collections import Counter
 from collections.abc import Hashable
+from typing import TypeVar
+
+import msgspec
 
 from r2p.codecs import management
+from r2p.protocols.aliases import Aliases
 from r2p.protocols.announcer import Announcer
 from r2p.protocols.directory import Directory
 from r2p.protocols.events import Echoes, ModuleChanged, ModuleGone, ModuleInfo, NameConflict, Source
@@ -24,6 +28,7 @@ _ECHO_MEMORY = 10 * _SECOND
 """A line that echoed is expected to do so for this long."""
 _SWAPS = 3
 """A name that goes back and forth between two instances this often belongs to two modules."""
+_Shows = TypeVar("_Shows", management.Alive, management.Hello)
 _RESTART = management.FLAG_REBOOTED | management.FLAG_BOOT
 
 
@@ -51,11 +56,24 @@ class Neighbours:
         self._timers = timers
         self._outbox = outbox
         self._counts = counts
+        self._aliases = Aliases()
         self._echoing_until = 0
         self._silent_until: dict[str, int] = {}
 
+    def named(self, now: int, message: management.Name, source: Source) -> None:
+        """What an alias stands for: a module that is known by it has its name from now on."""
+        name = self._aliases.heard(message)
+        info = self._directory.modules.get(message.alias)
+        if name is not None and info is not None and (info.hops or not info.r2p):
+            self._gone(now, info)
+            self._keep(now, None, msgspec.structs.replace(info, name=name))
+
     def alive(self, now: int, message: management.Alive, source: Source) -> None:
         """Any module shows its state."""
+        if "/" in message.module:  # those travel by their alias
+            self._counts["impossible name"] += 1
+            return
+        message = self._with_name(message)
         if message.module.startswith("_"):
             return  # a gateway looks for loops: no module is called that, and tools send no ALIVE
         if message.module == self._module and not self._is_namesake(now):
@@ -67,6 +85,10 @@ class Neighbours:
 
     def hello(self, now: int, message: management.Hello, source: Source) -> None:
         """An r2p module, maybe this very one."""
+        if "/" in message.module:
+            self._counts["impossible name"] += 1
+            return
+        message = self._with_name(message)
         if (message.module, message.instance) == (self._module, self._instance):
             if not message.hops:  # else a gateway does not know yet that we are on both sides of it
                 self._heard_ourselves(now)
@@ -76,6 +98,10 @@ class Neighbours:
             self._leaving(now, message, source)
         else:
             self._present(now, message, source)
+
+    def _with_name(self, message: _Shows) -> _Shows:
+        name = self._aliases.name_of(message.module)
+        return message if name == message.module else msgspec.structs.replace(message, module=name)
 
     def _is_nearer(self, message: management.Hello) -> bool:
         """Whether a module of this name is known to be nearer than a gateway says: the latter may be its last start,

@@ -15,6 +15,8 @@ from r2p.codecs import UnknownType, liveliness, management
 from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
+from r2p.names import module_alias
+from r2p.protocols import aliases
 from r2p.protocols.announcer import Relayed
 from r2p.protocols.census import Census
 from r2p.protocols.declarations import Declarations, Own
@@ -68,6 +70,7 @@ class Presence:
         self._matching = Matching(self._own, self._events)
         self._census = Census(module, instance, self._events, self.counts)
         self._tokens: dict[str, liveliness.Token] = {}
+        self._aliases = aliases.Aliases()
         self._freshen_at: int | None = None
 
     @property
@@ -164,7 +167,9 @@ class Presence:
                     token = msgspec.structs.replace(known, flags=flags & liveliness.FLAGS)
                     self._relay(("module", name), token, gone=False)
                 else:
-                    self._say(message)
+                    for each in aliases.told(name):
+                        self._say(each)
+                    self._say(management.Alive(module_alias(name), flags))
             case management.Endpoint(role, instance, node, topic, publisher_class):
                 key = (instance, node, topic, role & ~management.ROLE_GONE)
                 endpoint = TopicToken(self._instance, key[3], topic, instance, node, publisher_class, hops=1)
@@ -183,7 +188,7 @@ class Presence:
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         """Order a module to stop, reboot or enter its loader."""
-        self._say(_ORDERS[command](module), urgent=True)
+        self._say(_ORDERS[command](module_alias(module)), urgent=True)
         return self._take()
 
     def query(self, now: int) -> list[Event]:
@@ -192,7 +197,7 @@ class Presence:
 
     def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
         """Tell two modules, which don't see each other, that they carry one name."""
-        self._say(management.Conflict(module, instance_a, instance_b))
+        self._say(management.Conflict(module_alias(module), instance_a, instance_b))
         return self._take()
 
     # The network
@@ -312,7 +317,10 @@ class Presence:
                 self._events.append(NameConflict(self._module, a, b))
             case management.Denied(gateway, module, order, reason) if order in ORDERS:
                 self._events.append(OrderDenied(gateway, ORDERS[order], module, reason))
+            case management.Name():
+                self._aliases.heard(message)
             case management.Alive(name, flags):
+                name = self._aliases.name_of(name)
                 self._census.firmware(ModuleInfo(name, flags, now, hops=1, source=source))
 
     def _say(self, message: management.Management, *, urgent: bool = False) -> None:

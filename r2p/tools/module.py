@@ -13,7 +13,7 @@ import typer
 
 import r2p
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
-from r2p.names import module_name
+from r2p.names import module_path
 from r2p.tools import session
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, TimedOut, Timeout, Usage, Wait
@@ -120,7 +120,7 @@ _DONE = {r2p.Command.STOP: "stopped", r2p.Command.REBOOT: "rebooted", r2p.Comman
 async def _order(
     session: Session, command: r2p.Command, name: str, timeout: float | None, done: Callable[[_Watch], bool]
 ) -> None:
-    module_name(name)
+    module_path(name)
     if not session.settings.via:
         raise Usage("there is nobody to order around: give --via tcp:HOST:PORT, or set R2P_VIA")
     await session.settle(wait=0)

@@ -26,7 +26,7 @@ from r2p.protocols.discovery import Discovery
 from r2p.protocols.door import Door
 from r2p.protocols.events import Command, Event, Joined, Left, ModuleChanged, ModuleGone, Opened, Send, Shut
 from r2p.room import LINK_DOWN, Room
-from r2p.sample import PublisherClass, Sample
+from r2p.sample import PublisherClass, Sample, Source
 from r2p.topic import Topic, TopicSpace
 from r2p.transports.announce import NOTHING, Told, announce, wish_of
 from r2p.transports.intake import Arrival, Inlets, Intake, LinkStats
@@ -99,6 +99,9 @@ class Gate(Protocol):
     @property
     def shares(self) -> bool:
         """Whether there are other gateways on the link's network."""
+
+    def source_name(self, source: Source) -> str:
+        """What the module that published a message is called there."""
 
     def looked(self) -> None:
         """Discovery may have learnt something."""

@@ -138,7 +138,7 @@ def test_another_version_is_left_alone() -> None:
             attachment.decode(data)
 
 
-@pytest.mark.parametrize("tail", [b"PC1", b"TOOLONG8/node", b"PC1/nodeof9ch", b"PC 1/a", b"a/b/c"])
+@pytest.mark.parametrize("tail", [b"PC1", b"A" * 25 + b"/node", b"PC1/nodeof9ch", b"PC 1/a", b"a/b/c/d"])
 def test_names_that_are_none(tail: bytes) -> None:
     with pytest.raises(DecodeError, match="module/node"):
         attachment.decode(attachment.encode(HEADER)[: -len("PC1/blink")] + tail)

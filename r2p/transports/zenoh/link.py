@@ -21,7 +21,7 @@ from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
 from r2p.protocols.events import Declare, Event, Joined, Parted, Undeclare
 from r2p.protocols.presence import Presence
-from r2p.sample import PublisherClass, Sample
+from r2p.sample import PublisherClass, Sample, Source
 from r2p.topic import Topic
 from r2p.transports.announce import NOTHING
 from r2p.transports.link import Hub, Link, unique_name
@@ -268,6 +268,10 @@ class ZenohLink(Link):
         return outlet if isinstance(outlet, ZenohOutlet) else None
 
     # For outlets and streams
+
+    def source_name(self, source: Source) -> str:
+        """What the module of a message is called on this network."""
+        return source.module if self.gate is None else self.gate.source_name(source)
 
     def instance_of(self, module: str) -> int:
         """The number of a module on any link; 0: firmware, or not known."""

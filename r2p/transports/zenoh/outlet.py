@@ -139,7 +139,7 @@ class ZenohOutlet(LinkOutlet):
             instance,
             self._zenoh.instance_of(source.module) if source.link else instance,
             ANY_TYPE if layout is None else layout.fingerprint,
-            source.module,
+            self._zenoh.source_name(source),
             source.node,
         )
         lane.prepare(source, origin, self._zenoh.senders.put(self.topic.name, sample.publisher_class))
