@@ -81,6 +81,7 @@ class ModuleHub:
         self._ordered: dict[tuple[Command, str], tuple[int, str]] = {}
         self._mismatches: dict[Link, dict[str, int]] = {}
         self._limits: dict[Link, LineLimit] = {}
+        self._clients = LineLimit()
         self._refused: dict[str, tuple[int, int]] = {}
         space.changed = self._topic_changed
         if bridging is not None:
@@ -187,13 +188,19 @@ class ModuleHub:
             if lost:
                 meanwhile += f"; {lost} messages lost meanwhile"
             expected = self.observer and first and outage < _PROMPT
-            logger.log(logging.DEBUG if expected else logging.INFO, "link %s is up%s", link.title, meanwhile)
+            self._log_change(link, logging.DEBUG if expected else logging.INFO, "up", f"is up{meanwhile}")
             self._events.tell(LinkUp(link.name, outage, lost))
         else:
             abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
-            logger.log(logging.WARNING if abandoned else logging.INFO, "link %s is down: %s", link.title, reason)
+            self._log_change(link, logging.WARNING if abandoned else logging.INFO, "down", f"is down: {reason}")
             self._events.tell(LinkDown(link.name, reason))
         self._joints.link_changed(link)
+
+    def _log_change(self, link: Link, level: int, kind: str, text: str) -> None:
+        """Clients may come and go by the thousand."""
+        more = self._clients.suffix(kind, self.space.clock.monotonic()) if link.passing else ""
+        if more is not None:
+            logger.log(level, "link %s %s%s", link.title, text, more)
 
     def discovered(self, link: Link, event: Event) -> None:
         """The discovery of a link found something that concerns the module."""

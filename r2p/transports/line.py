@@ -233,6 +233,8 @@ class LineLink(Link):
     def discard(self) -> int:
         discarded = len(self._samples)
         self.stats.sent -= discarded
+        if self._urgent:  # other management is repeated
+            self.stats.lost["orders not sent"] += len(self._urgent)
         self._urgent.clear()
         self._management.clear()
         self._samples.clear()

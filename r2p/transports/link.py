@@ -140,6 +140,8 @@ class Link(abc.ABC):
         """Whether a gateway at its other end takes part in the mesh of ours; else it is for clients."""
         self.gate: Gate | None = None
         """Set by the module: what gateways, and it beside gateways, do with the link."""
+        self.passing = False
+        """Whether it is closed for good when it goes down: that of a client."""
         self.stands_by = ""
         """Why another link is used in place of this one, where gateways join their networks; empty while it is used."""
         self.stats = LinkStats(lost=Losses(name, hub.space.clock))

@@ -273,6 +273,7 @@ class _Incoming(_Tcp):
 
     def open_link(self, peer: str) -> LineLink:
         link = LineLink(peer, self._hub)
+        link.passing = True
         link.admits_gateways = self._clients.gateways
         self._clients.served.add(self)
         self._hub.attach(link)

@@ -98,6 +98,11 @@ async def test_orders_that_wait_for_a_blocked_line_are_bounded() -> None:
         script.unblock()
         await asyncio.sleep(0)
         assert 90 < sum(isinstance(each.management, m.Stop) for each in script.said) < 100
+        script.blocked = True
+        for _ in range(3):
+            module.command(r2p.Command.STOP, "A")
+        script.link.disconnected("broken")
+        assert script.link.losses["orders not sent"] == 2  # the line had taken the first one
 
 
 async def test_what_waits_for_a_blocked_line_is_bounded() -> None:

@@ -301,6 +301,21 @@ async def test_a_flood_of_clients_too_many_is_bounded_and_logged_once(caplog: py
             writer.close()
 
 
+async def test_clients_that_come_and_go_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "r2p")
+    transport = listen()
+    async with asyncio.timeout(GUARD), r2p.Module("A", via=transport, watchdog=False) as module:
+        for _ in range(100):
+            _, writer = await dial(transport)
+            await until(lambda: module.links)
+            writer.close()
+            await until(lambda: not module.links)
+        assert module.closed_links.ups == 100
+    seconds = 1 + round(caplog.records[-1].created - caplog.records[0].created)
+    assert 0 < caplog.text.count("is up") <= 10 * seconds
+    assert 0 < caplog.text.count("is down") <= 10 * seconds
+
+
 async def test_a_client_that_leaves_does_not_take_what_it_has_lost_with_it() -> None:
     transport = listen()
     async with (
