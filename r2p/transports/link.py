@@ -128,6 +128,8 @@ class Link(abc.ABC):
     """Characters of the longest topic's name."""
     passes_probes: ClassVar[bool] = True
     """Whether there may be gateways of firmware on it."""
+    in_order: ClassVar[bool] = True
+    """Whether what is sent first comes first; else a message may overtake the answer that announces it."""
     lone: ClassVar[bool] = False
     """Whether it has only one other end."""
 
@@ -231,7 +233,7 @@ class Link(abc.ABC):
     def take_unexpected(self, arrival: Arrival) -> None:
         """Count it; what is wanted may be announced by what comes next: keep the last message for that."""
         self.stats.lost[_NOT_SUBSCRIBED] += 1
-        topic = self._space.topics.get(arrival.topic.decode("ascii", "replace"))
+        topic = None if self.in_order else self._space.topics.get(arrival.topic.decode("ascii", "replace"))
         if topic is None or not topic.wanted:
             return
         key = arrival.topic, self.sender(arrival)

@@ -189,6 +189,7 @@ class MemoryLink(Link):
     """One module's place on a memory network; it can be unplugged, and plugged in again."""
 
     longest: ClassVar[int] = 1024
+    in_order: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, network: MemoryNetwork) -> None:
         super().__init__(name, hub)
