@@ -21,6 +21,7 @@ from r2p.room import LINK_DOWN
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import Advertised, Topic
 from r2p.transports.announce import NOTHING
+from r2p.transports.handed_over import HandedOver
 from r2p.transports.link import Hub, Link, is_booting
 from r2p.transports.sources import Sources
 
@@ -67,6 +68,11 @@ class Carrier(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Send what is held, as far as the other end takes it, and close."""
+
+    @property
+    def unconfirmed(self) -> int:
+        """Bytes that it was given and that the other end has not confirmed, as far as that is known."""
+        return 0
 
 
 class Connection(Carrier):
@@ -120,6 +126,8 @@ class LineLink(Link):
         self._grace: asyncio.TimerHandle | None = None
         self._piecemeal = piecemeal
         self._stamp = 0
+        self._handed = HandedOver()
+        self._given = 0
         self._held: tuple[str, Sample] | None = None
         self._unasked: set[str] = set()
 
@@ -133,6 +141,8 @@ class LineLink(Link):
         self._carrier = carrier
         self._blocked = False
         self._reader = debug.Reader(self.stats.lost)
+        self._handed = HandedOver()
+        self._given = self.stats.sent
         self._send(OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
             self._begin_grace()
@@ -140,6 +150,7 @@ class LineLink(Link):
 
     def disconnected(self, reason: str) -> None:
         """Bytes do not flow any more."""
+        self._count_unknown()
         self._carrier = None
         self._end_grace()
         self.went_down(reason)
@@ -316,8 +327,18 @@ class LineLink(Link):
 
     def _send(self, data: bytes) -> None:
         if self._carrier is not None:
+            self._handed.note(len(data), self._given)
+            self._given = self.stats.sent - len(self._samples)
             self.stats.bytes_sent += len(data)
             self._carrier.send(data)
+
+    def _count_unknown(self) -> None:
+        """What the connection had taken, and the other end may not have got."""
+        if self._carrier is not None and not self._closed:
+            held = self._held is not None  # that one is lost
+            unknown = self._handed.within(self._carrier.unconfirmed, self._given) - held
+            if unknown > 0:
+                self.stats.lost["unknown at disconnect"] += unknown
 
     # The sample of a real-time publisher that the carrier could not send at once: it is on its way when all is sent.
 

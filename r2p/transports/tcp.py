@@ -1,6 +1,7 @@
 """The debug line over TCP: a client that comes back, and a server for many clients, each a peer of its own."""
 
 import abc
+import array
 import asyncio
 import errno
 import ipaddress
@@ -10,6 +11,10 @@ import socket
 import sys
 from collections.abc import Callable
 from typing import cast
+
+if sys.platform == "linux":
+    import fcntl
+    import termios
 
 from r2p.backoff import Backoff
 from r2p.codecs import debug, management
@@ -44,6 +49,7 @@ class _Tcp(asyncio.BufferedProtocol, Connection):
         self._buffer = bytearray(_CHUNK)
         self._transport: asyncio.Transport | None = None
         self._paused = False
+        self._unconfirmed = 0
 
     @abc.abstractmethod
     def open_link(self, peer: str) -> LineLink:
@@ -76,6 +82,10 @@ class _Tcp(asyncio.BufferedProtocol, Connection):
             self._transport.abort()
         else:
             self.ended.set()
+
+    @property
+    def unconfirmed(self) -> int:
+        return self._unconfirmed
 
     def forget(self) -> None:
         """It was given up while it was made: the event loop closes it, and uvloop's never tells its end."""
@@ -115,10 +125,24 @@ class _Tcp(asyncio.BufferedProtocol, Connection):
             self.link.carrier_ready()
 
     def connection_lost(self, exc: Exception | None) -> None:
+        if self._transport is not None:
+            self._unconfirmed = self._transport.get_write_buffer_size() + _unacknowledged(self._transport)
         self._transport = None
         if self.link is not None:
             self.link.disconnected(_explain(exc) if exc else "the other end closed the connection")
         self.ended.set()
+
+
+def _unacknowledged(transport: asyncio.Transport) -> int:
+    """Bytes that the kernel has taken, and the other end's has not; 0 where that can't be asked."""
+    if sys.platform != "linux":
+        return 0
+    answer = array.array("i", [0])
+    try:
+        fcntl.ioctl(transport.get_extra_info("socket").fileno(), termios.TIOCOUTQ, answer)
+    except (OSError, ValueError, AttributeError):  # it is closed
+        return 0
+    return max(0, answer[0])
 
 
 def _find_dead_peers(sock: socket.socket) -> None:

@@ -32,6 +32,8 @@ class Script(Transport, Carrier):
         self.said: list[Said] = []
         self.blocked = False
         """While it is set the line takes nothing after what it takes now."""
+        self.on_the_way = 0
+        """Bytes that the other end has not confirmed."""
         self._reader = debug.Reader()
         self._held: list[bytes] = []
         self._paused = False
@@ -70,6 +72,10 @@ class Script(Transport, Carrier):
         self.said += [Said(now, line.topic.decode(), line.data) for line in self._reader.feed(data)]
         if self.blocked:
             self.link.carrier_full()
+
+    @property
+    def unconfirmed(self) -> int:
+        return self.on_the_way
 
     def pause(self) -> None:
         self._paused = True

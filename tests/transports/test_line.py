@@ -187,6 +187,23 @@ async def test_what_waited_when_the_line_broke_is_never_sent() -> None:
         assert script.link.losses == {"link down": 6 - sent}
 
 
+async def test_what_was_on_the_way_when_the_line_broke_is_unknown() -> None:
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        for number in range(10):
+            await publisher.publish(Led(led=number))
+            await asyncio.sleep(0.001)
+        script.on_the_way = 2 * len(line("leds", Led().encode())) + 1
+        script.link.disconnected("broken")
+        assert script.link.losses == {"unknown at disconnect": 3}
+        script.link.connected(script)
+        script.on_the_way = 5
+        script.link.disconnected("broken again, before anything was sent")
+        assert script.link.losses == {"unknown at disconnect": 3}
+
+
 async def test_whoever_waits_for_a_line_that_breaks_waits_no_more() -> None:
     """A message without a deadline as well as an event with one: both are lost, counted."""
     async with scripted() as (script, _, node):

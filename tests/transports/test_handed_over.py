@@ -1,0 +1,36 @@
+"""How many messages the last bytes of a connection were."""
+
+import pytest
+
+from r2p.transports.handed_over import HandedOver
+
+
+def given(pieces: int, messages: int = 2, size: int = 10) -> HandedOver:
+    """So many pieces of `size` bytes, each of so many messages."""
+    handed = HandedOver()
+    for number in range(pieces):
+        handed.note(size, number * messages)
+    return handed
+
+
+@pytest.mark.parametrize(("last", "messages"), [(0, 0), (1, 2), (10, 2), (11, 4), (100, 20), (999, 20)])
+def test_pieces_count_as_a_whole(last: int, messages: int) -> None:
+    assert given(10).within(last, 20) == messages
+
+
+def test_nothing_was_given() -> None:
+    assert HandedOver().within(5, 7) == 0
+
+
+def test_what_is_long_ago_is_less_exact_but_never_less() -> None:
+    count = 100_000
+    handed = given(count)
+    for pieces in (1, 50):
+        assert handed.within(10 * pieces, 2 * count) == 2 * pieces
+    for pieces in (100, 5000, 50_000, count):
+        assert 2 * pieces <= handed.within(10 * pieces, 2 * count) <= 2 * pieces + 1000
+
+
+def test_what_no_socket_holds_is_not_remembered() -> None:
+    handed = given(5000, size=4096)
+    assert handed.within(5000 * 4096, 10_000) == 2 * 2048
