@@ -178,10 +178,11 @@ def _hops(robot: dict[str, Any], gateway: dict[str, Any], pc: dict[str, Any], ve
     _, received, lost = gateway["links"].get(source, (0, 0, {}))
     forwarded, dropped = sum(each[2] for each in ways), sum(each[3] for each in ways)
     out_sent, _, out_lost = gateway["links"][out]
+    waited = out_lost.get("converging", 0) - sum(each[4].get("converging", 0) for each in ways)
     yield verdict.hop("robot's publisher to its link", robot["published"], robot["sent"], _of(robot, *_SENDING))
     yield verdict.hop("robot's link to the gateway's", robot["sent"], received, _of({"losses": lost}, "wrong size"))
     yield verdict.hop("through the gateway", received, forwarded, dropped + gateway["ports"].get(source, 0))
-    yield verdict.hop("to the gateway's zenoh link", forwarded, out_sent, _of({"losses": out_lost}, *_SENDING))
+    yield verdict.hop("to the gateway's zenoh link", forwarded, out_sent, _of({"losses": out_lost}, *_SENDING) + waited)
     on_the_way = _of(pc, "on the way", "wrong size", "wrong type", "repeated")
     yield verdict.hop("by zenoh to the PC", out_sent, pc["link"], on_the_way)
     queued = pc["queue"] + _of(pc, "receive queue full")

@@ -100,7 +100,7 @@ def _forwarded(module: r2p.Module) -> dict[str, Any]:
     ways = [each for each in statistics.ways if each.topic == TOPIC]
     return {
         "links": {each.name: (each.stats.sent, each.stats.received, dict(each.losses)) for each in module.links},
-        "ways": [(each.source, each.target, each.forwarded, sum(each.dropped.values())) for each in ways],
+        "ways": [(each.source, each.target, each.forwarded, sum(each.dropped.values()), each.dropped) for each in ways],
         "ports": {each.link: sum(each.dropped.values()) for each in statistics.ports},
     }
 

@@ -57,7 +57,7 @@ class Outflow:
         """
         taker = self.takers.pop(session, None)
         self._update()
-        return 0 if taker is None or taker.leaving else self.serial - taker.taken
+        return 0 if taker is None or taker.leaving else max(0, self.serial - taker.taken)
 
     def credited(self, session: int, serial: int, *, leaving: bool = False) -> None:
         """It has taken everything up to this serial, of which the wire tells the low 32 bits.

@@ -54,10 +54,11 @@ class Burst:
             lane.send(self._stats, self._error, batching=self._batching)
 
     def discard(self) -> int:
-        """Forget what waits; says how much that was."""
+        """Forget what waits; says how much that was. Subscribers need not miss it, too, so its serials come again."""
         lanes, self._lanes = self._lanes, {}
         count = sum(len(lane.waiting) for lane in lanes)
         for lane in lanes:
+            lane.flow.serial -= len(lane.waiting)
             lane.waiting.clear()
         return count
 

@@ -124,6 +124,8 @@ async def test_a_link_that_goes_down_takes_along_what_waits() -> None:
     assert wire.burst.discard() == 2
     await turns(TURNS)
     assert wire.sent == [b"1"]
+    wire.add(b"4")
+    assert [each.serial for each in wire.headers] == [1, 2]  # it was counted here, so nobody else has to
 
 
 async def test_what_zenoh_does_not_take_is_counted() -> None:
