@@ -101,6 +101,8 @@ class Presences:
         self._told: dict[str, dict[_Key, _Told]] = {}
         self._alarm = Alarm(space.loop, self._due, background=True)
         self._dirty: set[str] = set()
+        self._behind: set[str] = set()
+        """Links that had to wait until the gateways agree, and lack what has changed meanwhile."""
         self._asked: set[str] = set()
         self._met: dict[str, set[int]] = {}
         self._answered_at: dict[str, int] = {}
@@ -128,6 +130,7 @@ class Presences:
         for known in (self._told, self._met, self._answered_at, self._refresh_at, self._again):
             known.pop(port.name, None)
         self._asked.discard(port.name)
+        self._behind.discard(port.name)
         self._answering.discard(port.name)
         self.changed(port)
 
@@ -140,6 +143,8 @@ class Presences:
         dues = [now + _REFRESH, *self._refresh_at.values()]
         if self._dirty:
             dues.append(max(now + _SOON, self._next_round_at))
+        if self._behind:
+            dues.append(now + _APART)
         if self._again:
             dues.append(now + _SLICE_APART)
         dues += [max(now + _SOON, self._answered_at.get(name, -_APART) + _APART) for name in self._asked]
@@ -156,7 +161,8 @@ class Presences:
             self._set_alarm(now)
 
     def _do_due(self, now: int) -> None:
-        if self._dirty and now >= self._next_round_at:
+        late = any(self._is_open(port, now) for port in self._ports.values() if port.name in self._behind)
+        if (self._dirty or late) and now >= self._next_round_at:
             self._rounds.append(now)
             self._look(now)
             took = self._clock.monotonic() - now
@@ -223,13 +229,15 @@ class Presences:
 
     def _look(self, now: int) -> None:
         """See what has changed on the links, and tell it on the others."""
-        dirty, self._dirty = self._dirty, set()
+        dirty, behind = self._dirty | self._behind, self._behind
+        self._dirty, self._behind = set(), set()
         changed: dict[_Key, None] = {}
-        again: list[BridgePort] = []
+        again = [port for port in self._ports.values() if port.name in behind]
         for name in dirty:
             port = self._ports.get(name)
             if port is not None and port.link.up and not self._is_open(port, now):
-                continue  # what it has told holds until the gateways agree: then it has another place in the tree
+                self._behind.add(name)  # what it has told holds until the gateways agree
+                continue
             try:
                 self._collect(name, port, changed)
             except Exception as error:  # noqa: BLE001 - counted and logged; it is read anew, and the next link follows
@@ -243,6 +251,8 @@ class Presences:
                 keys: Iterable[_Key] = [*self._sources, *self._told.get(port.name, ())] if port in again else changed
                 for key in list(dict.fromkeys(keys)):
                     port.link.stats.lost.guard(self._tell, port, key)
+            elif port.link.up:
+                self._behind.add(port.name)
 
     def _collect(self, name: str, port: BridgePort | None, changed: dict[_Key, None]) -> None:
         """Read what a link tells now."""

@@ -9,6 +9,7 @@ import pytest
 import r2p
 from r2p.codecs import management
 from r2p.msg import Led
+from r2p.testing.network import node_in
 from tests.bridge.test_bridge import Tap, gateway, node
 
 pytestmark = pytest.mark.virtual_time
@@ -84,3 +85,28 @@ async def test_a_link_on_which_much_comes_and_goes_is_looked_at_now_and_then(mon
         await asyncio.sleep(3.0)
         (link,) = b.links
         assert len([each for each in link.discovery.endpoints.values() if each.instance == 99]) == 400
+
+
+async def test_what_changes_while_gateways_converge_is_told_afterwards() -> None:
+    async with (
+        gateway(),
+        r2p.Module("B", via="memory:b") as b,
+        r2p.Module("A", via="memory:a") as a,
+        node_in(a) as there,
+    ):
+        await asyncio.sleep(2)
+        async with gateway(name="G2"):
+            await asyncio.sleep(0.05)
+            there.advertise("leds", Led)
+            await asyncio.sleep(3)
+            assert [each.node for each in b.network.topics()["leds"].publishers] == ["test"]
+
+
+async def test_nodes_of_a_network_that_a_gateway_joins_later_are_told() -> None:
+    """Two gateways away, by a line that has to wait until they agree."""
+    async with gateway(name="G1", networks="ab"), node("A", "a") as a:
+        a.advertise("leds", Led)
+        await asyncio.sleep(3)
+        async with gateway(name="G2", networks="bc"), r2p.Module("C", via="memory:c") as c:
+            await asyncio.sleep(3)
+            assert [(each.module, each.node) for each in c.network.topics()["leds"].publishers] == [("A", "test")]
