@@ -4,14 +4,19 @@ PYTHON ?= python3
 BIN := .venv/bin
 RUN := .venv/stamp-run
 STAMP := .venv/stamp
+LOWEST := .venv-lowest
 
-.PHONY: demo test lint bench soak docs clean
+.PHONY: demo test test-lowest lint bench soak docs clean
 
 demo: $(RUN)
 	$(BIN)/r2p demo
 
 test: $(STAMP) system
 	$(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadgroup
+
+# The tests with the lowest versions that pyproject.toml allows; `make test-lowest TESTS=tests/tools` runs some of them.
+test-lowest: $(LOWEST)/stamp system
+	$(LOWEST)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check
@@ -34,7 +39,7 @@ docs: $(STAMP)
 	$(BIN)/mkdocs build --strict
 
 clean:
-	rm -rf .venv site
+	rm -rf .venv $(LOWEST) site
 
 $(RUN): pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -44,6 +49,14 @@ $(RUN): pyproject.toml
 
 $(STAMP): $(RUN)
 	$(BIN)/python -m pip install --quiet --group test --group lint --group docs --group bench
+	touch $@
+
+$(LOWEST)/stamp: pyproject.toml
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet uv
+	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct --editable '.[all]' --group test
+	$(LOWEST)/bin/uv pip install --quiet --python $(LOWEST)/bin/python --group docs mypy types-pyserial types-pyyaml
+	$(LOWEST)/bin/uv pip list --python $(LOWEST)/bin/python
 	touch $@
 
 # What the tests use of the system: installed for root, unpacked for others, else they say what they skip.
