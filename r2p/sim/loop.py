@@ -252,9 +252,9 @@ def _same(before: dict[asyncio.Task[Any], object], now: dict[asyncio.Task[Any], 
 
 
 def _in_background(timer: asyncio.TimerHandle) -> bool:
-    """Whether it only repeats itself; what is cancelled comes to nothing."""
+    """Whether it only repeats itself, or is cancelled."""
     background = getattr(timer, "background", False)
-    return timer.cancelled() or bool(background() if callable(background) else background)
+    return bool(background() if callable(background) else background)
 
 
 class _Selector(selectors.DefaultSelector):
@@ -287,6 +287,11 @@ class _Timer(asyncio.TimerHandle):
         self.background: bool | Callable[[], bool] = False
         """Set by `r2p.clock.in_background`."""
         self._scheduled = True  # how asyncio marks what is in its heap
+
+    def cancel(self) -> None:
+        """As in asyncio: it stays in the heap, and holds nothing there."""
+        super().cancel()
+        self.background = True
 
     def __lt__(self, other: object) -> bool:
         return isinstance(other, _Timer) and self.order < other.order
