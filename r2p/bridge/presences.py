@@ -101,6 +101,8 @@ class Presences:
         self._told: dict[str, dict[_Key, _Told]] = {}
         self._alarm = Alarm(space.loop, self._due, background=True)
         self._dirty: set[str] = set()
+        self._joined: set[str] = set()
+        """Links in the tree, which know all."""
         self._behind: set[str] = set()
         """Links that had to wait until the gateways agree, and lack what has changed meanwhile."""
         self._asked: set[str] = set()
@@ -131,6 +133,7 @@ class Presences:
             known.pop(port.name, None)
         self._asked.discard(port.name)
         self._behind.discard(port.name)
+        self._joined.discard(port.name)
         self._answering.discard(port.name)
         self.changed(port)
 
@@ -244,8 +247,9 @@ class Presences:
                 internal_error_of((each.link.stats.lost for each in self._ports.values()), error)
                 self._dirty.add(name)
                 continue
-            if port is not None and port.link.up and not (port.in_tree and name in self._told):
-                again.append(port)
+            if port is not None and port.link.up and port.in_tree != (name in self._joined):
+                again.append(port)  # it has just joined the tree, or left it
+                self._joined ^= {name}
         for port in self._ports.values():
             if port.link.up and self._is_open(port, now):
                 keys: Iterable[_Key] = [*self._sources, *self._told.get(port.name, ())] if port in again else changed

@@ -10,6 +10,7 @@ import r2p
 from r2p.codecs import management
 from r2p.msg import Led
 from r2p.testing.network import node_in
+from r2p.transports.memory import MemoryLink, MemoryTransport
 from tests.bridge.test_bridge import Tap, gateway, node
 
 pytestmark = pytest.mark.virtual_time
@@ -110,3 +111,16 @@ async def test_nodes_of_a_network_that_a_gateway_joins_later_are_told() -> None:
         async with gateway(name="G2", networks="bc"), r2p.Module("C", via="memory:c") as c:
             await asyncio.sleep(3)
             assert [(each.module, each.node) for each in c.network.topics()["leds"].publishers] == [("A", "test")]
+
+
+async def test_a_link_that_comes_later_is_told_what_was_known_before() -> None:
+    late = MemoryTransport("c")
+    async with r2p.Module("GW", via=["memory:a", late], bridge=True) as gw, node("A", "a"):
+        (_, link) = gw.links
+        assert isinstance(link, MemoryLink)
+        link.disconnect()
+        await asyncio.sleep(3)
+        link.connect()
+        async with r2p.Module("C", via="memory:c") as c:
+            await asyncio.sleep(0.9)
+            assert "A" in {view.name for view in c.network.modules()}
