@@ -459,9 +459,13 @@ class Link(abc.ABC):
             self._admit_early(name.encode(), sender)
 
     def _admit_early(self, name: bytes, sender: Hashable) -> None:
-        """A message may overtake the answer that announces it; a latched one would not come again."""
+        """A message may overtake the answer that announces it; a latched one would not come again.
+
+        Not where the module has other links, by which the same message may have come meanwhile.
+        """
         arrival, at = self._early.pop((name, sender), (None, 0))
-        if arrival is not None and self._clock.monotonic() - at <= _EARLY:
+        alone = len(self._space.links) == 1
+        if arrival is not None and alone and self._clock.monotonic() - at <= _EARLY:
             self.stats.lost[_NOT_SUBSCRIBED] -= 1
             self._intake.take_first(arrival)
 
