@@ -30,8 +30,8 @@ def module_name(name: str) -> str:
 
 
 def module_path(name: str) -> str:
-    """Check the name of a module of any robot, which may be in a namespace: `robot1/MOTOR1`."""
-    if name.count("/") != 1 and len(name) <= MODULE_MAX:
+    """Check the name of a module of any robot, which may have a prefix: `robot1/MOTOR1`, `robot1_MOTOR1`."""
+    if name.count("/") != 1 and (len(name) <= MODULE_MAX or "_" not in name):
         return module_name(name)
     namespace, slash, inner = name.rpartition("/")
     if slash:

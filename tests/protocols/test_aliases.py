@@ -10,7 +10,7 @@ from r2p.names import module_alias, module_path
 from r2p.protocols import aliases
 from r2p.protocols.aliases import Aliases
 
-NAMES = ["robot1/MOTOR1", "a/b", "ABCDEFGH", "sixteen_letters_/MOTOR_1"]
+NAMES = ["robot1/MOTOR1", "a/b", "ABC_DEFGH", "sixteen_letters_/MOTOR_1"]
 
 
 def test_short_names_are_their_own_aliases() -> None:
