@@ -83,7 +83,7 @@ def multicast() -> tuple[str, int] | None:
 def robot() -> Iterator[Robot]:
     group, port = multicast() or ("", 0)
     bus = f"rtcan:udp_multicast:{group},slots=20,cycle=20ms" if group else ""
-    links = ["--via", "tcp-listen:0", *(["--via", bus] if bus else [])]
+    links = ["--via", "tcp-listen:0,gateways=yes", *(["--via", bus] if bus else [])]
     with contextlib.ExitStack() as stack:
         # To one port Linux brings the packets of all groups, those of other tests, too.
         stack.enter_context(pytest.MonkeyPatch.context()).setenv("CAN_CONFIG", json.dumps({"port": port}))
