@@ -305,7 +305,7 @@ async def test_a_reader_that_keeps_up_loses_nothing(cable: Cable) -> None:
 
 @conforms_lines
 async def test_a_peer_that_does_not_read(cable: Cable) -> None:
-    """It costs its publisher `stall` seconds once, a bounded buffer, and nobody else anything."""
+    """It costs its publisher `stall` seconds once, and what it does not get is told; other subscribers lose nothing."""
     missed: list[r2p.Missed] = []
     text = Text(text="x" * 64)
     async with (
@@ -331,7 +331,7 @@ async def test_a_peer_that_does_not_read(cable: Cable) -> None:
         for _ in range(1000):  # does not stall any more
             await publisher.publish(text)
             assert await carols.fetch() == text
-        assert len(missed) == publisher.missed == 1
+        assert sum(each.count for each in missed) == publisher.missed == 1001
         assert missed[0].where == frozen.name
         assert frozen.stats.lost["send buffer full"] == 1001
         cable.thaw()

@@ -14,6 +14,7 @@ import r2p
 from r2p.codecs import management as m
 from r2p.errors import MessageError
 from r2p.msg import Led, Text
+from r2p.names import module_alias
 from r2p.protocols import demand, directory, peers
 from r2p.testing.network import node_in
 from r2p.topic import Topic, TopicSpace
@@ -27,8 +28,10 @@ KNOWN = {
     "gateway": ["GW1"],
     "node": ["test"],
     "topic": ["leds", "text", "R2P", "R2P_PC1", "R2P_IMU1"],
+    "alias": ["PC1", module_alias("robot1/MOTOR1")],
+    "piece": ["robot1/", "MOTOR1", "robot1/MOTOR1"],
 }
-LENGTHS = {"module": 7, "gateway": 7, "node": 8, "topic": 16}
+LENGTHS = {"module": 7, "gateway": 7, "node": 8, "topic": 16, "alias": 7, "piece": 22}
 LETTERS = "abcdefghijklmnopqrstuvwxyzABC0123456789_"
 
 
