@@ -1,9 +1,9 @@
 """Slots and cycles: where this node is in which cycle, by its own clock (PROTOCOL.md 6, thesis 4.3.3).
 
-The reference is the start of frame of the sync in slot 0. The master plans it on a grid of its own clock, and takes it
-from the confirmation of its own frame, which may have left a bit later; a slave takes it from each sync it hears: the
-reception's stamp, less the exact length of the frame with its stuff bits, less its own calibrated latency. A sync that
-does not come is made up for by the slave's own clock, for at most three cycles.
+The reference is the start of frame of the sync in slot 0. The master plans it on a grid of its own clock; if the
+confirmation of its own frame shows that it left later than latencies vary, it takes that. A slave takes it from each
+sync it hears: the reception's stamp, less the exact length of the frame with its stuff bits, less its own calibrated
+latency. A sync that does not come is made up for by the slave's own clock, for at most three cycles.
 
 The first sync of a master that goes on with a network may leave late: then its grid begins where that sync did, and
 moves back from cycle to cycle, so that network time catches up.
@@ -23,6 +23,7 @@ HOLDOVER = 3
 NO_SLOT = 1 << 16
 """Behind every slot of a cycle."""
 _CATCH_UP = 64  # part of a slot by which a cycle is shortened while network time catches up
+_IN_TIME = 8_000  # ns between plan and stamp of a sync: two calibrated latencies that vary by +-3 us, and a bit more
 _AMBIGUOUS = 128  # cycles: half of what 8 bits tell
 _DELAYED = 16  # cycles that NETWORK may be ahead of a sync
 _MICROSECOND = 1000
@@ -225,9 +226,13 @@ class Cycle:
         return self._grid + self.timing.cycle - min(self._behind, self._slot // _CATCH_UP)
 
     def left(self, frame: Frame, at: int) -> None:
-        """The master's sync was on the bus until `at`: all take its start for the reference, and so does the master."""
+        """The master's sync was on the bus until `at`. If it left late, all are late with it, and so is the master.
+
+        What the jitter of latencies explains moves nothing: the plan is as good a guess as the stamp, and, unlike that,
+        the slots of the next cycle are just one cycle later.
+        """
         start = at - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
-        if 0 <= start - self._grid <= self._slot and frame.id >> 7 == self.counter & 0xFF:
+        if _IN_TIME < start - self._grid <= self._slot and frame.id >> 7 == self.counter & 0xFF:
             self.reference = start
 
     def _start(self, start: int, low: int, mask: int) -> Alignment:

@@ -104,6 +104,23 @@ def test_a_master_whose_syncs_leave_late_has_the_time_of_its_slaves() -> None:
     assert not any(slave.engine.counts["foreign syncs"] for slave in slaves)
 
 
+def test_syncs_that_jitter_move_neither_the_master_s_time_nor_its_slots() -> None:
+    """They move the slaves, which know nothing but when each sync came."""
+    bus = Bus()
+    master, slave, _ = network(bus, 3, 0, 0)
+    start, cycle = shown(master), master.engine._core.cycle
+    master.late = lambda frame: bus.now // CYCLE % 4 * 2 * US if is_sync(frame) else 0
+    phases, seen = set(), set()
+    for _ in range(50):
+        bus.run(7 * MS)
+        phases.add((cycle.reference - cycle.counter * CYCLE) // US)
+        seen.add((shown(slave) - start) // US)
+        assert abs(shown(master) - start) < US
+        assert abs(shown(slave) - start) < 7 * US
+    assert len(phases) == 1
+    assert len(seen) > 2
+
+
 def test_no_old_counter_is_told_when_a_master_wakes_up() -> None:
     """It would be taken for the right one less a multiple of 256."""
     bus = Bus()
