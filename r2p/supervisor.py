@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, cast
 
 from r2p.backoff import Backoff
-from r2p.clock import random_of
+from r2p.clock import in_background, random_of
 from r2p.errors import Error, NameTooLong
 from r2p.names import NODE_MAX, node_name
 from r2p.node import Node
@@ -145,8 +145,12 @@ class Supervisor:
         """Run the function to its end; what it raised."""
         task = asyncio.current_task()
         assert task is not None
-        # Only coroutine functions are let in (check_function), and those give coroutines.
-        body = cast("Coroutine[Any, Any, object]", self._function(self.node, *self._args))
+        try:  # arguments that do not fit raise here, before there is a coroutine
+            # Only coroutine functions are let in (check_function), and those give coroutines.
+            body = cast("Coroutine[Any, Any, object]", self._function(self.node, *self._args))
+        except Exception as error:  # noqa: BLE001 - the user's code may raise anything
+            self.node.close()
+            return error
         self._attempt = attempt = _Attempt(self.node, task, body)
         self.node.enter()
         try:
@@ -199,6 +203,7 @@ class _Attempt:
         failed = self.error is not None or self._task.cancelling() > 0
         if cleans_up(self._body, handlers=failed and self._loop.time() - since < _HANDLER):
             self._timer = self._loop.call_later(_LOOK, self._cancel, since)
+            in_background(self._timer)  # a clean-up that waits for ever is a deadlock all the same
         else:
             self._cancelled = True
             self._task.cancel()

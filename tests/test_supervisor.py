@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
+from r2p.errors import Deadlock
 from r2p.msg import Led, Log
+from r2p.sim import run
 from r2p.transports.link import Hub, Transport
 from tests.bench import Recorder, collect, crashes, elapsed, hold, led, local, settle
 
@@ -51,6 +53,25 @@ async def test_a_node_that_raises_ends_alone(caplog: pytest.LogCaptureFixture) -
         (logging.ERROR, "broken", "Traceback (most recent call last):"),
     ]
     assert texts[-1] == (logging.ERROR, "broken", "KeyError: 'left'")
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("restart", [False, True])
+async def test_a_node_with_wrong_arguments_ends_alone(restart: bool) -> None:
+    async def needy(node: r2p.Node, number: int) -> None:
+        raise AssertionError(number)  # pragma: no cover
+
+    async def main() -> None:
+        async with local() as module:
+            module.start(hold)
+            module.start(needy, restart=restart)
+            await settle(10.0)
+            assert module.nodes["hold"].running
+            assert module.nodes["needy"].running == restart
+            assert (module.nodes["needy"].restarts > 1) == restart
+            assert module.nodes["needy"].node.closed
+
+    assert [type(error) for error in await crashes(main)] == [TypeError] * (not restart)
 
 
 @pytest.mark.virtual_time
@@ -449,6 +470,22 @@ async def test_a_crash_ends_a_node_that_handles_an_error_for_long() -> None:
             assert elapsed(module) == pytest.approx(1.0, abs=0.02)
 
     assert [str(error) for error in await crashes(main)] == ["fill"]
+
+
+def test_a_clean_up_that_waits_for_ever_is_a_deadlock() -> None:
+    async def stuck(node: r2p.Node) -> None:
+        try:
+            raise OSError("sensor")
+        finally:
+            await asyncio.Event().wait()
+
+    async def main() -> None:
+        async with local() as module:
+            module.start(stuck)
+            await asyncio.sleep(0.1)
+
+    with pytest.raises(Deadlock, match=r"leads nowhere[\s\S]*stuck"):
+        run(main, limit=400.0)
 
 
 @pytest.mark.virtual_time
