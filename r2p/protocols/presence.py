@@ -160,7 +160,9 @@ class Presence:
                 before = self._own.relayed(("module", name))
                 if isinstance(before, ModuleToken):
                     token = msgspec.structs.replace(token, flags=before.flags)
-                self._relay(("module", name), token, gone=bool(flags & management.HELLO_LEAVING))
+                gone = bool(flags & management.HELLO_LEAVING)
+                if not gone or (isinstance(before, ModuleToken) and before.instance == instance):
+                    self._relay(("module", name), token, gone=gone)  # its next start may have been told already
             case management.Alive(name, flags):
                 known = self._own.relayed(("module", name))
                 if isinstance(known, ModuleToken):

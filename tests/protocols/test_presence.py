@@ -381,6 +381,19 @@ def test_r2p_modules_behind_a_gateway(world: World) -> None:
     assert "ROBOT" not in pc.modules
 
 
+def test_a_module_behind_a_gateway_starts_anew(world: World) -> None:
+    """Its new start is told before the farewell of the old one, which takes back nothing else."""
+    gateway = world.add("GW", 1)
+    pc = world.add("PC", 2)
+    for instance, flags in ((98, 0), (99, 0), (98, management.HELLO_LEAVING)):
+        world.act(1, gateway.relay(world.now, management.Hello("ROBOT", instance, flags, 1)))
+        world.settle()
+    assert pc.modules["ROBOT"].instance == 99
+    world.act(1, gateway.relay(world.now, management.Hello("ROBOT", 99, management.HELLO_LEAVING, 1)))
+    world.settle()
+    assert "ROBOT" not in pc.modules
+
+
 def test_a_gateway_dies_and_takes_along_what_was_behind_it(world: World) -> None:
     gateway = world.add("GW", 1)
     pc = world.add("PC", 2)
