@@ -19,7 +19,7 @@ from r2p.codecs import UnknownType, management
 from r2p.errors import DecodeError
 from r2p.names import module_alias
 from r2p.printable import get_logger
-from r2p.protocols.bridging.base import MOST_PORTS, Changed, Port, Probe, Say, SayToClients, State
+from r2p.protocols.bridging.base import MOST_PORTS, Action, Changed, Port, Probe, Say, SayToClients, State
 from r2p.protocols.bridging.clients import FIRST
 from r2p.protocols.bridging.tree import Tree
 from r2p.sample import Source
@@ -79,6 +79,8 @@ class Bridge:
         self._by_number: dict[int, BridgePort] = {}
         self._numbers = itertools.count(FIRST)
         self._held = Held()
+        self._changed: set[int] = set()
+        """Ports whose place in the tree is another one, which is yet to be told to the rest."""
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
     def make_topic(self, name: str, waker: Waker) -> Topic:
@@ -134,7 +136,8 @@ class Bridge:
         self.presences.forget(port)
 
     def _port_changed(self, port: BridgePort) -> None:
-        self.relays.port_changed(port)
+        if not port.link.stats.lost.guard(self.relays.port_changed, port):
+            self._changed.add(port.number)
         self._act()
 
     def close(self) -> None:
@@ -310,36 +313,51 @@ class Bridge:
         now = self._clock.monotonic()
         try:
             self.tree.poll(now)
+            self._act()
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
             self._alarm.set(now + TRY_AGAIN)
-        else:
-            self._act()
 
     def _failed(self, error: Exception) -> None:
         internal_error_of((port.link.stats.lost for port in self.ports.values()), error)
 
     def _act(self) -> None:
-        changed: set[int] = set()
-        for action in self.tree.take():
-            if isinstance(action, SayToClients):
+        """Do what the tree says. Where something raises, that is counted and the rest is done."""
+        try:
+            for action in self.tree.take():
+                self._do(action)
+            for port in [port for number in self._changed if (port := self._by_number.get(number)) is not None]:
+                self._see_changed(port)
+            self._changed.intersection_update(self._by_number)
+            if self._held and not any(port.place.resumes for port in self.ports.values()):
+                self._held.release(self._failed)
+        finally:
+            again = self._clock.monotonic() + TRY_AGAIN if self._changed else None
+            dues = [due for due in (self.tree.next_deadline(), again) if due is not None]
+            self._alarm.set(min(dues, default=None))
+
+    def _do(self, action: Action) -> None:
+        if isinstance(action, SayToClients):
+            try:
                 self._say_to_clients(management.encode(action.message))
-                continue
-            port = self._by_number.get(action.port)
-            if port is None or not port.link.up:
-                continue
-            if isinstance(action, Changed):
-                changed.add(action.port)
-            else:
-                port.link.stats.lost.guard(self._send, port, action)
-        for number in changed:
-            port = self._by_number[number]
-            port.link.stats.lost.guard(self._state_changed, port)
-            self.relays.port_changed(port)
-            self.presences.changed(port)
-        if self._held and not any(port.place.resumes for port in self.ports.values()):
-            self._held.release(self._failed)
-        self._alarm.set(self.tree.next_deadline())
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next action follows
+                self._failed(error)
+            return
+        port = self._by_number.get(action.port)
+        if port is None or not port.link.up:
+            return
+        if isinstance(action, Changed):
+            self._changed.add(action.port)
+        else:
+            port.link.stats.lost.guard(self._send, port, action)
+
+    def _see_changed(self, port: BridgePort) -> None:
+        """Its place in the tree is another one; where that can't be told to the rest, it is tried again."""
+        lost = port.link.stats.lost
+        lost.guard(self._state_changed, port)
+        if lost.guard(self.relays.port_changed, port):
+            self._changed.discard(port.number)
+        lost.guard(self.presences.changed, port)
 
     def _send(self, port: BridgePort, action: Say | Probe) -> None:
         if isinstance(action, Say):

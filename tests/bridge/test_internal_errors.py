@@ -11,21 +11,22 @@ import pytest
 import r2p
 from r2p.bridge import Standby
 from r2p.bridge.held import Held
-from r2p.codecs.management import Endpoint, Hello
+from r2p.codecs.management import Bridge, Endpoint, Hello
 from r2p.msg import Led
+from r2p.protocols.bridging.base import SayToClients
 from r2p.sample import Sample, Source
-from tests.bridge.test_bridge import drain, gateway, node
+from tests.bridge.test_bridge import Tap, drain, gateway, node
 from tests.faults import once
 
 if TYPE_CHECKING:
-    from r2p.bridge import Bridge
+    from r2p import bridge
 
 pytestmark = [pytest.mark.virtual_time, pytest.mark.internal_errors]
 
 SETTLED = 5.0
 
 
-def bridge_of(module: r2p.Module) -> Bridge:
+def bridge_of(module: r2p.Module) -> bridge.Bridge:
     hub = module._hub
     assert hub is not None
     assert hub.bridge is not None
@@ -64,6 +65,32 @@ async def test_what_the_tree_sends(monkeypatch: pytest.MonkeyPatch) -> None:
         bridge_of(module)._act()
         await asyncio.sleep(1.0)
         assert (errors(module), bool(sent)) == ([1, 0], True)
+
+
+@pytest.mark.parametrize("part", ["relays", "presences"])
+async def test_what_follows_from_a_new_place_in_the_tree(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Topics and modules pass, though it raised where a link got its place; and the gateway is heard on."""
+    async with r2p.Module("GW", via=["memory:a", "memory:b"], bridge=True) as module:
+        target = getattr(bridge_of(module), part)
+        method = {"relays": "port_changed", "presences": "changed"}[part]
+        monkeypatch.setattr(target, method, once(getattr(target, method)))
+        await asyncio.sleep(SETTLED)
+        assert sum(errors(module)) == 1
+        tap = Tap("a")
+        await passes()
+        assert any(isinstance(each, Bridge) for each in tap.heard)
+
+
+async def test_what_is_said_to_clients(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway() as module:
+        bridge = bridge_of(module)
+        say = once(bridge._say_to_clients)
+        monkeypatch.setattr(bridge, "_say_to_clients", say)
+        monkeypatch.setattr(bridge.tree, "take", lambda: [SayToClients(Bridge(7, 0, 1, 0, 7, bytes(12)))])
+        bridge._act()
+        monkeypatch.undo()
+        assert errors(module) == [1, 1]
+        await passes()
 
 
 @pytest.mark.parametrize("kind", [Hello, Endpoint])
