@@ -60,8 +60,10 @@ class Streams:
         self._latched = latched
         self._subscribe = subscribe
         self._streams: dict[str, Stream] = {}
-        self._kept: dict[str, Flows] = {}
+        self._kept: dict[str, tuple[Flows, dict[tuple[int, int], int]]] = {}
+        """How far the publishers of each topic had come when the link went down, and a copy of that."""
         self._kept_until = 0.0
+        self._up = False
 
     def begin(self, topic: Topic) -> None:
         """Somebody here subscribes the topic, or its type has changed."""
@@ -80,18 +82,22 @@ class Streams:
 
     def interrupted(self) -> None:
         """The link is down: what is sent until it is back is lost, so keep how far each publisher had come."""
-        if len(self._kept) >= SENDERS:
+        self._up = False
+        if len(self._kept) >= SENDERS or self.loop.time() >= self._kept_until:
             self._kept.clear()
-        self._kept |= {name: stream.flows for name, stream in self._streams.items()}
+        self._kept |= {name: (stream.flows, _progress(stream.flows)) for name, stream in self._streams.items()}
 
     def resumed(self) -> None:
         """It is up again."""
+        self._up = True
         self._kept_until = self.loop.time() + _RESUME
 
     def _flows(self, topic: str) -> "Flows":
         """How far the publishers of a topic had come when the link went down; else it begins anew."""
-        flows = self._kept.pop(topic, {})
-        return flows if self.loop.time() < self._kept_until else {}
+        if self.loop.time() >= self._kept_until:
+            self._kept.clear()
+        flows, _ = self._kept.pop(topic, ({}, {}))
+        return flows
 
     def window(self, topic: Topic) -> int:
         """How many messages may be on the way; 0: as many as come, the subscribers would rather lose some."""
@@ -134,6 +140,9 @@ class Streams:
         """Nobody here subscribes the topic any more."""
         stream = self._streams.pop(name, None)
         if stream is not None:
+            _, before = self._kept.get(name, ({}, {}))
+            if self._up and before != _progress(stream.flows):  # it went on after the outage, and ends by itself
+                self._kept.pop(name, None)
             stream.close()
             stream.topic.inlets -= len(stream.senders)
             stream.topic.memories.remove(self)
@@ -147,3 +156,8 @@ class Streams:
     def close(self) -> None:
         for name in list(self._streams):
             self.shut_all(name)
+
+
+def _progress(flows: Flows) -> dict[tuple[int, int], int]:
+    """The serial that is expected of each publisher that has been heard."""
+    return {key: flow.next for key, flow in flows.items() if flow.next >= 0}

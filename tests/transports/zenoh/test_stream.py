@@ -319,6 +319,40 @@ async def test_what_came_by_another_link_in_the_meantime_is_not_lost() -> None:
     assert ring.stats.lost == Counter()
 
 
+async def test_a_topic_that_went_on_after_an_outage_begins_anew_when_it_was_closed() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.interrupted()
+    ring.streams.resumed()
+    ring.put(6)
+    await turns()
+    assert ring.stats.lost == {"on the way": 2}
+    ring.streams.shut_all("leds")  # nobody here subscribes it any more
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(500)
+    await turns()
+    assert ring.stats.lost == {"on the way": 2}
+
+
+async def test_a_later_outage_does_not_count_what_was_sent_before_it_to_nobody_here() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.interrupted()
+    ring.streams.shut_all("leds")
+    ring.streams.resumed()
+    await asyncio.sleep(60)
+    ring.streams.interrupted()
+    ring.streams.resumed()
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(500)
+    await turns()
+    assert ring.stats.lost == Counter()
+
+
 async def test_who_unsubscribes_tells_those_who_publish_and_counts_what_waits() -> None:
     ring = Ring(queue=2)
     ring.streams.open(ring.topic, SIZE, 7)
