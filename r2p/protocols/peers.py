@@ -14,7 +14,7 @@ from r2p.protocols.events import Joined, ModuleInfo, Shape, Source
 MOST = 4096
 """Peers on one link."""
 
-ANSWERED = 1_000_000_000
+ANSWER_LOST_AFTER = 1_000_000_000
 """Ns after which an answer has come, or was lost: less than a round of repetition."""
 
 
@@ -95,7 +95,7 @@ class Peers:
         peer.requests[topic] = False
         if stale is None:
             self._subscribed[topic] += 1
-        elif not stale and not (unanswered and now - peer.joined_at[topic] >= ANSWERED):
+        elif not stale and not (unanswered and now - peer.joined_at[topic] >= ANSWER_LOST_AFTER):
             return False
         peer.joined_at[topic] = now
         return True

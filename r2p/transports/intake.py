@@ -50,7 +50,8 @@ class LinkStats(msgspec.Struct):
         """Count what another link has counted, too; its `losses` are those of its discovery as well."""
         for name in ("sent", "received", "bytes_sent", "bytes_received", "ups"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.lost.update(losses)
+        for reason, count in losses.items():
+            dict.__setitem__(self.lost, reason, self.lost[reason] + count)  # its link has logged it
         self.faults.update(other.faults)
 
 

@@ -170,11 +170,13 @@ class LineLink(Link):
     def _sound_lines(self, data: bytes) -> list[debug.Line]:
         """What there is but for the line whose reading raised: each is read for itself."""
         lines: list[debug.Line] = []
+        self._reader.drops = {}  # up to what raised they are counted already
         for piece in data.splitlines(keepends=True):
             try:
                 lines += self._reader.feed(piece)
             except Exception:  # noqa: BLE001 - counted before
                 self._reader = debug.Reader(self.stats.lost)
+        self._reader.drops = self.stats.lost
         return lines
 
     def carrier_full(self) -> None:
@@ -222,9 +224,11 @@ class LineLink(Link):
             if self._waiting >= self._limit:
                 self._flush()
             return
+        if real_time:
+            self._held = topic, sample  # lost if the carrier breaks by it
         self._send_at_once(line)
         if real_time:
-            self._hold(topic, sample)
+            self._see_sent()
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         if len(self._urgent) >= _URGENT_MOST if urgent else self._waiting >= self._limit + _MANAGEMENT_BUFFER:
@@ -291,7 +295,7 @@ class LineLink(Link):
             self._grace.cancel()
             self._grace = None
             self._limit = self._buffer
-            if self.up:
+            if self.up and self._carrier is not None:  # else what waits for room is lost with the connection
                 self.made_room()
 
     def _send_at_once(self, line: bytes) -> None:
@@ -342,11 +346,11 @@ class LineLink(Link):
 
     # The sample of a real-time publisher that the carrier could not send at once: it is on its way when all is sent.
 
-    def _hold(self, topic: str, sample: Sample) -> None:
-        if self._blocked or not self.up:
-            self._held = topic, sample
+    def _see_sent(self) -> None:
         if not self.up:
             self._lose_held()
+        elif not self._blocked:
+            self._held = None
 
     def _see_held_off(self) -> None:
         held, self._held = self._held, None

@@ -119,6 +119,7 @@ class _Port(Connection):
         self._reading = False
         self._full = False
         self._closing = False
+        self._unconfirmed = 0
 
     def start(self) -> None:
         """Begin to read, and tell the link."""
@@ -155,6 +156,10 @@ class _Port(Connection):
 
     def abort(self) -> None:
         self._end("closed")
+
+    @property
+    def unconfirmed(self) -> int:
+        return self._unconfirmed
 
     def _read(self) -> None:
         try:
@@ -205,6 +210,7 @@ class _Port(Connection):
         self.ended.set()
         self.pause()
         self._wait_no_more()
+        self._unconfirmed = len(self._unsent) + _queued(self._fd)
         self._device.close()
         self._link.disconnected(reason)
 
@@ -231,7 +237,7 @@ def _tell_end_from_silence(fd: int) -> None:
 
 
 def _queued(fd: int) -> int:
-    """Bytes that the kernel has not sent yet; 0 where the driver does not tell."""
+    """Bytes that the kernel has not sent yet; 0 where the driver does not tell, or its device is gone."""
     try:
         return int.from_bytes(fcntl.ioctl(fd, termios.TIOCOUTQ, bytes(4)), "little")
     except OSError:

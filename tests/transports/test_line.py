@@ -187,6 +187,23 @@ async def test_what_waited_when_the_line_broke_is_never_sent() -> None:
         assert script.link.losses == {"link down": 6 - sent}
 
 
+async def test_what_waits_for_a_new_connection_that_breaks_again_is_lost() -> None:
+    """Firmware takes no data in the first 50 ms: what waits for them was never sent."""
+    async with scripted() as (script, _, node):
+        publisher = node.advertise("leds", Led)
+        script.hear(manage(SUBSCRIBE))
+        await asyncio.sleep(1)
+        script.link.disconnected("broken")
+        script.link.connected(script)
+        publishing = asyncio.create_task(publisher.publish(Led()))
+        await asyncio.sleep(0.01)
+        script.link.disconnected("broken again")
+        await publishing
+        assert script.topics("leds") == []
+        assert script.link.stats.sent == 0
+        assert script.link.losses == {"link down": 1}
+
+
 async def test_what_was_on_the_way_when_the_line_broke_is_unknown() -> None:
     async with scripted() as (script, _, node):
         publisher = node.advertise("leds", Led)
@@ -570,10 +587,10 @@ async def test_a_line_whose_reading_raises_does_not_stop_the_others(monkeypatch:
         subscriber = node.subscribe("leds", None, lossy=True)
         script.hear(manage(m.SubscribeResponse("leds", 1, 1)))
         lines = b"".join(line("leds", str(number).encode()) for number in range(5))
-        script.hear(lines[:-5])
-        script.hear(lines[-5:])
+        script.hear(b"before\r\n" + lines[:-5])
+        script.hear(lines[-5:] + b"after\r\n")
         assert [sample.data for sample in subscriber._sink.queue] == [b"0", b"2", b"3", b"4"]
-        assert script.link.losses == {"internal error": 1}
+        assert script.link.losses == {"internal error": 1, "garbage": 2}
 
 
 async def test_a_flood_of_modules_that_come_and_go_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:

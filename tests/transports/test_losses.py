@@ -8,6 +8,7 @@ import pytest
 
 import r2p
 from r2p.clock import clock_of
+from r2p.transports.intake import LinkStats
 from r2p.transports.losses import Losses
 from tests.transports.conversation import Script
 
@@ -30,6 +31,17 @@ async def test_each_reason_is_logged_once_a_second(caplog: pytest.LogCaptureFixt
     losses["garbage"] += 1
     assert lines(caplog)[2:] == ["link lab drops: garbage (4 so far)"]
     assert losses == {"garbage": 4, "checksum": 2, "link down": 0}
+
+
+async def test_the_sum_of_closed_links_is_not_logged_again(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, logger="r2p.link")
+    closed = LinkStats()
+    for _ in range(2):
+        link = LinkStats(lost=Losses("lab"))
+        link.lost["garbage"] += 1
+        closed.add(link, link.lost)
+    assert closed.lost == {"garbage": 2}
+    assert lines(caplog) == ["link lab drops: garbage (1 so far)"] * 2
 
 
 async def test_bad_bytes_and_bad_management_are_told(caplog: pytest.LogCaptureFixture) -> None:

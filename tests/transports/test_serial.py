@@ -135,6 +135,38 @@ async def test_only_a_short_queue_is_left_to_the_kernel(board: Board, monkeypatc
             await until(lambda: queued[-1])
 
 
+@pytest.mark.parametrize(("queued", "unknown"), [(0, 1), (10_000, 3)])
+@pytest.mark.parametrize("publisher_class", [r2p.NonRealTime(), r2p.Sporadic(3600.0)])
+async def test_what_had_not_been_sent_when_the_device_went(
+    board: Board,
+    monkeypatch: pytest.MonkeyPatch,
+    queued: int,
+    unknown: int,
+    publisher_class: r2p.NonRealTime | r2p.Sporadic,
+) -> None:
+    """By the port, and by the kernel, where that tells; one with a deadline that the port had not sent is lost."""
+    in_kernel = 0
+    board.plug()
+    async with asyncio.timeout(GUARD), on(board) as module, node_in(module) as node:
+        publisher = node.advertise("leds", Led, publisher_class)
+        board.say(manage(m.SubscribeRequest("leds", 5, 1)))
+        await publisher.wait_subscriber()
+        monkeypatch.setattr(port, "_queued", lambda _fd: in_kernel)
+        for _ in range(2):
+            await publisher.publish(Led())
+            await asyncio.sleep(0)
+        in_kernel = 10_000
+        await publisher.publish(Led())
+        in_kernel = queued
+        board.pull()
+        link = module.links[0]
+        await until(lambda: not link.up)
+        lost = isinstance(publisher_class, r2p.Sporadic)
+        assert link.losses["link down"] == lost
+        assert link.losses["unknown at disconnect"] == unknown - lost
+        assert link.stats.sent == 3 - lost
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="another ioctl")
 def test_the_kernel_tells_what_it_has_queued(board: Board) -> None:
     board.plug()
