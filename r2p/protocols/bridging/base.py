@@ -28,6 +28,8 @@ PROBE = 2_000 * _MS
 PROBE_MEMORY = 7_000 * _MS
 PROBE_PROVEN = 300 * _MS
 """A gateway of which only a probe was heard for so long is not on this network itself."""
+STRANGE_PROBES = 256
+"""Probes of gateways in no mesh of ours that are kept for each port."""
 
 MOST_PORTS = 250
 """Ports that other gateways may use."""

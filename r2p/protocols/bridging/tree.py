@@ -33,6 +33,7 @@ from r2p.protocols.bridging.base import (
     PROBE_MEMORY,
     PROBE_PROVEN,
     SETTLE,
+    STRANGE_PROBES,
     TICK,
     TICK_ALONE,
     TICK_LISTENING,
@@ -210,8 +211,18 @@ class Tree:
         port = self.ports.get(number)
         place = gateway, its_port
         if port is not None and place != (self.gateway, number % 13) and gateway not in port.gateways:
+            if place not in port.probes and not self._has_room(port, gateway):
+                port.lost["too many probes"] += 1
+                return
             port.probes = port.probes | {place: (port.probes.get(place, (now, now))[0], now)}
             self._look(now)
+
+    def _has_room(self, port: Port, gateway: int) -> bool:
+        """Whether a probe of this gateway can be kept: of those that are in no mesh of ours, which may be forged, only
+        some are, should they turn up later.
+        """
+        members = {self.gateway, *self._atlas.members}
+        return gateway in members or sum(each not in members for each, _ in port.probes) < STRANGE_PROBES
 
     # What follows from it
 

@@ -9,7 +9,7 @@ import pytest
 
 from r2p.codecs.management import Bridge, Mesh, encode
 from r2p.protocols.bridging.atlas import CHANGES, MOST_RECORDS, Atlas
-from r2p.protocols.bridging.base import State
+from r2p.protocols.bridging.base import STRANGE_PROBES, State
 from r2p.protocols.bridging.mesh import MOST_HEARD, parts
 from r2p.protocols.bridging.tree import Tree
 from tests.protocols.bridging.wires import MS, Gateway, World
@@ -38,6 +38,19 @@ def states(gateway: Gateway) -> list[str]:
 
 def reached(made: World, message: int) -> dict[str, int]:
     return {network: count for (number, network), count in made.seen.items() if number == message}
+
+
+def test_forged_probes_are_not_kept_without_end() -> None:
+    tree = Tree(5)
+    tree.open(0, 0)
+    port = tree.ports[0]
+    for gateway in range(1000, 1000 + STRANGE_PROBES + 3):
+        tree.probed(SECOND, 0, gateway, 1)
+    assert (len(port.probes), port.lost) == (STRANGE_PROBES, {"too many probes": 3})
+    tree.probed(SECOND, 0, 5, 1)  # our own, and what is known already
+    tree.probed(2 * SECOND, 0, 1000, 1)
+    assert (len(port.probes), port.probes[1000, 1]) == (STRANGE_PROBES + 1, (SECOND, 2 * SECOND))
+    assert port.lost.total() == 3
 
 
 def test_a_gateway_listens_then_forwards() -> None:
