@@ -72,7 +72,7 @@ class Bridge:
         self._policy = Policy(options)
         self.relays = Relays(self.ports, space, self._policy)
         self.presences = Presences(self.name, instance, self.ports, space, self._policy, self.relays.retyped)
-        self.names = ModuleNames(self._policy, self.presences.modules)
+        self.names = ModuleNames(self._policy, self.presences.modules, self.presences.foreign)
         self._space = space
         self._clock = space.clock
         self._told = told
@@ -265,16 +265,21 @@ class Bridge:
         name = self.names.meant(order.module, port.name)
         if name is None:
             return False
+        passed, refused, known = False, 0, False
         for other in self._open_from(port):
             called = self.names.called(name, other.name)
             if called is None:
                 continue
             reason = self._order_denied(port, other, order, called)
             if not reason:
+                passed = True
                 named = msgspec.structs.replace(order, module=module_alias(called))
                 other.link.write_management(management.encode(named), urgent=True)
-            else:
-                self._refuse_order(port, order, data[-1], reason, known=called in other.link.discovery.modules)
+            elif not known:
+                known = called in other.link.discovery.modules
+                refused = reason if known else refused or reason
+        if refused and (known or not passed):
+            self._refuse_order(port, order, data[-1], refused, known=known)
         return False
 
     def _refuse_order(self, port: BridgePort, order: _Order, kind: int, reason: int, *, known: bool) -> None:

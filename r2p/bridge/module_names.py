@@ -15,11 +15,14 @@ logger = get_logger("r2p.bridge")
 
 
 class ModuleNames:
-    """`names` gives the modules that are known, with the link where each is foreign ("": it is the robot's)."""
+    """`names` gives the modules that are known, with the link where each is foreign ("": it is the robot's), and
+    `foreign` that link for one of them.
+    """
 
-    def __init__(self, policy: Policy, names: Callable[[], dict[str, str]]) -> None:
+    def __init__(self, policy: Policy, names: Callable[[], dict[str, str]], foreign: Callable[[str], str]) -> None:
         self._policy = policy
         self._names = names
+        self._foreign = foreign
         self._doubted: set[str] = set()
 
     def meant(self, wire: str, link: str) -> str | None:
@@ -42,7 +45,7 @@ class ModuleNames:
 
     def called(self, name: str, link: str) -> str | None:
         """What the module is called on a link."""
-        foreign = self._names().get(name, "")
+        foreign = self._foreign(name)
         if foreign:
             return name if link == foreign or not self._policy.prefix(link) else None
         return self._policy.prefix(link) + name

@@ -221,12 +221,17 @@ class Presences:
 
     def modules(self) -> dict[str, str]:
         """The modules by their name on the robot, with the link where each is foreign ("": it is the robot's)."""
-        found = {}
-        for key, facts in self._sources.items():
-            if key[0] == "module":
-                link = min(facts, key=lambda each: facts[each].rank)
-                found[str(key[1])] = link if facts[link].rank[0] else ""
-        return found
+        return {
+            name: self.foreign(name) for kind, name, *_ in self._sources if kind == "module" and isinstance(name, str)
+        }
+
+    def foreign(self, name: str) -> str:
+        """The link where the module of this name is foreign; "": it is the robot's, or not known."""
+        facts = self._sources.get(("module", name))
+        if facts is None:
+            return ""
+        link = min(facts, key=lambda each: facts[each].rank)
+        return link if facts[link].rank[0] else ""
 
     # What is there
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -290,6 +291,46 @@ async def test_orders_pass() -> None:
         await asyncio.sleep(0.1)
         assert b.orders() == orders
         assert a.orders() == []
+
+
+async def test_an_order_that_is_delivered_is_not_refused(caplog: pytest.LogCaptureFixture) -> None:
+    """Other links are read-only, but its module is not there."""
+    async with gateway(BridgeOptions(read_only=("memory:c", "memory:d")), networks="abcd") as gw:
+        a, b = Tap("a"), Tap("b")
+        b.say(management.Alive("IMU1"))
+        await asyncio.sleep(1.0)
+        a.say(management.Stop("IMU1"))
+        await asyncio.sleep(0.1)
+        assert b.orders() == [management.Stop("IMU1")]
+        assert all("order refused" not in link.losses for link in gw.links)
+        assert "is refused" not in caplog.text
+
+
+async def test_an_order_that_goes_nowhere_is_refused_once() -> None:
+    async with gateway(BridgeOptions(read_only=("memory:b", "memory:c", "memory:d")), networks="abcd") as gw:
+        a = Tap("a")
+        a.say(management.Stop("IMU1"))
+        await asyncio.sleep(0.1)
+        assert gw.links[0].losses["order refused"] == 1
+        Tap("d").say(management.Alive("IMU1"))
+        await asyncio.sleep(0.5)
+        a.say(management.Stop("IMU1"))
+        await asyncio.sleep(0.1)
+        assert gw.links[0].losses["order refused"] == 2
+        assert [type(each) for each in a.heard if isinstance(each, management.Denied)] == [management.Denied]
+
+
+async def test_an_order_without_a_prefix_does_not_ask_for_all_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway(networks="abcd") as gw:
+        assert gw._hub is not None
+        assert gw._hub.bridge is not None
+        asked = Mock(return_value={})
+        monkeypatch.setattr(gw._hub.bridge.names, "_names", asked)
+        a, b = Tap("a"), Tap("b")
+        a.say(management.Stop("IMU1"))
+        await asyncio.sleep(0.1)
+        assert b.orders() == [management.Stop("IMU1")]
+        asked.assert_not_called()
 
 
 async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.MonkeyPatch) -> None:

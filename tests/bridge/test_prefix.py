@@ -133,7 +133,7 @@ async def test_what_an_alias_stands_for_may_come_after_it() -> None:
 
 def test_an_alias_of_two_modules_is_nobodys(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("r2p.bridge.module_names.module_alias", lambda name: "robxxxx")
-    names = ModuleNames(Policy(BridgeOptions(prefix="robot1/")), lambda: {"A": "", "B": ""})
+    names = ModuleNames(Policy(BridgeOptions(prefix="robot1/")), lambda: {"A": "", "B": ""}, lambda _: "")
     assert names.meant("robxxxx", "zenoh:") is None
     assert names.meant("robxxxx", "zenoh:") is None
     assert [record.message for record in caplog.records] == [
