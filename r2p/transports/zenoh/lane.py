@@ -56,7 +56,10 @@ class Lane:
         self._put = put
 
     def send(self, stats: "LinkStats", error: type[Exception], *, batching: bool) -> None:
-        """Send what waits; zenoh drops it where the network is too slow. `error`: the session is closed."""
+        """Send what waits; zenoh drops it where the network is too slow. `error`: the session is closed.
+
+        What is not sent is counted here, and subscribers need not miss it, too: its serials are those of what follows.
+        """
         waiting, self.waiting = self.waiting, []
         serial = self.flow.serial - len(waiting) + 1
         for samples in _packets(waiting) if batching and len(waiting) > 1 else [[each] for each in waiting]:
@@ -72,7 +75,8 @@ class Lane:
             else:
                 stats.sent += len(samples)
                 stats.bytes_sent += len(data)
-            serial += len(samples)
+                serial += len(samples)
+        self.flow.serial = serial - 1
 
     def _header(self, samples: list[Sample], serial: int) -> bytes:
         """What comes from another link has crossed a gateway more."""

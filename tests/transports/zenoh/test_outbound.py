@@ -85,6 +85,7 @@ async def test_what_does_not_fit_is_counted() -> None:
         lane.waiting.append(Sample(b"x", Source("PC1", "talk"), 1, sequence=sequence))
         lane.send(stats, ConnectionError, batching=True)
     assert (stats.sent, dict(stats.lost)) == (MOST_URGENT, {"send buffer full": 3})
+    assert lane.flow.serial == MOST_URGENT  # so the next one that is sent leaves no gap to count once more
     busy.free.set()
     await asyncio.to_thread(out.finish)
     assert len(busy.calls) == MOST_URGENT
