@@ -103,7 +103,8 @@ class Stream:
         self.flows = flows
         """How far each session has come in each class."""
         self._blocked: _Blocked | None = None
-        self._waiting: deque[tuple[_Lane, int, Sample]] = deque()
+        self._waiting: deque[tuple[_Lane, int, Sample | None]] = deque()
+        """What is behind the message that is blocked; None: one that was refused, and is only told of."""
         self._paused = False
         self._queueing = False
         self._shape = _shape(topic)
@@ -139,7 +140,7 @@ class Stream:
             tap.close()
         self._take_leave()
         if self._waiting:
-            self._streams.stats.lost["not subscribed"] += len(self._waiting)
+            self._streams.stats.lost["not subscribed"] += sum(sample is not None for _, _, sample in self._waiting)
             self._waiting.clear()
         blocked, self._blocked = self._blocked, None
         if blocked is not None and blocked.held is not None:
@@ -151,7 +152,8 @@ class Stream:
         for (session, publisher_class), flow in latest:
             if flow.next >= 0:
                 last = (flow.next - 1) & SERIAL_WRAP
-                self._streams.credit(self.topic.name, session, publisher_class, last, leaving=True)
+                credit, guard = self._streams.credit, self._streams.stats.lost.guard
+                guard(credit, self.topic.name, session, publisher_class, last, leaving=True)
 
     def arrived(self, arrived: "zenoh.Sample | None") -> None:
         """In the loop: hand out what is there, about TURN messages in one turn."""
@@ -256,8 +258,7 @@ class Stream:
         size, sequence, stamp = len(sample.data), sample.sequence, sample.stamp
         flow, heard = lane.flow, lane.heard
         if size != lane.usual and not self._may_have(lane, size):
-            if serial == flow.next:  # it is no gap: it came, and was counted
-                flow.next = serial + 1
+            self._refused(lane, serial)
             return False
         lane.usual = size
         if serial == flow.next:
@@ -273,6 +274,23 @@ class Stream:
         stats.received += 1
         stats.bytes_received += size
         return True
+
+    def _refused(self, lane: _Lane, serial: int) -> None:
+        """A message that nobody here can use. It is no gap, as it came and was counted; and it is as good as taken, or
+        its publisher would wait for it: after those that wait for room.
+        """
+        gap = lane.flow.gap(serial)
+        if gap < 0:
+            return
+        if gap:
+            self._streams.count_gap(self.topic.name, lane.source, gap)
+            lane.flow.skipped(gap)
+        if self._blocked is None or lane.publisher_class != _NRT:
+            self._taken(lane, serial)
+        elif len(self._waiting) < _MOST:
+            self._waiting.append((lane, serial, None))
+        else:
+            lane.flow.skipped(1)
 
     def _came_again(self, lane: _Lane, serial: int, sequence: int) -> None:
         """A message that was here before: by this way, as somebody wants to know whether it came, or by another one."""
@@ -322,9 +340,9 @@ class Stream:
             self._streams.stats.lost["receive queue full"] += 1
             lane.flow.skipped(1)
 
-    def _deliver(self, lane: _Lane, serial: int, sample: Sample) -> None:
-        sinks = self._delivered(sample)
-        if sinks is None:
+    def _deliver(self, lane: _Lane, serial: int, sample: Sample | None) -> None:
+        sinks = None if sample is None else self._delivered(sample)
+        if sample is None or sinks is None:
             self._taken(lane, serial)
         else:
             self._block(lane, serial, sample, sinks)

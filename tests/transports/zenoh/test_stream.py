@@ -176,6 +176,32 @@ async def test_a_message_of_the_wrong_size_is_counted_once() -> None:
     assert numbers(ring.sink) == [1, 5]
 
 
+@pytest.mark.parametrize("queue", [4 * WINDOW, 1])
+async def test_messages_that_nobody_can_use_earn_credit(queue: int) -> None:
+    """Else a publisher would wait for those who will never take them. They do so behind what waits for room."""
+    ring = Ring(queue=queue)
+    ring.put(1, 2)
+    for serial in range(3, WINDOW, 64):
+        ring.put(serial, 64, size=SIZE + 1)
+    await turns(2 * WINDOW // 64)
+    last = ring.credits[-1][1]
+    assert (last == 1) == (queue == 1)
+    ring.sink.queue.clear()
+    ring.sink.refill()
+    await turns()
+    assert ring.credits[-1][1] > WINDOW // 2
+    assert ring.stats.lost == {"wrong size": 2048}
+
+
+async def test_a_message_of_the_wrong_size_behind_a_gap_is_counted_once() -> None:
+    ring = Ring(queue=10)
+    ring.put(1)
+    ring.put(4, size=SIZE + 1)
+    ring.put(5)
+    await turns()
+    assert ring.stats.lost == {"wrong size": 1, "on the way": 2}
+
+
 async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
     ring = Ring(queue=10, typed=False)
     ring.put(1, 2)
@@ -351,6 +377,18 @@ async def test_a_later_outage_does_not_count_what_was_sent_before_it_to_nobody_h
     ring.put(500)
     await turns()
     assert ring.stats.lost == Counter()
+
+
+@pytest.mark.internal_errors
+async def test_a_last_credit_that_fails_does_not_keep_the_stream() -> None:
+    ring = Ring(queue=1)
+    ring.streams.open(ring.topic, SIZE, 7)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.credit = lambda *_, **__: 1 // 0  # type: ignore[assignment]
+    ring.streams.shut_all("leds")
+    assert (ring.topic.inlets, ring.topic.memories) == (0, [])
+    assert ring.stats.lost == {"internal error": 1, "not subscribed": 1}
 
 
 async def test_who_unsubscribes_tells_those_who_publish_and_counts_what_waits() -> None:
