@@ -8,12 +8,16 @@ compiled code. Where that is not understood, the answer is no.
 
 import dis
 import functools
+import gc
+import inspect
 from collections.abc import Iterator
-from types import CodeType
+from types import CodeType, FrameType
 from typing import NamedTuple
 
 _CATCHES = ("CHECK_EXC_MATCH", "CHECK_EG_MATCH")
 _MOST = 1024  # functions to remember
+_STEPS = {"async_generator_asend", "async_generator_athrow", "anext_awaitable", "coroutine_wrapper"}
+"""Types that stand between a coroutine and what it waits in, and tell of that to the garbage collector alone."""
 _CLOSES = ("COPY", "POP_EXCEPT", "RERAISE")  # how the compiled code of each handler ends
 
 
@@ -27,7 +31,9 @@ class _Handler(NamedTuple):
 
 def ends(coroutine: object) -> bool:
     """Whether an exception has reached a `finally` or an `async with` in which it waits, and no `except` is around."""
-    return cleans_up(coroutine) and _uncaught(list(_places(coroutine)))
+    return cleans_up(coroutine) and _uncaught(
+        [(each.f_code, each.f_lasti) for each in frames(coroutine, closing=False)]
+    )
 
 
 def _uncaught(places: list[tuple[CodeType, int]]) -> bool:
@@ -44,18 +50,39 @@ def cleans_up(coroutine: object, *, handlers: bool = False) -> bool:
 
     What comes after it does not matter: also in the middle of a program that goes on, clean-up is not to be disturbed.
     """
-    for code, offset in _places(coroutine):
-        for handler in _handlers(code):
+    for frame in frames(coroutine):
+        offset = frame.f_lasti
+        for handler in _handlers(frame.f_code):
             if handler.start <= offset < handler.end and (handlers or not handler.catches):
                 return True
     return False
 
 
-def _places(awaitable: object) -> Iterator[tuple[CodeType, int]]:
-    """Where each coroutine of a chain waits, the outermost first."""
-    while (frame := getattr(awaitable, "cr_frame", None)) is not None:
-        yield frame.f_code, frame.f_lasti
-        awaitable = getattr(awaitable, "cr_await", None)
+def frames(awaitable: object, *, closing: bool = True) -> Iterator[FrameType]:
+    """Where each coroutine and generator of a chain waits, the outermost first.
+
+    Without `closing`, up to an async generator that is closed: what ends that (GeneratorExit) does not leave `aclose`.
+    """
+    while awaitable is not None:
+        if type(awaitable).__name__ in _STEPS:
+            referents = gc.get_referents(awaitable)
+            if not closing and type(awaitable).__name__ == "async_generator_athrow" and len(referents) == 1:
+                return
+            awaitable = next((each for each in referents if _waits(each)), None)
+        elif inspect.iscoroutine(awaitable):
+            frame, awaitable = awaitable.cr_frame, awaitable.cr_await
+            if frame is not None:
+                yield frame
+        elif inspect.isasyncgen(awaitable):
+            frame, awaitable = awaitable.ag_frame, awaitable.ag_await
+            if frame is not None:
+                yield frame
+        else:
+            return
+
+
+def _waits(each: object) -> bool:
+    return inspect.iscoroutine(each) or inspect.isasyncgen(each) or type(each).__name__ in _STEPS
 
 
 _known: dict[int, tuple[CodeType, tuple[_Handler, ...]]] = {}

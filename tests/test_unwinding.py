@@ -11,7 +11,7 @@ import pytest
 from r2p.unwinding import cleans_up, ends
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Coroutine, Generator
+    from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Generator
     from typing import Self
 
 WORK, CATCH, INNER, END = "works", "catches", "cleans up, and goes on", "cleans up, and ends"
@@ -159,6 +159,58 @@ async def in_a_finally_that_returns() -> int:
     return 4  # pragma: no cover
 
 
+async def in_an_async_generator() -> None:
+    async for _ in cleaned_up():
+        pass
+
+
+async def cleaned_up() -> AsyncIterator[int]:
+    try:
+        yield 1
+        await fail()
+    finally:
+        await at(END)
+
+
+async def in_an_async_generator_that_is_closed() -> None:
+    async def numbers() -> AsyncGenerator[int]:
+        try:
+            yield 1
+        finally:
+            await at(INNER)
+
+    generator = numbers()
+    await at(WORK) or await anext(generator)
+    await generator.aclose()
+    await at(WORK)
+
+
+async def in_a_context_manager_that_is_a_generator() -> None:
+    @contextlib.asynccontextmanager
+    async def managed() -> AsyncIterator[None]:
+        try:
+            yield
+        finally:
+            await at(END)
+
+    async with managed():
+        await fail()
+
+
+async def in_a_generator_that_is_asked_with_a_default() -> None:
+    generator = cleaned_up()
+    await anext(generator, None)
+    await anext(generator, None)
+
+
+async def in_an_object_that_is_awaited() -> None:
+    class Job:
+        def __await__(self) -> Generator[Any, None, None]:
+            return in_finally().__await__()
+
+    await Job()
+
+
 @pytest.mark.parametrize(
     "shape",
     [
@@ -174,6 +226,11 @@ async def in_a_finally_that_returns() -> int:
         without_an_exception,
         with_all_kinds_of_things_in_it,
         in_a_finally_that_returns,
+        in_an_async_generator,
+        in_an_async_generator_that_is_closed,
+        in_a_context_manager_that_is_a_generator,
+        in_a_generator_that_is_asked_with_a_default,
+        in_an_object_that_is_awaited,
     ],
 )
 def test_each_place_is_told(shape: Callable[[], Coroutine[Any, None, object]]) -> None:

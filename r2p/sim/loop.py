@@ -15,8 +15,6 @@ in asyncio that goes through the loop works unchanged. What virtual time can't s
 from __future__ import annotations
 
 import asyncio
-import gc
-import inspect
 import itertools
 import random
 import selectors
@@ -28,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, Type
 from r2p.clock import SystemClock
 from r2p.durations import timeout_or_none
 from r2p.errors import Deadlock
+from r2p.unwinding import frames
 
 if TYPE_CHECKING:
     import contextvars
@@ -335,15 +334,9 @@ def _where(awaitable: object) -> str:
     """
     steps: list[str] = []
     topic: object = ""
-    while awaitable is not None:
-        if type(awaitable).__name__ == "async_generator_asend":  # what `async for` waits for
-            awaitable = next((each for each in gc.get_referents(awaitable) if inspect.isasyncgen(each)), None)
-        kind = "ag" if inspect.isasyncgen(awaitable) else "cr"
-        frame = getattr(awaitable, f"{kind}_frame", None)
-        if frame is not None:
-            code = frame.f_code
-            steps.append(f"{code.co_qualname} ({Path(code.co_filename).name}:{frame.f_lineno})")
-            topic = getattr(frame.f_locals.get("self"), "topic", topic)
-        awaitable = getattr(awaitable, f"{kind}_await", None)
+    for frame in frames(awaitable):
+        code = frame.f_code
+        steps.append(f"{code.co_qualname} ({Path(code.co_filename).name}:{frame.f_lineno})")
+        topic = getattr(frame.f_locals.get("self"), "topic", topic)
     waits = " > ".join(steps) or "not started"
     return f"{waits}, topic {topic}" if isinstance(topic, str) and topic else waits
