@@ -10,6 +10,7 @@ to end it. Whatever comes while an exception, the node's own or a cancellation, 
 import asyncio
 import functools
 import inspect
+import weakref
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, cast
 
@@ -180,7 +181,9 @@ class _Attempt:
         self._timer: asyncio.TimerHandle | None = None
         self._cancelled = False
         node.crashed = self.crash
-        node.unwinds = lambda: ends(body)
+        self._waits: Callable[[], object] = lambda: None
+        self._unwound = False
+        node.unwinds = self._unwinds
 
     def crash(self, error: Exception) -> None:
         if self._node.ending:
@@ -196,6 +199,17 @@ class _Attempt:
         self._node.end()
         if self._timer is None:
             self._cancel(self._loop.time())
+
+    def _unwinds(self) -> bool:
+        """Whether the function is in its clean-up. It stays where it is for as long as its task waits for one future.
+
+        That is asked at each tick of a periodic publisher, and much slower to find out than to remember.
+        """
+        waits = getattr(self._task, "_fut_waiter", None)  # asyncio's own
+        if waits is None or self._waits() is not waits:
+            self._unwound = ends(self._body)
+            self._waits = weakref.ref(waits) if waits is not None else lambda: None
+        return self._unwound
 
     def _cancel(self, since: float) -> None:
         """Cancel the function, which was to end at `since` (loop time), once it cleans nothing up any more."""

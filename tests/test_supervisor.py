@@ -19,7 +19,7 @@ from r2p.transports.link import Hub, Transport
 from tests.bench import Recorder, collect, crashes, elapsed, hold, led, local, settle
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable
 
 
 @pytest.mark.virtual_time
@@ -350,6 +350,17 @@ class Motor:
             stack.push_async_callback(self._ramp_down)
             await self._work()
 
+    async def _generator(self) -> None:
+        async for _ in self._values():
+            pass
+
+    async def _values(self) -> AsyncIterator[int]:
+        try:
+            yield 1
+            await self._work()
+        finally:
+            await self._ramp_down()
+
     async def _helper(self) -> None:
         await self._finally()
 
@@ -380,7 +391,7 @@ class Motor:
             raise OSError("signal")
 
 
-STYLES = pytest.mark.parametrize("style", ["finally", "with", "helper", "except"])
+STYLES = pytest.mark.parametrize("style", ["finally", "with", "helper", "generator", "except"])
 
 
 async def _ending(motor: Motor, end: Callable[[r2p.Module, r2p.Node], Awaitable[object]]) -> list[Exception]:
@@ -423,7 +434,7 @@ async def test_nothing_disturbs_the_clean_up_after_an_error_of_the_node(style: s
 
 
 @pytest.mark.virtual_time
-@pytest.mark.parametrize("style", ["finally", "with", "helper"])
+@pytest.mark.parametrize("style", ["finally", "with", "helper", "generator"])
 async def test_stop_and_close_wait_for_a_clean_up_that_has_begun(style: str) -> None:
     motor = Motor(fails=1.0, style=style)
     assert [str(e) for e in await _ending(motor, lambda module, _node: module.nodes["motor"].stop())] == ["sensor"]
@@ -451,6 +462,18 @@ async def test_stop_does_not_disturb_the_clean_up_after_a_crash(style: str) -> N
     motor = Motor(style=style)
     assert [str(error) for error in await _ending(motor, crash_and_stop)] == ["fill"]
     assert motor.did == ["ramp", "stopped"]
+
+
+@pytest.mark.virtual_time
+async def test_where_a_node_waits_is_looked_at_once_and_not_at_each_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = Recorder()
+    monkeypatch.setattr("r2p.supervisor.ends", lambda body: bool(looks(body)))
+    motor = Motor()
+    async with local() as module:
+        module.start(motor, name="motor")
+        await settle(1.005)
+        assert motor.fills == 100
+        assert len(looks.calls) == 1
 
 
 @pytest.mark.virtual_time
