@@ -180,7 +180,8 @@ async def in_an_async_generator_that_is_closed() -> None:
             await at(INNER)
 
     generator = numbers()
-    await at(WORK) or await anext(generator)
+    await at(WORK)
+    await anext(generator)
     await generator.aclose()
     await at(WORK)
 
