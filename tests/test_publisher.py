@@ -557,3 +557,32 @@ async def test_one_message_may_be_missed_here_and_there() -> None:
         await settle(1.0)
         assert [(each.where, each.count) for each in missed.calls] == [("can", 1), ("sub", 0)]
         assert publisher.missed == 1
+
+
+@pytest.mark.virtual_time
+async def test_without_a_callback_a_miss_is_described_only_when_it_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    described: list[r2p.Missed] = []
+
+    def describe(topic: str, reason: str, names: str, late: float, count: int) -> r2p.Missed:
+        described.append(r2p.Missed(topic, reason, names, late, count))
+        return described[-1]
+
+    monkeypatch.setattr("r2p.publishers.base.Missed", describe)
+    async with local() as module:
+        module.start(hold, name="sub").subscribe("leds", Led, queue=1)
+        publisher = module.start(hold, name="pub").advertise("leds", Led)
+        await settle()
+        for number in range(100):
+            publisher.publish_nowait(led(number))
+        assert publisher.missed == 99
+        assert len(described) == 1
+
+
+@pytest.mark.virtual_time
+async def test_a_message_that_many_missed_does_not_make_others_count_again() -> None:
+    async with local() as module:
+        publisher = module.start(hold, name="pub").advertise("leds", Led)
+        for link in ("first", *(f"link{number}" for number in range(100))):
+            publisher.link_missed(link, "never sent", sequence=1 if link == "first" else 2)
+        publisher.link_missed("last", "never sent", sequence=1)
+        assert publisher.missed == 2

@@ -52,6 +52,7 @@ class BasePublisher(Generic[M]):
         self._signalling = False
         self._later: list[tuple[Signal, Missed]] = []
         self._missed_lately: deque[int] = deque(maxlen=_REMEMBERED)
+        self._newest_missed = 0
 
     @property
     def size(self) -> int:
@@ -162,24 +163,37 @@ class BasePublisher(Generic[M]):
     def _wrong_type(self, message: object) -> MessageError:
         return MessageError(f"topic {self.topic} takes {self.type.__name__}, not {type(message).__name__}")
 
-    def _miss(self, sequence: int, reason: str, where: str, late: float = 0.0) -> None:
-        """A message has not reached somebody; however many that are, it counts once."""
-        is_news = sequence not in self._missed_lately
+    def _miss(self, sequence: int, reason: str, without: str | Sequence[Sink], late: float = 0.0) -> None:
+        """A message has not reached these sinks, or this link; however many that are, it counts once."""
+        is_news = self._is_news(sequence)
         self.missed += is_news
-        if sequence:
-            self._missed_lately.append(sequence)
-        self._signal(Missed(self.topic, reason, where, late, int(is_news)), self._on_missed)
+        if self._on_missed is not None or self._is_log_due(reason):
+            names = without if isinstance(without, str) else where(without)
+            self._signal(Missed(self.topic, reason, names, late, int(is_news)), self._on_missed)
+
+    def _is_news(self, sequence: int) -> bool:
+        """Whether this message has not been missed yet; of one without a number that is not known."""
+        if not sequence:
+            return True
+        if sequence <= self._newest_missed and (sequence == self._newest_missed or sequence in self._missed_lately):
+            return False
+        self._newest_missed = max(sequence, self._newest_missed)
+        self._missed_lately.append(sequence)
+        return True
+
+    def _is_log_due(self, reason: str) -> bool:
+        """Once a second; not of a link that is down, which was told when it went down."""
+        return reason != LINK_DOWN and self._clock.monotonic() - self._logged >= _SECOND
 
     def _unreachable(self, sample: Sample, sinks: list[Sink]) -> None:
         """Links that are down: who is behind them misses the sample."""
         for sink in sinks:
             sink.force(sample)
-        self._miss(sample.sequence, LINK_DOWN, where(sinks))
+        self._miss(sample.sequence, LINK_DOWN, sinks)
 
     def _signal(self, missed: Missed, callback: Signal | None) -> None:
-        now = self._clock.monotonic()
-        if now - self._logged >= _SECOND and missed.reason != LINK_DOWN:  # which was told when it went down
-            self._logged = now
+        if self._is_log_due(missed.reason):
+            self._logged = self._clock.monotonic()
             self.node.log.warning("%s (missed %d, late %d so far)", missed, self.missed, self.late)
         if callback is None:
             return

@@ -4,7 +4,7 @@ import asyncio
 
 from r2p.classes import NonRealTime
 from r2p.messages import Layout
-from r2p.publishers.base import BasePublisher, M, where
+from r2p.publishers.base import BasePublisher, M
 from r2p.room import CANCELLED, NO_ROOM, Claim, Sink
 from r2p.sample import PublisherClass, Sample
 from r2p.topic import BURST, Owner, Topic, TopicSpace, pause
@@ -62,7 +62,7 @@ class Publisher(BasePublisher[M]):
             if sink.lost > lost:
                 without.append(sink)
         if without:
-            self._miss(sample.sequence, NO_ROOM, where(without))
+            self._miss(sample.sequence, NO_ROOM, without)
         return not without
 
     async def _wait_for_room(self, sample: Sample, blocked: list[Sink]) -> None:
@@ -83,9 +83,9 @@ class Publisher(BasePublisher[M]):
             for sink in without:
                 sink.lose(CANCELLED)
             if without:
-                self._miss(sample.sequence, CANCELLED, where(without))
+                self._miss(sample.sequence, CANCELLED, without)
             if wait.refused:
-                self._miss(sample.sequence, wait.refusal, where(wait.refused))
+                self._miss(sample.sequence, wait.refusal, wait.refused)
 
 
 class _Wait(Claim):

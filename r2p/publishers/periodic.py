@@ -107,7 +107,7 @@ class PeriodicPublisher(BasePublisher[M]):
         if queues:
             for sink in queues:
                 sink.force(sample)
-            self._miss(sample.sequence, NO_ROOM, where(queues))
+            self._miss(sample.sequence, NO_ROOM, queues)
         if down:
             self._unreachable(sample, down)
 
@@ -115,7 +115,7 @@ class PeriodicPublisher(BasePublisher[M]):
         """A link has got a sample that waited, or lost it."""
         late = self._clock.monotonic() - waited.since
         if refusal:
-            self._miss(waited.sample.sequence, refusal, where([sink]))
+            self._miss(waited.sample.sequence, refusal, [sink])
         elif late > self.period * _SECOND / _LATE_SHARE:
             self.late += 1
             self._signal(Missed(self.topic, "sent late", where([sink]), late / _SECOND), self._on_late)
@@ -127,7 +127,7 @@ class PeriodicPublisher(BasePublisher[M]):
         if waited is not None and without:
             for sink in without:
                 sink.lose(GIVEN_UP)
-            self._miss(waited.sample.sequence, reason, where(without))
+            self._miss(waited.sample.sequence, reason, without)
 
 
 class _Period(Claim, Generic[M]):

@@ -75,7 +75,7 @@ class SporadicPublisher(BasePublisher[M]):
             self._pending.remove(event)
             self._arm()
         if refusal:
-            self._miss(event.sample.sequence, refusal, where([sink]))
+            self._miss(event.sample.sequence, refusal, [sink])
 
     def _arm(self) -> None:
         self._alarm.set(next((event.due for event in self._pending if not event.overdue), None))
@@ -99,7 +99,7 @@ class SporadicPublisher(BasePublisher[M]):
             for sink in without:
                 sink.lose(GIVEN_UP)
             late = max(0, self._clock.monotonic() - event.due) / _SECOND
-            self._miss(event.sample.sequence, reason, where(without), late)
+            self._miss(event.sample.sequence, reason, without, late)
 
 
 class _Event(Claim, Generic[M]):
