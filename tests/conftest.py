@@ -11,6 +11,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
+import hypothesis
 import pytest
 
 from r2p.testing import plugin
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from collections.abc import Generator
 
 pytest_plugins = ["pytester"]
+
+hypothesis.settings.register_profile("r2p", deadline=None)  # how long an example takes depends on the machine
+hypothesis.settings.load_profile("r2p")
 
 _NO_UVLOOP = pytest.mark.skipif(sys.platform == "win32", reason="uvloop is not made for Windows")
 

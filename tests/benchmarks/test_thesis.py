@@ -179,7 +179,7 @@ def frames(wishes: list[Wish], seed: int) -> list[Record]:
     return run(main)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(wishes, st.integers(1, 1000))
 def test_no_slot_ever_holds_two_frames(wishes: list[Wish], seed: int) -> None:
     """Whatever is asked for, granted or refused, and given back."""

@@ -93,7 +93,7 @@ def rate_kept(side: Side) -> bool:
     )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(lines, changes, st.integers(0, 1 << 32))
 def test_they_agree_when_the_losses_stop(line: Line, steps: list[Change], seed: int) -> None:
     world = world_of(line, seed)
@@ -110,7 +110,7 @@ def test_they_agree_when_the_losses_stop(line: Line, steps: list[Change], seed: 
         assert rate_kept(side)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(lines, st.integers(0, 1 << 32), st.floats(0, 10))
 def test_who_dies_in_silence_is_forgotten(line: Line, seed: int, life: float) -> None:
     world = world_of(line, seed)
@@ -152,7 +152,7 @@ def test_who_restarts_joins_again(seed: int) -> None:
     assert not world.a.rejoined
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.binary(min_size=30, max_size=33), st.integers(0, 4)), max_size=50), st.data())
 def test_noise_is_harmless(noise: list[tuple[bytes, int]], data: st.DataObject) -> None:
     """Random bytes with likely endings: nothing raises, and afterwards an honest peer is served."""

@@ -7,7 +7,7 @@ import hashlib
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.clock import clock_of
@@ -112,7 +112,6 @@ def traffic(draw: st.DrawFn) -> list[list[tuple[int, Frame]]]:
     return nodes
 
 
-@settings(deadline=None)
 @given(traffic(), st.booleans())
 def test_as_the_bus_that_goes_bit_by_bit(nodes: list[list[tuple[int, Frame]]], one_shot: bool) -> None:
     async def main() -> None:

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.protocols.rtcan.calendar import LONGEST_PERIOD, Calendar, Reason, Refusal, Reservation, meet, occupied
@@ -147,7 +147,6 @@ requests = st.lists(
 )
 
 
-@settings(deadline=None)
 @given(st.integers(2, 64), requests)
 def test_no_slot_ever_has_two_owners(slots: int, changes: list[object]) -> None:
     calendar = Calendar(slots)
@@ -176,7 +175,6 @@ def test_no_slot_ever_has_two_owners(slots: int, changes: list[object]) -> None:
         assert calendar.mask(cycle) == sum(count << slot for slot, count in enumerate(owners))
 
 
-@settings(deadline=None)
 @given(
     st.integers(1, 40), st.integers(0, 40), st.integers(1, 5), st.integers(1, 40), st.integers(0, 40), st.integers(1, 5)
 )
@@ -188,7 +186,6 @@ def test_meet_is_what_it_says(p: int, f: int, k: int, q: int, g: int, n: int) ->
     assert meet(Reservation(1, p, f, k), Reservation(2, q, g, n)) == both
 
 
-@settings(deadline=None)
 @given(st.integers(2, 64), st.data())
 def test_nothing_is_refused_that_would_fit_at_some_phase(slots: int, data: st.DataObject) -> None:
     calendar = Calendar(slots)

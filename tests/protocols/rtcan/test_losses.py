@@ -43,7 +43,7 @@ def hard_failures(node: Node) -> int:
     return sum(count for name, count in node.engine.counts.items() if name.startswith("hrt "))
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(st.integers(0, 1 << 32), st.sampled_from([0.01, 0.1, 0.3]), st.booleans())
 def test_a_lossy_network_recovers(seed: int, loss: float, all_of_them: bool) -> None:
     numbers = random.Random(seed)
