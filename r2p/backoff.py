@@ -15,6 +15,10 @@ class Backoff:
     def reset(self) -> None:
         self._next = self._first
 
+    def slow_down(self) -> None:
+        """Take the longest delay next."""
+        self._next = self._longest
+
     def delay(self) -> float:
         """Seconds to wait now."""
         delay, self._next = self._next, min(self._next * 2, self._longest)

@@ -4,11 +4,15 @@ It keeps the links of one module, tells all of them what changes here, and tells
 they find out. With a bridge it tells that, too.
 """
 
+import asyncio
 import logging
 import random
 from collections.abc import Callable, Iterator
 
+import msgspec
+
 from r2p.bridge import Bridge, BridgeOptions, Standby
+from r2p.clock import in_background
 from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY
 from r2p.errors import Error
 from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
@@ -39,12 +43,21 @@ _CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
 _ANSWERED = 5_000_000_000  # ns after an order in which gateways may say that it does not pass
 _APART = 1_000_000_000  # ns between two lines about one topic whose types differ
+_USED_AFTER = 3.0  # seconds after which a connection counts as one that the other end did not refuse
 _REFUSED_APART = 60_000_000_000  # ns between two lines about connections that one URL refuses, or is refused
 
 _DENIED = {
     DENIED_READ_ONLY: "it is read-only there",
     DENIED_BOOT: "the module is in its boot loader, where a STOP hangs its management until its power is cut",
 }
+
+
+class _Denial(msgspec.Struct, eq=False):
+    """The other end refused a link: `since` it was down by that (monotonic ns), and `lost` messages found it down."""
+
+    since: int | None = None
+    lost: int = 0
+    trial: asyncio.TimerHandle | None = None
 
 
 class ModuleHub:
@@ -83,6 +96,7 @@ class ModuleHub:
         self._limits: dict[Link, LineLimit] = {}
         self._clients = LineLimit()
         self._refused: dict[str, tuple[int, int]] = {}
+        self._denials: dict[Link, _Denial] = {}
         space.changed = self._topic_changed
         if bridging is not None:
             self._joints = self.bridge = Bridge(space, self.instance, bridging, self._port_changed)
@@ -130,6 +144,7 @@ class ModuleHub:
         self._joints.detach(link)
         del self._limits[link]
         self._mismatches.pop(link, None)
+        self._end_denial(link)
         self.closed_links.add(link.stats, link.losses)
 
     def link_waits(self, link: Link, reason: str) -> None:
@@ -172,6 +187,9 @@ class ModuleHub:
 
     def _connection_denied(self, link: Link, event: ConnectionDenied) -> None:
         """The other end refuses this one; the transport tries again and again."""
+        if not event.gateway:
+            self._denials.setdefault(link, _Denial())
+            link.denied = True
         now = self.space.clock.monotonic()
         if now - self._refused.get(link.name, (-_REFUSED_APART, 0))[0] >= _REFUSED_APART:
             self._refused[link.name] = now, 0
@@ -182,19 +200,52 @@ class ModuleHub:
 
     def link_changed(self, link: Link, reason: str, outage: float, lost: int) -> None:
         """The link went up or down."""
-        if link.up:
-            first = link.stats.ups == 1
-            meanwhile = "" if first else f", after {outage:.1f} s"
-            if lost:
-                meanwhile += f"; {lost} messages lost meanwhile"
-            expected = self.observer and first and outage < _PROMPT
-            self._log_change(link, logging.DEBUG if expected else logging.INFO, "up", f"is up{meanwhile}")
-            self._events.tell(LinkUp(link.name, outage, lost))
+        denial = self._denials.get(link)
+        if denial is not None and denial.since is not None:
+            self._tried_again(link, denial, lost)
+        elif link.up:
+            self._tell_up(link, outage, lost)
         else:
-            abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
-            self._log_change(link, logging.WARNING if abandoned else logging.INFO, "down", f"is down: {reason}")
-            self._events.tell(LinkDown(link.name, reason))
+            self._tell_down(link, reason)
+            if denial is not None:
+                denial.since = self.space.clock.monotonic()
         self._joints.link_changed(link)
+
+    def _tell_up(self, link: Link, outage: float, lost: int) -> None:
+        first = link.stats.ups == 1
+        meanwhile = "" if first else f", after {outage:.1f} s"
+        if lost:
+            meanwhile += f"; {lost} messages lost meanwhile"
+        expected = self.observer and first and outage < _PROMPT
+        self._log_change(link, logging.DEBUG if expected else logging.INFO, "up", f"is up{meanwhile}")
+        self._events.tell(LinkUp(link.name, outage, lost))
+
+    def _tell_down(self, link: Link, reason: str) -> None:
+        abandoned = bool(link.discovery.modules)  # whoever says good-bye is forgotten by now
+        self._log_change(link, logging.WARNING if abandoned else logging.INFO, "down", f"is down: {reason}")
+        self._events.tell(LinkDown(link.name, reason))
+
+    def _tried_again(self, link: Link, denial: _Denial, lost: int) -> None:
+        """The other end refused the last connection: this one is no news before it is of use."""
+        logger.debug("link %s: %s", link.title, "connected again" if link.up else "refused again")
+        denial.lost += lost
+        if denial.trial is not None:
+            denial.trial.cancel()
+        if link.up:
+            denial.trial = self.space.loop.call_later(_USED_AFTER, self._end_denial, link)
+            in_background(denial.trial)
+
+    def _end_denial(self, link: Link) -> None:
+        """The other end has taken the link, or it is closed."""
+        denial = self._denials.pop(link, None)
+        if denial is None:
+            return
+        link.denied = False
+        if denial.trial is not None:
+            denial.trial.cancel()
+        if denial.since is not None and link.up:
+            outage = self.space.clock.monotonic() - denial.since
+            self._tell_up(link, outage / 1e9, denial.lost)
 
     def _log_change(self, link: Link, level: int, kind: str, text: str) -> None:
         """Clients may come and go by the thousand."""
@@ -221,6 +272,7 @@ class ModuleHub:
             case Echoes():
                 logger.error("link %s gives back what we send: switch off local echo at the other end", link.title)
             case ModuleChanged():
+                self._end_denial(link)
                 self._suspect_namesakes(link, event.info)
                 self._events.tell(event)
             case ModuleGone():

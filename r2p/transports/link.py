@@ -142,6 +142,8 @@ class Link(abc.ABC):
         """Whether a gateway at its other end takes part in the mesh of ours; else it is for clients."""
         self.gate: Gate | None = None
         """Set by the module: what gateways, and it beside gateways, do with the link."""
+        self.denied = False
+        """Set by the module: whether its other end has refused it, and no connection has been of use since."""
         self.passing = False
         """Whether it is closed for good when it goes down: that of a client."""
         self.stands_by = ""

@@ -174,6 +174,8 @@ class TcpTransport(Transport):
             while True:
                 if await self._connect(link) >= _STABLE:
                     backoff.reset()
+                if link.denied:
+                    backoff.slow_down()
                 await asyncio.sleep(backoff.delay())
         finally:
             link.close()

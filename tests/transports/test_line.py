@@ -593,6 +593,38 @@ async def test_a_line_whose_reading_raises_does_not_stop_the_others(monkeypatch:
         assert script.link.losses == {"internal error": 1, "garbage": 2}
 
 
+@pytest.mark.parametrize("heard", [True, False])
+async def test_a_line_that_is_refused_again_and_again_is_told_once(
+    caplog: pytest.LogCaptureFixture, heard: bool
+) -> None:
+    """It is up again when a module is heard there, or nobody has refused it for a while."""
+    caplog.set_level(logging.INFO, "r2p")
+    script = Script()
+    module = r2p.Module("PC1", via=script)
+    events = module.events()
+    async with module:
+        for number in range(10):
+            if number:
+                await asyncio.sleep(2)
+                script.link.connected(script)
+            script.hear(manage(m.Denied("A", "A", 0, m.DENIED_CLIENTS)))
+            script.link.disconnected("closed")
+            assert script.link.denied
+        told = [await anext(events) for _ in range(3)]
+        assert [type(each) for each in told] == [r2p.LinkUp, r2p.LinkNotice, r2p.LinkDown]
+        assert (caplog.text.count("is up"), caplog.text.count("is down")) == (1, 1)
+        await asyncio.sleep(2)
+        script.link.connected(script)
+        if heard:
+            script.hear(manage(m.Hello("A", 7)))
+        else:
+            await asyncio.sleep(3)
+        assert not script.link.denied
+        assert await anext(events) == r2p.LinkUp("script", 20.0 if heard else 23.0, 0)
+        script.link.disconnected("closed")
+        assert caplog.text.count("is down") == 2
+
+
 async def test_a_flood_of_modules_that_come_and_go_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "r2p")
     async with scripted() as (script, module, _):
