@@ -95,7 +95,7 @@ class ModuleHub:
         self._mismatches: dict[Link, dict[str, int]] = {}
         self._limits: dict[Link, LineLimit] = {}
         self._clients = LineLimit()
-        self._refused: dict[str, tuple[int, int]] = {}
+        self._refused = LineLimit(1, _REFUSED_APART)
         self._denials: dict[Link, _Denial] = {}
         space.changed = self._topic_changed
         if bridging is not None:
@@ -176,23 +176,16 @@ class ModuleHub:
     def connection_refused(self, url: str, reason: str) -> None:
         """A transport does not take a connection: how many that were is logged once a minute."""
         self.closed_links.faults["connection refused"] += 1
-        at, count = self._refused.get(url, (-_REFUSED_APART, 0))
-        now = self.space.clock.monotonic()
-        if now - at < _REFUSED_APART:
-            self._refused[url] = at, count + 1
-            return
-        self._refused[url] = now, 0
-        more = f" ({count} more since it was logged last)" if count else ""
-        logger.warning("%s refuses a connection%s: %s", url, more, reason)
+        more = self._refused.suffix(url, self.space.clock.monotonic())
+        if more is not None:
+            logger.warning("%s refuses a connection%s: %s", url, more, reason)
 
     def _connection_denied(self, link: Link, event: ConnectionDenied) -> None:
         """The other end refuses this one; the transport tries again and again."""
         if not event.gateway:
             self._denials.setdefault(link, _Denial())
             link.denied = True
-        now = self.space.clock.monotonic()
-        if now - self._refused.get(link.name, (-_REFUSED_APART, 0))[0] >= _REFUSED_APART:
-            self._refused[link.name] = now, 0
+        if self._refused.suffix(link.name, self.space.clock.monotonic()) is not None:
             text = f"{event.server} has no connection left (max_clients= of its tcp-listen:); trying again"
             if event.gateway:
                 text = f"{event.server} lets no gateway join by this line: have it listen with ?gateways=yes"
