@@ -46,6 +46,7 @@ _CLOCK = struct.Struct("<IqI")
 _ORIGIN = struct.Struct("<BII8s")
 _CREDIT = struct.Struct("<BBII")
 _LEAVING = 0x80
+_SENDER = struct.Struct("<BI")
 _unpack = _FIXED.unpack_from
 _pack_start = struct.Struct("<IIQqq").pack
 
@@ -222,6 +223,21 @@ def decode_credit(data: bytes) -> Credit:
     _, publisher_class, session, serial = _CREDIT.unpack_from(data)
     leaving = bool(publisher_class & _LEAVING)
     return Credit(session, publisher_class & ~_LEAVING, serial, data[_CREDIT.size :].decode(), leaving)
+
+
+def encode_sender(session: int) -> bytes:
+    """Who sends a management message: `u8 version; u32 session`."""
+    return _SENDER.pack(VERSION, session)
+
+
+def decode_sender(data: bytes) -> int:
+    """The session. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    if data[:1] not in (b"", bytes((VERSION,))):
+        raise UnknownType(f"version {data[:1]!r} of a sender")
+    if len(data) != _SENDER.size:
+        raise DecodeError(f"a sender of {len(data)} bytes")
+    session: int = _SENDER.unpack(data)[1]
+    return session
 
 
 def _itself(origin: Origin) -> Origin:

@@ -157,6 +157,15 @@ def test_credits(credit: Credit) -> None:
     assert attachment.decode_credit(attachment.encode_credit(credit)) == credit
 
 
+@given(st.binary(max_size=7) | st.integers(0, 2**32 - 1).map(attachment.encode_sender))
+def test_any_bytes_are_a_sender_or_counted(data: bytes) -> None:
+    try:
+        session = attachment.decode_sender(data)
+    except DecodeError:
+        return
+    assert attachment.encode_sender(session) == data
+
+
 @given(st.binary(max_size=40))
 def test_any_bytes_are_a_credit_or_counted(data: bytes) -> None:
     try:

@@ -5,7 +5,7 @@ Keys, all under `r2p/NETWORK/`:
     live/...                what each module has, as liveliness tokens (r2p.codecs.liveliness)
     topic/TOPIC             messages: one or several, packed; the rest is in the attachment (r2p.codecs.attachment)
     credit/SESSION          to a publisher's module: how far a subscriber has come
-    control/SESSION         management messages, from a module to all
+    control                 management messages, from a module to all; who sends them is in the attachment
     schema/SESSION/TYPE     asks a module for the fields of a type, by fingerprint
 """
 
@@ -14,8 +14,8 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from r2p.codecs import liveliness, schemas
-from r2p.codecs.attachment import Credit, encode_credit
+from r2p.codecs import UnknownType, liveliness, schemas
+from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_sender
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
@@ -113,7 +113,7 @@ class ZenohLink(Link):
             self.went_up()
         session.watch(self._funnel(self._transport_changed))
         session.watch_tokens(f"{self.prefix}/{liveliness.PLACE}", self._funnel(self._token_changed))
-        session.listen(f"{self.prefix}/control/*", self._funnel(self._controlled))
+        session.listen(f"{self.prefix}/control", self._funnel(self._controlled))
         session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema, functools.partial(self._funnel, most=_QUERIES))
         self.credits.connect(session, f"{self.prefix}/credit/{hexed}")
 
@@ -142,7 +142,8 @@ class ZenohLink(Link):
         if self._session is not None and self._session.outbound.full and not urgent:
             self.stats.lost["management, send buffer full"] += 1
         elif self._session is not None:
-            self._session.put(f"{self.prefix}/control/{self.instance:x}", data, urgent=urgent)
+            sender = encode_sender(self.instance)
+            self._session.put(f"{self.prefix}/control", data, attachment=sender, urgent=urgent)
 
     def sample(self, topic: str, arrival: Any) -> Sample:
         raise AssertionError("streams make their samples themselves")
@@ -327,18 +328,14 @@ class ZenohLink(Link):
         else:
             self._apply(events)
 
-    def _controlled(self, message: tuple[str, bytes]) -> None:
-        key, data = message
-        sender = _sender(key)
-        if sender is None:
+    def _controlled(self, message: tuple[bytes, bytes]) -> None:
+        header, data = message
+        try:
+            sender = decode_sender(header)
+        except UnknownType:
+            self.stats.lost["unknown type"] += 1
+        except DecodeError:
             self.stats.lost["foreign"] += 1
-        elif sender != self.instance and self.up:
-            self.manage(data, sender)
-
-
-def _sender(key: str) -> int | None:
-    """The session that a control key names."""
-    try:
-        return int(key.rpartition("/")[2], 16)
-    except ValueError:
-        return None
+        else:
+            if sender != self.instance and self.up:
+                self.manage(data, sender)

@@ -195,11 +195,14 @@ class Session:
         self._hear(declared, changed, funnel)
 
     def listen(self, key: str, funnel: Funnel) -> None:
-        """Tell of each message: (its key, payload); of one that is none of ours by its length, without the payload."""
+        """Tell of each message: (its attachment, payload), either of them empty if it is longer than any of ours.
+
+        A key without a wildcard: of each session that is closed, zenoh keeps 3 kB for ever in the router if it has
+        subscribed with a wildcard, and another session has by the same key expression.
+        """
 
         def arrived(sample: zenoh.Sample) -> None:
-            payload = sample.payload
-            funnel.put((str(sample.key_expr), payload.to_bytes() if len(payload) <= _MESSAGE_MAX else b""))
+            funnel.put((_bytes_of(sample.attachment), _bytes_of(sample.payload)))
 
         messages: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
         declared = self._session.declare_subscriber(key, messages, allowed_origin=zenoh.Locality.REMOTE)
@@ -268,12 +271,13 @@ class Session:
         self._publishers.discard(publisher)
         self.outbound.call(publisher.undeclare)
 
-    def put(self, key: str, data: bytes, *, urgent: bool = False) -> None:
+    def put(self, key: str, data: bytes, *, attachment: bytes | None = None, urgent: bool = False) -> None:
         """Send something of the protocol's own."""
         self.outbound.call(
             self._session.put,
             key,
             data,
+            attachment=attachment,
             priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
             congestion_control=zenoh.CongestionControl.DROP,
             express=True,
@@ -396,3 +400,7 @@ def _close(session: zenoh.Session) -> None:
 def _plain(error: Exception) -> str:
     """zenoh's text without the places in its source."""
     return re.sub(r" at /\S+?\.rs:\d+\.?", "", str(error)).strip()
+
+
+def _bytes_of(data: zenoh.ZBytes | None) -> bytes:
+    return data.to_bytes() if data is not None and len(data) <= _MESSAGE_MAX else b""

@@ -2,7 +2,8 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
@@ -22,6 +23,7 @@ from r2p.protocols.flow import NO_LIMIT
 from r2p.testing.network import node_in
 from r2p.transports.zenoh.link import ZenohLink
 from r2p.transports.zenoh.outlet import ZenohOutlet
+from r2p.transports.zenoh.session import Session
 from r2p.transports.zenoh.streams import WINDOW
 from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.cable import Net, ZenohCable, guarded, module, plain_session
@@ -324,6 +326,29 @@ async def test_the_last_words_of_a_module_arrive() -> None:
 
 
 @guarded
+async def test_modules_share_no_wildcard_of_which_zenoh_would_keep_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A router keeps 3 kB of each session that is closed, had a wildcard, and shared it with another session."""
+    keys: Counter[str] = Counter()
+
+    def recorded(declare: Callable[..., Any]) -> Callable[..., Any]:
+        def declared(session: Session, key: str, *args: Any) -> Any:
+            keys[key] += 1
+            return declare(session, key, *args)
+
+        return declared
+
+    for name in ("listen", "serve", "subscribe"):
+        monkeypatch.setattr(Session, name, recorded(getattr(Session, name)))
+    net = Net()
+    async with nodes(net, "A", "B") as (alice, bob):
+        alice.subscribe("leds", Led)
+        bob.subscribe("leds", Led)
+        await until(lambda: keys["r2p/lab/topic/leds"] == 2)
+    assert keys["r2p/lab/control"] == 2
+    assert [key for key, count in keys.items() if "*" in key and count > 1] == []
+
+
+@guarded
 async def test_garbage_and_foreign_keys_are_counted_and_harm_nobody() -> None:
     net = Net()
     async with nodes(net, "A", "B") as (alice, bob), alien_on(net) as alien:
@@ -345,9 +370,12 @@ async def test_garbage_and_foreign_keys_are_counted_and_harm_nobody() -> None:
             ("topic/leds", bytes(16), three, "undecodable"),
             ("topic/leds", b"", three, "undecodable"),
             ("topic/leds", bytes(3), three, "wrong size"),
-            ("control/zz", bytes(32), None, "foreign"),
-            ("control/7", bytes(33), None, "undecodable"),
-            ("control/7", huge, None, "undecodable"),
+            ("control", bytes(32), None, "foreign"),
+            ("control", bytes(32), huge, "foreign"),
+            ("control", bytes(32), b"\1\7\0\0", "foreign"),
+            ("control", bytes(32), b"\2\7\0\0\0", "unknown type"),
+            ("control", bytes(33), attachment.encode_sender(7), "undecodable"),
+            ("control", huge, attachment.encode_sender(7), "undecodable"),
             (f"credit/{link_of(bob).instance:x}", b"\1\1junk", None, "undecodable"),
             (f"credit/{link_of(bob).instance:x}", huge, None, "unknown type"),
         ):
