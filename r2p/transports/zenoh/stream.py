@@ -279,7 +279,7 @@ class Stream:
         """A message that nobody here can use. It is no gap, as it came and was counted; and it is as good as taken, or
         its publisher would wait for it: after those that wait for room.
         """
-        gap = lane.flow.gap(serial)
+        gap = lane.flow.gap(serial) if lane.flow.next >= 0 else 0  # serials are counted from the first good one
         if gap < 0:
             return
         if gap:

@@ -193,6 +193,15 @@ async def test_messages_that_nobody_can_use_earn_credit(queue: int) -> None:
     assert ring.stats.lost == {"wrong size": 2048}
 
 
+async def test_serials_are_counted_from_the_first_message_that_can_be_used() -> None:
+    ring = Ring(queue=10)
+    ring.put(7, size=SIZE + 1)
+    ring.put(7)
+    await turns()
+    assert (numbers(ring.sink), ring.stats.lost) == ([7], {"wrong size": 1})
+    assert ring.credits == [(1, 7)]
+
+
 async def test_a_message_of_the_wrong_size_behind_a_gap_is_counted_once() -> None:
     ring = Ring(queue=10)
     ring.put(1)
