@@ -11,6 +11,8 @@ from r2p.errors import InvalidName, NameTooLong
 MODULE_MAX = 7
 MODULE_PATH_MAX = 24
 """`robot1/MOTOR1`: a module of a robot on a network of several."""
+MODULE_PATH = r"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,24}"
+"""What the name of a module on a network of several robots looks like; it has MODULE_PATH_MAX characters in all."""
 NODE_MAX = 8
 TOPIC_MAX = 16
 NAMESPACED_MAX = 2 * TOPIC_MAX + 1

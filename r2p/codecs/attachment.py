@@ -30,6 +30,7 @@ import msgspec
 
 from r2p.codecs import UnknownType
 from r2p.errors import DecodeError
+from r2p.names import MODULE_PATH, MODULE_PATH_MAX, module_alias
 
 T = TypeVar("T")
 
@@ -54,7 +55,8 @@ PACKET_MOST = 256
 """Messages in one payload."""
 
 _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
-_NAMES = re.compile(rb"([A-Za-z0-9_]{1,16}/[A-Za-z0-9_]{1,7}|[A-Za-z0-9_]{0,24})/([A-Za-z0-9_]{0,8})")
+_NAMES = re.compile(rf"((?:{MODULE_PATH})?)/([A-Za-z0-9_]{{0,8}})".encode())
+_MODULE = re.compile(MODULE_PATH)
 _CLASSES = (1, 2, 3)
 _REMEMBERED = 4096  # origins
 
@@ -240,6 +242,14 @@ def decode_sender(data: bytes) -> int:
     return session
 
 
+def name_for(module: str) -> str:
+    """What a header calls a module: by its alias where the name is too long, or in two namespaces; else by no name."""
+    for name in (module, module_alias(module)):
+        if len(name) <= MODULE_PATH_MAX and _MODULE.fullmatch(name):
+            return name
+    return ""
+
+
 def _itself(origin: Origin) -> Origin:
     return origin
 
@@ -266,7 +276,7 @@ def _encode_origin(origin: Origin) -> bytes:
 
 def _decode_origin(data: bytes) -> Origin:
     names = _NAMES.fullmatch(data, _ORIGIN.size)
-    if names is None:
+    if names is None or len(names[1]) > MODULE_PATH_MAX:
         raise DecodeError("the header ends in no `module/node`")
     publisher_class, sender, instance, fingerprint = _ORIGIN.unpack_from(data)
     if publisher_class not in _CLASSES:

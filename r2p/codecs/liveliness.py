@@ -21,6 +21,7 @@ from r2p.codecs import UnknownType
 from r2p.codecs.management import ANY_TYPE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 from r2p.messages import SIZE_MAX
+from r2p.names import MODULE_PATH, MODULE_PATH_MAX
 
 VERSION = "1"
 
@@ -32,7 +33,7 @@ _WILD = "*/"
 _NONE = "-"
 _HEX32 = r"[0-9a-f]{1,8}"
 _MODULE = re.compile(
-    rf"({_HEX32})/module/((?:[A-Za-z0-9_]{{1,16}}%)?[A-Za-z0-9_]{{1,24}})/({_HEX32}|-)/([0-9a-f]{{1,2}})/([0-9]{{1,2}})"
+    rf"({_HEX32})/module/({MODULE_PATH.replace('/', '%')})/({_HEX32}|-)/([0-9a-f]{{1,2}})/([0-9]{{1,2}})"
 )
 _TOPIC = re.compile(
     rf"({_HEX32})/(pub|sub)/([A-Za-z0-9_]{{1,16}}(?:%[A-Za-z0-9_]{{1,16}})?)/({_HEX32}|-)/([A-Za-z0-9_]{{1,8}}|-)"
@@ -99,10 +100,9 @@ def decode(key: str) -> Token:
     version, _, rest = key.partition("/")
     if version != VERSION:
         raise UnknownType(f"version {version[:8]} of a token")
-    if found := _MODULE.fullmatch(rest):
+    if (found := _MODULE.fullmatch(rest)) and len(found[2]) <= MODULE_PATH_MAX:
         session, name, instance, flags, hops = found.groups()
         bits = int(flags, 16)
-        name = name.replace("%", "/")
         return ModuleToken(
             int(session, 16),
             name.replace("%", "/"),

@@ -5,9 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from r2p.bridge.options import check_prefix
 from r2p.codecs import UnknownType, attachment
 from r2p.codecs.attachment import Clock, Credit, Header, Origin, Reader
 from r2p.errors import DecodeError
+from r2p.names import module_alias
 
 ORIGIN = Origin(1, 0xA0B1C2D3, 0x01020304, bytes(range(8)), "PC1", "blink")
 HEADER = Header(ORIGIN, serial=7, sequence=9, stamp=1_700_000_000_000_000_000, deadline=1_700_000_000_020_000_000)
@@ -41,6 +43,28 @@ HEADERS = st.builds(
 @given(HEADERS)
 def test_what_is_encoded_is_decoded(header: Header) -> None:
     assert attachment.decode(attachment.encode(header)) == header
+
+
+_PREFIXES = st.from_regex(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_", fullmatch=True)
+
+
+@given(_PREFIXES, st.just("") | _PREFIXES, st.text(NAME, min_size=1, max_size=7))
+def test_a_module_behind_prefixes_has_a_name_that_is_carried(outer: str, inner: str, module: str) -> None:
+    """Its own, where that has 24 characters at most, and is in one namespace of 16 at most."""
+    for each in (outer, inner):
+        check_prefix(each)
+    name = outer + inner + module
+    told = attachment.name_for(name)
+    origin = msgspec.structs.replace(ORIGIN, module=told)
+    assert attachment.decode(attachment.encode(msgspec.structs.replace(HEADER, origin=origin))).origin.module == told
+    namespace, _, _ = name.rpartition("/")
+    fits = len(name) <= 24 and len(namespace) <= 16 and "/" not in namespace
+    assert told == (name if fits else module_alias(name))
+
+
+def test_a_module_that_has_no_name_for_a_header_goes_without() -> None:
+    assert attachment.name_for("lab/robot1_MOTOR1") == "lab/robot1_MOTOR1"
+    assert [attachment.name_for(each) for each in ("", "A B", "A*")] == ["", "", ""]
 
 
 def test_the_bytes_of_a_header() -> None:

@@ -59,6 +59,7 @@ def test_keys_as_people_see_them() -> None:
         "1/ab",
         "1/ab/module",
         "1/ab/module/a%b%c/ab/0/0",
+        "1/ab/module/abcdefgh%abcdefghabcdefgh/ab/0/0",
         "1/ab/module/PC1/ab/0/0/more",
         "1/123456789/module/PC1/ab/0/0",
         "1/AB/module/PC1/ab/0/0",

@@ -15,7 +15,7 @@ from collections.abc import Callable, Hashable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from r2p.codecs import UnknownType, liveliness, schemas
-from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_sender
+from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_sender, name_for
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
@@ -272,7 +272,7 @@ class ZenohLink(Link):
 
     def source_name(self, source: Source) -> str:
         """What the module of a message is called on this network."""
-        return source.module if self.gate is None else self.gate.source_name(source)
+        return name_for(source.module if self.gate is None else self.gate.source_name(source))
 
     def instance_of(self, module: str) -> int:
         """The number of a module on any link; 0: firmware, or not known."""
