@@ -27,6 +27,8 @@ from r2p.transports.url import parse
 TOPIC = "soak"
 LIFE = 0.2
 """Seconds that a subscriber stays."""
+AT_ONCE = 2
+"""Lives at one time: a subscriber of a module that stays, and one of a module that comes and goes with it."""
 
 _LISTEN = "zenoh:?mode=router&listen=tcp/127.0.0.1:0&scouting=off&network=soak"
 _QUEUE = 4096
@@ -199,19 +201,21 @@ class Lives:
         self.silent = 0
         """Lives without a message."""
         self.received = 0
-        self.uncounted = 0
-        """Messages that were missing, and in no counter."""
+        self.missing = 0
+        """Messages between first and last of a life that it neither got nor counted: lost before they reached it."""
         self.disorder = 0
         self.worst = ""
+        self._most = 0
 
     def add(self, account: Account, counted: int, lost: dict[str, int]) -> None:
         self.lives += 1
         self.silent += not account.received
         self.received += account.received
         self.disorder += account.disorder
-        uncounted = max(0, account.missing - counted)  # a link counts, too, what was lost before the first message
-        self.uncounted += uncounted
-        if uncounted:
+        missing = max(0, account.missing - counted)  # a link counts, too, what was lost before the first message
+        self.missing += missing
+        if missing > self._most:
+            self._most = missing
             self.worst = f"{account.missing} missing, {counted} counted, {lost}"
 
 

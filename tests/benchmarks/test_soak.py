@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.soak import State, Verdict, judge_growth, soak
+from benchmarks.soak import State, Verdict, _judge, judge_growth, soak
 from benchmarks.soak_roles import Account, Lives
 
 
@@ -56,7 +56,17 @@ def test_what_one_that_came_and_went_missed_has_to_be_in_a_counter() -> None:
         account.take(number)
     assert (account.received, account.missing, account.disorder) == (5, 5, 1)
     lives.add(account, 5, {})
-    assert lives.uncounted == 0
+    assert lives.missing == 0
     lives.add(account, 3, {"on the way": 3})
     lives.add(Account(), 0, {})
-    assert (lives.lives, lives.silent, lives.uncounted) == (3, 1, 2)
+    assert (lives.lives, lives.silent, lives.missing) == (3, 1, 2)
+
+
+def test_what_was_lost_before_zenoh_is_in_the_counters_of_robot_and_gateway() -> None:
+    verdict = Verdict()
+    said = {"received": 1, "ups": 1, "disorder": 0}
+    churn = {"disorder": 0, "missing": 20, "worst": ""}
+    _judge(said, said, churn, 10, verdict)
+    assert verdict.troubles == []
+    _judge(said, said, churn, 9, verdict)
+    assert len(verdict.troubles) == 1
