@@ -16,7 +16,7 @@ from r2p.clock import in_background
 from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY
 from r2p.errors import Error
 from r2p.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
-from r2p.logs import LineLimit
+from r2p.line_limit import LineLimit
 from r2p.names import module_alias
 from r2p.network import describe_mismatch
 from r2p.printable import get_logger

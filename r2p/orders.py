@@ -4,13 +4,16 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Callable
 
+from r2p.line_limit import LineLimit
 from r2p.printable import get_logger
 from r2p.protocols.events import Command
 
 logger = get_logger("r2p.module")
 
-_APART = 1.0
-"""Seconds between two lines of the log about one kind of order."""
+_LINES = 1
+"""Lines of the log in a second about one kind of order."""
+
+_SECOND = 1_000_000_000
 
 
 class Orders:
@@ -29,30 +32,29 @@ class Orders:
         self._refused = refused
         self._stop = stop
         self._reboot = reboot
-        self._logged: dict[tuple[int, Command], float] = {}
+        self._limit = LineLimit(_LINES)
         self._latest: Command | None = None
         self._obeying: asyncio.Task[None] | None = None
 
     def take(self, command: Command) -> None:
         """An order has come in."""
-        self._log(logging.WARNING, command, "module %s: %s from the network", self._module, command.name)
+        self._log(logging.WARNING, f"module {self._module}: {command.name} from the network")
         if self.tasks is None:
             return
         if command is Command.BOOTLOAD:
             count = self._refused[command.name] = self._refused.get(command.name, 0) + 1
-            text = "module %s is a program on a PC, it has no boot loader: BOOTLOAD refused (%d so far)"
-            self._log(logging.ERROR, command, text, self._module, count)
+            text = f"module {self._module} is a program on a PC, it has no boot loader: BOOTLOAD refused"
+            self._log(logging.ERROR, text, f" ({count} so far)")
             return
         self._latest = command
         if self._obeying is None or self._obeying.done():
             self._obeying = self.tasks.create_task(self._obey(), name=f"{self._module} orders")
 
-    def _log(self, level: int, command: Command, text: str, *args: object) -> None:
-        """Each kind of order at most once a second."""
-        now = asyncio.get_running_loop().time()
-        if now >= self._logged.get((level, command), -_APART) + _APART:
-            self._logged[level, command] = now
-            logger.log(level, text, *args)
+    def _log(self, level: int, text: str, detail: str = "") -> None:
+        """What others can make happen any number of times a second."""
+        more = self._limit.suffix(text, int(asyncio.get_running_loop().time() * _SECOND))
+        if more is not None:
+            logger.log(level, "%s%s%s", text, detail, more)
 
     async def _obey(self) -> None:
         """One order at a time; of those that come meanwhile the last one counts."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
-from r2p.logs import RATE, LineLimit
+from r2p.logs import RATE
 from r2p.msg import Led, Log
 from r2p.topic import Topic
 from tests.bench import hold, led, local, settle
@@ -149,11 +149,3 @@ def test_a_thread_may_log_when_the_loop_is_closed() -> None:
     thread = threading.Thread(target=node.log.warning, args=("too late",))
     thread.start()
     thread.join()
-
-
-def test_the_lines_of_a_kind_are_limited_and_the_next_one_says_how_many_were_left_out() -> None:
-    limit = LineLimit(2, period=60)
-    assert [limit.suffix("a", now) for now in (0, 1, 2, 59)] == ["", "", None, None]
-    assert limit.suffix("b", 59) == ""
-    assert limit.suffix("a", 60) == " (2 more since the last such line)"
-    assert limit.suffix("a", 120) == ""

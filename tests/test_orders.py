@@ -61,6 +61,22 @@ async def test_bootload_is_refused_and_counted(caplog: pytest.LogCaptureFixture)
 
 
 @pytest.mark.virtual_time
+async def test_a_flood_of_orders_is_logged_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+    async with joined("A") as a, joined("B") as b:
+        b.start(hold)
+        await settle(1.0)
+        for _ in range(300):
+            a.command(r2p.Command.STOP, "B")
+            a.command(r2p.Command.BOOTLOAD, "B")
+            await settle(0.01)
+        assert b.refused == {"BOOTLOAD": 300}
+    for text in ("STOP from the network", "BOOTLOAD from the network", "BOOTLOAD refused"):
+        lines = [each for each in caplog.messages if text in each]
+        assert 3 <= len(lines) <= 4
+        assert all("more since the last such line)" in each for each in lines[1:])
+
+
+@pytest.mark.virtual_time
 async def test_a_reboot_does_not_end_wait() -> None:
     async with local() as module:
         module.start(hold)

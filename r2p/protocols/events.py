@@ -178,10 +178,13 @@ class Undeclare(msgspec.Struct, frozen=True):
 
 
 class Parted(msgspec.Struct, frozen=True):
-    """One remote subscriber is gone; if it was the last one, `Left` follows. Told where they are told apart."""
+    """Nothing flows to one remote subscriber any more; if it was the last one, `Left` follows. Told where they are
+    told apart. `gone`: it is gone itself; else it still subscribes, and this module publishes no more, or another type.
+    """
 
     topic: str
     source: Source
+    gone: bool = True
 
 
 Event = (

@@ -51,19 +51,21 @@ class Outflow:
         self._update()
 
     def parted(self, session: int) -> int:
-        """It is gone; says how many messages it may not have got: those that it has not granted credit for.
-
-        One that left in order does not want them.
+        """Nothing is sent to it any more; says how many messages it may not have got: those that it has not granted
+        credit for. One that leaves in order does not want them.
         """
         taker = self.takers.pop(session, None)
         self._update()
         return 0 if taker is None or taker.leaving else max(0, self.serial - taker.taken)
 
-    def credited(self, session: int, serial: int, *, leaving: bool = False) -> None:
-        """It has taken everything up to this serial, of which the wire tells the low 32 bits.
+    def leaves(self, session: int, *, leaving: bool) -> None:
+        """Whether it has said that it does not subscribe any more; one that grants credit again has come back."""
+        taker = self.takers.get(session)
+        if taker is not None:
+            taker.leaving = leaving
 
-        `leaving`: this is its last credit, as it does not subscribe any more.
-        """
+    def credited(self, session: int, serial: int) -> None:
+        """It has taken everything up to this serial, of which the wire tells the low 32 bits."""
         taker = self.takers.get(session)
         if taker is None:
             return
@@ -71,7 +73,6 @@ class Outflow:
         if behind < _HALF:  # else it is from before, or nonsense
             taker.taken = max(taker.taken, self.serial - behind)
             taker.heard = taker.waited_for = True
-            taker.leaving = leaving
         self._update()
 
     def give_up(self) -> list[int]:

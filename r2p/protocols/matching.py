@@ -127,7 +127,7 @@ class Matching:
         if role == ROLE_PUBLISHES:
             self._events.append(Shut(topic, number))
             return
-        self._events.append(Parted(topic, number))
+        self._events.append(Parted(topic, number, gone=key not in session.tokens))
         self._takers[topic] -= 1
         if not self._takers[topic]:
             del self._takers[topic]

@@ -122,7 +122,8 @@ def test_one_that_leaves_in_order_wants_no_more() -> None:
     flow = Outflow()
     flow.joined(A, 10)
     flow.serial = 8
-    flow.credited(A, 5, leaving=True)
+    flow.credited(A, 5)
+    flow.leaves(A, leaving=True)
     assert flow.parted(A) == 0
     flow.joined(A, 10)  # it is back
     flow.serial = 10
@@ -133,8 +134,10 @@ def test_one_that_comes_back_before_it_is_gone_has_not_left() -> None:
     flow = Outflow()
     flow.joined(A, 10)
     flow.serial = 8
-    flow.credited(A, 5, leaving=True)
+    flow.credited(A, 5)
+    flow.leaves(A, leaving=True)
     flow.credited(A, 6)
+    flow.leaves(A, leaving=False)
     assert flow.parted(A) == 2
 
 

@@ -150,6 +150,17 @@ def test_topics_are_matched_whoever_comes_first(world: World, publisher_first: b
     assert world.news(2, Shut) == [Shut("leds", 1)]
 
 
+def test_a_subscriber_that_is_sent_nothing_any_more_need_not_be_gone(world: World) -> None:
+    world.add("A", 1), world.add("B", 2)
+    advertise(world, 1, "leds")
+    subscribe(world, 2, "leds")
+    world.act(1, world.members[1].withdraw(world.now, "leds"))
+    assert world.news(1, Parted) == [Parted("leds", 2, gone=False)]
+    advertise(world, 1, "leds")
+    world.crash(2)
+    assert world.news(1, Parted)[-1] == Parted("leds", 2)
+
+
 def test_a_late_joiner_learns_everything(world: World) -> None:
     world.add("A", 1)
     advertise(world, 1, "leds")

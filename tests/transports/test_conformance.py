@@ -300,7 +300,10 @@ async def test_a_reader_that_keeps_up_loses_nothing(cable: Cable) -> None:
             if message.data == total - 1:
                 break
         assert subscriber.lost == 0
+        await until(lambda: not a.nodes["send"].running)  # while its subscriber stays
         assert not a.links[0].losses
+        links = a.links[0], b.links[0]
+    assert not links[0].losses + links[1].losses
 
 
 @conforms_lines

@@ -31,14 +31,21 @@ _LONGEST = 256  # bytes
 
 
 class Credits:
-    """The credit of all topics of one link. `outlets` gives those that are there."""
+    """The credit of all topics of one link. `outlets` gives those that are there; `left(topic, session)` is called for
+    each last credit, whether or not there is an outlet.
+    """
 
     def __init__(
-        self, loop: "asyncio.AbstractEventLoop", stats: LinkStats, outlets: Callable[[], Iterable["ZenohOutlet"]]
+        self,
+        loop: "asyncio.AbstractEventLoop",
+        stats: LinkStats,
+        outlets: Callable[[], Iterable["ZenohOutlet"]],
+        left: Callable[[str, int], object],
     ) -> None:
         self._loop = loop
         self._stats = stats
         self._outlets = outlets
+        self._left = left
         self._tap: Tap | None = None
         self._expected = False
         self._rest: asyncio.TimerHandle | None = None
@@ -92,6 +99,8 @@ class Credits:
             outlet = outlets.get(credit.topic)
             if outlet is not None:
                 outlet.credited(credit.session, publisher_class, credit.serial, leaving=credit.leaving)
+            if credit.leaving:
+                self._left(credit.topic, credit.session)
 
     def _serve(self) -> None:
         """Those who wait."""

@@ -28,6 +28,7 @@ from r2p.transports.link import Hub, Link, unique_name
 from r2p.transports.losses import Losses
 from r2p.transports.zenoh.burst import Burst
 from r2p.transports.zenoh.credits import Credits
+from r2p.transports.zenoh.farewells import Farewells
 from r2p.transports.zenoh.outlet import ZenohOutlet
 from r2p.transports.zenoh.reach import Reach
 from r2p.transports.zenoh.senders import Senders
@@ -83,8 +84,9 @@ class ZenohLink(Link):
         self._tokens = Tokens(hub.space.loop, self._believed)
         self.senders = Senders()
         self.burst = Burst(hub.space.loop, self.stats, self.send_error, batching=batching)
-        self.credits = Credits(hub.space.loop, self.stats, self.zenoh_outlets)
+        self.credits = Credits(hub.space.loop, self.stats, self.zenoh_outlets, self._left)
         self._reach = Reach(self, hub.space.loop)
+        self._farewells = Farewells(hub.space.loop, self.credits.look, self._count_unknown)
         self._streams = Streams(
             name,
             hub.space.loop,
@@ -199,6 +201,7 @@ class ZenohLink(Link):
         self._tokens.went_down()
         super().close()
         self._reach.close()
+        self._farewells.close()
         self.credits.close()
         self.senders.close()
         self._session = None
@@ -217,11 +220,8 @@ class ZenohLink(Link):
                     self._session.undeclare(f"{self.prefix}/{liveliness.place(key)}")
             case Joined(topic, _, window, int(session)):
                 self._welcome(topic, session, window)
-            case Parted(topic, int(session)):
-                self._reach.left(topic, session)
-                outlet = self._outlet(topic)
-                if outlet is not None:
-                    outlet.parted(session)
+            case Parted(topic, int(session), gone):
+                self._part(topic, session, gone=gone)
             case _:
                 super()._act(event)
 
@@ -235,7 +235,25 @@ class ZenohLink(Link):
         else:
             self._reach.came(name, session, window)
 
-    def let_in(self, name: str, session: int, window: int) -> None:
+    def _part(self, name: str, session: int, *, gone: bool) -> None:
+        """Nothing is sent to a subscriber any more. One that is still there goes on taking what is on the way."""
+        self._reach.left(name, session)
+        outlet = self._outlet(name)
+        unconfirmed = 0 if outlet is None else outlet.parted(session)
+        if unconfirmed and gone and self.up:
+            self._farewells.expect(name, session, unconfirmed)
+        elif unconfirmed and gone:  # nothing comes on a link that is down
+            self._count_unknown(unconfirmed)
+
+    def _left(self, name: str, session: int) -> None:
+        """A subscriber says that it leaves."""
+        self._farewells.came(name, session)
+        self._reach.leaves(name, session)
+
+    def _count_unknown(self, count: int) -> None:
+        self.stats.lost["unknown at disconnect"] += count
+
+    def let_in(self, name: str, session: int, window: int, *, leaving: bool = False) -> None:
         """Messages reach it: send it what is latched, and all that comes."""
         topic = self._space.topics[name]
         outlet = self._outlet(name)
@@ -247,6 +265,8 @@ class ZenohLink(Link):
             outlet = self._outlets[name] = ZenohOutlet(self, topic)
             outlet.joined(session, window)
             topic.join(outlet)
+        if leaving:
+            outlet.leaves(session, leaving=True)
 
     def tell_unheard(self, topic: str, session: int) -> None:
         """Messages do not reach a subscriber."""
@@ -288,7 +308,7 @@ class ZenohLink(Link):
     def _credit(self, topic: str, sender: int, publisher_class: int, serial: int, *, leaving: bool = False) -> None:
         if self._session is not None:
             data = encode_credit(Credit(self.instance, publisher_class, serial, topic, leaving))
-            self._session.put(f"{self.prefix}/credit/{sender:x}", data)
+            self._session.put(f"{self.prefix}/credit/{sender:x}", data, final=leaving)
 
     # What comes in; in the loop
 

@@ -71,7 +71,11 @@ class Outbound:
         if not self.by_thread:
             function(*args, **kwargs)
         else:
-            self._hand_over(lambda: function(*args, **kwargs))
+            self.call_by_thread(function, *args, **kwargs)
+
+    def call_by_thread(self, function: Callable[..., object], *args: Any, **kwargs: Any) -> None:
+        """Have the thread call it: it may take long."""
+        self._hand_over(lambda: function(*args, **kwargs))
 
     def ask(self, function: Callable[[], T], then: Callable[[T | None], object]) -> None:
         """Call it in the thread, and `then` with what it returns, in the loop; with None if it raises."""

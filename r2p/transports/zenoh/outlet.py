@@ -108,17 +108,25 @@ class ZenohOutlet(LinkOutlet):
         self.topic.welcome(self)
         self.welcoming = False
 
-    def parted(self, session: int) -> None:
-        """A subscriber is gone: what it was sent and has not confirmed may be lost, unless it left in order."""
+    def parted(self, session: int) -> int:
+        """A subscriber is sent nothing any more; says what it has not confirmed, unless it left in order."""
         self._zenoh.credits.look()
-        unknown = sum([lane.flow.parted(session) for lane in self._lanes.values()])
-        if unknown:
-            self._link.stats.lost["unknown at disconnect"] += unknown
+        unconfirmed = sum([lane.flow.parted(session) for lane in self._lanes.values()])
         self.refill()
+        return unconfirmed
 
     def credited(self, session: int, publisher_class: PublisherClass, serial: int, *, leaving: bool = False) -> None:
-        """A subscriber has taken everything up to this serial; who waits for that is served by `refill`."""
-        self._lanes[publisher_class].flow.credited(session, serial, leaving=leaving)
+        """A subscriber has taken everything up to this serial; who waits for that is served by `refill`.
+
+        `leaving`: it does not subscribe any more, in no class.
+        """
+        self._lanes[publisher_class].flow.credited(session, serial)
+        self.leaves(session, leaving=leaving)
+
+    def leaves(self, session: int, *, leaving: bool) -> None:
+        """Whether a subscriber has said that it does not subscribe any more."""
+        for lane in self._lanes.values():
+            lane.flow.leaves(session, leaving=leaving)
 
     @property
     def expects(self) -> bool:

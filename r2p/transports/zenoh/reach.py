@@ -32,6 +32,7 @@ class _Guest(msgspec.Struct, eq=False):
 
     window: int
     waited: int = 0
+    leaving: bool = False
 
 
 class Reach:
@@ -47,6 +48,12 @@ class Reach:
         """A subscriber is new: let it in as soon as messages reach it."""
         guest = self._guests[topic, session] = _Guest(window)
         self._look(topic, session, guest)
+
+    def leaves(self, topic: str, session: int) -> None:
+        """It has sent its last credit, but its token is still there: should it be let in, it is known to be leaving."""
+        guest = self._guests.get((topic, session))
+        if guest is not None:
+            guest.leaving = True
 
     def left(self, topic: str, session: int) -> None:
         self._guests.pop((topic, session), None)
@@ -67,7 +74,7 @@ class Reach:
             self._loop.call_later(_NEXT * min(guest.waited, 100), self._look, topic, session, guest)
             return
         del self._guests[topic, session]
-        self._link.stats.lost.guard(self._link.let_in, topic, session, guest.window)
+        self._link.stats.lost.guard(self._link.let_in, topic, session, guest.window, leaving=guest.leaving)
         if self._checking is None:
             self._checking = self._loop.call_later(_CHECK, self._check)
 

@@ -113,9 +113,11 @@ class Tap:
         return self._receive() if self._thread_rests else None
 
     def wait(self) -> None:
-        """Nothing waits any more: call `arrived` with the next sample."""
+        """Call `arrived` with the next sample, or soon with one that was handed over meanwhile."""
         self._idle = True
-        if self._thread_rests:
+        if self._handed:
+            self._loop.call_soon(self._pass_on)
+        elif self._thread_rests:
             self._thread_rests = False
             self._go_on.release()
 
@@ -141,12 +143,23 @@ class Tap:
     def _hand_over(self, sample: zenoh.Sample, rests: bool) -> None:
         """In the loop, one sample after the other; behind the last one the thread may rest."""
         self._thread_rests = rests
-        if self._idle:
+        if self._idle and not self._handed:
             self._idle = False
             self._taken += 1
             self._arrived(sample)
         else:
             self._handed.append(sample)
+
+    def _pass_on(self) -> None:
+        """What was handed over before `wait` comes before all that is handed over after it."""
+        if not self._idle or self._closed:
+            return
+        if self._handed:
+            self._idle = False
+            self._taken += 1
+            self._arrived(self._handed.popleft())
+        else:  # it has been taken meanwhile
+            self.wait()
 
 
 async def open_session(config: zenoh.Config) -> "Session":
@@ -271,15 +284,20 @@ class Session:
         self._publishers.discard(publisher)
         self.outbound.call(publisher.undeclare)
 
-    def put(self, key: str, data: bytes, *, attachment: bytes | None = None, urgent: bool = False) -> None:
-        """Send something of the protocol's own."""
-        self.outbound.call(
+    def put(
+        self, key: str, data: bytes, *, attachment: bytes | None = None, urgent: bool = False, final: bool = False
+    ) -> None:
+        """Send something of the protocol's own. `final`: nothing makes up for it if it is lost, so a thread waits where
+        zenoh has no room for it, and with it what is sent afterwards.
+        """
+        call = self.outbound.call_by_thread if final else self.outbound.call
+        call(
             self._session.put,
             key,
             data,
             attachment=attachment,
             priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
-            congestion_control=zenoh.CongestionControl.DROP,
+            congestion_control=zenoh.CongestionControl.BLOCK if final else zenoh.CongestionControl.DROP,
             express=True,
             allowed_destination=zenoh.Locality.REMOTE,
         )

@@ -122,6 +122,10 @@ class Stream:
             if publisher_class == _NRT and flow.window != window:
                 flow.resized(window)
 
+    def opened(self, session: int) -> None:
+        """A publisher's module is there: it is to know when we leave, even if nothing of what it sent has come yet."""
+        self._flow(session, int(_NRT))
+
     def parted(self, sender: Hashable) -> None:
         """A publisher's module is gone: should it come back, what it repeats is as good as new."""
         if sender in self.senders:
@@ -150,10 +154,9 @@ class Stream:
         """Tell those who publish that what is still on the way is not wanted any more."""
         latest = itertools.islice(reversed(self.flows.items()), _FAREWELLS)  # older ones may be gone for long
         for (session, publisher_class), flow in latest:
-            if flow.next >= 0:
-                last = (flow.next - 1) & SERIAL_WRAP
-                credit, guard = self._streams.credit, self._streams.stats.lost.guard
-                guard(credit, self.topic.name, session, publisher_class, last, leaving=True)
+            last = (flow.next - 1) & SERIAL_WRAP if flow.next >= 0 else 0
+            credit, guard = self._streams.credit, self._streams.stats.lost.guard
+            guard(credit, self.topic.name, session, publisher_class, last, leaving=True)
 
     def arrived(self, arrived: "zenoh.Sample | None") -> None:
         """In the loop: hand out what is there, about TURN messages in one turn."""
@@ -425,22 +428,27 @@ class Stream:
     def _lane(self, origin: Origin) -> _Lane:
         """A publisher is new."""
         key = origin.sender, origin.publisher_class
-        if key not in self.flows:
-            if len(self.flows) >= SENDERS:
-                self.flows.clear()
-            window = self._streams.window(self.topic) if origin.publisher_class == _NRT else 0
-            self.flows[key] = Inflow(window)
         lane = _Lane(
             origin,
             Source(origin.module, origin.node, self._streams.link),
             PublisherClass(origin.publisher_class),
-            self.flows[key],
+            self._flow(*key),
             -1,
             False,
             self.topic.heard((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
         self._fit(lane)
         return lane
+
+    def _flow(self, session: int, publisher_class: int) -> Inflow:
+        """How far it has come; the latest one is last."""
+        flow = self.flows.pop((session, publisher_class), None)
+        if flow is None:
+            if len(self.flows) >= SENDERS:
+                self.flows.clear()
+            flow = Inflow(self._streams.window(self.topic) if publisher_class == _NRT else 0)
+        self.flows[session, publisher_class] = flow
+        return flow
 
     def _fit(self, lane: _Lane) -> None:
         lane.fits = self._shape.fits(Shape(0, lane.origin.fingerprint))

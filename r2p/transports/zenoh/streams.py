@@ -127,6 +127,8 @@ class Streams:
         if stream is not None and sender not in stream.senders:
             stream.senders.add(sender)
             topic.inlets += 1
+            if isinstance(sender, int):
+                stream.opened(sender)
             for queue in topic.queues:
                 queue.publisher_joined()
 

@@ -42,7 +42,7 @@ class Payload(bytes):
 async def test_credits() -> None:
     stats = LinkStats()
     outlets = [outlet("a", credited=once(print)), outlet("b", refill=once(print)), outlet("c")]
-    credits_of = Credits(asyncio.get_running_loop(), stats, lambda: outlets)
+    credits_of = Credits(asyncio.get_running_loop(), stats, lambda: outlets, lambda *_: None)
     waiting = [SimpleNamespace(payload=Payload(encode_credit(Credit(7, 1, 5, each)))) for each in "abc"]
     session: Any = SimpleNamespace(
         subscribe=lambda *_: SimpleNamespace(
@@ -64,7 +64,7 @@ async def test_subscribers(fault: str) -> None:
         stats=LinkStats(),
         knows=lambda _: True,
         senders=SimpleNamespace(reach=lambda _: True),
-        let_in=lambda topic, *_: calls.append(topic),
+        let_in=lambda topic, *_, **__: calls.append(topic),
         credits=SimpleNamespace(look=lambda: None),
         zenoh_outlets=lambda: outlets,
         tell_unheard=lambda *_: None,

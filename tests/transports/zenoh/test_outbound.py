@@ -54,6 +54,19 @@ async def test_with_few_tokens_every_call_is_made_at_once() -> None:
     assert busy.threads == {threading.get_ident()}
 
 
+async def test_what_may_take_long_is_called_by_the_thread_and_what_follows_stays_behind_it() -> None:
+    out, busy = outbound(), Busy()
+    out.call_by_thread(busy.call, 1)
+    out.call(busy.call, 2)
+    assert busy.calls == []
+    busy.free.set()
+    await idle(out)
+    out.call(busy.call, 3)
+    out.finish()
+    assert busy.calls == [1, 2, 3]
+    assert len(busy.threads) == 2
+
+
 async def test_with_many_a_thread_makes_them_in_order_and_the_loop_goes_on() -> None:
     out, busy = outbound(), Busy()
     out.watch(CROWD)

@@ -113,6 +113,24 @@ async def test_a_tap_gives_everything_once_and_in_order_fast_or_slow() -> None:
     reader.tap.close()
 
 
+@pytest.mark.parametrize("taken_meanwhile", [False, True])
+async def test_what_was_handed_over_before_a_tap_waits_comes_before_what_comes_after_it(taken_meanwhile: bool) -> None:
+    subscriber: Any = Channel()
+    taken: list[int] = []
+    tap = Tap(subscriber, asyncio.get_running_loop(), taken.append)  # type: ignore[arg-type]
+    for number in (1, 2):
+        tap._hand_over(number, rests=False)  # type: ignore[arg-type]
+    tap.wait()
+    if taken_meanwhile:
+        taken.append(tap.take())  # type: ignore[arg-type]
+    tap._hand_over(3, rests=False)  # type: ignore[arg-type]
+    await asyncio.sleep(0)
+    tap.wait()
+    await asyncio.sleep(0)
+    assert taken == [1, 2, 3]
+    tap.close()
+
+
 @pytest.mark.parametrize("waiting", [0, 1, 5])
 async def test_the_thread_of_a_tap_ends_with_it(waiting: int) -> None:
     before = set(threading.enumerate())

@@ -400,6 +400,15 @@ async def test_a_last_credit_that_fails_does_not_keep_the_stream() -> None:
     assert ring.stats.lost == {"internal error": 1, "not subscribed": 1}
 
 
+async def test_who_unsubscribes_tells_those_of_whom_nothing_has_come_yet() -> None:
+    """What they sent may be on the way."""
+    ring = Ring(queue=2)
+    ring.streams.open(ring.topic, SIZE, 7)
+    ring.streams.shut("leds", 7)  # as discovery does, before the stream ends
+    ring.streams.shut_all("leds")
+    assert (ring.last_words, ring.credits) == (1, [(1, 0)])
+
+
 async def test_who_unsubscribes_tells_those_who_publish_and_counts_what_waits() -> None:
     ring = Ring(queue=2)
     ring.streams.open(ring.topic, SIZE, 7)
