@@ -42,7 +42,7 @@ logger = get_logger("r2p.module")
 _CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link comes up without a word
 _ANSWERED = 5_000_000_000  # ns after an order in which gateways may say that it does not pass
-_APART = 1_000_000_000  # ns between two lines about one topic whose types differ
+_MISMATCH_LINES = 1  # of the log in a second about one topic whose types differ
 _USED_AFTER = 3.0  # seconds after which a connection counts as one that the other end did not refuse
 _REFUSED_APART = 60_000_000_000  # ns between two lines about connections that one URL refuses, or is refused
 
@@ -92,7 +92,7 @@ class ModuleHub:
         self._obey = obey
         self._suspected: set[str] = set()
         self._ordered: dict[tuple[Command, str], tuple[int, str]] = {}
-        self._mismatches: dict[Link, dict[str, int]] = {}
+        self._mismatches: dict[Link, LineLimit] = {}
         self._limits: dict[Link, LineLimit] = {}
         self._clients = LineLimit()
         self._refused = LineLimit(1, _REFUSED_APART)
@@ -131,6 +131,7 @@ class ModuleHub:
         """A transport has a link, up or not yet."""
         self.links.append(link)
         self._limits[link] = LineLimit()
+        self._mismatches[link] = LineLimit(_MISMATCH_LINES)
         self.space.links.append(link)
         self._joints.attach(link)
         for topic in list(self.space.topics.values()):
@@ -143,7 +144,7 @@ class ModuleHub:
         self.space.links.remove(link)
         self._joints.detach(link)
         del self._limits[link]
-        self._mismatches.pop(link, None)
+        del self._mismatches[link]
         self._end_denial(link)
         self.closed_links.add(link.stats, link.losses)
 
@@ -288,11 +289,11 @@ class ModuleHub:
 
     def _log_mismatch(self, link: Link, event: Mismatched) -> None:
         """At most once a second: another type in each message would fill the log."""
-        now = self.space.clock.monotonic()
-        logged = self._mismatches.setdefault(link, {})
-        if now - logged.get(event.topic, -_APART) >= _APART:
-            logged[event.topic] = now
-            logger.error("link %s: topic %s is refused: %s", link.title, event.topic, describe_mismatch(event))
+        limit = self._mismatches.get(link)
+        more = None if limit is None else limit.suffix(event.topic, self.space.clock.monotonic())
+        if more is not None:
+            text = describe_mismatch(event)
+            logger.error("link %s: topic %s is refused: %s%s", link.title, event.topic, text, more)
 
     def _tell_gone(self, link: Link, event: ModuleGone) -> None:
         """A module on the link itself is gone. While the link is up that is news; without a good-bye it is trouble."""

@@ -9,13 +9,15 @@ class LineLimit:
     def __init__(self, rate: int = 10, period: int = _SECOND) -> None:
         self._rate = rate
         self._period = period
-        self._seconds: dict[str, tuple[int, int]] = {}  # when it began, and how many lines there would have been
+        self._lines: dict[str, list[int]] = {}
+        """Of each kind: since when (ns), and how many there would have been since then."""
 
     def suffix(self, kind: str, now: int) -> str | None:
         """What to append to one more line (monotonic `now` in ns); None: leave it out."""
-        began, count = self._seconds.get(kind, (now - self._period, 0))
-        if now - began >= self._period:
-            self._seconds[kind] = now, 1
-            return f" ({count - self._rate} more since the last such line)" if count > self._rate else ""
-        self._seconds[kind] = began, count + 1
-        return "" if count < self._rate else None
+        lines = self._lines.get(kind)
+        if lines is not None and now - lines[0] < self._period:  # first: it is so for most lines of a flood
+            lines[1] += 1
+            return "" if lines[1] <= self._rate else None
+        left_out = lines[1] - self._rate if lines is not None else 0
+        self._lines[kind] = [now, 1]
+        return f" ({left_out} more since the last such line)" if left_out > 0 else ""

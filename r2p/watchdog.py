@@ -22,10 +22,12 @@ from pathlib import Path
 from types import FrameType
 
 from r2p.clock import clock_of
+from r2p.line_limit import LineLimit
 
 logger = logging.getLogger("r2p.watchdog")
 
 _SECOND = 1_000_000_000
+_REPORTS = 1  # in a second
 _MOST_KNOWN = 256  # stacks that are remembered
 
 LIMIT = 0.1
@@ -70,8 +72,7 @@ class Watchdog:
         self._ended = threading.Event()
         self._watched = 0
         self._known: set[str] = set()  # stacks that have been logged
-        self._reported = -_SECOND
-        self._left_out = 0  # blocks since then that were not reported
+        self._line_limit = LineLimit(_REPORTS)
         self._base: FrameType | None = None  # whatever runs a loop that is not written in Python
         self._thread = threading.Thread(target=self._watch, name="r2p-watchdog", daemon=True)
 
@@ -134,12 +135,9 @@ class Watchdog:
 
     def _report(self) -> bool:
         """Log where the loop is stuck; False: there was a report less than a second ago."""
-        now = self._clock.monotonic()
-        if now - self._reported < _SECOND:
-            self._left_out += 1
+        more = self._line_limit.suffix("", self._clock.monotonic())
+        if more is None:
             return False
-        more = f" ({self._left_out} more blocks since the last report)" if self._left_out else ""
-        self._reported, self._left_out = now, 0
         frame = sys._current_frames().get(self._watched)  # noqa: SLF001 - documented, for exactly this use
         stack = _own_part(frame) if frame is not None and frame is not self._base else []
         if not stack:

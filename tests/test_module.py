@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import r2p
+from r2p.codecs.management import ROLE_PUBLISHES
 from r2p.events import EVENTS
 from r2p.module import PATIENCE
 from r2p.msg import Encoder, Led, Log, Odometry
-from r2p.protocols.events import Mismatched, NameConflict
+from r2p.protocols.events import Mismatched, NameConflict, Shape
 from r2p.transports.link import Transport
 from r2p.transports.memory import network
 from tests.bench import collect, crashes, hold, joined, led, local, settle
@@ -300,6 +301,18 @@ async def test_namesakes_on_two_links_are_told_by_who_hears_both() -> None:
         await settle(3.0)
     for stream in events:
         assert [event.module async for event in stream if isinstance(event, NameConflict)]
+
+
+@pytest.mark.virtual_time
+async def test_types_that_differ_again_and_again_are_logged_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+    async with joined("A") as a:
+        for _ in range(3):
+            for size in (9, 10):
+                event = Mismatched("leds", None, ROLE_PUBLISHES, Shape(5), Shape(size))
+                a._opened.discovered(a.links[0], event)
+            await settle(1.0)
+    lines = [record.getMessage() for record in caplog.records if "topic leds is refused" in record.getMessage()]
+    assert [line.endswith(" (1 more since the last such line)") for line in lines] == [False, True, True]
 
 
 @pytest.mark.virtual_time

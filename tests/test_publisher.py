@@ -112,6 +112,7 @@ async def test_misses_are_logged_once_a_second_and_signalled_each_time(caplog: p
     lines = [record.getMessage() for record in caplog.records if record.name == "r2p.PC1.pub"]
     assert len(lines) == 3
     assert lines[0] == "topic leds (sub): no room (missed 1, late 0 so far)"
+    assert lines[1] == "topic leds (sub): no room (missed 11, late 0 so far) (9 more since the last such line)"
 
 
 @pytest.mark.virtual_time

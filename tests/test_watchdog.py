@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 import pytest
 
 import r2p
+from r2p.line_limit import LineLimit
 from r2p.transports.link import Hub, Transport
 from r2p.watchdog import Watchdog
 from tests.bench import local
@@ -102,10 +103,10 @@ async def test_a_loop_that_only_waits_has_nobody_to_blame(reports: Reports) -> N
     watchdog = Watchdog(asyncio.get_running_loop())
     watchdog.start()
     watchdog._ended.set()
+    watchdog._line_limit = LineLimit(1001)
 
     def look() -> None:
         for _ in range(1000):  # once the loop has come to where it waits for this thread
-            watchdog._reported = -(1 << 62)
             watchdog._report()
             if "none of its code runs" in reports.texts[-1]:
                 return
@@ -218,9 +219,9 @@ async def test_one_report_a_second_and_each_stack_once(reports: Reports) -> None
     first, again, second = reports.texts
     assert "in one\n" in first
     assert again.splitlines() == [again]
-    assert "ms (2 more blocks since the last report), again in " in again
+    assert "ms (2 more since the last such line), again in " in again
     assert "in other\n" in second
-    assert "(1 more blocks" in second
+    assert "(1 more since" in second
 
 
 class Steps:

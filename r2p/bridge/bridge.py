@@ -45,7 +45,6 @@ _ALIVE = 0x11
 _HELLO = 0x50
 _HELLO_FLAGS = 12  # its place
 _TREE = (0x60, 0x61, 0x62)
-_SELDOM = 1_000_000_000  # ns between two lines of the log on one link about orders that do not pass
 _NO_GATEWAY = "no gateway may be there: nothing passes; listen with ?gateways=yes where gateways are to join"
 _WORDS = {
     State.ALONE: "forwards",
@@ -285,15 +284,15 @@ class Bridge:
     def _refuse_order(self, port: BridgePort, order: _Order, kind: int, reason: int, *, known: bool) -> None:
         """Count it, log it once in a while, and answer if it is for a module that is `known`."""
         port.lose("order refused")
-        now = self._clock.monotonic()
-        if now >= port.refusal_logged_at + _SELDOM:
-            port.refusal_logged_at = now
+        more = port.refusals.suffix("", self._clock.monotonic())
+        if more is not None:
             logger.warning(
-                "%s from %s is refused: %s (%d orders refused so far)",
+                "%s from %s is refused: %s (%d orders refused so far)%s",
                 type(order).__name__.upper(),
                 port.name,
                 _REFUSALS[reason],
                 port.dropped["order refused"],
+                more,
             )
         if known:
             self._deny(port, management.Denied(self.name, order.module, kind, reason))

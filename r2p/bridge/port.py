@@ -4,11 +4,14 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
+from r2p.line_limit import LineLimit
 from r2p.protocols.bridging.base import Port, State
 from r2p.sample import Source
 from r2p.topic import Topic
 from r2p.transports.announce import Told
 from r2p.transports.link import Link
+
+_REFUSAL_LINES = 1  # of the log in a second on one link about orders that do not pass
 
 
 class Owner(Protocol):
@@ -52,8 +55,8 @@ class BridgePort:
         self.demand = link.discovery.demand()
         self.denied_at = -(1 << 62)
         """When it was told last that an order does not pass (monotonic ns)."""
-        self.refusal_logged_at = -(1 << 62)
-        """When that was logged last (monotonic ns)."""
+        self.refusals = LineLimit(_REFUSAL_LINES)
+        """For the lines of the log that say so."""
         self._owner = owner
         self._generation = -1
 

@@ -15,6 +15,7 @@ from r2p.bridge.relay import BridgedTopic, Relay, Way
 from r2p.bridge.reserving import RelayedPeriodic
 from r2p.bridge.shaping import Shaper
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.line_limit import LineLimit
 from r2p.names import LOADER_PREFIX
 from r2p.printable import get_logger
 from r2p.protocols.events import Shape
@@ -28,7 +29,7 @@ _NAME = re.compile(r"[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)?")
 LONG_NAMES = 64
 """Names too long for a link that are remembered, so that each is told once; beyond that one a second is told."""
 
-_SECOND = 1_000_000_000
+_LINES = 1  # of the log in a second about names that are too long, when there are many of them
 _BUSES = frozenset({"rtcan", "sim"})
 
 
@@ -46,7 +47,7 @@ class Relays:
         self._reviewing = False
         self._shapes: dict[tuple[str, str], tuple[Shape, Shape]] = {}
         self._too_long: dict[str, None] = {}
-        self._told_at = 0
+        self._limit = LineLimit(_LINES)
 
     # What has changed
 
@@ -243,11 +244,12 @@ class Relays:
         return False
 
     def _tell_too_long(self, name: str, port: BridgePort) -> None:
-        now = self._space.clock.monotonic()
-        if len(self._too_long) < LONG_NAMES or now >= self._told_at + _SECOND:
-            self._told_at = now
-            logger.warning("link %s carries no name as long as %s: the topic is not relayed there", port.name, name)
-        if len(self._too_long) >= LONG_NAMES:
+        many = len(self._too_long) >= LONG_NAMES
+        more = self._limit.suffix("", self._space.clock.monotonic()) if many else ""
+        if more is not None:
+            text = "link %s carries no name as long as %s: the topic is not relayed there%s"
+            logger.warning(text, port.name, name, more)
+        if many:
             del self._too_long[next(iter(self._too_long))]
         self._too_long[name] = None
 

@@ -100,11 +100,6 @@ def id8_of(message: int) -> int:
     return message & 0xFF
 
 
-def firmware_message_id(index: int, id8: int) -> int:
-    """The id that firmware of 2014 gives to the topic at this place in its list: only four bits of `index` are left."""
-    return (index & 15) << 12 | (id8 & 15) << 8 | id8 & 0xFF
-
-
 def srt_laxity(remaining: int) -> int:
     """The laxity of a soft real-time message with `remaining` ns to its deadline, which may be over: 1..62."""
     laxity = remaining // _MILLISECOND

@@ -10,6 +10,7 @@ from msgspec import structs
 from r2p.classes import Missed, Signal
 from r2p.durations import timeout_or_none
 from r2p.errors import Closed, MessageError
+from r2p.line_limit import LineLimit
 from r2p.messages import Layout, Message
 from r2p.room import LINK_DOWN, Sink
 from r2p.sample import PublisherClass, Sample, Source
@@ -17,7 +18,7 @@ from r2p.topic import BURST, Owner, Topic, TopicSpace
 
 M = TypeVar("M", bound=Message)
 
-_SECOND = 1_000_000_000
+_LINES = 1  # of the log in a second about what is missed or late
 _AGAIN = 0.001  # seconds until a signal that publishes is told what became of that
 _AT_ONCE = 4  # of those, one by one
 _REMEMBERED = 64  # messages that were missed last
@@ -47,7 +48,7 @@ class BasePublisher(Generic[M]):
         self._source = Source(space.module, node.name)
         self._last: Sample | None = None
         self._credit = BURST
-        self._logged = -_SECOND
+        self._lines = LineLimit(_LINES)
         self._waiters: list[asyncio.Future[None]] = []
         self._signalling = False
         self._later: list[tuple[Signal, Missed]] = []
@@ -167,9 +168,11 @@ class BasePublisher(Generic[M]):
         """A message has not reached these sinks, or this link; however many that are, it counts once."""
         is_news = self._is_news(sequence)
         self.missed += is_news
-        if self._on_missed is not None or self._is_log_due(reason):
+        # As _line_suffix, inlined: where a queue is full, this is done for each message.
+        more = None if reason == LINK_DOWN else self._lines.suffix("", self._clock.monotonic())
+        if self._on_missed is not None or more is not None:
             names = without if isinstance(without, str) else where(without)
-            self._signal(Missed(self.topic, reason, names, late, int(is_news)), self._on_missed)
+            self._tell(Missed(self.topic, reason, names, late, int(is_news)), self._on_missed, more)
 
     def _is_news(self, sequence: int) -> bool:
         """Whether this message has not been missed yet; of one without a number that is not known."""
@@ -181,9 +184,9 @@ class BasePublisher(Generic[M]):
         self._missed_lately.append(sequence)
         return True
 
-    def _is_log_due(self, reason: str) -> bool:
-        """Once a second; not of a link that is down, which was told when it went down."""
-        return reason != LINK_DOWN and self._clock.monotonic() - self._logged >= _SECOND
+    def _line_suffix(self, reason: str) -> str | None:
+        """What to append to a line of the log; None: leave it out, as all of a link that is down: that is logged."""
+        return None if reason == LINK_DOWN else self._lines.suffix("", self._clock.monotonic())
 
     def _unreachable(self, sample: Sample, sinks: list[Sink]) -> None:
         """Links that are down: who is behind them misses the sample."""
@@ -192,9 +195,12 @@ class BasePublisher(Generic[M]):
         self._miss(sample.sequence, LINK_DOWN, sinks)
 
     def _signal(self, missed: Missed, callback: Signal | None) -> None:
-        if self._is_log_due(missed.reason):
-            self._logged = self._clock.monotonic()
-            self.node.log.warning("%s (missed %d, late %d so far)", missed, self.missed, self.late)
+        self._tell(missed, callback, self._line_suffix(missed.reason))
+
+    def _tell(self, missed: Missed, callback: Signal | None, more: str | None) -> None:
+        """Log it, unless `more` is None, and call the user's code."""
+        if more is not None:
+            self.node.log.warning("%s (missed %d, late %d so far)%s", missed, self.missed, self.late, more)
         if callback is None:
             return
         if self._signalling:

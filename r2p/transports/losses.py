@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
 from r2p.clock import Clock, clock_of
+from r2p.line_limit import LineLimit
 from r2p.printable import get_logger
 
 logger = get_logger("r2p.link")
@@ -18,8 +19,10 @@ logger = get_logger("r2p.link")
 TRY_AGAIN = 100_000_000
 """Ns after which a timer goes off again whose work raised; else a deadline that is over would be tried without end."""
 
-_APART = 1_000_000_000
-"""Ns between two lines about one reason."""
+_LINES = 1
+"""Lines of the log in a second about one reason."""
+
+_TRACEBACK = "traceback"
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -33,26 +36,23 @@ class Losses(Counter[str]):
         super().__init__()
         self._link = link
         self._clock = clock or clock_of()
-        self._told: dict[str, int] = {}
-        self._traced = -_APART
+        self._limit = LineLimit(_LINES)
 
     def __setitem__(self, reason: str, count: int) -> None:
         grown = count > self[reason]
         super().__setitem__(reason, count)
         if grown and logger.isEnabledFor(logging.DEBUG):
-            now = self._clock.monotonic()
-            if now - self._told.get(reason, -_APART) >= _APART:
-                self._told[reason] = now
-                logger.debug("link %s drops: %s (%d so far)", self._link, reason, count)
+            more = self._limit.suffix(reason, self._clock.monotonic())
+            if more is not None:
+                logger.debug("link %s drops: %s (%d so far)%s", self._link, reason, count, more)
 
     def internal_error(self, error: Exception, count: int = 1) -> None:
         """The handling of an item, or of `count` messages, raised: count them, log the traceback once a second."""
         self["internal error"] += count
-        now = self._clock.monotonic()
-        if now - self._traced >= _APART:
-            self._traced = now
-            total = self["internal error"]
-            logger.error("link %s: internal error (%d so far), please report it", self._link, total, exc_info=error)
+        more = self._limit.suffix(_TRACEBACK, self._clock.monotonic())
+        if more is not None:
+            text = "link %s: internal error (%d so far), please report it%s"
+            logger.error(text, self._link, self["internal error"], more, exc_info=error)
 
     def guard(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> bool:
         """Call it; False if it raised."""

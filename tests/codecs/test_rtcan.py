@@ -23,7 +23,6 @@ from r2p.codecs.rtcan import (
     decode_sync,
     encode_identifier,
     encode_sync,
-    firmware_message_id,
     fragment_count,
     fragments,
     frame_bits,
@@ -226,10 +225,7 @@ def test_message_id_has_limits(high: int, id8: int) -> None:
         message_id(high, id8)
 
 
-def test_message_ids_of_2014() -> None:
-    assert firmware_message_id(index=3, id8=0x28) == 0x3828
-    assert firmware_message_id(index=19, id8=0x28) == 0x3828  # only four bits of the index
-    assert firmware_message_id(index=0, id8=0) == FIRMWARE_MANAGEMENT
+def test_management_of_2014_has_the_high_byte_of_a_sync() -> None:
     assert high_byte(FIRMWARE_MANAGEMENT) == SYNC != MANAGEMENT
 
 

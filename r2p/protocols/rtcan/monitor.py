@@ -11,7 +11,7 @@ from collections import Counter, deque
 import msgspec
 
 from r2p.codecs import management, rtcan
-from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.codecs.rtcan import Frame, Identifier, OtherFrame
 from r2p.protocols.rtcan.census import Census
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.reassembly import Reassembly
@@ -177,8 +177,9 @@ class Monitor:
     def frame(self, frame: Frame, stamp: int) -> SeenFrame:
         """A frame was on the bus until `stamp`."""
         self._on_bus(stamp)
-        message = frame.id >> 7 & 0xFFFF
-        kind = self._kind(frame, message)
+        identifier = rtcan.decode_identifier(frame.id)
+        message = identifier.message
+        kind = self._kind(frame, identifier)
         bits = rtcan.frame_bits(frame.id, frame.data)
         start = stamp - bits * self.census.timing.bit
         if kind is FrameKind.SYNC:
@@ -195,8 +196,8 @@ class Monitor:
             kind,
             "" if kind is FrameKind.SYNC else self.census.topic(message),
             "" if kind is FrameKind.SYNC else self.census.module(message),
-            frame.id >> 23,
-            frame.id & 0x7F,
+            identifier.laxity,
+            identifier.left,
             bits + rtcan.INTERMISSION,
             rtcan.fragment_count(size) if size and size <= rtcan.PAYLOAD_MAX else None,
             self._cycle if self._sync is not None else None,
@@ -317,12 +318,12 @@ class Monitor:
             self._forget_slots()
         return text
 
-    def _kind(self, frame: Frame, message: int) -> FrameKind:
+    def _kind(self, frame: Frame, identifier: Identifier) -> FrameKind:
+        message, laxity = identifier.message, identifier.laxity
         if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX and not self._ends_management(message):
             return FrameKind.SYNC
         if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.census.topics:
             return FrameKind.MANAGEMENT  # firmware of 2014 may have topics there
-        laxity = frame.id >> 23
         return FrameKind.HRT if laxity == rtcan.HRT else FrameKind.NRT if laxity == rtcan.NRT else FrameKind.SRT
 
     def _ends_management(self, message: int) -> bool:

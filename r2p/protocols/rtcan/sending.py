@@ -152,7 +152,7 @@ class Sender:
         slot = periodic.waiting
         periodic.restart(payload)
         if slot is not None and payload is not None:
-            current = (now + self._latency - self._cycle.reference) // self._slot
+            current = self._cycle.slot_at(now + self._latency)
             self._send_periodic(now, periodic, 0, slot - self._cycle.number_of(0), current)
 
     def reset(self) -> None:
@@ -166,7 +166,7 @@ class Sender:
             if self.mode is _FREE:
                 self.kick(now)
                 return
-            current = (now + self._latency - self._cycle.reference) // self._slot
+            current = self._cycle.slot_at(now + self._latency)
             if now + self._latency >= self._end:
                 self._run(now, self._slots, current)
                 self._turn(now)
@@ -225,7 +225,7 @@ class Sender:
         cycle = self._cycle
         slot = self._agenda.next[self._done]
         if self._queue.size and self._post.idle and self.mode is _SLOTTED:
-            over = (now + self._ahead - cycle.reference) // self._slot
+            over = cycle.slot_at(now + self._ahead)
             if over < self._tried:
                 over = self._tried
             if over < self._slots and cycle.next_free[over] < slot:

@@ -62,7 +62,7 @@ def test_a_topic_of_firmware_with_a_low_high_byte_is_no_management() -> None:
     node, _ = bus.add(id8=10, profile=Profile.FIRMWARE), bus.add(id8=11, profile=Profile.FIRMWARE)
     bus.start()
     bus.run(2 * SECOND)
-    node.engine.subscribe(rtcan.firmware_message_id(0, 0x21), 4)  # 0x0121
+    node.engine.subscribe(0x0121, 4)  # the first topic of the module 0x21
     node.act(node.engine.receive(node.now, Frame(rtcan.encode_identifier(9, 0x0121), b"abcd"), node.now))
     assert node.of(Received)[-1].payload == b"abcd"
 
