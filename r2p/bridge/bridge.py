@@ -1,6 +1,7 @@
 """The gateway of a module: its ports, the tree that they are part of, and what passes between them besides topics."""
 
 import itertools
+import operator
 from collections.abc import Callable
 
 import msgspec
@@ -401,7 +402,7 @@ class Bridge:
         ways = [
             WayStatistics(topic, source, target, way.forwarded, dict(way.dropped))
             for topic, relay in sorted(self.relays.by_name.items())
-            for (source, target), way in sorted(relay.ways.items())
+            for (source, target), way in sorted(relay.ways, key=operator.itemgetter(0))
         ]
         return GatewayStatistics(ports, ways)
 

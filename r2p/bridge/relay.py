@@ -1,12 +1,14 @@
 """A topic of a gateway: what comes in by one link goes out by those others where somebody wants it.
 
-`ways` is worked out when something changes (`Relays`), so that forwarding is one loop over what is there. Each message
-asks the clock whether its two ports may still forward: a gateway that was stopped must not go on with an old tree.
+`ways` are worked out when something changes (`Relays`), and which of them messages of a link take when the first one
+comes after that: so forwarding is one loop over what is there, and a change costs as much as the ways that it concerns.
+Each message asks the clock whether its two ports may still forward: a gateway that was stopped must not go on with an
+old tree.
 """
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import TYPE_CHECKING, cast
 
 from r2p.bridge.held import Held
@@ -51,7 +53,11 @@ class BridgedTopic(Topic):
         self.relay: Relay | None = None
         """Set while it is relayed."""
         self.open: dict[str, list[Way]] = {}
-        """The ways that messages take now, by the name of the link that they come from."""
+        """The ways that messages take now, by the name of the link that they come from, as far as any came since the
+        last change. Replaced whole at a change, as a message may be on its way through one of the lists.
+        """
+        self.by_carrier: dict[object, Outlet] = {}
+        """The outlets, by their links."""
         self.reserved: RelayedPeriodic | None = None
         """Set where a bus is to send it in slots of its own."""
         self._ports = ports
@@ -89,37 +95,43 @@ class BridgedTopic(Topic):
             port.lose("seen before")
             return None
         ways = self.open.get(link)
-        if ways is None and not self.queues:  # not yet, or not any more, as its publisher will soon know
-            port.dropped["not subscribed"] += 1
-            return None
+        if not ways:
+            if ways is None:
+                ways = self.open[link] = [] if self.relay is None else self.relay.route(link)
+            if not ways and not self.queues:  # not yet, or not any more, as its publisher will soon know
+                port.dropped["not subscribed"] += 1
+                return None
         blocked = super().deliver(sample) if self.queues else None
-        for way in ways or ():
+        for way in ways:
             blocked = self._forward(way, sample, now, blocked)
         return blocked
 
     def replay(self, sample: Sample, outlet: Outlet) -> None:
-        """Send the last message to somebody who has joined later, if it comes from another link."""
-        for way in self.open.get(sample.source.link, ()):
-            if way.outlet is outlet:
-                for sink in self._forward(way, sample, self._monotonic(), None) or ():
-                    sink.remind(sample)
+        """Send the last message to a subscriber that has joined later, if it comes from another link."""
+        way = None if self.relay is None else self.relay.way(sample.source.link, outlet.link)
+        if way is not None and way.outlet is outlet:
+            for sink in self._forward(way, sample, self._monotonic(), None) or ():
+                sink.remind(sample)
 
     def join(self, sink: QueueSink | Outlet) -> None:
+        if isinstance(sink, Outlet):
+            self.by_carrier[sink.carrier] = sink
+            if self.relay is not None:
+                self.relay.outlet_changed(self, sink)
         super().join(sink)
-        self._joined(sink)
+        if self.relay is not None and isinstance(sink, Outlet):
+            self.relay.remind(sink)
 
     def leave(self, sink: QueueSink | Outlet) -> None:
+        if isinstance(sink, Outlet) and self.by_carrier.get(sink.carrier) is sink:
+            del self.by_carrier[sink.carrier]
+            if self.relay is not None:
+                self.relay.outlet_changed(self, sink)
         super().leave(sink)
-        if self.relay is not None:
-            self.relay.route()
 
     def welcome(self, sink: QueueSink | Outlet) -> None:
         super().welcome(sink)
-        self._joined(sink)
-
-    def _joined(self, sink: QueueSink | Outlet) -> None:
         if self.relay is not None and isinstance(sink, Outlet):
-            self.relay.route()
             self.relay.remind(sink)
 
     def _forward(self, way: Way, sample: Sample, now: int, blocked: list[Sink] | None) -> list[Sink] | None:
@@ -175,43 +187,75 @@ class BridgedTopic(Topic):
 class Relay:
     """A topic of the robot, on all links: `topics` by name, one unless it is called otherwise on some links.
 
-    `ways` are by the names of the two links, from those that have offered it to those that have wanted it; they stay
-    for their counters. `offering` and `wanting` are the ports where that is so now.
+    Its ways lead from links that have offered it to those that have wanted it; they stay for their counters. `offering`
+    and `wanting` are the ports where that is so now.
     """
 
     def __init__(self) -> None:
         self.topics: dict[str, BridgedTopic] = {}
-        self.ways: dict[tuple[str, str], Way] = {}
         self.offering: list[BridgePort] = []
         self.wanting: list[BridgePort] = []
+        self.sources: set[str] = set()
+        """The links whose ways to all of `targets` are worked out."""
+        self.targets: set[str] = set()
+        self._from: dict[str, dict[str, Way]] = {}
+        """Ways by the name of the link that they come from, and that of the link that they go to."""
+        self._into: dict[str, dict[str, Way]] = {}
+        """The other way round."""
+
+    @property
+    def ways(self) -> Iterator[tuple[tuple[str, str], Way]]:
+        """All ways, each with the names of its two links."""
+        return (((source, target), way) for source, ways in self._from.items() for target, way in ways.items())
+
+    def way(self, source: str, target: str) -> Way | None:
+        """The way from one link to another, if there is one."""
+        return self._from.get(source, {}).get(target)
+
+    def add(self, source: str, way: Way) -> None:
+        """There is one more way; it is not `open` before `changed` is called."""
+        way.outlet = way.target.by_carrier.get(way.port.link)
+        self._from.setdefault(source, {})[way.port.name] = way
+        self._into.setdefault(way.port.name, {})[source] = way
 
     def keep(self, links: set[str]) -> None:
         """Forget the ways from and to other links."""
-        for key in [key for key in self.ways if key[0] not in links or key[1] not in links]:
-            del self.ways[key]
+        for link in (self._from.keys() | self._into.keys()) - links:
+            self.forget(link)
+        self.sources &= links
+        self.targets &= links
 
-    def forget(self, link: str) -> bool:
-        """Forget the ways from and to a link; says whether there were any."""
-        keys = [key for key in self.ways if link in key]
-        for key in keys:
-            del self.ways[key]
-        return bool(keys)
+    def forget(self, link: str) -> None:
+        """Forget the ways from and to a link."""
+        self.sources.discard(link)
+        self.targets.discard(link)
+        onward, inward = self._from.pop(link, {}), self._into.pop(link, {})
+        for target in onward:
+            del self._into[target][link]
+        for source in inward:
+            del self._from[source][link]
+        if onward or inward:
+            self.changed()
 
-    def route(self) -> None:
-        """Somebody joined or left, or the ways have changed."""
-        outlets: dict[tuple[str, object], Outlet] = {}
+    def changed(self) -> None:
+        """The ways, or who takes what they bring, have changed: `route` is asked anew by the next message."""
         for topic in self.topics.values():
             topic.open = {}
-            outlets |= {(topic.name, each.carrier): each for each in topic.outlets}
-        for (source, _), way in self.ways.items():
-            way.outlet = outlet = outlets.get((way.target.name, way.port.link))
-            if outlet is None:
-                continue
-            for topic in self.topics.values():
-                topic.open.setdefault(source, []).append(way)
+
+    def outlet_changed(self, topic: BridgedTopic, outlet: Outlet) -> None:
+        """A link joined or left."""
+        now = topic.by_carrier.get(outlet.carrier)
+        for way in self._into.get(outlet.link, {}).values():
+            if way.target is topic and way.port.link is outlet.carrier:
+                way.outlet = now
+        self.changed()
+
+    def route(self, source: str) -> list[Way]:
+        """The ways that messages from a link take now."""
+        return [way for way in self._from.get(source, {}).values() if way.outlet is not None]
 
     def remind(self, outlet: Outlet) -> None:
-        """Send what publishers latch to somebody who has joined."""
+        """Send what publishers latch to a subscriber that has joined."""
         for topic in self.topics.values():
             for memory in topic.memories:
                 memory.remind(topic, cast("QueueSink", _Reminder(topic, outlet)))

@@ -4,6 +4,7 @@ On a link we publish what is offered, and subscribe what is wanted, on another o
 that only on links that are in the tree; so demand travels along the tree, and can't feed itself.
 """
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator
 
@@ -46,6 +47,8 @@ class Relays:
         """Topics that are offered or wanted, and may go nowhere as long as no other link comes."""
         self._reviewing = False
         self._shapes: dict[tuple[str, str], tuple[Shape, Shape]] = {}
+        self._known: dict[tuple[str, int], list[tuple[BridgePort, Shape]]] | None = None
+        """What `_known_types` found, while all links are asked about the same topics one after the other."""
         self._too_long: dict[str, None] = {}
         self._limit = LineLimit(_LINES)
 
@@ -67,16 +70,22 @@ class Relays:
                 continue
             if there and self._carries(topic, port):
                 self._enter(relay, topic, port)
-            elif relay.forget(port.name):
-                relay.route()
+            else:
+                relay.forget(port.name)
             self._tell_port(topic, port)
 
     def retyped(self) -> None:
         """See whether other types, or sizes, are told than before."""
-        for (topic, link), shape in list(self._shapes.items()):
-            port = self._ports.get(link)
-            if port is not None and topic in self.by_name and self._types(topic, port) != shape:
-                self._mark((topic,))
+        self._known = {}
+        try:
+            changed = {topic for (topic, link), shape in self._shapes.items() if self._is_retyped(topic, link, shape)}
+        finally:
+            self._known = None
+        self._mark(changed)
+
+    def _is_retyped(self, topic: str, link: str, shape: tuple[Shape, Shape]) -> bool:
+        port = self._ports.get(link)
+        return port is not None and topic in self.by_name and self._types(topic, port) != shape
 
     def _mark(self, topics: Iterable[str]) -> None:
         """Look at these anew, at once: what comes in next may need a new way."""
@@ -135,17 +144,29 @@ class Relays:
             self._enter(relay, topic, port)
         if topic.startswith(LOADER_PREFIX):
             offering = wanting = ports  # it flows without being offered or wanted
-        for source, target in _pairs(offering, wanting):
-            key = source.name, target.name
-            if key not in relay.ways and self._allows(topic, source, target):
-                relay.ways[key] = Way(target, self._topic(topic, target), self._shaper(topic, source.name, target))
         relay.keep({port.name for port in ports})
-        relay.route()
+        self._find_ways(relay, topic, offering, wanting)
         self._tell(topic)
+
+    def _find_ways(self, relay: Relay, topic: str, offering: list[BridgePort], wanting: list[BridgePort]) -> None:
+        """Add the ways from and to what is new here: looking at all pairs each time would cost links squared."""
+        sources, targets = {port.name for port in offering}, {port.name for port in wanting}
+        new = [port for port in offering if port.name not in relay.sources]
+        old = [port for port in offering if port.name in relay.sources]
+        added = [port for port in wanting if port.name not in relay.targets]
+        for source, target in itertools.chain(_pairs(new, wanting), _pairs(old, added)):
+            if relay.way(source.name, target.name) is None and self._allows(topic, source, target):
+                here = self._topic(topic, target)
+                relay.add(source.name, Way(target, here, self._shaper(topic, source.name, target)))
+        relay.sources, relay.targets = sources, targets
+        if new or added:
+            relay.changed()
 
     def _enter(self, relay: Relay, topic: str, port: BridgePort) -> None:
         here = self._topic(topic, port)
-        here.relay = relay
+        if here.relay is not relay:
+            here.relay = relay
+            here.open = {}
         relay.topics[here.name] = here
 
     def _end(self, topic: str) -> None:
@@ -161,8 +182,12 @@ class Relays:
                 self._space.topics.pop(here.name, None)
 
     def _tell(self, topic: str, topics: dict[str, BridgedTopic] | None = None) -> None:
-        for port in list(self._ports.values()):
-            self._tell_port(topic, port, topics)
+        self._known = {}
+        try:
+            for port in list(self._ports.values()):
+                self._tell_port(topic, port, topics)
+        finally:
+            self._known = None
 
     def _tell_port(self, topic: str, port: BridgePort, topics: dict[str, BridgedTopic] | None = None) -> None:
         """Tell one link of a topic; `topics`: those of a relay that has ended."""
@@ -202,12 +227,26 @@ class Relays:
         Those that it has itself are asked for what they have, so that one of another type elsewhere does not end it.
         """
         relay = self.by_name[topic]
-        others = [each for each in self._ports.values() if each.in_tree] if not relay.offering else relay.offering
-        wanting = [each for each in self._ports.values() if each.in_tree] if not relay.wanting else relay.wanting
         here = self._told(topic, [port], ROLE_PUBLISHES)
-        published = self._told(topic, (each for each in others if each is not port), ROLE_PUBLISHES)
-        asked = self._told(topic, (each for each in wanting if each is not port), ROLE_SUBSCRIBES)
+        published = self._told_elsewhere(topic, port, relay.offering, ROLE_PUBLISHES)
+        asked = self._told_elsewhere(topic, port, relay.wanting, ROLE_SUBSCRIBES)
         return published or asked or Shape(), here or asked or published or Shape()
+
+    def _told_elsewhere(self, topic: str, port: BridgePort, ports: list[BridgePort], role: int) -> Shape | None:
+        """The type that the first other one of these links tells; where there are none, the first that is known."""
+        if ports:
+            return self._told(topic, (each for each in ports if each is not port), role)
+        return next((shape for each, shape in self._known_types(topic, role) if each is not port), None)
+
+    def _known_types(self, topic: str, role: int) -> list[tuple[BridgePort, Shape]]:
+        """The first two links that know a type: so each link finds one besides its own, and none looks at all."""
+        known = None if self._known is None else self._known.get((topic, role))
+        if known is None:
+            told = ((port, self._told(topic, [port], role)) for port in self._ports.values() if port.in_tree)
+            known = list(itertools.islice(((port, shape) for port, shape in told if shape is not None), 2))
+            if self._known is not None:
+                self._known[topic, role] = known
+        return known
 
     def _told(self, topic: str, ports: Iterable[BridgePort], role: int) -> Shape | None:
         """The type that the first link tells."""
