@@ -28,6 +28,7 @@ class Census:
         self._names: dict[int, str] = {}  # by instance
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
         self._suspected: dict[str, int] = {}
+        self._hidden: dict[str, None] = {}  # names with tokens for which there is no room among the modules
 
     # Tokens
 
@@ -84,11 +85,15 @@ class Census:
     # Namesakes
 
     def next_deadline(self) -> int | None:
-        """When to call `poll` (monotonic ns)."""
+        """When to call `poll` (monotonic ns); a time in the past means at once."""
+        if self._hidden and len(self.modules) < MOST:
+            return 0
         return min(self._suspected.values(), default=None)
 
     def poll(self, now: int) -> None:
-        """Tell of modules that have carried one name for long enough."""
+        """Tell of modules that have room now, and of those that have carried one name for long enough."""
+        while self._hidden and len(self.modules) < MOST:
+            self._review(now, next(iter(self._hidden)))
         for name in [name for name, due in self._suspected.items() if due <= now]:
             del self._suspected[name]
             instances = [each.instance for each in self._named.get(name, {}).values()]
@@ -101,6 +106,7 @@ class Census:
         """The tokens of a name have changed: the nearest and latest of them is the module."""
         tokens = [each for each in self._named.get(name, {}).values() if each.instance != self._instance]
         before = self.modules.get(name)
+        self._hidden.pop(name, None)
         if not tokens:
             self._suspected.pop(name, None)
             if before is not None:
@@ -116,6 +122,8 @@ class Census:
     def _keep(self, before: ModuleInfo | None, info: ModuleInfo) -> None:
         if before is None and len(self.modules) >= MOST:
             self._counts["modules forgotten"] += 1
+            if info.name in self._named:  # no token tells of it again
+                self._hidden[info.name] = None
             return
         self.modules[info.name] = info
         if before is not None and before.instance is not None and before.instance != info.instance:

@@ -177,6 +177,10 @@ class Undeclare(msgspec.Struct, frozen=True):
     key: str
 
 
+class Look(msgspec.Struct, frozen=True):
+    """Ask the network for all tokens: call `Presence.appeared` with each of them, then `Presence.looked`."""
+
+
 class Parted(msgspec.Struct, frozen=True):
     """Nothing flows to one remote subscriber any more; if it was the last one, `Left` follows. Told where they are
     told apart. `gone`: it is gone itself; else it still subscribes, and this module publishes no more, or another type.
@@ -203,5 +207,6 @@ Event = (
     | ModuleGone
     | Declare
     | Undeclare
+    | Look
     | Parted
 )

@@ -26,6 +26,7 @@ from r2p.protocols.events import (
     ORDERS,
     Command,
     Event,
+    Look,
     ModuleInfo,
     NameConflict,
     Obey,
@@ -35,6 +36,7 @@ from r2p.protocols.events import (
     Source,
 )
 from r2p.protocols.matching import Matching
+from r2p.protocols.refused import Refused
 
 TOKENS = 4 * MOST
 """Tokens of others that are kept at most."""
@@ -70,6 +72,7 @@ class Presence:
         self._matching = Matching(self._own, self._events)
         self._census = Census(module, instance, self._events, self.counts)
         self._tokens: dict[str, liveliness.Token] = {}
+        self._refused = Refused(TOKENS, instance)
         self._aliases = aliases.Aliases()
         self._freshen_at: int | None = None
 
@@ -208,6 +211,7 @@ class Presence:
         """It can be reached: declare what there is."""
         self._up = True
         self._events += self._own.changes()
+        self._review_refused(now)
         return self._take()
 
     def link_down(self, now: int) -> list[Event]:
@@ -216,19 +220,21 @@ class Presence:
         self._events += self._own.take_back()
         for key in list(self._tokens):
             self._remove_token(now, key)
+        self._refused.clear()
         self._census.clear()  # firmware that gateways told of
         return self._take()
 
     def leave(self, now: int) -> list[Event]:
         """Nothing is said after it: our tokens go with our session."""
         self._up = False
+        self._refused.clear()
         return self._take()
 
     def next_deadline(self) -> int | None:
         """When to call `poll` (monotonic ns); a time in the past means at once."""
         if self._up and self._own.pending:
             return 0
-        due = (self._census.next_deadline(), self._freshen_at)
+        due = (self._census.next_deadline(), self._refused.next_deadline(), self._freshen_at)
         return min((each for each in due if each is not None), default=None)
 
     def poll(self, now: int) -> list[Event]:
@@ -237,6 +243,8 @@ class Presence:
             self._events += self._own.changes()
         if self._freshen_at is not None and self._freshen_at <= now:
             self._freshen(now)
+        if self._refused.due(now, self._free):
+            self._events.append(Look())
         self._census.poll(now)
         return self._take()
 
@@ -258,8 +266,7 @@ class Presence:
         if token is None or token.session == self._instance:
             return self._take()
         if len(self._tokens) >= TOKENS:
-            self.counts["too many tokens"] += 1
-            return self._take()
+            return self.refused(now)
         self._tokens[key] = token
         if self._freshen_at is None:
             self._freshen_at = now + _FRESHEN
@@ -273,7 +280,28 @@ class Presence:
 
     def disappeared(self, now: int, key: str) -> list[Event]:
         """A token is not there any more."""
-        self._remove_token(now, key)
+        if key in self._tokens:
+            self._remove_token(now, key)
+        else:
+            self._refused.went()
+        self._review_refused(now)
+        return self._take()
+
+    def refused(self, now: int) -> list[Event]:
+        """There was no room for a token."""
+        self.counts["too many tokens"] += 1
+        return self.missed(now, 1)
+
+    def missed(self, now: int, count: int) -> list[Event]:
+        """So many tokens may be there that were not told of; they are asked for when there is room for them."""
+        self._refused.add(count)
+        self._review_refused(now)
+        return self._take()
+
+    def looked(self, now: int, *, complete: bool) -> list[Event]:
+        """All answers to `Look` have come, or, if not `complete`, some of them."""
+        self._refused.answered(complete=complete)
+        self._review_refused(now)
         return self._take()
 
     # Topics
@@ -288,6 +316,14 @@ class Presence:
         self._own.remove(topic, role)
         self._matching.changed(topic, role)
         return self._take()
+
+    @property
+    def _free(self) -> int:
+        return TOKENS - len(self._tokens)
+
+    def _review_refused(self, now: int) -> None:
+        if self._up:
+            self._refused.review(now, self._free)
 
     def _remove_token(self, now: int, key: str) -> None:
         token = self._tokens.pop(key, None)

@@ -19,7 +19,7 @@ from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_s
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
-from r2p.protocols.events import Declare, Event, Joined, Parted, Undeclare
+from r2p.protocols.events import Declare, Event, Joined, Look, Parted, Undeclare
 from r2p.protocols.presence import Presence
 from r2p.sample import PublisherClass, Sample, Source
 from r2p.topic import Topic
@@ -42,6 +42,12 @@ if TYPE_CHECKING:
 
 _EVENTS = 65_536
 """Tokens, messages of the protocol and the like that wait for the loop at most."""
+
+_TOKENS_FOUND = 4 * _EVENTS
+"""Tokens that were asked for and wait for the loop: more than zenoh is asked for at once, so the last word has room."""
+
+_LOOK = 30.0
+"""Seconds for the network to tell of all its tokens."""
 
 _QUERIES = 1024
 """Queries for types that wait for the loop at most."""
@@ -81,7 +87,10 @@ class ZenohLink(Link):
         self._session: Session | None = None
         self._funnels: list[Funnel] = []
         self._transports: set[str] = set()
-        self._tokens = Tokens(hub.space.loop, self._believed)
+        self._tokens = Tokens(hub.space.loop, self._believed, self._refused)
+        self._changes = self._funnel(self._token_changed)
+        self._overflown = 0
+        self._found = self._funnel(self._token_found, most=_TOKENS_FOUND)
         self.senders = Senders()
         self.burst = Burst(hub.space.loop, self.stats, self.send_error, batching=batching)
         self.credits = Credits(hub.space.loop, self.stats, self.zenoh_outlets, self._left)
@@ -114,7 +123,7 @@ class ZenohLink(Link):
         if not self._connects:
             self.went_up()
         session.watch(self._funnel(self._transport_changed))
-        session.watch_tokens(f"{self.prefix}/{liveliness.PLACE}", self._funnel(self._token_changed))
+        session.watch_tokens(f"{self.prefix}/{liveliness.PLACE}", self._changes)
         session.listen(f"{self.prefix}/control", self._funnel(self._controlled))
         session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema, functools.partial(self._funnel, most=_QUERIES))
         self.credits.connect(session, f"{self.prefix}/credit/{hexed}")
@@ -218,6 +227,8 @@ class ZenohLink(Link):
             case Undeclare(key):
                 if self._session is not None:
                     self._session.undeclare(f"{self.prefix}/{liveliness.place(key)}")
+            case Look():
+                self._look()
             case Joined(topic, _, window, int(session)):
                 self._welcome(topic, session, window)
             case Parted(topic, int(session), gone):
@@ -336,8 +347,32 @@ class ZenohLink(Link):
         super().went_down(reason)
 
     def _token_changed(self, change: tuple[str, bool]) -> None:
-        if not self._closed:
-            self._tokens.changed(*change)
+        if self._closed:
+            return
+        if self._changes.overflown != self._overflown:
+            overflown = self._changes.overflown
+            missed, self._overflown = overflown - self._overflown, overflown
+            self._apply(self._presence.missed(self._clock.monotonic(), missed))
+        self._tokens.changed(*change)
+
+    def _refused(self) -> None:
+        self._apply(self._presence.refused(self._clock.monotonic()))
+
+    def _look(self) -> None:
+        """Ask for all tokens: zenoh tells of each but once, and some were refused."""
+        if self._session is not None:
+            self._tokens.look()
+            self._session.look_for_tokens(f"{self.prefix}/{liveliness.PLACE}", _LOOK, self._found)
+
+    def _token_found(self, found: str | bool) -> None:
+        """A token, or at last whether these were all."""
+        if self._closed:
+            return
+        if isinstance(found, str):
+            self._tokens.found(found)
+        else:
+            usable = self._tokens.looked()
+            self._apply(self._presence.looked(self._clock.monotonic(), complete=found and usable))
 
     def _believed(self, key: str, there: bool) -> None:
         now = self._clock.monotonic()

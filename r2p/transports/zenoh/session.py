@@ -182,6 +182,7 @@ class Session:
         self._kept: list[Any] = []
         self._publishers: set[zenoh.Publisher] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._watched = 0
 
     def watch(self, funnel: Funnel) -> None:
         """Tell of each transport, those that are there included: (id, whether it opened)."""
@@ -194,18 +195,49 @@ class Session:
 
     def watch_tokens(self, prefix: str, funnel: Funnel) -> None:
         """Tell of each token under a prefix, also those that are there: (rest of its key, whether it is there)."""
-        start, count = len(prefix) + 1, 0
+        start = len(prefix) + 1
 
         def changed(sample: zenoh.Sample) -> None:
-            nonlocal count
             there = sample.kind == zenoh.SampleKind.PUT
-            count += 1 if there else -1
-            self.outbound.watch(count)
+            self._watched += 1 if there else -1
+            self.outbound.watch(self._watched)
             funnel.put((liveliness.token_at(str(sample.key_expr)[start:]), there))
 
         tokens: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
         self._hear(declared, changed, funnel)
+
+    def look_for_tokens(self, prefix: str, timeout: float, funnel: Funnel) -> None:
+        """Ask for the tokens under a prefix that is watched: the rest of each key, and at last whether these are all.
+
+        A thread waits for them, not that of `outbound`: it may take seconds where there are many.
+        """
+        start = len(prefix) + 1
+
+        def ask() -> bool:
+            if self._watched > _AT_ONCE // 2:
+                return False
+            replies: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
+            complete = True
+            for reply in self._session.liveliness().get(f"{prefix}/**", replies, timeout=timeout):
+                if reply.ok is None:  # the time is over
+                    complete = False
+                else:
+                    funnel.put(liveliness.token_at(str(reply.ok.key_expr)[start:]))
+            return complete
+
+        def look() -> None:
+            complete = False
+            try:
+                complete = ask()
+            except zenoh.ZError:  # the session is closed
+                pass
+            except Exception as error:  # noqa: BLE001 - counted and logged in the loop
+                funnel.failed(error)
+            finally:
+                funnel.put(complete)
+
+        threads.start(look)
 
     def listen(self, key: str, funnel: Funnel) -> None:
         """Tell of each message: (its attachment, payload), either of them empty if it is longer than any of ours.

@@ -19,6 +19,7 @@ from r2p.codecs.liveliness import TopicToken
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import layout
 from r2p.msg import Led, Text
+from r2p.protocols import presence, refused
 from r2p.protocols.flow import NO_LIMIT
 from r2p.testing.network import node_in
 from r2p.transports.zenoh.link import ZenohLink
@@ -294,6 +295,21 @@ async def test_a_router_that_asks_who_is_there_is_not_stopped_by_many_answers() 
             found = await session.networks(tools=False)
         assert found == {"lab", "full"}
         del tokens
+
+
+@guarded
+@pytest.mark.parametrize("asks", ["router", "client"])
+async def test_refused_tokens_are_believed_when_there_is_room(monkeypatch: pytest.MonkeyPatch, asks: str) -> None:
+    monkeypatch.setattr(presence, "TOKENS", 8)
+    monkeypatch.setattr(refused, "_FIRST", 1)
+    async with nodes(net := Net(), "A", "B") as (alice, bob), alien_on(net) as alien:
+        link, live = link_of(alice if asks == "router" else bob), alien.liveliness()
+        tokens = [live.declare_token(f"r2p/lab/live/*/1/{n:x}/module/M{n}/{n:x}/0/0") for n in range(1, 13)]
+        await until(lambda: link.losses["too many tokens"] >= 5)
+        for token in tokens[:8]:
+            token.undeclare()
+        await until(lambda: {f"M{n}" for n in range(9, 13)} <= set(link.discovery.modules))
+        await until(lambda: not {f"M{n}" for n in range(1, 9)} & set(link.discovery.modules))
 
 
 @guarded

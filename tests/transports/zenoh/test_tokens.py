@@ -1,0 +1,74 @@
+"""Which tokens are believed, and when."""
+
+import asyncio
+
+import pytest
+
+from r2p.transports.zenoh import tokens
+from r2p.transports.zenoh.tokens import Tokens
+
+pytestmark = [pytest.mark.anyio, pytest.mark.virtual_time]
+
+
+class Believer:
+    """Keeps what is believed."""
+
+    def __init__(self, *, up: bool = True) -> None:
+        self.there: set[str] = set()
+        self.refused = 0
+        self.tokens = Tokens(asyncio.get_running_loop(), self._believed, self._count)
+        if up:
+            self.tokens.went_up()
+
+    def _believed(self, key: str, there: bool) -> None:
+        (self.there.add if there else self.there.discard)(key)
+
+    def _count(self) -> None:
+        self.refused += 1
+
+
+async def test_an_answer_that_is_older_than_the_end_of_its_token_is_not_believed() -> None:
+    believer = Believer()
+    for key in ("before", "during", "again"):
+        believer.tokens.changed(key, True)
+    believer.tokens.changed("before", False)
+    believer.tokens.look()
+    for key in ("during", "again"):
+        believer.tokens.changed(key, False)
+    await asyncio.sleep(1.0)
+    believer.tokens.changed("again", True)
+    for key in ("before", "during", "again", "refused"):
+        believer.tokens.found(key)
+    assert believer.tokens.looked()
+    await asyncio.sleep(1.0)
+    assert believer.there == {"again", "refused"}
+
+
+async def test_answers_are_of_no_use_once_the_link_was_down() -> None:
+    believer = Believer()
+    believer.tokens.look()
+    believer.tokens.went_down()
+    believer.tokens.went_up()
+    believer.tokens.found("old")
+    assert not believer.tokens.looked()
+    assert not believer.there
+
+
+async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tokens, "TOKENS", 4)
+    believer = Believer()
+    believer.tokens.look()
+    for number in range(5):
+        believer.tokens.changed(f"{number}", False)
+    believer.tokens.found("0")
+    assert not believer.tokens.looked()
+    assert not believer.there
+
+
+async def test_what_has_no_room_before_the_link_is_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tokens, "TOKENS", 2)
+    believer = Believer(up=False)
+    for key in ("a", "b", "b", "c", "d"):
+        believer.tokens.changed(key, True)
+    believer.tokens.went_up()
+    assert (believer.there, believer.refused) == ({"a", "b"}, 2)
