@@ -9,8 +9,7 @@ from benchmarks.thesis.network import Scenario, simulated
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Outcome, Profile, Transmit
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import EngineSettings, Outcome, Profile, Transmit
 from r2p.sim import run
 from r2p.sim.can import CanBus, CanController, CanNode
 
@@ -31,7 +30,7 @@ def frames(size: int, messages: list[int]) -> list[Frame]:
 
 def ready_engine(now: int = 0) -> tuple[Engine, int]:
     """An engine that may send, without a bus, and the instant."""
-    engine = Engine(Settings(number=1 << 40, id8=10, profile=Profile.RTCAN, listen=0))
+    engine = Engine(EngineSettings(number=1 << 40, id8=10, profile=Profile.RTCAN, listen=0))
     actions = list(engine.start(now))
     while not engine.ready:
         now = engine.next_deadline() or now

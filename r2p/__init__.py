@@ -11,7 +11,6 @@ Nodes are coroutine functions that exchange typed messages on topics; modules ru
 """
 
 from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics, PortStatistics, WayStatistics
-from r2p.classes import Missed, NonRealTime, Periodic, Sporadic
 from r2p.errors import (
     Broken,
     Closed,
@@ -25,33 +24,18 @@ from r2p.errors import (
     TransportError,
     TypeMismatch,
 )
-from r2p.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
-from r2p.messages import (
-    Layout,
-    Len,
-    Message,
-    Timestamp,
-    f32,
-    f64,
-    i8,
-    i16,
-    i32,
-    i64,
-    layout,
-    u8,
-    u16,
-    u32,
-    u64,
-)
-from r2p.module import Module
-from r2p.network import Endpoint, ModuleView, NetworkView, TopicView
-from r2p.node import Node, Tick
-from r2p.protocols.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
-from r2p.publishers import PeriodicPublisher, Publisher, SporadicPublisher
-from r2p.runner import run, run_main
-from r2p.sample import PublisherClass, Sample, Source
-from r2p.subscriber import Subscriber
-from r2p.supervisor import NodeFunction, name_of
+from r2p.messages import Layout, Len, Message, Timestamp, f32, f64, i8, i16, i32, i64, layout, u8, u16, u32, u64
+from r2p.modules.graph import Endpoint, ModuleView, NetworkView, TopicView
+from r2p.modules.module import Module
+from r2p.modules.runner import run, run_main
+from r2p.modules.supervisor import NodeFunction, name_of
+from r2p.protocols.discovery.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
+from r2p.runtime.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
+from r2p.runtime.node import Node, Tick
+from r2p.runtime.publishers import PeriodicPublisher, Publisher, SporadicPublisher
+from r2p.runtime.qos import Missed, NonRealTime, Periodic, Sporadic
+from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.subscriber import Subscriber
 
 __version__ = "0.1.0"
 

@@ -24,11 +24,11 @@ from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupie
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import Mailbox, Outcome
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
-from r2p.transports.losses import Losses
+from r2p.transports.receiver import LoggedCounter
 from r2p.transports.url import parse
 
 if TYPE_CHECKING:
-    from r2p.transports.rtcan.port import CanPort
+    from r2p.transports.can.port import CanPort
 
 __all__ = [
     "BusLoad",
@@ -79,13 +79,13 @@ class BusMonitor:
     async def __aenter__(self) -> Self:
         """Open the bus. Raises TransportError for a URL that can't work; an interface that is down is waited for."""
         from r2p.transports.rtcan import open_port  # not at the top: only who listens to a bus needs it
-        from r2p.transports.rtcan.options import Options
+        from r2p.transports.rtcan.options import RtcanOptions
 
         if self._port is None:
             port, options = open_port(parse(self.via))
         else:
-            port, options = self._port, Options()
-        self._errors = Losses(self.via, clock_of())
+            port, options = self._port, RtcanOptions()
+        self._errors = LoggedCounter(self.via, clock_of())
         self._now = port.now
         self.since = self._now()
         self._monitor = Monitor(options.timing)

@@ -7,7 +7,7 @@ from typing import Any
 
 from r2p.clock import clock_of
 from r2p.codecs.rtcan import Frame, encode_identifier, frame_bits
-from r2p.sim.can import CanBus, CanController, CanNode, Record
+from r2p.sim.can import CanBus, CanController, CanNode, FrameRecord
 
 BIT = 1000  # ns at 1 Mbit/s
 GAP = 3 * BIT
@@ -29,7 +29,7 @@ class Watch:
     """Writes down what its controllers hear, and what the bus did."""
 
     def __init__(self, bus: CanBus) -> None:
-        self.records: list[Record] = []
+        self.records: list[FrameRecord] = []
         self.heard: list[tuple[Any, ...]] = []
         bus.observers.append(self.records.append)
 

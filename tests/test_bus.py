@@ -13,13 +13,15 @@ from r2p.bus import BusLoad, BusMonitor, FrameKind
 from r2p.codecs.rtcan import Frame
 from r2p.msg import Led
 from r2p.protocols.rtcan.events import Transmit, Withdraw
-from r2p.protocols.rtcan.monitor import Tally
+from r2p.protocols.rtcan.monitor import TrafficCount
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimCan, SimPort
-from r2p.tools import bus_dump, bus_load, bus_schedule
-from r2p.tools._bus.listening import listen
+from r2p.tools.bus import dump as bus_dump
+from r2p.tools.bus import load as bus_load
+from r2p.tools.bus import schedule as bus_schedule
+from r2p.tools.bus.load import listen
 from r2p.tools.session import Usage
-from r2p.transports.rtcan.port import CanPort, PortUser
+from r2p.transports.can.port import CanPort, CanPortListener
 
 pytestmark = pytest.mark.virtual_time
 
@@ -195,7 +197,7 @@ class LatePort(CanPort):
     def stand_still(self, duration: int) -> None:
         self._stood += duration
 
-    async def run(self, user: PortUser, opened: Callable[[], object]) -> None:
+    async def run(self, user: CanPortListener, opened: Callable[[], object]) -> None:
         opened()
         frame, stamp = Frame(20 << 23, bytes(8)), self.now() + self.APART // 2
         while True:
@@ -228,6 +230,6 @@ async def test_the_load_is_right_after_the_process_stood_still(stopped_at: float
 
 
 async def test_a_load_that_cannot_be_is_told() -> None:
-    tallies = {("", "", FrameKind.OTHER): Tally(1, 2000)}
+    tallies = {("", "", FrameKind.OTHER): TrafficCount(1, 2000)}
     load = BusLoad(1_000_000, 1000, tallies, {}, 0.0, 0.0, None)
     assert "200% is more than the bus can carry" in str(bus_load.trouble(load))

@@ -1,6 +1,6 @@
 """Lines of the log that others can make happen."""
 
-from r2p.line_limit import LineLimit
+from r2p.log_lines import LineLimit
 
 
 def test_the_lines_of_a_kind_are_limited_and_the_next_one_says_how_many_were_left_out() -> None:

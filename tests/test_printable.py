@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from r2p.printable import get_logger, printable
+from r2p.log_lines import get_logger, printable
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ import r2p
 from r2p.codecs import debug
 from r2p.codecs import management as m
 from r2p.msg import Led, Velocity3
-from tests.protocols.test_discovery_recorded import NOT_LIKE_US, PubSub, gist, management, recorded_answers
+from tests.protocols.discovery.test_recorded import NOT_LIKE_US, PubSub, gist, management, recorded_answers
 from tests.transports.conversation import Script
 from tests.vectors import FROM_NODE, TO_NODE, Case, Entry, cases
 

@@ -16,12 +16,11 @@ from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Action, Due, Granted, Ready
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Granted, Ready
 from r2p.sim import run
-from r2p.sim.can import CanBus, CanNode, Latency, Record
+from r2p.sim.can import CanBus, CanNode, FrameRecord, Latency
 from r2p.sim.transport import SimCan, SimPort
-from r2p.transports.rtcan.shell import Shell
+from r2p.transports.rtcan.driver import EngineDriver
 
 SECOND = 1_000_000_000
 MS = 1_000_000
@@ -159,7 +158,7 @@ class Node:
         node = CanNode(name, one_shot=True, offset=offset, drift_ppm=drift, transmit=latency, receive=latency)
         self.port = SimPort(shared, node)
         self.engine = Engine(
-            Settings(
+            EngineSettings(
                 number=numbers.getrandbits(64),
                 id8=_FIRST_ID8 + NODES.index(name),
                 priority=len(NODES) - NODES.index(name),
@@ -167,7 +166,7 @@ class Node:
                 transmit_latency=_LATENCY,
             )
         )
-        self.shell = Shell(self.engine, self.port, self)
+        self.shell = EngineDriver(self.engine, self.port, self)
         self._data = numbers.randbytes
         self._sizes: dict[int, int] = {}
 
@@ -264,7 +263,7 @@ class Listener:
         self._cyclic = {each.high for each in HRT}
         bus.observers.append(self._write)
 
-    def _write(self, record: Record) -> None:
+    def _write(self, record: FrameRecord) -> None:
         frame = record.frame
         message = frame.id >> 7
         self.frames += 1

@@ -13,7 +13,7 @@ from benchmarks.thesis.svg import COLOURS, Plot
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.sim import run
-from r2p.sim.can import CanBus, CanNode, Record
+from r2p.sim.can import CanBus, CanNode, FrameRecord
 
 MS = 1_000_000
 DEADLINES = {"A": 20, "B": 25, "C": 30}
@@ -87,7 +87,7 @@ def scheduled(priority: Callable[[str, int], int]) -> list[Sent]:
         sources = {name: Source(name, bus, priority) for name in DEADLINES}
         sent: list[Sent] = []
 
-        def write(record: Record) -> None:
+        def write(record: FrameRecord) -> None:
             (name,) = record.senders
             turn = sum(each.source == name for each in sent)
             triggered = [at for source, at in EVENTS if source == name][turn]

@@ -6,28 +6,23 @@ from collections.abc import Callable
 
 import msgspec
 
-from r2p.bridge import probes
-from r2p.bridge.held import Held
-from r2p.bridge.module_names import ModuleNames
+from r2p.bridge.directory_relay import DirectoryRelay, ModuleNames
+from r2p.bridge.forwarding import BridgedTopic, HeldMessages
 from r2p.bridge.options import BridgeOptions, Policy
-from r2p.bridge.port import BridgePort
-from r2p.bridge.presences import Presences
-from r2p.bridge.relay import BridgedTopic
-from r2p.bridge.relays import Relays
-from r2p.bridge.statistics import GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge.port import BridgePort, GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge.routing import RoutingTable
 from r2p.clock import Alarm
-from r2p.codecs import UnknownType, management
+from r2p.codecs import UnknownType, management, probes
 from r2p.errors import DecodeError
+from r2p.log_lines import get_logger
 from r2p.names import module_alias
-from r2p.printable import get_logger
-from r2p.protocols.bridging.base import MOST_PORTS, Action, Changed, Port, Probe, Say, SayToClients, State
-from r2p.protocols.bridging.clients import FIRST
-from r2p.protocols.bridging.tree import Tree
-from r2p.sample import Source
-from r2p.topic import Topic, TopicSpace, Waker
-from r2p.transports.announce import Told
-from r2p.transports.link import Link, is_booting
-from r2p.transports.losses import TRY_AGAIN, internal_error_of
+from r2p.protocols.bridge.base import MOST_PORTS, Action, Changed, PortState, Probe, Say, SayToClients, TreePort
+from r2p.protocols.bridge.clients import FIRST
+from r2p.protocols.bridge.tree import Tree
+from r2p.runtime.sample import Source
+from r2p.runtime.topic import Topic, TopicSpace, WakeScheduler
+from r2p.transports.link import Announcement, Link, is_booting
+from r2p.transports.receiver import TRY_AGAIN, internal_error_of
 
 logger = get_logger("r2p.bridge")
 
@@ -48,13 +43,13 @@ _HELLO_FLAGS = 12  # its place
 _TREE = (0x60, 0x61, 0x62)
 _NO_GATEWAY = "no gateway may be there: nothing passes; listen with ?gateways=yes where gateways are to join"
 _WORDS = {
-    State.ALONE: "forwards",
-    State.FORWARDING: "forwards, in agreement with {gateways}",
-    State.BLOCKED: "is blocked: its network is joined to our others by {gateways}",
-    State.CONVERGING: "is silent until it agrees with {gateways}",
-    State.LISTENING: "listens for other gateways",
-    State.LOOP: "is blocked: what we send on another link comes back here, through a gateway that is not one of r2p",
-    State.REFUSED: _NO_GATEWAY,
+    PortState.ALONE: "forwards",
+    PortState.FORWARDING: "forwards, in agreement with {gateways}",
+    PortState.BLOCKED: "is blocked: its network is joined to our others by {gateways}",
+    PortState.CONVERGING: "is silent until it agrees with {gateways}",
+    PortState.LISTENING: "listens for other gateways",
+    PortState.LOOP: "is blocked: what we send on another link comes back here, through a gateway that is not r2p's",
+    PortState.REFUSED: _NO_GATEWAY,
 }
 
 
@@ -70,20 +65,20 @@ class Bridge:
         """By the name of the link."""
         self.tree = Tree(instance)
         self._policy = Policy(options)
-        self.relays = Relays(self.ports, space, self._policy)
-        self.presences = Presences(self.name, instance, self.ports, space, self._policy, self.relays.retyped)
+        self.relays = RoutingTable(self.ports, space, self._policy)
+        self.presences = DirectoryRelay(self.name, instance, self.ports, space, self._policy, self.relays.retyped)
         self.names = ModuleNames(self._policy, self.presences.modules, self.presences.foreign)
         self._space = space
         self._clock = space.clock
         self._told = told
         self._by_number: dict[int, BridgePort] = {}
         self._numbers = itertools.count(FIRST)
-        self._held = Held()
+        self._held = HeldMessages()
         self._changed: set[int] = set()
         """Ports whose place in the tree is another one, which is yet to be told to the rest."""
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
-    def make_topic(self, name: str, waker: Waker) -> Topic:
+    def make_topic(self, name: str, waker: WakeScheduler) -> Topic:
         """For the module's topic space."""
         return BridgedTopic(name, waker, self.ports, self._clock.monotonic, self._held)
 
@@ -97,7 +92,7 @@ class Bridge:
         port = self.ports[link.name] = self._by_number[number] = BridgePort(self, link, number, self._clock.now)
         link.gate = port
         if link.admits_gateways and number >= FIRST:
-            port.state = port.place.state = State.REFUSED
+            port.state = port.place.state = PortState.REFUSED
             self._told(link, "too many links", f"a gateway joins {MOST_PORTS} links: this one is not", True)
 
     def detach(self, link: Link) -> None:
@@ -129,10 +124,10 @@ class Bridge:
         now = self._clock.monotonic()
         if port.client:
             self.tree.clients.shut(port.number)
-            port.place = Port(port.number, now)
+            port.place = TreePort(port.number, now)
         elif port.number < FIRST:
             self.tree.shut(now, port.number)
-            port.place = Port(port.number, now)
+            port.place = TreePort(port.number, now)
         self.presences.forget(port)
 
     def _port_changed(self, port: BridgePort) -> None:
@@ -148,9 +143,9 @@ class Bridge:
     def gateway(self) -> int:
         return self.tree.gateway
 
-    def wish(self, port: BridgePort, topic: Topic, own: Told) -> Told:
+    def desired_state(self, port: BridgePort, topic: Topic, own: Announcement) -> Announcement:
         """What a link is to be told of a topic."""
-        return self.relays.wish(port, topic, own)
+        return self.relays.desired_state(port, topic, own)
 
     def demand_changed(self, port: BridgePort, topics: set[str]) -> None:
         self.relays.changed(topics, port)
@@ -187,7 +182,7 @@ class Bridge:
         if not port.client:
             self.tree.probed(self._clock.monotonic(), port.number, gateway, its_port)
         elif self.tree.knows(gateway):
-            self.tree.clients.refuse(port.place, State.LOOP)
+            self.tree.clients.refuse(port.place, PortState.LOOP)
         self._act()
 
     def _is_our_own(self, port: BridgePort, data: bytes) -> bool:
@@ -224,7 +219,7 @@ class Bridge:
             self.tree.clients.leaf(now, port.place, message)
         else:
             port.link.stats.lost["gateway refused"] += 1
-            self.tree.clients.refuse(port.place, State.REFUSED)
+            self.tree.clients.refuse(port.place, PortState.REFUSED)
 
     def _open_from(self, port: BridgePort) -> list[BridgePort]:
         """Where what came in here may go on to now."""
@@ -379,18 +374,21 @@ class Bridge:
         state = port.place.state
         if state is port.state:
             return
-        forwarded = port.state in (State.ALONE, State.FORWARDING)
+        forwarded = port.state in (PortState.ALONE, PortState.FORWARDING)
         port.state = state
         if forwarded:
             port.link.stats.lost["converging"] += port.link.discard()
         count = len(port.place.gateways)
         gateways = "another gateway" if count == 1 else f"{count} other gateways" if count else "modules there"
         self._told(
-            port.link, state.value, _WORDS[state].format(gateways=gateways), state in (State.LOOP, State.REFUSED)
+            port.link,
+            state.value,
+            _WORDS[state].format(gateways=gateways),
+            state in (PortState.LOOP, PortState.REFUSED),
         )
-        if state in (State.ALONE, State.FORWARDING):
+        if state in (PortState.ALONE, PortState.FORWARDING):
             port.link.query()
-        if state is State.REFUSED:
+        if state is PortState.REFUSED:
             denied = management.Denied(self.name, self.name, 0, management.DENIED_GATEWAYS)
             port.link.write_management(management.encode(denied))
 

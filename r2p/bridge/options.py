@@ -9,7 +9,7 @@ import msgspec
 from r2p.codecs.management import DENIED_CONTROL, DENIED_READ_ONLY
 from r2p.errors import Error
 from r2p.names import LOADER_PREFIX
-from r2p.sample import PublisherClass
+from r2p.runtime.sample import PublisherClass
 
 T = TypeVar("T")
 
@@ -131,11 +131,11 @@ class Policy:
     def reserves(self, topic: str) -> bool:
         return any(fnmatchcase(topic, each) for each in self._options.reserve)
 
-    def called(self, topic: str, link: str) -> str:
+    def to_link_name(self, topic: str, link: str) -> str:
         """What a topic of the robot is called on this link."""
         return self.prefix(link) + topic
 
-    def meant(self, name: str, link: str) -> str | None:
+    def to_canonical(self, name: str, link: str) -> str | None:
         """The topic of the robot that has this name on the link; None: it is not the robot's."""
         prefix = self.prefix(link)
         return name.removeprefix(prefix) if name.startswith(prefix) else None

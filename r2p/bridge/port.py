@@ -4,17 +4,18 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
-from r2p.line_limit import LineLimit
-from r2p.protocols.bridging.base import Port, State
-from r2p.sample import Source
-from r2p.topic import Topic
-from r2p.transports.announce import Told
-from r2p.transports.link import Link
+import msgspec
+
+from r2p.log_lines import LineLimit
+from r2p.protocols.bridge.base import PortState, TreePort
+from r2p.runtime.sample import Source
+from r2p.runtime.topic import Topic
+from r2p.transports.link import Announcement, Link
 
 _REFUSAL_LINES = 1  # of the log in a second on one link about orders that do not pass
 
 
-class Owner(Protocol):
+class PortOwner(Protocol):
     """The gateway, as its ports see it."""
 
     @property
@@ -24,7 +25,7 @@ class Owner(Protocol):
     def heard(self, port: "BridgePort", data: bytes) -> bool:
         """A management message; True if discovery need not see it."""
 
-    def wish(self, port: "BridgePort", topic: Topic, own: Told) -> Told:
+    def desired_state(self, port: "BridgePort", topic: Topic, own: Announcement) -> Announcement:
         """What the link is to be told of a topic that this module itself has as `own`."""
 
     def demand_changed(self, port: "BridgePort", topics: set[str]) -> None:
@@ -40,15 +41,15 @@ class Owner(Protocol):
 class BridgePort:
     """A link and its place in the tree (one that forwards nothing while the link is down)."""
 
-    def __init__(self, owner: Owner, link: Link, number: int, now: Callable[[], int]) -> None:
+    def __init__(self, owner: PortOwner, link: Link, number: int, now: Callable[[], int]) -> None:
         self.link = link
         self.number = number
-        self.place = Port(number, 0)
+        self.place = TreePort(number, 0)
         self.client = not link.admits_gateways
         """Whether it is a client's: no gateway may be at its other end."""
         self.now = now
         """UTC in ns."""
-        self.state = State.LISTENING
+        self.state = PortState.LISTENING
         """As it was told last."""
         self.dropped: Counter[str] = Counter()
         """What came in, or was published here, while nothing was forwarded."""
@@ -71,7 +72,7 @@ class BridgePort:
     @property
     def resumes(self) -> bool:
         """Whether it forwards nothing just because this program stood still, and is likely to go on."""
-        return self.place.resumes or self.place.state is State.ALONE
+        return self.place.resumes or self.place.state is PortState.ALONE
 
     def lose(self, reason: str) -> None:
         """Count a message that does not pass."""
@@ -83,24 +84,59 @@ class BridgePort:
     def heard(self, data: bytes) -> bool:
         return self._owner.heard(self, data)
 
-    def wish(self, topic: Topic, own: Told) -> Told:
-        return self._owner.wish(self, topic, own)
+    def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
+        return self._owner.desired_state(self, topic, own)
 
     @property
-    def speaks(self) -> bool:
+    def may_announce(self) -> bool:
         return self.place.in_tree or self._owner.gateway not in self.place.gateways
 
     @property
-    def shares(self) -> bool:
+    def has_other_gateways(self) -> bool:
         return bool(self.place.neighbours)
 
     def source_name(self, source: Source) -> str:
         return self._owner.source_name(self, source)
 
-    def looked(self) -> None:
+    def discovery_changed(self) -> None:
         changed = self.demand.changed()
         if changed:
             self._owner.demand_changed(self, changed)
         if self.link.discovery.generation != self._generation:
             self._generation = self.link.discovery.generation
             self._owner.modules_changed(self)
+
+
+# What a gateway has done so far, for people and programs.
+
+
+class WayStatistics(msgspec.Struct, frozen=True):
+    """One topic from one link to another; `dropped` by reason, all since the way exists."""
+
+    topic: str
+    source: str
+    target: str
+    forwarded: int
+    dropped: dict[str, int]
+
+
+class PortStatistics(msgspec.Struct, frozen=True):
+    """One link of a gateway: what it does in the tree, and how many other gateways are on its network.
+
+    `dropped` counts what came in while nothing was forwarded. `offset` (ns) is UTC less the time of the link's network,
+    where that has one, known to +-`error` (ns).
+    """
+
+    link: str
+    state: str
+    gateways: int
+    dropped: dict[str, int]
+    offset: int | None = None
+    error: int | None = None
+
+
+class GatewayStatistics(msgspec.Struct, frozen=True):
+    """All of it."""
+
+    ports: list[PortStatistics]
+    ways: list[WayStatistics]

@@ -61,7 +61,7 @@ _CLASSES = (1, 2, 3)
 _REMEMBERED = 4096  # origins
 
 
-class Clock(msgspec.Struct, frozen=True, gc=False):
+class ClockOffset(msgspec.Struct, frozen=True, gc=False):
     """How a stamp was translated to UTC from another clock, that of the RTCAN network `epoch`.
 
     UTC = that clock + `offset` (ns), known to +-`error` (ns).
@@ -101,7 +101,7 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     deadline: int = 0
     hops: int = 0
     stamped: bool = True
-    clock: Clock | None = None
+    clock: ClockOffset | None = None
     more: tuple[int, ...] = ()
     """The stamps of the messages that follow in the same payload."""
 
@@ -141,7 +141,7 @@ def encode(header: Header) -> bytes:
     return fixed + _encode_clock(header.clock) + _stamps(more).pack(*header.more) + _encode_origin(header.origin)
 
 
-class Reader(Generic[T]):
+class HeaderReader(Generic[T]):
     """Decodes headers; `remember` makes of each new origin what is kept of it, and handed out with its headers."""
 
     def __init__(self, remember: Callable[[Origin], T]) -> None:
@@ -149,7 +149,7 @@ class Reader(Generic[T]):
         self.known: dict[bytes, T] = {}
         """By the bytes of the origin."""
 
-    def read(self, data: bytes) -> tuple[T, int, int, tuple[int, ...], int, int, bool, Clock | None]:
+    def read(self, data: bytes) -> tuple[T, int, int, tuple[int, ...], int, int, bool, ClockOffset | None]:
         """What is known of the origin; serial and sequence of the first message, the stamps of all, then deadline,
         hops, whether the stamps are the publisher's, and clock.
 
@@ -192,7 +192,7 @@ class Reader(Generic[T]):
 
 def decode(data: bytes) -> Header:
     """The header in these bytes. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
-    origin, serial, sequence, stamps, deadline, hops, stamped, clock = Reader(_itself).read(data)
+    origin, serial, sequence, stamps, deadline, hops, stamped, clock = HeaderReader(_itself).read(data)
     return Header(origin, serial, sequence, stamps[0], deadline, hops, stamped, clock, stamps[1:])
 
 
@@ -259,13 +259,13 @@ def _stamps(count: int) -> struct.Struct:
     return struct.Struct(f"<{count}q")
 
 
-def _decode_clock(data: bytes) -> Clock:
+def _decode_clock(data: bytes) -> ClockOffset:
     if len(data) < _FIXED.size + _CLOCK.size:
         raise DecodeError("the header ends in its clock part")
-    return Clock(*_CLOCK.unpack_from(data, _FIXED.size))
+    return ClockOffset(*_CLOCK.unpack_from(data, _FIXED.size))
 
 
-def _encode_clock(clock: Clock | None) -> bytes:
+def _encode_clock(clock: ClockOffset | None) -> bytes:
     return b"" if clock is None else _CLOCK.pack(clock.epoch, clock.offset, min(clock.error, 0xFFFFFFFF))
 
 

@@ -16,7 +16,7 @@ modules that are directly on it. After the version, without gaps (`slot` and `ut
 | 0x46 | RENEW | `u8 serial; u8 highs[24]` (of the messages, 0: none) |
 | 0x47 | RENEWED | `u8 id8; u8 serial; u16 lease_ms; u8 highs[24]` |
 
-Gateways agree on their tree (`r2p.protocols.bridging`) with three more, which stay on their network as well:
+Gateways agree on their tree (`r2p.protocols.bridge`) with three more, which stay on their network as well:
 
 | type | name | body |
 | --- | --- | --- |

@@ -31,7 +31,7 @@ def decode(data):
 def functions(cls: type[Any], fields: tuple[Field, ...]) -> tuple[Callable[[Any], bytes], Callable[[bytes], Any]]:
     """The `encode` and the `decode` of a message class with these fields."""
     packed = struct.Struct("<" + "".join(field.shape.format for field in fields))
-    source = _Source()
+    source = _SourceCode()
     value, slots = source.add_message(cls, fields, "message"), ", ".join(source.slots)
     flat = value == f"T({slots})"  # then the slots need no names, which is faster
     text = _SOURCE.format(
@@ -58,7 +58,7 @@ def functions(cls: type[Any], fields: tuple[Field, ...]) -> tuple[Callable[[Any]
     return names["encode"], names["decode"]
 
 
-class _Source:
+class _SourceCode:
     """The parts of the source: checks first, then what `pack` takes; the slots are what `unpack` gives."""
 
     def __init__(self) -> None:

@@ -37,7 +37,7 @@ def message_type(name: str, schema: str) -> type[Message]:
         raise MessageError(f"{show(name)} is no name for a message class")
     if len(schema) > SCHEMA_MAX:
         raise MessageError(f"the schema of {name} has {len(schema)} characters, more than {SCHEMA_MAX}")
-    cls = _Reader().message(name, tuple(_leaf(text) for text in schema.split(" ")))
+    cls = _SchemaReader().message(name, tuple(_leaf(text) for text in schema.split(" ")))
     if layout(cls).schema != schema:
         raise MessageError(f"{show(schema)} is no schema of a message class")
     return cls
@@ -51,7 +51,7 @@ def _leaf(text: str) -> _Leaf:
     return parts, kind
 
 
-class _Reader:
+class _SchemaReader:
     """Groups leaves by the first part of their path, and the groups by the next one."""
 
     def __init__(self) -> None:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, Type
 from r2p.clock import SystemClock
 from r2p.durations import timeout_or_none
 from r2p.errors import Deadlock
-from r2p.unwinding import frames
+from r2p.modules.unwinding import frames
 
 if TYPE_CHECKING:
     import contextvars
@@ -141,7 +141,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             when = instant / _SECOND
             if instant < self._limit:
                 self._limit = instant
-        timer = _Timer(when, next(self._timer_numbers), callback, args, self, context)
+        timer = _VirtualTimer(when, next(self._timer_numbers), callback, args, self, context)
         heappush(self._scheduled, timer)
         return timer
 
@@ -277,7 +277,7 @@ class _Selector(selectors.DefaultSelector):
         return super().select(None) if self._idle() else []
 
 
-class _Timer(asyncio.TimerHandle):
+class _VirtualTimer(asyncio.TimerHandle):
     """A timer that has its place behind those set earlier for the same instant: a heap alone forgets that."""
 
     def __init__(self, when: float, number: int, callback: Any, args: Any, loop: VirtualLoop, context: Any) -> None:
@@ -293,7 +293,7 @@ class _Timer(asyncio.TimerHandle):
         self.background = True
 
     def __lt__(self, other: object) -> bool:
-        return isinstance(other, _Timer) and self.order < other.order
+        return isinstance(other, _VirtualTimer) and self.order < other.order
 
 
 class _Task(asyncio.Task[Any]):

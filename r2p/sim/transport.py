@@ -21,10 +21,10 @@ from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
-from r2p.sim.can import CanBus, CanController, CanNode, ErrorKind, Latency, State
+from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
+from r2p.transports.can.port import CanPort, CanPortListener, PortAlarm
 from r2p.transports.link import Hub, Transport
-from r2p.transports.rtcan.options import OPTIONS, Options, checked
-from r2p.transports.rtcan.port import CanPort, PortAlarm, PortUser
+from r2p.transports.rtcan.options import OPTIONS, RtcanOptions, checked
 from r2p.transports.rtcan.transport import run_link
 from r2p.transports.url import Url, duration
 
@@ -32,7 +32,7 @@ _BILLION = 1_000_000_000
 _NO_POWER = "no power"
 _MAILBOXES = (Mailbox.HRT, *[Mailbox.SRT] * (rtcan.NRT - 1), Mailbox.NRT)  # by laxity
 _SENT, _LOST, _LATE = Outcome.SENT, Outcome.LOST, Outcome.LATE  # Python 3.11 takes its time to find a member of an enum
-DEFAULTS = Options(priority=1, utc=0.0)
+DEFAULTS = RtcanOptions(priority=1, utc=0.0)
 """Of `sim:` URLs: anybody may be the master, and knows UTC."""
 
 
@@ -51,7 +51,7 @@ class SimCan:
         self._ports: dict[str, SimPort] = {}
         self._spare: dict[str, CanController] = {}
 
-    def transport(self, options: Options = DEFAULTS, **node: Any) -> "SimTransport":
+    def transport(self, options: RtcanOptions = DEFAULTS, **node: Any) -> "SimTransport":
         """A place on this bus, for `Module(via=...)` of one module; `node` are fields of `CanNode`."""
         return SimTransport("", options, node, shared=self)
 
@@ -107,10 +107,10 @@ class SimPort(CanPort):
         self._timeline = shared.bus.timeline
         self._clock = self.controller.clock
         self.now = self._clock.monotonic if self._clock.virtual else self._present
-        self._user: PortUser | None = None
+        self._user: CanPortListener | None = None
         self._up = False
 
-    async def run(self, user: PortUser, opened: Callable[[], object]) -> None:
+    async def run(self, user: CanPortListener, opened: Callable[[], object]) -> None:
         self._user = user
         controller = self.controller
         controller.on_receive = user.received
@@ -188,10 +188,10 @@ class SimPort(CanPort):
         if self._user is not None and self._up:
             self._user.confirmed(mailbox, outcome, at)
 
-    def _state(self, state: State, _stamp: int) -> None:
-        if state is State.BUS_OFF:
+    def _state(self, state: ControllerState, _stamp: int) -> None:
+        if state is ControllerState.BUS_OFF:
             self._goes_down(state.value)
-        elif state is State.ACTIVE:
+        elif state is ControllerState.ACTIVE:
             self._goes_up()
         elif self._user is not None:
             self._user.fault(state.value)
@@ -217,7 +217,7 @@ class SimTransport(Transport):
     def __init__(
         self,
         name: str,
-        options: Options = DEFAULTS,
+        options: RtcanOptions = DEFAULTS,
         node: dict[str, Any] | None = None,
         *,
         shared: SimCan | None = None,

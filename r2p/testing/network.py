@@ -4,8 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from r2p.module import Module
-from r2p.node import Node
+from r2p import Module, Node
 from r2p.transports.memory import MemoryLink, MemoryNetwork
 
 

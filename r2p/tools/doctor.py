@@ -24,7 +24,7 @@ from r2p.clock import Ticker
 from r2p.names import module_name_from
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Quiet, Usage, Verbose, execute, settings
-from r2p.transports.rtcan.interface import ARPHRD_CAN, Interface, interfaces, socketcan
+from r2p.transports.can.netlink import ARPHRD_CAN, Interface, interfaces, socketcan
 
 EXTRAS = {"can": "python-can", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
 """The extras of r2p, and the package that each brings."""

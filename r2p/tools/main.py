@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from r2p.tools.output import abandon_stdout
-from r2p.tools.stderr import say
+from r2p.tools.terminal import say
 
 GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
@@ -25,9 +25,9 @@ GROUPS = {
 COMMANDS = {
     "run": ("r2p.tools.run", "Run functions as the nodes of a module."),
     "gateway": ("r2p.tools.gateway", "Join links to one network: a robot's bus, a debug line, zenoh."),
-    "sim": ("r2p.tools.sim", "An emulated robot, without hardware."),
+    "sim": ("r2p.tools.simulator.command", "An emulated robot, without hardware."),
     "doctor": ("r2p.tools.doctor", "Tell what this machine has and lacks for r2p."),
-    "demo": ("r2p.tools.demo", "Show r2p at work, without hardware."),
+    "demo": ("r2p.tools.demo.command", "Show r2p at work, without hardware."),
 }
 
 

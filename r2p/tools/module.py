@@ -90,7 +90,7 @@ async def bootload(session: Session, module: Name, *, timeout: Timeout = None) -
     await _order(session, r2p.Command.BOOTLOAD, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_BOOT))
 
 
-class _Watch(msgspec.Struct):
+class _CommandWatch(msgspec.Struct):
     """What was heard of a module: its flags one after the other, and how long (s) after the order firmware spoke.
 
     `denied`: why a gateway does not let the order through, in words; `refused`: why it is not given at all.
@@ -102,7 +102,7 @@ class _Watch(msgspec.Struct):
     refused: r2p.Error | None = None
 
 
-def _has_rebooted(watch: _Watch) -> bool:
+def _has_rebooted(watch: _CommandWatch) -> bool:
     """A new start shows in the flags; those of firmware that was rebooted before in an ALIVE right after the order."""
     if not _restarted(watch.flags[-1]):
         return False
@@ -118,7 +118,7 @@ _DONE = {r2p.Command.STOP: "stopped", r2p.Command.REBOOT: "rebooted", r2p.Comman
 
 
 async def _order(
-    session: Session, command: r2p.Command, name: str, timeout: float | None, done: Callable[[_Watch], bool]
+    session: Session, command: r2p.Command, name: str, timeout: float | None, done: Callable[[_CommandWatch], bool]
 ) -> None:
     module_path(name)
     if not session.settings.via:
@@ -126,7 +126,7 @@ async def _order(
     await session.settle(wait=0)
     loop = asyncio.get_running_loop()
     started = loop.time()
-    watch = _Watch([])
+    watch = _CommandWatch([])
     with session.waiting(f"{name} to confirm {command.name}"):
         try:
             async with asyncio.timeout(timeout or TIMEOUT), asyncio.TaskGroup() as tasks:
@@ -143,7 +143,7 @@ async def _order(
     session.say(f"{name}: {_DONE[command]}, after {loop.time() - started:.1f} s")
 
 
-async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str, watch: _Watch) -> None:
+async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str, watch: _CommandWatch) -> None:
     """Note each change of the module's flags, and that a gateway denies the order."""
     async for event in events:
         match event:
@@ -154,7 +154,7 @@ async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str
 
 
 async def _confirmed(
-    session: Session, command: r2p.Command, name: str, watch: _Watch, done: Callable[[_Watch], bool]
+    session: Session, command: r2p.Command, name: str, watch: _CommandWatch, done: Callable[[_CommandWatch], bool]
 ) -> None:
     """Send the order, again and again, until the module confirms it."""
     loop = asyncio.get_running_loop()

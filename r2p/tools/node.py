@@ -10,9 +10,9 @@ import typer
 import r2p
 from r2p.tools import session
 from r2p.tools.module import TOOLS_THERE
-from r2p.tools.options import CLASS_NAMES
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Session, Wait
+from r2p.tools.topic.watching import CLASS_NAMES
 from r2p.tools.types import Types, type_name
 
 app = session.group("Nodes, and what they publish and subscribe.")

@@ -23,7 +23,7 @@ import textwrap
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, TextIO
 
-from r2p.printable import printable
+from r2p.log_lines import printable
 
 Record = Mapping[str, Any]
 

@@ -33,9 +33,9 @@ import typer
 
 import r2p
 from r2p.clock import random_of
-from r2p.printable import printable
+from r2p.log_lines import printable
 from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout
-from r2p.tools.stderr import log_to_stderr, say
+from r2p.tools.terminal import log_to_stderr, say
 from r2p.transports.url import duration, open_transport
 
 B = TypeVar("B", bound=Callable[..., Awaitable[None]])

@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Iterable
 
 import r2p
-from r2p.tools.loading import load_module
+from r2p.tools.run import load_module
 from r2p.tools.session import Session, Settings, Usage
 
 STANDARD = "r2p.msg"

@@ -16,14 +16,13 @@ from r2p.codecs import debug
 from r2p.codecs.management import FLAG_BOOT
 from r2p.errors import MessageError
 from r2p.names import LOADER_PREFIX, MANAGEMENT
-from r2p.protocols.exchange import GRACE
-from r2p.room import LINK_DOWN
-from r2p.sample import PublisherClass, Sample
-from r2p.topic import Advertised, Topic
-from r2p.transports.announce import NOTHING
-from r2p.transports.handed_over import HandedOver
-from r2p.transports.link import Hub, Link, is_booting
-from r2p.transports.sources import Sources
+from r2p.protocols.discovery.negotiation import GRACE
+from r2p.runtime.backpressure import LINK_DOWN
+from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.topic import PublisherHandle, Topic
+from r2p.transports.link import NOTHING, Hub, Link, is_booting
+from r2p.transports.receiver import PublisherLookup
+from r2p.transports.unconfirmed import UnconfirmedBytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -105,7 +104,7 @@ class LineLink(Link):
     behind one that it has not taken entirely.
     """
 
-    longest: ClassVar[int] = debug.PAYLOAD_MAX
+    max_payload: ClassVar[int] = debug.PAYLOAD_MAX
     lone: ClassVar[bool] = True
 
     def __init__(
@@ -114,7 +113,7 @@ class LineLink(Link):
         super().__init__(name, hub, management_rate=management_rate)
         self._reader = debug.Reader(self.stats.lost)
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
-        self._sources = Sources(self.discovery, self.name)
+        self._sources = PublisherLookup(self.discovery, self.name)
         self._carrier: Carrier | None = None
         self._urgent: deque[bytes] = deque()
         self._management: deque[bytes] = deque()
@@ -126,7 +125,7 @@ class LineLink(Link):
         self._grace: asyncio.TimerHandle | None = None
         self._piecemeal = piecemeal
         self._stamp = 0
-        self._handed = HandedOver()
+        self._handed = UnconfirmedBytes()
         self._given = 0
         self._held: tuple[str, Sample] | None = None
         self._unasked: set[str] = set()
@@ -141,19 +140,19 @@ class LineLink(Link):
         self._carrier = carrier
         self._blocked = False
         self._reader = debug.Reader(self.stats.lost)
-        self._handed = HandedOver()
+        self._handed = UnconfirmedBytes()
         self._given = self.stats.sent
         self._send(OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
             self._begin_grace()
-            self.went_up()
+            self.on_up()
 
     def disconnected(self, reason: str) -> None:
         """Bytes do not flow any more."""
         self._count_unknown()
         self._carrier = None
         self._end_grace()
-        self.went_down(reason)
+        self.on_down(reason)
         self._lose_held()
 
     def fed(self, data: bytes | memoryview) -> None:
@@ -258,7 +257,7 @@ class LineLink(Link):
 
     @property
     def waits(self) -> bool:
-        if self._carrier is None or (self.gate is not None and self.gate.shares):
+        if self._carrier is None or (self.gate is not None and self.gate.has_other_gateways):
             return False  # hellos of gateways that come late would part the tree
         return self._carrier.waits
 
@@ -310,7 +309,7 @@ class LineLink(Link):
             self._flush()
         except Exception as error:  # noqa: BLE001 - counted and logged
             self.stats.lost.internal_error(error)
-        if self.room:
+        if self.wait_queue:
             self.made_room()
 
     def _flush(self, *, last_words: bool = False) -> None:
@@ -369,7 +368,7 @@ class LineLink(Link):
             if publisher is not None:
                 publisher.link_missed(self.name, LINK_DOWN, sequence=held[1].sequence)
 
-    def _publisher(self, topic: str, sample: Sample) -> Advertised | None:
+    def _publisher(self, topic: str, sample: Sample) -> PublisherHandle | None:
         where = self._space.topics.get(topic)
         return None if where is None else where.publisher_of(sample)
 

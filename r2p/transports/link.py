@@ -17,21 +17,93 @@ from typing import Any, ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
-from r2p.codecs.attachment import Clock
-from r2p.codecs.management import FLAG_BOOT, NO_PARAMS, QUEUE
+from r2p.codecs.attachment import ClockOffset
+from r2p.codecs.management import CLASS_LATCHES, FLAG_BOOT, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import Message
 from r2p.names import MANAGEMENT, TOPIC_MAX
-from r2p.protocols.announcer import Relayed
-from r2p.protocols.discovery import Discovery
-from r2p.protocols.door import Door
-from r2p.protocols.events import Command, Event, Joined, Left, ModuleChanged, ModuleGone, Opened, Send, Shut
-from r2p.room import LINK_DOWN, Room
-from r2p.sample import PublisherClass, Sample, Source
-from r2p.topic import Topic, TopicSpace
-from r2p.transports.announce import NOTHING, Told, announce, wish_of
-from r2p.transports.intake import Arrival, Inlets, Intake, LinkStats
-from r2p.transports.losses import TRY_AGAIN, Losses
-from r2p.transports.outlet import LinkOutlet
+from r2p.protocols.discovery.announcer import Relayed
+from r2p.protocols.discovery.base import DiscoveryProtocol
+from r2p.protocols.discovery.events import (
+    Command,
+    Event,
+    ModuleChanged,
+    ModuleGone,
+    PublisherFound,
+    PublisherGone,
+    Send,
+    Shape,
+    SubscriberJoined,
+    SubscribersGone,
+)
+from r2p.protocols.discovery.session import Discovery
+from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
+from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
+from r2p.transports.receiver import TRY_AGAIN, Arrival, Intake, LinkStats, LoggedCounter, Receiver
+
+# What the other ends of a link are told of this module's topics, and the difference to what they should be told.
+
+
+class Announcement(msgspec.Struct, frozen=True):
+    """What the other ends have been told of a topic; `asked` is the type in which it is subscribed.
+
+    `queue`: how many messages a publisher keeps, or has on the way, for this module; that has nothing to do with the
+    queues of its own subscribers.
+    """
+
+    publishes: bool = False
+    subscribes: bool = False
+    size: int = 0
+    fingerprint: bytes = bytes(8)
+    asked: Shape = Shape()
+    queue: int = QUEUE
+    params: bytes = NO_PARAMS
+    endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
+
+
+NOTHING = Announcement()
+
+
+def wish_of(topic: Topic) -> Announcement:
+    """What the other ends should know of a topic."""
+    publishers: dict[tuple[str, int], int] = {}
+    for each in topic.publishers:
+        key = each.node.name, ROLE_PUBLISHES
+        publisher_class = int(each.publisher_class) | (CLASS_LATCHES if each.latch else 0)
+        publishers[key] = max(publisher_class, publishers.get(key, 0))  # a node may have several, of several classes
+    subscribers = {(each.owner, ROLE_SUBSCRIBES): 0 for each in topic.queues}
+    shape = Shape() if topic.layout is None else Shape(topic.layout.size, topic.layout.fingerprint)
+    return Announcement(
+        publishes=bool(publishers),
+        subscribes=bool(subscribers),
+        size=shape.size,
+        fingerprint=shape.fingerprint,
+        asked=shape,
+        endpoints=publishers | subscribers,
+    )
+
+
+def announce(discovery: DiscoveryProtocol, now: int, topic: str, told: Announcement, wish: Announcement) -> list[Event]:
+    events: list[Event] = []
+    retyped = (wish.size, wish.fingerprint) != (told.size, told.fingerprint)
+    if wish.publishes and (retyped or not told.publishes or wish.params != told.params):
+        events += discovery.advertise(now, topic, wish.size, wish.fingerprint, wish.params)
+    elif told.publishes and not wish.publishes:
+        events += discovery.withdraw(now, topic)
+    if wish.subscribes and ((wish.asked, wish.queue) != (told.asked, told.queue) or not told.subscribes):
+        events += discovery.subscribe(now, topic, wish.asked.size, wish.queue, wish.asked.fingerprint)
+    elif told.subscribes and not wish.subscribes:
+        events += discovery.unsubscribe(now, topic)
+    for (node, role), publisher_class in wish.endpoints.items():
+        if told.endpoints.get((node, role)) != publisher_class:
+            events += discovery.endpoint(now, node, topic, role, publisher_class)
+    for node, role in told.endpoints.keys() - wish.endpoints.keys():
+        events += discovery.endpoint_gone(now, node, topic, role)
+    return events
+
+
+# link
+
 
 _SECOND = 1_000_000_000
 _MANAGEMENT = MANAGEMENT.encode()
@@ -83,27 +155,27 @@ class Hub(Protocol):
         """Its discovery found something that concerns the module."""
 
 
-class Gate(Protocol):
+class GatewayHooks(Protocol):
     """What a gateway has to say about one of its links, and a module with several links about what gateways join."""
 
     def heard(self, data: bytes) -> bool:
         """A management message, before discovery gets it; True if it concerns gateways only."""
 
-    def wish(self, topic: Topic, own: Told) -> Told:
+    def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
         """What the other ends are to be told of a topic, with what is wanted for other links."""
 
     @property
-    def speaks(self) -> bool:
+    def may_announce(self) -> bool:
         """Whether discovery may say anything: where two links lead to one network, only one of them does."""
 
     @property
-    def shares(self) -> bool:
+    def has_other_gateways(self) -> bool:
         """Whether there are other gateways on the link's network."""
 
     def source_name(self, source: Source) -> str:
         """What the module that published a message is called there."""
 
-    def looked(self) -> None:
+    def discovery_changed(self) -> None:
         """Discovery may have learnt something."""
 
 
@@ -122,9 +194,9 @@ class Transport(abc.ABC):
 class Link(abc.ABC):
     """What all links share: discovery, outlets and inlets, fair intake, state and counters."""
 
-    longest: ClassVar[int] = 255
+    max_payload: ClassVar[int] = 255
     """Bytes of the longest message."""
-    longest_name: ClassVar[int] = TOPIC_MAX
+    max_name: ClassVar[int] = TOPIC_MAX
     """Characters of the longest topic's name."""
     passes_probes: ClassVar[bool] = True
     """Whether there may be gateways of firmware on it."""
@@ -133,14 +205,16 @@ class Link(abc.ABC):
     lone: ClassVar[bool] = False
     """Whether it has only one other end."""
 
-    def __init__(self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: Door | None = None) -> None:
+    def __init__(
+        self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: DiscoveryProtocol | None = None
+    ) -> None:
         self.name = name = unique_name(name, hub)
         self.title = self.name.removesuffix(":")
         """The name as it stands in texts."""
         self.up = False
         self.admits_gateways = True
         """Whether a gateway at its other end takes part in the mesh of ours; else it is for clients."""
-        self.gate: Gate | None = None
+        self.gate: GatewayHooks | None = None
         """Set by the module: what gateways, and it beside gateways, do with the link."""
         self.denied = False
         """Set by the module: whether its other end has refused it, and no connection has been of use since."""
@@ -148,20 +222,20 @@ class Link(abc.ABC):
         """Whether it is closed for good when it goes down: that of a client."""
         self.stands_by = ""
         """Why another link is used in place of this one, where gateways join their networks; empty while it is used."""
-        self.stats = LinkStats(lost=Losses(name, hub.space.clock))
-        self.discovery: Door = discovery or _discovery(name, hub, management_rate)
+        self.stats = LinkStats(lost=LoggedCounter(name, hub.space.clock))
+        self.discovery: DiscoveryProtocol = discovery or _discovery(name, hub, management_rate)
         self._hub = hub
         self._space = hub.space
         self._clock = hub.space.clock
         self._alarm = Alarm(hub.space.loop, self._poll, background=True)
-        self._outlets: dict[str, LinkOutlet] = {}
-        self._intake: Inlets = Intake(self, hub.space.loop, self.stats)
-        self._told: dict[str, Told] = {}
+        self._outlets: dict[str, LinkSubscriber] = {}
+        self._intake: Intake = Receiver(self, hub.space.loop, self.stats)
+        self._told: dict[str, Announcement] = {}
         self._lapsed: set[str] = set()
         self._early: dict[tuple[bytes, Hashable], tuple[Arrival, int]] = {}  # the last message, and when it came (ns)
         self._events: deque[Event] = deque()
         self._acting = False
-        self.room = Room()
+        self.wait_queue = WaitQueue()
         self._down_at = self._clock.monotonic()
         self._lost_at_down = 0
         self._unreachable = ""
@@ -169,7 +243,7 @@ class Link(abc.ABC):
 
     # For the transport that owns the link
 
-    def went_up(self) -> None:
+    def on_up(self) -> None:
         """The other end can be reached: announce everything."""
         outage = (self._clock.monotonic() - self._down_at) / _SECOND
         lost = self.stats.lost["link down"] - self._lost_at_down
@@ -188,7 +262,7 @@ class Link(abc.ABC):
             self._unreachable = reason
             self._hub.link_waits(self, reason)
 
-    def went_down(self, reason: str) -> None:
+    def on_down(self, reason: str) -> None:
         """The other end is gone. What waits to be sent is discarded and counted: no stale command ever arrives late."""
         if not self.up:
             return
@@ -201,7 +275,7 @@ class Link(abc.ABC):
         self._hub.link_changed(self, reason, 0.0, 0)
         carried = [publisher for outlet in self._outlets.values() for publisher in outlet.topic.publishers]
         self._apply(self.discovery.link_down(self._down_at))
-        self.room.refuse_all(LINK_DOWN)  # whoever waits for it waits for nothing
+        self.wait_queue.reject_all(LINK_DOWN)  # whoever waits for it waits for nothing
         for publisher in carried:
             publisher.degraded(self.name, reason)
 
@@ -213,7 +287,7 @@ class Link(abc.ABC):
         self._closed = True
         self.up = False
         self._alarm.close()
-        self.room.refuse_all("link closed")
+        self.wait_queue.reject_all("link closed")
         for name in list(self._outlets):
             self._detach(name)
         self._intake.close()
@@ -294,10 +368,10 @@ class Link(abc.ABC):
 
     def made_room(self) -> None:
         """To be called whenever `takes` may say something else: whoever waits gets the room, in order."""
-        while not self.stats.lost.guard(self.room.serve):
+        while not self.stats.lost.guard(self.wait_queue.serve):
             pass  # the one that raised waits no more
         if not self.full:
-            self.room.recover()
+            self.wait_queue.recover()
 
     def module_changed(self, module: str) -> None:
         """A module at the other end came, went, or changed its state."""
@@ -321,7 +395,9 @@ class Link(abc.ABC):
         return publisher_class != PublisherClass.NON_REAL_TIME
 
     def refusal(self, size: int) -> str | None:
-        return f"{size} bytes, and it carries at most {self.longest} in a message" if size > self.longest else None
+        return (
+            f"{size} bytes, and it carries at most {self.max_payload} in a message" if size > self.max_payload else None
+        )
 
     def inadmissible(self, size: int, period: float) -> str | None:
         """Why there can never be slots for messages of `size` bytes each `period` seconds."""
@@ -331,7 +407,7 @@ class Link(abc.ABC):
         """The time (ns) that all nodes of the network share. None: it has none, or it is not known."""
         return None
 
-    def translation(self) -> Clock | None:
+    def translation(self) -> ClockOffset | None:
         """How that time is translated to UTC here, and how well. None: there is none, or it is not known."""
         return None
 
@@ -376,8 +452,8 @@ class Link(abc.ABC):
         told = self._told.pop(topic.name, NOTHING)
         wish = wish_of(topic)
         if self.gate is not None:
-            wish = self.gate.wish(topic, wish)
-        if len(topic.name) > self.longest_name:
+            wish = self.gate.desired_state(topic, wish)
+        if len(topic.name) > self.max_name:
             wish = NOTHING
         params = self.params(topic.name) if wish.publishes and not self.refusal(wish.size) else None
         queue = self.window(topic) if wish.subscribes else QUEUE
@@ -416,22 +492,22 @@ class Link(abc.ABC):
         if not self._closed:
             self._alarm.set(self.discovery.next_deadline())
             if self.gate is not None:
-                self.stats.lost.guard(self.gate.looked)
+                self.stats.lost.guard(self.gate.discovery_changed)
 
     def _act(self, event: Event) -> None:
         match event:
             case Send(data, urgent):
-                if self.up and (self.gate is None or self.gate.speaks):
+                if self.up and (self.gate is None or self.gate.may_announce):
                     self.write_management(data, urgent=urgent)
-            case Joined(topic):
+            case SubscriberJoined(topic):
                 self._attach(topic)
-            case Left(topic) if self.up or self._closed:
+            case SubscribersGone(topic) if self.up or self._closed:
                 self._detach(topic)
-            case Left(topic):  # until the other end is back, what it does not get is counted
+            case SubscribersGone(topic):  # until the other end is back, what it does not get is counted
                 self._lapsed.add(topic)
-            case Opened(topic, source, _, size):
+            case PublisherFound(topic, source, _, size):
                 self._open(topic, size, source)
-            case Shut(topic, source):
+            case PublisherGone(topic, source):
                 self._intake.shut(topic, source)
             case _:
                 if isinstance(event, ModuleChanged | ModuleGone):
@@ -444,10 +520,10 @@ class Link(abc.ABC):
             return
         outlet = self._outlets.get(name)
         if outlet is None or outlet.topic is not topic:
-            outlet = self._outlets[name] = LinkOutlet(self, topic)
+            outlet = self._outlets[name] = LinkSubscriber(self, topic)
             topic.join(outlet)
         else:
-            topic.welcome(outlet)
+            topic.resend_latched(outlet)
 
     def _detach(self, name: str) -> None:
         outlet = self._outlets.pop(name, None)
@@ -487,7 +563,57 @@ def unique_name(name: str, hub: Hub) -> str:
 
 def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
     """That of a line or a bus; `rate` is in messages/s."""
-    counts = Losses(link, hub.space.clock)
+    counts = LoggedCounter(link, hub.space.clock)
     return Discovery(
         hub.space.module, hub.instance, rate=rate, burst=max(4, int(rate / 4)), observer=hub.observer, counts=counts
     )
+
+
+# One topic on its way out by one link: what a link looks like to publishers.
+
+
+class LinkSubscriber(RemoteSubscriber):
+    """One topic on its way out by one link.
+
+    Nobody waits for a link that is down. What it is given is lost, counted; real-time publishers are told of each
+    sample, the others were told when it went down.
+    """
+
+    __slots__ = ("_link", "topic")
+
+    def __init__(self, link: "Link", topic: Topic, lines: WaitQueue | None = None) -> None:
+        """`lines`: its own, or else those of the link."""
+        super().__init__(link.name, link, link.wait_queue if lines is None else lines)
+        self._link = link
+        self.topic = topic
+
+    @property
+    def reachable(self) -> bool:
+        return self._link.up
+
+    def offer(self, sample: Sample) -> bool:
+        link = self._link
+        if not link.up:
+            if sample.publisher_class != PublisherClass.NON_REAL_TIME:
+                return False
+            self.force(sample)
+            return True
+        if not link.takes(sample):
+            return False
+        link.write(self.topic.name, sample)
+        return True
+
+    def force(self, sample: Sample) -> None:
+        link = self._link
+        if link.up and not link.full:
+            link.write(self.topic.name, sample)
+        else:
+            self.lost += 1
+            link.stats.lost["send buffer full" if link.up else LINK_DOWN] += 1
+
+    def lose(self, reason: str) -> None:
+        super().lose(reason)
+        self._link.stats.lost[reason] += 1
+
+    def refill(self) -> None:
+        self._link.made_room()

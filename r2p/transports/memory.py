@@ -15,12 +15,12 @@ from typing import Any, ClassVar
 import msgspec
 
 from r2p.clock import in_background, random_of
-from r2p.codecs.attachment import Clock
+from r2p.codecs.attachment import ClockOffset
 from r2p.durations import seconds
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
-from r2p.sample import PublisherClass, Sample, Source
+from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.transports.link import Hub, Link, Transport
 from r2p.transports.url import Url, duration
 
@@ -28,7 +28,7 @@ IN_FLIGHT = 1024
 """Messages that may be on their way before senders find the network full."""
 
 
-class Frame(msgspec.Struct, frozen=True, gc=False):
+class Datagram(msgspec.Struct, frozen=True, gc=False):
     """One message on the network."""
 
     port: int
@@ -42,17 +42,17 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     publisher_class: PublisherClass = PublisherClass.NON_REAL_TIME
     stamped: bool = True
     hops: int = 0
-    clock: Clock | None = None
+    clock: ClockOffset | None = None
 
 
-class Port:
+class MemoryPort:
     """One module's socket on a network. A module that is slow to take holds its messages there, still on their way."""
 
-    def __init__(self, network: "MemoryNetwork", receive: Callable[[Frame], None], room: Callable[[], None]) -> None:
+    def __init__(self, network: "MemoryNetwork", receive: Callable[[Datagram], None], room: Callable[[], None]) -> None:
         self.network = network
         self.receive = receive
         self.room = room
-        self.held: deque[Frame] = deque()
+        self.held: deque[Datagram] = deque()
         self.paused = False
 
     def resume(self) -> None:
@@ -91,7 +91,7 @@ class MemoryNetwork:
         self.seed = seed
         self.counts: Counter[str] = Counter()
         self._random: random.Random | None = None
-        self._ports: dict[int, Port] = {}
+        self._ports: dict[int, MemoryPort] = {}
         self._addresses = 0
         self._in_flight = 0
 
@@ -107,7 +107,7 @@ class MemoryNetwork:
         self._addresses += 1
         return self._addresses
 
-    def plug_in(self, address: int, port: Port) -> None:
+    def plug_in(self, address: int, port: MemoryPort) -> None:
         self._ports[address] = port
 
     def unplug(self, address: int) -> None:
@@ -116,7 +116,7 @@ class MemoryNetwork:
             self.landed(len(port.held))
             port.held.clear()
 
-    def send(self, frame: Frame) -> None:
+    def send(self, frame: Datagram) -> None:
         """Send to all other ports."""
         for address in self._ports:
             if address != frame.port:
@@ -130,7 +130,7 @@ class MemoryNetwork:
             for port in list(self._ports.values()):
                 port.room()
 
-    def _send_to(self, address: int, frame: Frame) -> None:
+    def _send_to(self, address: int, frame: Datagram) -> None:
         if self._happens(self.loss):
             self.counts["lost"] += 1
             return
@@ -153,7 +153,7 @@ class MemoryNetwork:
             self._random = random.Random(random_of().getrandbits(64) if self.seed is None else self.seed)
         return self._random.random()
 
-    def _schedule(self, delay: float, address: int, frame: Frame) -> None:
+    def _schedule(self, delay: float, address: int, frame: Datagram) -> None:
         loop = asyncio.get_running_loop()
         self._in_flight += 1
         if delay:
@@ -161,7 +161,7 @@ class MemoryNetwork:
         else:
             loop.call_soon(self._arrive, address, frame)
 
-    def _arrive(self, address: int, frame: Frame) -> None:
+    def _arrive(self, address: int, frame: Datagram) -> None:
         port = self._ports.get(address)
         if port is None:
             self.landed()
@@ -188,25 +188,25 @@ def network(name: str) -> MemoryNetwork:
 class MemoryLink(Link):
     """One module's place on a memory network; it can be unplugged, and plugged in again."""
 
-    longest: ClassVar[int] = 1024
+    max_payload: ClassVar[int] = 1024
     in_order: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, network: MemoryNetwork) -> None:
         super().__init__(name, hub)
         self.network = network
         self._address = network.new_address()
-        self._port = Port(network, self._receive, self.made_room)
+        self._port = MemoryPort(network, self._receive, self.made_room)
         self._times_left = TimesLeft()
 
     def connect(self) -> None:
         """Plug in."""
         self.network.plug_in(self._address, self._port)
-        self.went_up()
+        self.on_up()
 
     def disconnect(self, reason: str = "unplugged") -> None:
         """Pull the plug."""
         self.network.unplug(self._address)
-        self.went_down(reason)
+        self.on_down(reason)
 
     @property
     def full(self) -> bool:
@@ -215,7 +215,7 @@ class MemoryLink(Link):
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
         self.stats.bytes_sent += len(sample.data)
-        frame = Frame(
+        frame = Datagram(
             self._address,
             topic.encode(),
             sample.data,
@@ -232,9 +232,9 @@ class MemoryLink(Link):
         self.network.send(frame)
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        self.network.send(Frame(self._address, MANAGEMENT.encode(), data))
+        self.network.send(Datagram(self._address, MANAGEMENT.encode(), data))
 
-    def sample(self, topic: str, arrival: Frame) -> Sample:
+    def sample(self, topic: str, arrival: Datagram) -> Sample:
         self.stats.bytes_received += len(arrival.data)
         source = Source(arrival.module, arrival.node, self.name)
         return Sample(
@@ -250,13 +250,13 @@ class MemoryLink(Link):
             expires=self._expiry(arrival) if arrival.deadline else 0,
         )
 
-    def _expiry(self, arrival: Frame) -> int:
+    def _expiry(self, arrival: Datagram) -> int:
         """The deadline by the clock here."""
         publisher = (arrival.port, arrival.module, arrival.node)
         left = self._times_left.of(publisher).left(self._clock.monotonic(), arrival.stamp, arrival.deadline)
         return self._clock.now() + left
 
-    def sender(self, arrival: Frame) -> Hashable:
+    def sender(self, arrival: Datagram) -> Hashable:
         return arrival.port
 
     def pause(self) -> None:
@@ -270,7 +270,7 @@ class MemoryLink(Link):
         super().close()
         self.network.unplug(self._address)
 
-    def _receive(self, frame: Frame) -> None:
+    def _receive(self, frame: Datagram) -> None:
         self.take((frame,))
 
 

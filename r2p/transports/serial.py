@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from r2p.backoff import Backoff
+from r2p.clock import Backoff
 from r2p.errors import TransportError
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
@@ -81,7 +81,7 @@ class SerialTransport(Transport):
         except (OSError, ValueError, termios.error) as error:
             link.unreachable(_explain(self._device, error))
             return False
-        port = _Port(device, link, bytes_a_second)
+        port = _SerialConnection(device, link, bytes_a_second)
         try:
             port.start()
             await port.ended.wait()
@@ -103,7 +103,7 @@ class SerialTransport(Transport):
         return device
 
 
-class _Port(Connection):
+class _SerialConnection(Connection):
     """An open serial port."""
 
     def __init__(self, device: "serial.Serial", link: LineLink, bytes_a_second: float) -> None:

@@ -16,7 +16,7 @@ if sys.platform == "linux":
     import fcntl
     import termios
 
-from r2p.backoff import Backoff
+from r2p.clock import Backoff
 from r2p.codecs import debug, management
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
@@ -38,7 +38,7 @@ _STABLE = 3.0  # seconds; a connection that lived as long was a good one: the ne
 _DEAD_AFTER = 5  # seconds
 
 
-class _Tcp(asyncio.BufferedProtocol, Connection):
+class _TcpConnection(asyncio.BufferedProtocol, Connection):
     """One TCP connection."""
 
     waits = True
@@ -184,7 +184,7 @@ class TcpTransport(Transport):
     async def _connect(self, link: LineLink) -> float:
         """One connection from beginning to end; says how many seconds it lasted."""
         loop = asyncio.get_running_loop()
-        connection = _Outgoing(link)
+        connection = _ClientConnection(link)
         try:
             try:
                 async with asyncio.timeout(_CONNECT_TIMEOUT):
@@ -205,7 +205,7 @@ class TcpTransport(Transport):
             await connection.aclose()
 
 
-class _Outgoing(_Tcp):
+class _ClientConnection(_TcpConnection):
     """A connection of the client, for a link that was there before it."""
 
     def __init__(self, link: LineLink) -> None:
@@ -237,7 +237,7 @@ class TcpListenTransport(Transport):
         loop = asyncio.get_running_loop()
         clients = _Clients(hub, str(self._url), self._max_clients, gateways=self._gateways)
         try:
-            server = await loop.create_server(lambda: _Incoming(clients), self._host, self._port)
+            server = await loop.create_server(lambda: _ServerConnection(clients), self._host, self._port)
         except OSError as error:
             raise TransportError(f"{self._url}: can't listen: {_explain(error)}") from error
         try:
@@ -259,12 +259,12 @@ class _Clients:
         self.hub = hub
         self.most = most
         self.gateways = gateways
-        self.served: set[_Incoming] = set()
-        self.refused: set[_Incoming] = set()
+        self.served: set[_ServerConnection] = set()
+        self.refused: set[_ServerConnection] = set()
         self.closing = asyncio.Event()
         self._url = url
 
-    def refuse(self, client: "_Incoming", transport: asyncio.Transport) -> None:
+    def refuse(self, client: "_ServerConnection", transport: asyncio.Transport) -> None:
         """Tell an r2p client why (PROTOCOL.md 9): when it has read that, it closes."""
         self.hub.connection_refused(self._url, f"all {self.most} connections are in use: see max_clients=")
         if len(self.refused) >= _REFUSED:
@@ -278,7 +278,7 @@ class _Clients:
         asyncio.get_running_loop().call_later(_REFUSED_FOR, client.abort)
 
 
-class _Incoming(_Tcp):
+class _ServerConnection(_TcpConnection):
     """A connection of the server, with a link of its own if it is served."""
 
     def __init__(self, clients: _Clients) -> None:

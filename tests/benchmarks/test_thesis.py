@@ -24,7 +24,7 @@ from r2p.sim import run
 from r2p.sim.transport import SimCan
 
 if TYPE_CHECKING:
-    from r2p.sim.can import Record
+    from r2p.sim.can import FrameRecord
 
 JITTER = 3_000  # ns
 BOUND = 3 * JITTER  # master's transmission, slave's reception, slave's transmission
@@ -148,15 +148,15 @@ wishes = st.lists(
 )
 
 
-def frames(wishes: list[Wish], seed: int) -> list[Record]:
+def frames(wishes: list[Wish], seed: int) -> list[FrameRecord]:
     """What is on the bus, with jitter and drift, while this is asked for."""
 
-    async def main() -> list[Record]:
+    async def main() -> list[FrameRecord]:
         failures: list[object] = []
         asyncio.get_running_loop().set_exception_handler(lambda _, context: failures.append(context))
         shared = SimCan(seed=seed)
         nodes = [Node(name, shared, Scenario(seed=seed)) for name in NODES]
-        records: list[Record] = []
+        records: list[FrameRecord] = []
         async with asyncio.TaskGroup() as group:
             running = []
             for node in nodes:

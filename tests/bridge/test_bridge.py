@@ -13,11 +13,11 @@ import pytest
 import r2p
 from r2p.bridge import BridgeOptions
 from r2p.codecs import management
-from r2p.events import LinkNotice
 from r2p.msg import Float32, Led, Text
-from r2p.protocols.events import Command
+from r2p.protocols.discovery.events import Command
+from r2p.runtime.events import LinkNotice
 from r2p.testing.network import node_in
-from r2p.transports.memory import Frame, Port, network
+from r2p.transports.memory import Datagram, MemoryPort, network
 from r2p.transports.rtcan.link import RtcanLink
 from tests.transports.conversation import Script, manage
 
@@ -264,14 +264,14 @@ class Tap:
         self.heard: list[management.Management] = []
         self._network = network(where)
         self._address = self._network.new_address()
-        self._network.plug_in(self._address, Port(self._network, self._hear, lambda: None))
+        self._network.plug_in(self._address, MemoryPort(self._network, self._hear, lambda: None))
 
-    def _hear(self, frame: Frame) -> None:
+    def _hear(self, frame: Datagram) -> None:
         if frame.topic == b"R2P":
             self.heard.append(management.decode(frame.data))
 
     def say(self, message: management.Management) -> None:
-        self._network.send(Frame(self._address, b"R2P", management.encode(message)))
+        self._network.send(Datagram(self._address, b"R2P", management.encode(message)))
 
     def orders(self) -> list[management.Management]:
         kinds = (management.Stop, management.Reboot, management.Bootload)
@@ -454,12 +454,12 @@ class FirmwareGateway:
             self._plug_in(here, there)
 
     def _plug_in(self, here: int, there: int) -> None:
-        def hear(frame: Frame) -> None:
+        def hear(frame: Datagram) -> None:
             if frame.topic != b"R2P" or frame.data[-1] < 0x40:
                 frame = msgspec.structs.replace(frame, port=self._ports[there])
                 self._networks[there].send(frame)
 
-        self._networks[here].plug_in(self._ports[here], Port(self._networks[here], hear, lambda: None))
+        self._networks[here].plug_in(self._ports[here], MemoryPort(self._networks[here], hear, lambda: None))
 
     def cut(self) -> None:
         for each, port in zip(self._networks, self._ports, strict=True):

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
-from r2p.bridge import Standby
-from r2p.bridge.held import Held
+from r2p.bridge import MultihomedModule
+from r2p.bridge.forwarding import HeldMessages
 from r2p.codecs.management import Bridge, Endpoint, Hello
 from r2p.msg import Led
-from r2p.protocols.bridging.base import SayToClients
-from r2p.sample import Sample, Source
+from r2p.protocols.bridge.base import SayToClients
+from r2p.runtime.sample import Sample, Source
 from tests.bridge.test_bridge import Tap, drain, gateway, node
 from tests.faults import once
 
@@ -125,7 +125,7 @@ async def test_the_review_of_one_topic(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_the_alarm_of_a_module_with_several_links(monkeypatch: pytest.MonkeyPatch) -> None:
     async with gateway(), r2p.Module("PC", via=["memory:a", "memory:b"]) as module:
         standby = module._hub and module._hub._joints
-        assert isinstance(standby, Standby)
+        assert isinstance(standby, MultihomedModule)
         monkeypatch.setattr(standby.homes, "poll", once(standby.homes.poll))
         await asyncio.sleep(SETTLED)
         assert errors(module) == [1, 1]
@@ -144,7 +144,7 @@ async def test_what_is_read_of_modules(step: str, monkeypatch: pytest.MonkeyPatc
 
 
 async def test_what_is_kept_while_a_gateway_listens_anew() -> None:
-    held, failed, taken = Held(), list[str](), list[int]()
+    held, failed, taken = HeldMessages(), list[str](), list[int]()
 
     def go_on(number: int) -> None:
         taken.append(10 // number)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r2p.bridge import probes
-from r2p.bridge.seen import Seen
-from r2p.codecs import management
-from r2p.sample import Sample, Source
+from r2p.bridge.forwarding import DuplicateFilter
+from r2p.codecs import management, probes
+from r2p.runtime.sample import Sample, Source
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 255))
@@ -26,7 +25,7 @@ def sample(sequence: int, stamp: int, module: str = "A") -> Sample:
 
 
 def test_what_was_seen_before() -> None:
-    seen = Seen()
+    seen = DuplicateFilter()
     assert not seen.again(sample(1, 100))
     assert seen.again(sample(1, 100))
     assert not seen.again(sample(1, 100, "B"))

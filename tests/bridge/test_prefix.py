@@ -11,13 +11,13 @@ import pytest
 
 import r2p
 from r2p.bridge import BridgeOptions
-from r2p.bridge.module_names import ModuleNames
+from r2p.bridge.directory_relay import ModuleNames
 from r2p.bridge.options import Policy
 from r2p.codecs import management
-from r2p.events import LinkNotice
 from r2p.msg import Led
 from r2p.names import module_alias
-from r2p.protocols.events import Command
+from r2p.protocols.discovery.events import Command
+from r2p.runtime.events import LinkNotice
 from r2p.testing.network import node_in
 from tests.bridge.test_bridge import CONVERGED, Tap
 
@@ -132,7 +132,7 @@ async def test_what_an_alias_stands_for_may_come_after_it() -> None:
 
 
 def test_an_alias_of_two_modules_is_nobodys(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("r2p.bridge.module_names.module_alias", lambda name: "robxxxx")
+    monkeypatch.setattr("r2p.bridge.directory_relay.module_alias", lambda name: "robxxxx")
     names = ModuleNames(Policy(BridgeOptions(prefix="robot1/")), lambda: {"A": "", "B": ""}, lambda _: "")
     assert names.meant("robxxxx", "zenoh:") is None
     assert names.meant("robxxxx", "zenoh:") is None

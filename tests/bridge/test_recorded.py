@@ -19,7 +19,7 @@ import r2p
 from r2p.codecs import debug, management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.sim import can_bus
-from r2p.sim.can import CanController, CanNode, Record
+from r2p.sim.can import CanController, CanNode, FrameRecord
 from tests.transports.conversation import Script
 from tests.vectors import FROM_NODE, TO_NODE, Case, Entry, cases
 
@@ -64,7 +64,7 @@ class Bus:
         self.messages: list[tuple[int, bytes]] = []
         self._parts: dict[int, bytes] = {}
 
-    def note(self, record: Record) -> None:
+    def note(self, record: FrameRecord) -> None:
         if record.error is not None or GATEWAY not in record.senders:
             return
         found = rtcan.decode_identifier(record.frame.id)
@@ -126,7 +126,7 @@ def on_bus(case: Case, direction: str) -> Bus:
     bus = Bus()
     for entry in case.transcript:
         if entry.dir == direction and entry.can_id is not None:
-            bus.note(Record(0, 0, Frame(entry.can_id, entry.data), (GATEWAY,), 0, None))
+            bus.note(FrameRecord(0, 0, Frame(entry.can_id, entry.data), (GATEWAY,), 0, None))
     return bus
 
 

@@ -11,7 +11,7 @@ from r2p.clock import clock_of
 from r2p.codecs import rtcan
 from r2p.msg import Led
 from r2p.testing.network import Network, node_in
-from r2p.tools.topic_rates import _Delay
+from r2p.tools.topic.rates import _Delay
 from r2p.transports.memory import MemoryNetwork
 from tests.transports.rtcan.networks import Lab
 

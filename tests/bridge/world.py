@@ -13,7 +13,7 @@ import msgspec
 import r2p
 from r2p.names import MANAGEMENT
 from r2p.testing.network import node_in
-from r2p.transports.memory import Frame, MemoryLink, MemoryNetwork
+from r2p.transports.memory import Datagram, MemoryLink, MemoryNetwork
 
 if TYPE_CHECKING:
     import random
@@ -50,12 +50,12 @@ class TestNetwork(MemoryNetwork):
         """Never: a message that is refused for want of room would be lost on the way."""
         return False
 
-    def send(self, frame: Frame) -> None:
+    def send(self, frame: Datagram) -> None:
         if self.anonymous and frame.topic != _MANAGEMENT:
             frame = msgspec.structs.replace(frame, sequence=0, module="", node="", hops=0)
         super().send(frame)
 
-    def _send_to(self, address: int, frame: Frame) -> None:
+    def _send_to(self, address: int, frame: Datagram) -> None:
         if frame.topic == _MANAGEMENT:
             super()._send_to(address, frame)
             return

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from r2p.clock import clock_of
-from r2p.transports.rtcan.socketcan import SocketCanPort
+from r2p.transports.can.socketcan import SocketCanPort
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
     from r2p.codecs.rtcan import Frame, OtherFrame
     from r2p.protocols.rtcan.events import Mailbox, Outcome
-    from r2p.transports.rtcan.port import CanPort
+    from r2p.transports.can.port import CanPort
 
 GUARD = 30.0
 """Seconds after which something that should have happened will not."""

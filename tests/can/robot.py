@@ -13,7 +13,7 @@ import sys
 from typing import Annotated, Any
 
 import r2p
-from r2p.runner import run_main
+from r2p.modules.runner import run_main
 
 ENOUGH = 4
 """Messages of each topic."""

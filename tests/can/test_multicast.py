@@ -8,7 +8,7 @@ import pytest
 
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
-from r2p.transports.rtcan.pythoncan import PythonCanPort
+from r2p.transports.can.pythoncan import PythonCanPort
 from tests.can.rig import using
 
 pytestmark = [pytest.mark.can, pytest.mark.anyio]

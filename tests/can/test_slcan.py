@@ -14,8 +14,8 @@ from can.interfaces import slcan
 
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
-from r2p.transports.rtcan import interface
-from r2p.transports.rtcan.pythoncan import PythonCanPort
+from r2p.transports.can import netlink as interface
+from r2p.transports.can.pythoncan import PythonCanPort
 from tests.can.rig import ip, port_on, until, using
 
 if TYPE_CHECKING:

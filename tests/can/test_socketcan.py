@@ -14,8 +14,9 @@ import pytest
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
-from r2p.transports.rtcan import interface, socketcan
-from r2p.transports.rtcan.socketcan import SocketCanPort
+from r2p.transports.can import netlink as interface
+from r2p.transports.can import socketcan
+from r2p.transports.can.socketcan import SocketCanPort
 from tests.can.rig import Candump, User, add, cangen, cansend, ip, new_name, now, port_on
 
 if TYPE_CHECKING:
@@ -317,7 +318,7 @@ async def test_what_the_kernel_tells_of_interfaces(vcan: str) -> None:
 
 async def test_changes_of_interfaces_are_noticed() -> None:
     name = new_name()
-    async with interface.Watch() as watch:
+    async with interface.InterfaceWatch() as watch:
         add(name)
         await watch.wait(3600.0)
         ip("delete", name)

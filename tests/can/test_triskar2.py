@@ -20,7 +20,7 @@ from r2p.msg import Odometry
 from r2p.sim.robots.emulated import MODULES, Triskar2
 from r2p.sim.robots.square import REST, square
 from r2p.testing.network import node_in
-from r2p.transports.rtcan import rawsocket
+from r2p.transports.can import rawsocket
 
 pytestmark = [pytest.mark.can, pytest.mark.virtual_time]
 

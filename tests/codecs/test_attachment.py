@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from r2p.bridge.options import check_prefix
 from r2p.codecs import UnknownType, attachment
-from r2p.codecs.attachment import Clock, Credit, Header, Origin, Reader
+from r2p.codecs.attachment import ClockOffset, Credit, Header, HeaderReader, Origin
 from r2p.errors import DecodeError
 from r2p.names import module_alias
 
@@ -35,7 +35,7 @@ HEADERS = st.builds(
     deadline=I64,
     hops=st.integers(0, 255),
     stamped=st.booleans(),
-    clock=st.none() | st.builds(Clock, epoch=U32, offset=I64, error=U32),
+    clock=st.none() | st.builds(ClockOffset, epoch=U32, offset=I64, error=U32),
     more=st.just(()) | st.lists(I64, max_size=attachment.PACKET_MOST - 1).map(tuple),
 )
 
@@ -88,8 +88,8 @@ def test_a_fast_encoder_says_the_same() -> None:
 
 def test_the_bytes_of_a_header_of_several_messages() -> None:
     """As docs/PROTOCOL.md has it."""
-    data = attachment.encode(msgspec.structs.replace(HEADER, clock=Clock(1, 2, 3), more=(4, 5)))
-    single = attachment.encode(msgspec.structs.replace(HEADER, clock=Clock(1, 2, 3)))
+    data = attachment.encode(msgspec.structs.replace(HEADER, clock=ClockOffset(1, 2, 3), more=(4, 5)))
+    single = attachment.encode(msgspec.structs.replace(HEADER, clock=ClockOffset(1, 2, 3)))
     assert (
         data
         == single[:3] + b"\2" + single[4:48] + bytes([4, 0, 0, 0, 0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0]) + single[48:]
@@ -97,9 +97,9 @@ def test_the_bytes_of_a_header_of_several_messages() -> None:
 
 
 def test_what_is_too_large_is_cut() -> None:
-    header = msgspec.structs.replace(HEADER, hops=300, serial=2**32 + 1, clock=Clock(1, -5, 2**40))
+    header = msgspec.structs.replace(HEADER, hops=300, serial=2**32 + 1, clock=ClockOffset(1, -5, 2**40))
     read = attachment.decode(attachment.encode(header))
-    assert (read.hops, read.serial, read.clock) == (255, 1, Clock(1, -5, 0xFFFFFFFF))
+    assert (read.hops, read.serial, read.clock) == (255, 1, ClockOffset(1, -5, 0xFFFFFFFF))
 
 
 def test_an_origin_is_remembered_once() -> None:
@@ -109,7 +109,7 @@ def test_an_origin_is_remembered_once() -> None:
         made.append(origin)
         return len(made)
 
-    reader = Reader(remember)
+    reader = HeaderReader(remember)
     data = attachment.encode(HEADER)
     other = attachment.encode(msgspec.structs.replace(HEADER, origin=msgspec.structs.replace(ORIGIN, node="other")))
     assert [reader.read(each)[0] for each in (data, other, data, other)] == [1, 2, 1, 2]
@@ -117,7 +117,7 @@ def test_an_origin_is_remembered_once() -> None:
 
 def test_a_liar_does_not_fill_the_memory() -> None:
     made: list[Origin] = []
-    reader = Reader(made.append)
+    reader = HeaderReader(made.append)
     for sender in range(5000):
         reader.read(
             attachment.encode(msgspec.structs.replace(HEADER, origin=msgspec.structs.replace(ORIGIN, sender=sender)))

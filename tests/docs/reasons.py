@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 
 from r2p.protocols.rtcan.events import Fate, Outcome
-from r2p.transports.rtcan import errorframes
+from r2p.transports.can import errorframes
 from tests.docs.blocks import ROOT
 
 COUNTERS = {"lost", "losses", "counts", "dropped", "drops", "faults", "missed", "errors"}
@@ -28,11 +28,15 @@ _ERROR_FRAMES = {
     "protocol error",
 }
 ELSEWHERE = {
-    ("r2p/protocols/rtcan/sending.py", "outcome.value"): {Outcome.LOST.value, Outcome.ERROR.value, Outcome.LATE.value},
-    ("r2p/transports/rtcan/socketcan.py", "kind"): _ERROR_FRAMES,
+    ("r2p/protocols/rtcan/transmitter.py", "outcome.value"): {
+        Outcome.LOST.value,
+        Outcome.ERROR.value,
+        Outcome.LATE.value,
+    },
+    ("r2p/transports/can/socketcan.py", "kind"): _ERROR_FRAMES,
     ("r2p/protocols/rtcan/engine.py", "fate.value"): _FATES | {Fate.DISCARDED.value},
-    ("r2p/transports/rtcan/handover.py", "done.fate.value"): _FATES,
-    ("r2p/transports/rtcan/periodics.py", "done.fate.value"): _FATES,
+    ("r2p/transports/rtcan/tx.py", "done.fate.value"): _FATES,
+    ("r2p/transports/rtcan/slots.py", "done.fate.value"): _FATES,
 }
 """(File, key): what the key may be."""
 

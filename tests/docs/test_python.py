@@ -57,8 +57,8 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     def run_coroutine(main: Coroutine[Any, Any, T]) -> T | None:
         return run_bounded(lambda: main)
 
-    monkeypatch.setattr(sys.modules["r2p.runner"], "run_main", run_bounded)
-    monkeypatch.setattr("r2p.module.open_transport", open_here)
+    monkeypatch.setattr(sys.modules["r2p.modules.runner"], "run_main", run_bounded)
+    monkeypatch.setattr("r2p.modules.module.open_transport", open_here)
     monkeypatch.setattr(asyncio, "run", run_coroutine)
     monkeypatch.setattr(sys, "argv", ["program"])
     monkeypatch.delenv("R2P_VIA", raising=False)

@@ -7,7 +7,7 @@ from typing import Annotated
 import pytest
 
 import r2p
-from r2p import watchdog
+from r2p.modules import watchdog
 from r2p.msg import Led
 from r2p.sim.modules import FirmwareModule, Powered
 from r2p.testing.network import Network, node_in
@@ -87,11 +87,11 @@ async def test_a_link_comes_back(r2p_network: Network, caplog: pytest.LogCapture
         bob.subscribe("leds", Led)
         await publisher.wait_subscriber()
         link = a.links[0]
-        link.went_down("unplugged")
+        link.on_down("unplugged")
         for _ in range(31):
             await publisher.publish(Led())
             await asyncio.sleep(0.1)
-        link.went_up()
+        link.on_up()
     logged = next(text for text in caplog.messages if "messages lost meanwhile" in text)
     assert _told(logged.removeprefix(f"link {link.title} "))
 

@@ -9,8 +9,8 @@ import pytest
 import zenoh
 
 import r2p
-from r2p.events import LinkNotice
 from r2p.msg import Led
+from r2p.runtime.events import LinkNotice
 from r2p.testing.network import node_in
 from tests.docs.blocks import Block, blocks, pages
 from tests.ports import free_port

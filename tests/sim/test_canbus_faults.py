@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from r2p.codecs.rtcan import Frame, encode_identifier, wire_bits
-from r2p.sim.can import CanBus, CanController, CanNode, ErrorKind, Record, State
+from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, FrameRecord
 from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
 from tests import can_watch
 
@@ -79,12 +79,12 @@ async def test_a_bit_error_destroys_the_frame_and_it_is_sent_again(bit: int) -> 
     level = "1" if wire_bits(FRAME)[bit - 1] == "0" else "0"
     seen = wire_bits(FRAME)[: bit - 1] + level
     dominant = len(seen) - len(seen.rstrip("0"))
-    error = Record(
+    error = FrameRecord(
         0, (bit + 12 - dominant + DELIMITER) * BIT, FRAME, ("A",), bit + 12 - dominant + DELIMITER, ErrorKind.BIT
     )
     assert watch.records[0] == error
     again = error.end + GAP
-    assert watch.records[1:] == [Record(again, again + bits(FRAME) * BIT, FRAME, ("A",), bits(FRAME), None)]
+    assert watch.records[1:] == [FrameRecord(again, again + bits(FRAME) * BIT, FRAME, ("A",), bits(FRAME), None)]
     assert watch.heard == [("sent", "A", FRAME, watch.records[1].end), ("received", "B", FRAME, watch.records[1].end)]
     assert (counters(a), counters(b)) == ((7, 0), (0, 0))  # +8 and +1, and each -1 for the frame that got through
     total = watch.bus.statistics.total
@@ -125,7 +125,7 @@ async def test_noise_at_one_node_destroys_frames_for_all_until_it_is_error_passi
     good = watch.attach("good")
     a.request(FRAME)
     await asyncio.sleep(0.1)
-    assert deaf.state is State.PASSIVE
+    assert deaf.state is ControllerState.PASSIVE
     assert watch.outcomes == [(FRAME, ErrorKind.BIT)] * (len(watch.records) - 1) + [(FRAME, None)]
     assert [name for name, *_ in watch.of("received")] == ["good"]
     assert good.confinement.receive == len(watch.records) - 2
@@ -139,7 +139,7 @@ async def test_without_another_node_nobody_acknowledges() -> None:
     await asyncio.sleep(0.01)
     known = bits(FRAME) - 8  # the acknowledge slot is the 9th bit from the end
     assert watch.heard == [("error", "A", FRAME, ErrorKind.ACK, known * BIT)]
-    assert watch.records == [Record(0, (known + 14) * BIT, FRAME, ("A",), known + 14, ErrorKind.ACK)]
+    assert watch.records == [FrameRecord(0, (known + 14) * BIT, FRAME, ("A",), known + 14, ErrorKind.ACK)]
 
 
 @pytest.mark.virtual_time
@@ -149,13 +149,16 @@ async def test_a_lone_node_tries_for_ever_and_never_goes_to_bus_off() -> None:
     b.power_off()
     a.request(FRAME)
     await asyncio.sleep(1)
-    assert (a.state, a.confinement.transmit) == (State.PASSIVE, 128)
+    assert (a.state, a.confinement.transmit) == (ControllerState.PASSIVE, 128)
     assert len(watch.records) > 4000
     b.power_on()
     await asyncio.sleep(0.001)
     assert [frame for _, frame, _ in watch.of("received")] == [FRAME]
-    assert a.state is State.ACTIVE
-    assert [state for name, state, _ in watch.of("state") if name == "A"] == [State.PASSIVE, State.ACTIVE]
+    assert a.state is ControllerState.ACTIVE
+    assert [state for name, state, _ in watch.of("state") if name == "A"] == [
+        ControllerState.PASSIVE,
+        ControllerState.ACTIVE,
+    ]
 
 
 @pytest.mark.virtual_time
@@ -168,10 +171,10 @@ async def test_an_error_passive_sender_waits_8_bits_longer() -> None:
     await asyncio.sleep(0.01)
     first, second = watch.records
     assert second.start - first.end == GAP + 8 * BIT
-    assert a.state is State.PASSIVE
+    assert a.state is ControllerState.PASSIVE
     b.request(OTHER)
     await asyncio.sleep(0.001)
-    assert b.state is State.ACTIVE
+    assert b.state is ControllerState.ACTIVE
 
 
 # Collisions
@@ -309,7 +312,12 @@ async def test_a_babbling_node_comes_back_from_bus_off_as_mad_as_before() -> Non
     mad.babble(FRAME)
     await asyncio.sleep(0.1)
     states = [state for name, state, _ in watch.of("state") if name == "mad"]
-    assert states[:4] == [State.PASSIVE, State.BUS_OFF, State.ACTIVE, State.PASSIVE]
+    assert states[:4] == [
+        ControllerState.PASSIVE,
+        ControllerState.BUS_OFF,
+        ControllerState.ACTIVE,
+        ControllerState.PASSIVE,
+    ]
     assert not watch.of("error")
     mad.power_off()
     await asyncio.sleep(0.001)
@@ -331,14 +339,14 @@ async def test_a_node_that_dies_in_the_middle_of_its_frame() -> None:
     sent = wire_bits(FRAME)[:60]
     silent = 6 - (len(sent) - len(sent.rstrip("1")))
     taken = 60 + silent + 6 + DELIMITER  # all receivers notice at once
-    assert watch.records[0] == Record(0, taken * BIT, FRAME, ("A",), taken, ErrorKind.STUFF)
+    assert watch.records[0] == FrameRecord(0, taken * BIT, FRAME, ("A",), taken, ErrorKind.STUFF)
     assert watch.records[1].start == taken * BIT + GAP
     assert watch.heard == [
         ("sent", "B", OTHER, watch.records[1].end),
         ("received", "C", OTHER, watch.records[1].end),
     ]
     assert b.confinement.receive == 1
-    assert a.state is State.DOWN
+    assert a.state is ControllerState.DOWN
     assert not a.request(FRAME)
 
 
@@ -450,7 +458,7 @@ async def test_a_node_that_returns_is_new_and_waits_for_11_recessive_bits() -> N
     await asyncio.sleep(0.001)
     assert [(record.start, record.frame) for record in watch.records] == [(1_000_000 + SEQUENCE, OTHER)]
     assert watch.of("received") == [("B", OTHER, watch.records[0].end)]
-    assert b.state is State.ACTIVE
+    assert b.state is ControllerState.ACTIVE
 
 
 @pytest.mark.virtual_time
@@ -474,7 +482,7 @@ async def into_bus_off(watch: Watch, node: CanController) -> None:
     watch.bus.disturb_next(30)
     node.request(FRAME)
     await asyncio.sleep(0.000_2)
-    assert node.state is State.BUS_OFF
+    assert node.state is ControllerState.BUS_OFF
 
 
 @pytest.mark.virtual_time
@@ -489,7 +497,7 @@ async def test_bus_off_gives_up_what_is_pending() -> None:
     ]
     assert not a.request(FRAME)
     await asyncio.sleep(1)
-    assert a.state is State.BUS_OFF
+    assert a.state is ControllerState.BUS_OFF
 
 
 @pytest.mark.virtual_time
@@ -498,7 +506,7 @@ async def test_recovery_on_an_idle_bus_takes_128_times_11_bits() -> None:
     a, _ = watch.attach("A"), watch.attach("B")
     write = a.on_state
 
-    def again(state: State, stamp: int) -> None:
+    def again(state: ControllerState, stamp: int) -> None:
         write(state, stamp)
         a.request(OTHER)
 
@@ -507,7 +515,7 @@ async def test_recovery_on_an_idle_bus_takes_128_times_11_bits() -> None:
     await asyncio.sleep(0.01)
     record, after = watch.records
     # the delimiter and the intermission of the error frame are the first time
-    assert watch.of("state")[-1] == ("A", State.ACTIVE, record.end + GAP + 127 * SEQUENCE)
+    assert watch.of("state")[-1] == ("A", ControllerState.ACTIVE, record.end + GAP + 127 * SEQUENCE)
     assert counters(a) == (0, 0)
     assert (after.start, after.error) == (record.end + GAP + 127 * SEQUENCE, None)
 
@@ -522,7 +530,7 @@ async def test_recovery_on_a_saturated_bus_takes_128_frames() -> None:
     failed = next(number for number, record in enumerate(watch.records) if record.error)
     await asyncio.sleep(0.1)
     *_, (_, state, recovered) = [entry for entry in watch.of("state") if entry[0] == "A"]
-    assert (state, recovered) == (State.ACTIVE, watch.records[failed + 127].end + GAP)
+    assert (state, recovered) == (ControllerState.ACTIVE, watch.records[failed + 127].end + GAP)
 
 
 @pytest.mark.virtual_time
@@ -538,7 +546,7 @@ async def test_recovery_counts_the_idle_time_between_frames() -> None:
     await asyncio.sleep(0.01)
     *_, (_, state, recovered) = watch.of("state")
     # 1 in the error frame, 50 idle, half of one broken off, 1 in the frame
-    assert (state, recovered) == (State.ACTIVE, watch.records[1].end + GAP + (128 - 52) * SEQUENCE)
+    assert (state, recovered) == (ControllerState.ACTIVE, watch.records[1].end + GAP + (128 - 52) * SEQUENCE)
 
 
 @pytest.mark.virtual_time
@@ -550,13 +558,13 @@ async def test_restart_by_hand_and_death_in_bus_off() -> None:
     await asyncio.sleep(0.1)
     a.restart()
     await asyncio.sleep(0.1)
-    assert watch.of("state")[-1][:2] == ("A", State.ACTIVE)
+    assert watch.of("state")[-1][:2] == ("A", ControllerState.ACTIVE)
     await into_bus_off(watch, a)
     a.restart()
     a.power_off()
     await asyncio.sleep(0.1)
     assert not a.live
-    assert watch.of("state")[-1][:2] == ("A", State.BUS_OFF)
+    assert watch.of("state")[-1][:2] == ("A", ControllerState.BUS_OFF)
 
 
 @pytest.mark.virtual_time
@@ -565,7 +573,10 @@ async def test_a_noisy_bus_drives_its_senders_to_bus_off() -> None:
     a, b = watch.attach("A"), watch.attach("B")
     a.request(FRAME)
     await asyncio.sleep(0.02)
-    assert [state for name, state, _ in watch.of("state") if name == "A"][:2] == [State.PASSIVE, State.BUS_OFF]
+    assert [state for name, state, _ in watch.of("state") if name == "A"][:2] == [
+        ControllerState.PASSIVE,
+        ControllerState.BUS_OFF,
+    ]
     assert len(watch.records) == 32  # 8 for each, over 255
     assert b.confinement.receive == 32
     watch.bus.noise = 0.0  # it can be set at any time
@@ -580,7 +591,7 @@ async def test_a_good_frame_takes_the_receive_counter_back_below_passive() -> No
     watch = Watch()
     a, b = watch.attach("A"), watch.attach("B")
     b.disturbed(200)
-    assert b.state is State.PASSIVE
+    assert b.state is ControllerState.PASSIVE
     a.request(FRAME)
     await asyncio.sleep(0.001)
-    assert (b.confinement.receive, b.state) == (119, State.ACTIVE)
+    assert (b.confinement.receive, b.state) == (119, ControllerState.ACTIVE)

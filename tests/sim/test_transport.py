@@ -11,7 +11,7 @@ import r2p
 import r2p.sim
 from r2p.clock import clock_of
 from r2p.msg import PWM2, Led
-from r2p.sim.can import Record
+from r2p.sim.can import FrameRecord
 from r2p.sim.loop import VirtualClock, VirtualLoop
 from r2p.testing.network import node_in
 from r2p.transports.url import open_transport
@@ -123,7 +123,7 @@ def _course(seed: int) -> str:
     async def main() -> None:
         lab = r2p.sim.can_bus("lab", noise=0.01)
 
-        def watch(record: Record) -> None:
+        def watch(record: FrameRecord) -> None:
             digest.update(repr(record).encode())
 
         lab.bus.observers.append(watch)
@@ -185,7 +185,7 @@ def test_paced_to_real_time() -> None:
     starts: list[int] = []
     late: list[int] = []
 
-    def observe(record: Record) -> None:
+    def observe(record: FrameRecord) -> None:
         late.append(clock_of().monotonic() - record.end)
         if record.frame.id < 1 << 15:
             starts.append(record.start)

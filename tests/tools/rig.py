@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any
 import r2p
 from r2p.codecs import management
 from r2p.tools.session import Session, Settings, join
-from r2p.transports.memory import Frame, network
+from r2p.transports.memory import Datagram, network
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
     import pytest
 
-    from r2p.supervisor import NodeFunction
+    from r2p.modules.supervisor import NodeFunction
 
 VIA = "memory:lab"
 PUBLISH = ("topic", "pub", "leds", "led=3", "--type", "Led", "--rate", "50", "--via", "tcp-listen:0")
@@ -56,7 +56,7 @@ class Firmware:
         self._name = name
 
     def say(self, message: management.Management) -> None:
-        self._network.send(Frame(self._port, b"R2P", management.encode(message)))
+        self._network.send(Datagram(self._port, b"R2P", management.encode(message)))
 
     def alive(self) -> None:
         self.say(management.Alive(self._name, 0))
@@ -67,7 +67,7 @@ class Firmware:
         self.say(management.SubscribeResponse(topic, size))
 
     def publish(self, topic: str, data: bytes) -> None:
-        self._network.send(Frame(self._port, topic.encode(), data))
+        self._network.send(Datagram(self._port, topic.encode(), data))
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[Any]:

@@ -12,7 +12,7 @@ import pytest
 
 from r2p.tools import doctor
 from r2p.tools.doctor import Check
-from r2p.transports.rtcan.interface import Interface
+from r2p.transports.can.netlink import Interface
 from tests.tools.rig import process
 
 if TYPE_CHECKING:

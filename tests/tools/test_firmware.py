@@ -12,9 +12,9 @@ import r2p
 from r2p.msg import Led, Text, Velocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
 from r2p.tools.session import Session, Settings, TimedOut
-from r2p.tools.topic_echo import echo
-from r2p.tools.topic_pub import pub
-from r2p.tools.topic_rates import bw, hz
+from r2p.tools.topic.echo import echo
+from r2p.tools.topic.pub import pub
+from r2p.tools.topic.rates import bw, hz
 from tests.tools.rig import printed
 
 if TYPE_CHECKING:

@@ -12,14 +12,13 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge.forwarding import Shaper
 from r2p.bridge.options import ClassOf, Policy, is_link, rule
-from r2p.bridge.shaping import Shaper
 from r2p.msg import GatewayStatus, Led
-from r2p.sample import PublisherClass, Sample, Source
+from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.testing.network import node_in
 from r2p.tools import gateway
-from r2p.tools._gateway_table import Rates, Screen, fitted, table
-from r2p.tools.gateway import serve
+from r2p.tools.gateway import GatewayScreen, Rates, fitted, serve, table
 from r2p.tools.output import Output
 from r2p.tools.session import Usage
 
@@ -85,7 +84,7 @@ async def test_the_table_stays_in_its_place_until_something_is_logged() -> None:
     stream = io.StringIO()
     output = Output("yaml", stream)
     output.format = "text"
-    screen = Screen(output)
+    screen = GatewayScreen(output)
     rows = Rates().rows(GatewayStatistics(PORTS, []), SECOND)
     await screen.draw(rows)
     await screen.draw(rows)

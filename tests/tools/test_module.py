@@ -17,7 +17,7 @@ from r2p.msg import Led, Velocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
 from r2p.tools.module import bootload, list_, reboot, stop
 from r2p.tools.session import Session, Settings, TimedOut, Usage
-from r2p.transports.memory import Frame, network
+from r2p.transports.memory import Datagram, network
 from tests.tools.rig import printed, robot, tool
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ async def test_a_gateway_does_not_stop_a_module_in_its_boot_loader() -> None:
         gateway = r2p.Module("GW", via=["memory:lab", power.wire()], bridge=True)
         async with gateway, tool() as session:
             await asyncio.sleep(3)
-            network("lab").send(Frame(99, b"R2P", management.encode(management.Stop("IMU1"))))
+            network("lab").send(Datagram(99, b"R2P", management.encode(management.Stop("IMU1"))))
             await asyncio.sleep(3)
             assert not power.module.fault
             assert gateway.gateway_statistics().ports[0].dropped == {"order refused": 1}

@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 import r2p
 from r2p.msg import Led
 from r2p.tools import session
-from r2p.tools.loading import load_module
 from r2p.tools.output import PipeClosed
+from r2p.tools.run import load_module
 from r2p.tools.session import Session, Settings, TimedOut, Usage, check_owned, execute, join, settings
 from tests.tools.rig import Firmware, robot, tool
 
@@ -280,7 +280,7 @@ async def test_it_listens_as_long_as_it_is_told(capsys: pytest.CaptureFixture[st
 async def test_no_link_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     async with tool() as session:
         for link in session.module.links:
-            link.went_down("unplugged")
+            link.on_down("unplugged")
         with pytest.raises(r2p.TransportError, match="no connection on memory:lab"):
             await session.settle()
 

@@ -5,7 +5,7 @@ import logging
 import pytest
 
 from r2p.tools.session import Usage, execute
-from r2p.tools.stderr import log_to_stderr, say
+from r2p.tools.terminal import log_to_stderr, say
 
 HOSTILE = "EV\x1b[2J\x9b\x07\rIL"
 

@@ -11,7 +11,7 @@ import r2p
 from r2p.msg import Led
 from r2p.names import MANAGEMENT
 from r2p.testing.network import node_in
-from r2p.transports.memory import Frame, network
+from r2p.transports.memory import Datagram, network
 
 pytestmark = pytest.mark.virtual_time
 
@@ -22,7 +22,7 @@ async def messages_of_a_start(monkeypatch: pytest.MonkeyPatch, modules: int, top
     lab = network("lab")
     send = lab.send
 
-    def count(frame: Frame) -> None:
+    def count(frame: Datagram) -> None:
         nonlocal said
         said += frame.topic == MANAGEMENT.encode()
         send(frame)

@@ -9,11 +9,11 @@ from typing import TypeVar
 
 import r2p
 import r2p.msg
-from r2p.events import ModuleEvent
 from r2p.messages import Message
+from r2p.modules.graph import ModuleView
 from r2p.msg import PWM2, Led, Speed3, Text
-from r2p.network import ModuleView
-from r2p.protocols.events import Mismatched, ModuleGone, NameConflict
+from r2p.protocols.discovery.events import Mismatched, ModuleGone, NameConflict
+from r2p.runtime.events import ModuleEvent
 from r2p.testing.network import node_in
 from tests.transports.cables import Cable, conforms, conforms_lines
 from tests.transports.exchange import EVERY, filled

@@ -15,9 +15,9 @@ from r2p.codecs import management as m
 from r2p.errors import MessageError
 from r2p.msg import Led, Text
 from r2p.names import module_alias
-from r2p.protocols import demand, directory, peers
+from r2p.protocols.discovery import demand, directory, peers
+from r2p.runtime.topic import Topic, TopicSpace
 from r2p.testing.network import node_in
-from r2p.topic import Topic, TopicSpace
 from tests.transports.conversation import Script, line, manage
 
 KINDS: tuple[type[msgspec.Struct], ...] = get_args(m.Management)

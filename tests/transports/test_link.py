@@ -6,10 +6,10 @@ import pytest
 
 import r2p
 from r2p.msg import Led
-from r2p.protocols.events import Event, ModuleChanged, ModuleGone
+from r2p.protocols.discovery.events import Event, ModuleChanged, ModuleGone
 from r2p.testing.network import Network, node_in
 from r2p.transports.link import Link
-from r2p.transports.memory import Frame, MemoryLink
+from r2p.transports.memory import Datagram, MemoryLink
 from tests.faults import once
 
 pytestmark = [pytest.mark.virtual_time, pytest.mark.internal_errors]
@@ -68,7 +68,7 @@ async def test_the_memory_network_goes_on(r2p_network: Network, monkeypatch: pyt
         link = link_of(b)
         assert isinstance(link, MemoryLink)
 
-        def is_second(_topic: str, arrival: Frame) -> bool:
+        def is_second(_topic: str, arrival: Datagram) -> bool:
             return arrival.sequence == 2
 
         monkeypatch.setattr(link, "sample", once(link.sample, is_second))

@@ -10,7 +10,7 @@ import pytest
 from r2p.msg import Led
 from r2p.names import MANAGEMENT
 from r2p.testing.network import Network, node_in
-from r2p.transports.memory import Frame
+from r2p.transports.memory import Datagram
 from tests.bench import led, settle
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class SlowManagement(Network):
         super().__init__()
         self.lead = lead
 
-    def _schedule(self, delay: float, address: int, frame: Frame) -> None:
+    def _schedule(self, delay: float, address: int, frame: Datagram) -> None:
         super()._schedule(self.lead if frame.topic == MANAGEMENT.encode() else delay, address, frame)
 
 
@@ -75,8 +75,8 @@ async def test_what_comes_unasked_is_kept_for_few_senders_and_for_no_other_topic
         assert not link._early
 
 
-def frame(port: int, topic: bytes) -> Frame:
-    return Frame(port, topic, Led().encode())
+def frame(port: int, topic: bytes) -> Datagram:
+    return Datagram(port, topic, Led().encode())
 
 
 async def test_nothing_is_kept_of_topics_that_were_closed() -> None:

@@ -11,13 +11,13 @@ from typing import cast
 import pytest
 
 import r2p
-from r2p.backoff import Backoff
+from r2p.clock import Backoff
 from r2p.codecs import management as m
 from r2p.codecs.debug import Reader
 from r2p.errors import TransportError
-from r2p.events import ModuleEvent
 from r2p.msg import Led
-from r2p.protocols.discovery import Discovery
+from r2p.protocols.discovery.session import Discovery
+from r2p.runtime.events import ModuleEvent
 from r2p.testing.network import node_in
 from r2p.transports import tcp
 from r2p.transports.line import LineLink
@@ -160,7 +160,7 @@ async def test_clients_come_and_go_without_a_trace() -> None:
 def traces_of_links() -> tuple[int, int, int]:
     """Objects of links that live, tasks, and open files."""
     gc.collect()
-    objects = sum(isinstance(each, LineLink | Discovery | tcp._Tcp) for each in gc.get_objects())
+    objects = sum(isinstance(each, LineLink | Discovery | tcp._TcpConnection) for each in gc.get_objects())
     return objects, len(asyncio.all_tasks()), len(list(Path("/proc/self/fd").iterdir()))
 
 
@@ -226,7 +226,7 @@ async def test_a_connection_to_itself_is_none() -> None:
     """A client that tries again and again on its own machine may be given the very port it asks for."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         itself = taken.getsockname()
-    connection = tcp._Outgoing(cast("LineLink", None))  # it must not come to use it
+    connection = tcp._ClientConnection(cast("LineLink", None))  # it must not come to use it
     async with asyncio.timeout(GUARD):
         await asyncio.get_running_loop().create_connection(lambda: connection, *itself, local_addr=itself)
         await connection.ended.wait()

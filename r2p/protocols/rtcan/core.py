@@ -1,26 +1,53 @@
-"""The parts of an engine put together, and what passes between them: management messages, timers, changes of mode."""
+"""Timers of which the next one is known at no cost: it is asked for after every frame, and seldom changes."""
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import DecodeError
-from r2p.protocols.rtcan.alarms import Alarms
-from r2p.protocols.rtcan.answers import Answers
+from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.cycle import Cycle, timing
-from r2p.protocols.rtcan.election import Election, Role
-from r2p.protocols.rtcan.events import Action, Done, Due, Fate, Profile, Ready, Received
-from r2p.protocols.rtcan.identity import Identity, Stage
-from r2p.protocols.rtcan.laxity import LaxityQueue, Outgoing
-from r2p.protocols.rtcan.leases import Grants, Wishes
-from r2p.protocols.rtcan.network import Network
-from r2p.protocols.rtcan.periodic import Agenda, Periodic
-from r2p.protocols.rtcan.post import Post
-from r2p.protocols.rtcan.profile import Detector, Pacer
+from r2p.protocols.rtcan.events import NEVER, Action, Done, Due, EngineSettings, Fate, Profile, Ready, Received
+from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
+from r2p.protocols.rtcan.management import ManagementHandlers
+from r2p.protocols.rtcan.master import Election, Role
+from r2p.protocols.rtcan.network import Detector, NetworkMembership, RateLimiter
+from r2p.protocols.rtcan.node_id import Identity, Stage
+from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
+from r2p.protocols.rtcan.queue import LaxityQueue, QueuedMessage
 from r2p.protocols.rtcan.reassembly import Reassembly
-from r2p.protocols.rtcan.sending import Mode, Sender
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.transmitter import Mailboxes, Mode, SlotTransmitter
+
+
+class Timers(DiscoveryTimers):
+    """As `DiscoveryTimers`, and remembers when the next key runs out."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.due = NEVER
+        """When the next key runs out; NEVER if there is none."""
+
+    def set(self, key: Hashable, due: int) -> None:
+        super().set(key, due)
+        self._look()
+
+    def clear(self, key: Hashable) -> None:
+        super().clear(key)
+        self._look()
+
+    def pop(self, now: int) -> Iterator[Hashable]:
+        for key in super().pop(now):
+            self._look()
+            yield key
+
+    def _look(self) -> None:
+        due = self.next()
+        self.due = NEVER if due is None else due
+
+
+# The parts of an engine put together, and what passes between them: management messages, timers, changes of mode.
+
 
 _DEADLINE = 50_000_000  # of management, ns
 _CONTROL = 10_000_000  # of what keeps the network: slots must not wait for all that discovery has to say
@@ -36,40 +63,40 @@ _SILENT, _FREE, _SLOTTED = Mode.SILENT, Mode.FREE, Mode.SLOTTED
 class Core:
     """All parts of one node. Its owner takes `out` after every call."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: EngineSettings) -> None:
         if settings.id8 is not None and not 0 < settings.id8 < 256:
             raise ValueError(f"id8 {settings.id8}: it is a byte, and not 0")
         self.settings = settings
         self.counts: Counter[str] = Counter()
         self.out: list[Action] = []
-        self.periodics: dict[int, Periodic] = {}
+        self.periodics: dict[int, PeriodicMessage] = {}
         self.joined = False
         """Whether messages may be sent: the node has an id8, and knows how the network works."""
         self._management_ends = False  # the next frame of firmware's management is the last one of a message
         self.timing = timing(settings.slots, settings.cycle, settings.bit_rate)
-        self.timers = Alarms()
+        self.timers = Timers()
         self.reassembly = Reassembly()
         self.detector = Detector(settings.profile)
         self.queue = LaxityQueue(settings.capacity, _DEPTH)
         self.cycle = Cycle(self.timing, settings.receive_latency)
-        self.agenda = Agenda(self.timing)
+        self.agenda = SlotPlan(self.timing)
         self.election = Election(settings.priority, 3 * self.timing.cycle, self.timers)
-        self.grants = Grants(self.cycle, self.timers)
+        self.grants = SlotGrants(self.cycle, self.timers)
         self._assemble(settings)
 
-    def _assemble(self, settings: Settings) -> None:
+    def _assemble(self, settings: EngineSettings) -> None:
         """The parts that work with others."""
         counts, out, timers, cycle = self.counts, self.out, self.timers, self.cycle
         self.identity = Identity(
             settings.id8, settings.number, settings.listen, timers, out, counts, self._announce, self._stage_changed
         )
-        self.pacer = Pacer(self.identity.draw, counts)
-        self.post = Post(self.queue, out, counts, self._pause)
+        self.pacer = RateLimiter(self.identity.draw, counts)
+        self.post = Mailboxes(self.queue, out, counts, self._pause)
         latency, coarse = settings.transmit_latency, settings.coarse
-        self.sender = Sender(
+        self.sender = SlotTransmitter(
             cycle, self.queue, self.agenda, self.post, out, counts, self._turn, latency=latency, coarse=coarse
         )
-        self.wishes = Wishes(
+        self.wishes = SlotRequests(
             cycle,
             self.agenda,
             timers,
@@ -80,8 +107,8 @@ class Core:
             enabled=settings.reserves,
         )
         parts = self.identity, self.election, self.grants, self.wishes
-        self.network = Network(cycle, self.sender, *parts, timers, out, counts, self.say, settings.priority)
-        self.answers = Answers(*parts, self.network, self.periodics, self.say, self.tick)
+        self.network = NetworkMembership(cycle, self.sender, *parts, timers, out, counts, self.say, settings.priority)
+        self.answers = ManagementHandlers(*parts, self.network, self.periodics, self.say, self.tick)
 
     @property
     def profile(self) -> Profile:
@@ -104,7 +131,7 @@ class Core:
         if not self.joined and self.identity.stage is Stage.OWNING and self.network.settled:
             self._join(now)
         if held and not electing:
-            self.sender.kick(now)
+            self.sender.reschedule(now)
 
     def discard(self, now: int) -> None:
         """Give up everything that waits to be sent."""
@@ -158,10 +185,10 @@ class Core:
         if message != rtcan.FIRMWARE_MANAGEMENT:
             self.identity.seen(rtcan.id8_of(message))
 
-    def intruded(self, now: int, identifier: int) -> None:
+    def duplicate_id_seen(self, now: int, identifier: int) -> None:
         """A frame with our id8 that is not ours."""
         if identifier >> 7 & 0xFFFF != rtcan.FIRMWARE_MANAGEMENT:
-            self.identity.intruded(now)
+            self.identity.duplicate_id_seen(now)
             self.settle(now)
 
     def low(self, now: int, frame: Frame, stamp: int) -> None:
@@ -219,12 +246,12 @@ class Core:
             case (str(kind), int(high)) if high in self.periodics:
                 self._periodic_timer(now, kind, self.periodics[high])
 
-    def tick(self, now: int, periodic: Periodic) -> None:
+    def tick(self, now: int, periodic: PeriodicMessage) -> None:
         """Without slots the node's own clock says when a periodic message is due."""
         if not periodic.active and self.joined and ("tick", periodic.high) not in self.timers:
             self.timers.set(("tick", periodic.high), now)
 
-    def _periodic_timer(self, now: int, kind: str, periodic: Periodic) -> None:
+    def _periodic_timer(self, now: int, kind: str, periodic: PeriodicMessage) -> None:
         if kind == "ask":
             self.wishes.request(now, periodic)
         elif kind == "lease":
@@ -244,7 +271,7 @@ class Core:
         self.network.turn(now)
         self.settle(now)
 
-    def _slots_lost(self, now: int, periodic: Periodic) -> None:
+    def _slots_lost(self, now: int, periodic: PeriodicMessage) -> None:
         self.sender.abandon(now, periodic, "slots lost")
 
     def _pause(self) -> int:
@@ -277,9 +304,9 @@ class Core:
             self.tick(now, periodic)
 
     def _queue_management(self, now: int, message: int, data: bytes, handle: Hashable, within: int) -> None:
-        outgoing = Outgoing(message, data, now + within, drop=False, handle=handle)
+        outgoing = QueuedMessage(message, data, now + within, drop=False, handle=handle)
         if self.queue.put(outgoing, urgent=within < _DEADLINE, management=True):
-            self.sender.kick(now)
+            self.sender.reschedule(now)
         else:
             self.counts["management dropped"] += 1
             self.post.report(handle, Fate.FULL, missed=False, at=now)

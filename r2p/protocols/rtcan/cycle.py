@@ -53,7 +53,7 @@ def timing(slots: int = 60, nominal: int = 10_000_000, bit_rate: int = 1_000_000
     return Timing(slots, slot, bit)
 
 
-class State(enum.Enum):
+class CycleState(enum.Enum):
     """How the node knows where in the cycle it is."""
 
     NONE = "no cycle"
@@ -62,7 +62,7 @@ class State(enum.Enum):
     LEADING = "leading"  # the node is the master
 
 
-_NONE = State.NONE  # Python 3.11 takes its time to find a member of an enum
+_NONE = CycleState.NONE  # Python 3.11 takes its time to find a member of an enum
 
 
 class Alignment(enum.Enum):
@@ -85,7 +85,7 @@ class Cycle:
 
     def __init__(self, timing: Timing, receive_latency: int = 0) -> None:
         self.timing = timing
-        self.state = State.NONE
+        self.state = CycleState.NONE
         self.reference = 0
         self.counter = 0
         self.mask: int | None = None
@@ -161,7 +161,7 @@ class Cycle:
         if self.missed > HOLDOVER:
             self.stop()
             return False
-        self.state = State.HOLDING
+        self.state = CycleState.HOLDING
         self.counter += 1
         self.reference += self.timing.cycle
         self._grid = self.reference
@@ -179,7 +179,7 @@ class Cycle:
 
     def stop(self) -> None:
         """There is no cycle any more."""
-        self.state = State.NONE
+        self.state = CycleState.NONE
         self._reserve(None)
         self._length = 0
 
@@ -202,7 +202,7 @@ class Cycle:
 
     def lead(self, start: int, counter: int, mask: int | None, *, anew: bool = False) -> None:
         """Be the master, from the cycle on that began there; `anew`: of a network that was not there before."""
-        self.state = State.LEADING
+        self.state = CycleState.LEADING
         self.reference = self._grid = start
         if anew:
             self._behind = 0
@@ -245,7 +245,7 @@ class Cycle:
         return Alignment.RESUMED if resumed else Alignment.STARTED
 
     def _follow(self, start: int, mask: int) -> None:
-        self.state = State.FOLLOWING
+        self.state = CycleState.FOLLOWING
         self.reference = self._grid = start
         self._behind = 0
         self._reserve(mask)

@@ -3,7 +3,7 @@
 It does no I/O and reads no clock; the same code runs on the simulated bus, on SocketCAN and in a unit test. What a
 transport has to do to drive it:
 
-1. Make it from `Settings`; `number` must be 64 random bits. Call `start` when the bus can be used, `stop` when not.
+1. Make it from `EngineSettings`; `number` must be 64 random bits. Call `start` when the bus works, `stop` when not.
 2. Every call takes `now`, the node's monotonic clock in ns, and gives back what to do, in order. After every call, set
    one timer to `next_deadline()` and call `poll` then. In slots, "then" is the start of a slot less
    `transmit_latency`: whoever comes late enough misses it.
@@ -33,12 +33,11 @@ from r2p.codecs.rtcan import Frame
 from r2p.errors import MessageError
 from r2p.protocols.rtcan.core import Core
 from r2p.protocols.rtcan.cycle import Timing
-from r2p.protocols.rtcan.election import Role
-from r2p.protocols.rtcan.events import NEVER, Action, Done, Fate, Mailbox, Outcome, Profile
-from r2p.protocols.rtcan.identity import Stage
-from r2p.protocols.rtcan.laxity import Outgoing
-from r2p.protocols.rtcan.periodic import Periodic
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import NEVER, Action, Done, EngineSettings, Fate, Mailbox, Outcome, Profile
+from r2p.protocols.rtcan.master import Role
+from r2p.protocols.rtcan.node_id import Stage
+from r2p.protocols.rtcan.plan import PeriodicMessage
+from r2p.protocols.rtcan.queue import QueuedMessage
 
 _NOTHING: tuple[Action, ...] = ()
 _LISTENING = Stage.LISTENING  # Python 3.11 takes its time to find a member of an enum
@@ -51,7 +50,7 @@ class Engine:
     Instants are ns of the node's monotonic clock. Topics are named by the high byte of their message id.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: EngineSettings) -> None:
         self._core = Core(settings)
         self._out = self._core.out
         self._sender = self._core.sender
@@ -186,7 +185,7 @@ class Engine:
                 core.settle(now)
             return self._take()
         if identifier >> 7 & 0xFF == self._identity.id8:
-            core.intruded(now, identifier)
+            core.duplicate_id_seen(now, identifier)
         if self._identity.stage is _LISTENING:
             core.listen(identifier)
         high = identifier >> 15 & 0xFF
@@ -246,7 +245,7 @@ class Engine:
         is a `handle`. Raises `MessageError` beyond 1..1024 bytes, and for high bytes that are not a topic's.
         """
         _check(high)
-        message = Outgoing(self._core.message_id(high), payload, deadline, drop and deadline != NEVER, handle)
+        message = QueuedMessage(self._core.message_id(high), payload, deadline, drop and deadline != NEVER, handle)
         if not self.ready:
             rtcan.fragment_count(len(payload))
             self._refuse(now, message, Fate.DISCARDED)
@@ -285,7 +284,7 @@ class Engine:
         fragments = rtcan.fragment_count(size)
         self._end(now, high)
         message = core.message_id(high) if self.ready else 0
-        periodic = core.periodics[high] = Periodic(high, message, size, fragments, interval, lead, handle)
+        periodic = core.periodics[high] = PeriodicMessage(high, message, size, fragments, interval, lead, handle)
         self._sender.add(periodic)
         if self.ready:
             core.wishes.want(now, periodic)
@@ -303,7 +302,7 @@ class Engine:
             self._sender.fill(now, periodic, payload)
         elif payload is not None:
             deadline = now + periodic.interval
-            self._send(now, Outgoing(periodic.message, payload, deadline, handle=periodic.handle))
+            self._send(now, QueuedMessage(periodic.message, payload, deadline, handle=periodic.handle))
         periodic.ticked = False
         return self._take()
 
@@ -321,13 +320,13 @@ class Engine:
         self._out.clear()
         return actions
 
-    def _send(self, now: int, message: Outgoing) -> None:
+    def _send(self, now: int, message: QueuedMessage) -> None:
         if self._core.queue.put(message):
-            self._sender.kick(now)
+            self._sender.reschedule(now)
         else:
             self._refuse(now, message, Fate.FULL)
 
-    def _refuse(self, now: int, message: Outgoing, fate: Fate) -> None:
+    def _refuse(self, now: int, message: QueuedMessage, fate: Fate) -> None:
         missed = message.deadline != NEVER
         self.counts[fate.value] += 1
         if message.handle is not None:

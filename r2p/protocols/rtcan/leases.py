@@ -1,19 +1,19 @@
 """Slots on lease: the node asks the master for slots, and says every second which ones it still wants.
 
-Both sides are here: `Wishes` at the owner of periodic messages, `Grants` at the master. A lease lasts 3 s from the
-request on, for its owner, and from the grant on for the master, so an owner that hears nothing stops first. A new
-master of the same epoch grants to those who had slots what they had; for three cycles it grants nothing else.
+Both sides are here: `SlotRequests` at the owner of periodic messages, `SlotGrants` at the master. A lease lasts 3 s
+from the request on, for its owner, and from the grant on for the master, so an owner that hears nothing stops first.
+A new master of the same epoch grants to those who had slots what they had; for three cycles it grants nothing else.
 """
 
 from collections.abc import Callable
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import NO_PHASE, Grant, Refuse, Renew, Renewed, Reserve
+from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.calendar import Calendar, Reason, Refusal, Reservation
 from r2p.protocols.rtcan.cycle import Cycle
 from r2p.protocols.rtcan.events import LONG_AGO, Action, Degraded, Granted, Refused
-from r2p.protocols.rtcan.periodic import Agenda, Periodic
-from r2p.protocols.schedule import Timers
+from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
 
 LEASE = 3_000_000_000
 _RENEWAL = 1_000_000_000
@@ -22,10 +22,10 @@ _AHEAD = 1
 """Cycles from a grant to its first slot."""
 
 
-class Grants:
+class SlotGrants:
     """The master's side: who has which slots, and until when."""
 
-    def __init__(self, cycle: Cycle, timers: Timers) -> None:
+    def __init__(self, cycle: Cycle, timers: DiscoveryTimers) -> None:
         self.calendar = Calendar(cycle.timing.slots)
         self.collecting = False
         """Only what another master granted is granted now."""
@@ -71,7 +71,7 @@ class Grants:
         self._timers.clear(("granted", message))
 
 
-class Wishes:
+class SlotRequests:
     """The owner's side: what this node wants slots for. `ask` sends a request to the master, which may be this node.
 
     `abandon` gives up a message that waits for its slot. Not `enabled`: it wants nothing.
@@ -80,12 +80,12 @@ class Wishes:
     def __init__(
         self,
         cycle: Cycle,
-        agenda: Agenda,
-        timers: Timers,
-        periodics: dict[int, Periodic],
+        agenda: SlotPlan,
+        timers: DiscoveryTimers,
+        periodics: dict[int, PeriodicMessage],
         out: list[Action],
         ask: Callable[[int, Reserve | Renew], None],
-        abandon: Callable[[int, Periodic], None],
+        abandon: Callable[[int, PeriodicMessage], None],
         *,
         enabled: bool = True,
     ) -> None:
@@ -121,12 +121,12 @@ class Wishes:
         for each in self._periodics.values():
             self.lapse(now, each, reason)
 
-    def want(self, now: int, periodic: Periodic) -> None:
+    def want(self, now: int, periodic: PeriodicMessage) -> None:
         """Ask for slots for this message, now and again, if there is a master."""
         if self.open and self._enabled:
             self._timers.set(("ask", periodic.high), now)
 
-    def forget(self, periodic: Periodic) -> bool:
+    def forget(self, periodic: PeriodicMessage) -> bool:
         """It does not need any slots any more. Says whether it had some."""
         had = periodic.reservation is not None
         periodic.reservation = None
@@ -139,7 +139,7 @@ class Wishes:
         self._agenda.changed()
         return had
 
-    def request(self, now: int, periodic: Periodic) -> None:
+    def request(self, now: int, periodic: PeriodicMessage) -> None:
         """It is time to ask."""
         if not self.open or periodic.active:
             return
@@ -164,7 +164,7 @@ class Wishes:
             serial = self._next_serial(now, *part)
             self._ask(now, Renew(serial, part.ljust(management.RENEW_MAX, b"\0")))
 
-    def granted(self, now: int, periodic: Periodic, grant: Grant) -> None:
+    def granted(self, now: int, periodic: PeriodicMessage, grant: Grant) -> None:
         """The master answered, be it late: the lease runs from the request on that it answers."""
         asked = self._asked.get(periodic.high, {}).get(grant.serial)
         if asked is None or grant.fragments != periodic.fragments or grant.period <= grant.fragments:
@@ -197,7 +197,7 @@ class Wishes:
                 self.suspend(now, periodic, "the master does not know of it")
                 self.want(now, periodic)
 
-    def refused(self, now: int, periodic: Periodic, refuse: Refuse) -> None:
+    def refused(self, now: int, periodic: PeriodicMessage, refuse: Refuse) -> None:
         """The master answered: no."""
         if periodic.active or refuse.serial not in self._asked.get(periodic.high, {}):
             return
@@ -213,13 +213,13 @@ class Wishes:
             self._refused[periodic.high] = text
             self._out.append(Refused(periodic.high, text))
 
-    def lapse(self, now: int, periodic: Periodic, reason: str) -> None:
+    def lapse(self, now: int, periodic: PeriodicMessage, reason: str) -> None:
         """Its slots are gone. What was answered to earlier requests does not count any more."""
         periodic.reservation = None
         self._asked.pop(periodic.high, None)
         self.suspend(now, periodic, reason)
 
-    def suspend(self, now: int, periodic: Periodic, reason: str) -> None:
+    def suspend(self, now: int, periodic: PeriodicMessage, reason: str) -> None:
         """Its slots may not be used until a master has confirmed them."""
         self._timers.clear(("lease", periodic.high))
         if periodic.active:
@@ -237,7 +237,7 @@ class Wishes:
             self._asked[high] = asked | {self._serial: now}
         return self._serial
 
-    def _confirm(self, periodic: Periodic, asked: int, lease_ms: int) -> None:
+    def _confirm(self, periodic: PeriodicMessage, asked: int, lease_ms: int) -> None:
         """The lease runs on; answers may come out of order."""
         if asked >= self._confirmed.get(periodic.high, LONG_AGO):
             self._confirmed[periodic.high] = asked

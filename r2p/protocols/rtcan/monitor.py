@@ -12,7 +12,7 @@ import msgspec
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame, Identifier, OtherFrame
-from r2p.protocols.rtcan.census import Census
+from r2p.errors import DecodeError
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.reassembly import Reassembly
 
@@ -55,7 +55,7 @@ class SeenFrame(msgspec.Struct, frozen=True):
     text: str = ""
 
 
-class Tally(msgspec.Struct):
+class TrafficCount(msgspec.Struct):
     """Frames and bits (stuffed ones and intermission included) of one message id and kind."""
 
     frames: int = 0
@@ -85,7 +85,7 @@ class BusLoad(msgspec.Struct, frozen=True):
 
     elapsed: int
     bit: int
-    tallies: dict[tuple[str, str, FrameKind], Tally]
+    tallies: dict[tuple[str, str, FrameKind], TrafficCount]
     faults: dict[str, int]
     reserved: float
     free_frames: float
@@ -116,7 +116,7 @@ class Monitor:
     """What a silent listener makes of the frames of a bus. Instants are ns of one clock, `bit` is the bit time."""
 
     def __init__(self, timing: Timing) -> None:
-        self.census = Census(timing)
+        self.census = BusDirectory(timing)
         self.cycles = 0
         """Whole cycles watched since the last `reset`."""
         self.heard = 0
@@ -157,7 +157,7 @@ class Monitor:
 
     def _begin_at(self, now: int) -> None:
         self._since = now
-        self._tallies: dict[tuple[int, FrameKind], Tally] = {}
+        self._tallies: dict[tuple[int, FrameKind], TrafficCount] = {}
         self._faults: Counter[str] = Counter()
         self._reserved = 0
         self._nrt: int | None = None
@@ -225,7 +225,7 @@ class Monitor:
             self._end_period()
 
     def _tally(self, message: int, kind: FrameKind, bits: int) -> None:
-        tally = self._tallies.setdefault((message, kind), Tally())
+        tally = self._tallies.setdefault((message, kind), TrafficCount())
         tally.frames += 1
         tally.bits += bits + rtcan.INTERMISSION
 
@@ -244,11 +244,11 @@ class Monitor:
         if self._nrt is not None:
             gap = max(gap or 0, now - self._nrt)
         elapsed = now - self._since
-        tallies: dict[tuple[str, str, FrameKind], Tally] = {}
+        tallies: dict[tuple[str, str, FrameKind], TrafficCount] = {}
         for (message, kind), tally in self._tallies.items():
             nameless = kind is FrameKind.SYNC or kind is FrameKind.OTHER
             names = ("", "") if nameless else (self.census.topic(message), self.census.module(message))
-            total = tallies.setdefault((*names, kind), Tally())
+            total = tallies.setdefault((*names, kind), TrafficCount())
             total.frames += tally.frames
             total.bits += tally.bits
         timing = self.census.timing
@@ -329,3 +329,70 @@ class Monitor:
     def _ends_management(self, message: int) -> bool:
         """Firmware without any time left ends its management with the identifier of the sync of cycle 0."""
         return message == rtcan.FIRMWARE_MANAGEMENT and self._reassembly.ends_with_next(message)
+
+
+# Who is who on an RTCAN bus, from what the modules tell each other again and again.
+
+
+class BusDirectory:
+    """What is known by now; all tables are bounded by the 16 bits of a message id."""
+
+    def __init__(self, timing: Timing) -> None:
+        self.timing = timing
+        self.told = False
+        """Whether the master has told the timing; else it is what the user said."""
+        self.modules: dict[int, str] = {}
+        """Names by id8."""
+        self.topics: dict[int, str] = {}
+        """Names by message id."""
+        self.sizes: dict[int, int] = {}
+        """Bytes of a message, by message id."""
+        self._greeted: set[int] = set()
+
+    def learn(self, data: bytes, source: int) -> str:
+        """A management message of this id8 (0: firmware, which does not say). Comes back in words."""
+        try:
+            message = management.decode(data)
+        except DecodeError:
+            return f"unknown management 0x{data[-1]:02x}"
+        match message:
+            case management.Hello(module, hops=0):
+                self._greeted.add(source)
+                self.modules[source] = module
+            case management.Alive(module) if source and source not in self._greeted:
+                self.modules[source] = module
+            case management.SubscribeResponse(topic, size, _, params):
+                number = int.from_bytes(params[:2], "little")
+                self.topics[number], self.sizes[number] = topic, size
+            case management.Network(slots=slots, slot=slot) if 2 <= slots <= rtcan.SLOTS_MAX and slot:
+                self.told = True
+                self.timing = Timing(slots, slot, self.timing.bit)
+        return describe(message)
+
+    def topic(self, message: int) -> str:
+        """The topic that a message id carries; its number if that is not known yet."""
+        if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.topics:
+            return "R2P"
+        return self.topics.get(message, f"0x{message:04X}")
+
+    def module(self, message: int) -> str:
+        """The module that uses a message id."""
+        id8 = rtcan.id8_of(message)
+        return self.modules.get(id8, f"id {id8}") if id8 else "?"
+
+
+def describe(message: management.Management) -> str:
+    """A management message in words."""
+    fields = {
+        name: getattr(message, name)
+        for name in message.__struct_fields__
+        if name != "params" and getattr(message, name) not in {"", 0}
+    }
+    if isinstance(message, management.SubscribeResponse):
+        fields["id"] = f"0x{int.from_bytes(message.params[:2], 'little'):04X}"
+    text = " ".join(f"{name}={_value(value)}" for name, value in fields.items())
+    return f"{type(message).__name__} {text}".rstrip()
+
+
+def _value(value: object) -> str:
+    return value.hex() if isinstance(value, bytes) else str(value)

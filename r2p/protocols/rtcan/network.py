@@ -11,20 +11,29 @@ lesser one yields when it hears that.
 `allegiance` tells whose syncs are heard, `reign` is the master's part, `election` says who takes over.
 """
 
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Hashable
+
+import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.rtcan import Frame
-from r2p.protocols.rtcan.allegiance import FORGOTTEN, Allegiance
-from r2p.protocols.rtcan.cycle import Alignment, Cycle, State
-from r2p.protocols.rtcan.election import Election, Role
-from r2p.protocols.rtcan.events import LONG_AGO, Action, LostSync, NewMaster, Silenced, Unsilenced
-from r2p.protocols.rtcan.identity import Identity, Stage
-from r2p.protocols.rtcan.leases import Grants, Wishes
-from r2p.protocols.rtcan.reign import Reign
-from r2p.protocols.rtcan.sending import Sender
-from r2p.protocols.schedule import Timers
+from r2p.protocols.discovery.schedule import DiscoveryTimers
+from r2p.protocols.rtcan.cycle import Alignment, Cycle, CycleState
+from r2p.protocols.rtcan.events import (
+    LONG_AGO,
+    NEVER,
+    Action,
+    LostSync,
+    NewMaster,
+    ParameterMismatch,
+    ParametersMatch,
+    Profile,
+)
+from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
+from r2p.protocols.rtcan.master import Election, MasterRole, Role
+from r2p.protocols.rtcan.node_id import Identity, Stage
+from r2p.protocols.rtcan.transmitter import SlotTransmitter
 
 REPEAT = 1_000_000_000
 """NETWORK is sent this often (ns)."""
@@ -37,18 +46,18 @@ _SLEPT = (
 )
 
 
-class Network:
+class NetworkMembership:
     """The network as this node sees it. `say(now, message)` sends management; `priority` is that to be the master."""
 
     def __init__(
         self,
         cycle: Cycle,
-        sender: Sender,
+        sender: SlotTransmitter,
         identity: Identity,
         election: Election,
-        grants: Grants,
-        wishes: Wishes,
-        timers: Timers,
+        grants: SlotGrants,
+        wishes: SlotRequests,
+        timers: DiscoveryTimers,
         out: list[Action],
         counts: Counter[str],
         say: Callable[[int, management.Management], None],
@@ -74,8 +83,8 @@ class Network:
         self._counts = counts
         self._say = say
         self._priority = priority
-        self._allegiance = Allegiance(cycle)
-        self._reign = Reign(cycle, sender, grants, self._crowned, self._later)
+        self._allegiance = MasterTracker(cycle)
+        self._reign = MasterRole(cycle, sender, grants, self._crowned, self._later)
         self._told = LONG_AGO
 
     @property
@@ -93,7 +102,7 @@ class Network:
             self._introduce(now)
             return
         self._sender.poll(now)
-        held = self._cycle.state is State.HOLDING
+        held = self._cycle.state is CycleState.HOLDING
         match self._cycle.heard(frame, stamp):
             case Alignment.ALIGNED:
                 if held:
@@ -153,12 +162,12 @@ class Network:
 
     def turn(self, now: int) -> None:
         """A cycle is over."""
-        if self._cycle.state is State.LEADING:
+        if self._cycle.state is CycleState.LEADING:
             if not self._reign.turn(now):
                 self._abdicate(now, _SLEPT)
                 self._elect(now, forget=True)
             return
-        if self._cycle.state is State.HOLDING:  # only now it is sure: a sync may be read late
+        if self._cycle.state is CycleState.HOLDING:  # only now it is sure: a sync may be read late
             self._counts["missed syncs"] += 1
         if self._cycle.roll():
             self._sender.turned(now)
@@ -186,7 +195,7 @@ class Network:
         if self.silenced is None:
             return
         self.silenced = None
-        self._out.append(Unsilenced())
+        self._out.append(ParametersMatch())
         if self._identity.stage is Stage.OWNING and not self._cycle.running:
             self._elect(now, forget=True)
 
@@ -256,7 +265,7 @@ class Network:
             self.verified = False
             self._reign.cancel()
             self._wishes.pause(now, "the network has other parameters")
-            self._out.append(Silenced(reason))
+            self._out.append(ParameterMismatch(reason))
 
     def _elect(self, now: int, *, forget: bool) -> None:
         self._election.begin(now, forget=forget)
@@ -309,3 +318,191 @@ class Network:
         self.master = None
         self.verified = False
         self._wishes.pause(now, reason)
+
+
+# Whose syncs are those that a slave follows? A sync frame does not say; NETWORK, which comes once a second, does.
+
+
+FORGOTTEN = 3_000_000_000
+"""A master that is not heard for so long is none (ns)."""
+_UNKNOWN_MASTER = 1_200_000_000  # a master that sends no NETWORK for so long is firmware
+_NEAR = 4  # cycles that a NETWORK may be late, or the last one be a guess
+_YIELDED = 3  # cycles after which a lesser master's syncs are over
+
+
+class MasterTracker:
+    """What is known about the master of the cycle that a node follows."""
+
+    def __init__(self, cycle: Cycle) -> None:
+        self._cycle = cycle
+        self._heard = LONG_AGO
+        self._rank = (0, 0)
+        self._latest: tuple[int, management.Network] | None = None
+        self._rival: tuple[int, management.Network] | None = None
+        self._since = 0
+
+    def told(self, now: int, told: management.Network, master: int | None, epoch: int | None) -> bool:
+        """A master says who it is; ours so far is this one. Says whether it is ours."""
+        self._latest = now, told
+        rank = told.priority, told.id8
+        if self._is_another(now, told, master, epoch):
+            if rank > self._rank:
+                self._rival = self._latest
+            return False
+        self._heard, self._rank = now, rank
+        return True
+
+    def matches(self, told: management.Network) -> bool:
+        """Whether a network has our slots."""
+        timing = self._cycle.timing
+        return (told.slots, told.slot) == (timing.slots, timing.slot)
+
+    def started(self, now: int) -> management.Network | None:
+        """A cycle has started: what its master last said, if it is the one that spoke last, by its count."""
+        self._since = now
+        self._rival = None
+        return self._recall(now, self._latest)
+
+    def goes_on(self, now: int) -> management.Network | None:
+        """One more sync: what its master said, if it is another one than ours."""
+        rival = self._rival
+        if rival is None or now < rival[0] + _YIELDED * self._cycle.timing.cycle:
+            return None
+        self._rival = None
+        return self._recall(now, rival)
+
+    def foreign(self) -> None:
+        """A sync is off our grid: there is another master, but ours has not become it."""
+        self._rival = None
+
+    def believed(self, now: int) -> bool | None:
+        """Whether a master that sends no NETWORK has our cycle, by its length; None: not known yet."""
+        measured = self._cycle.measured()
+        if now < self._since + _UNKNOWN_MASTER or measured is None:
+            return None
+        ours = self._cycle.timing.cycle
+        length, error = measured
+        return abs(length - ours) <= ours // 1000 + error
+
+    def forget(self, master: int | None) -> None:
+        """This master's syncs are over."""
+        self._rival = None
+        if self._latest is not None and self._latest[1].id8 == master:
+            self._latest = None
+
+    def _is_another(self, now: int, told: management.Network, master: int | None, epoch: int | None) -> bool:
+        """Whether the syncs that we follow are those of another master; one of the two will yield."""
+        if not self._cycle.running or master is None or now > self._heard + FORGOTTEN:
+            return False
+        if (told.id8, told.epoch) == (master, epoch):
+            return False
+        same_grid = told.epoch == epoch and -_NEAR <= told.cycle - self._cycle.counter <= _NEAR
+        return not (same_grid and (told.priority, told.id8) > self._rank)
+
+    def _recall(self, now: int, heard: tuple[int, management.Network] | None) -> management.Network | None:
+        """What a master said, as it would say it now, if it can be the master of this cycle."""
+        if heard is None or now > heard[0] + FORGOTTEN:
+            return None
+        at, told = heard
+        counter = told.cycle + (now - at) // self._cycle.timing.cycle
+        near = (self._cycle.counter - counter + _NEAR) & 0xFF <= 2 * _NEAR
+        if not near or not self.matches(told):
+            return None
+        self._heard, self._rank = at, (told.priority, told.id8)
+        return msgspec.structs.replace(told, cycle=counter)
+
+
+# What the modules on the bus expect: RTCAN with sync and claims, or firmware of 2014 (PROTOCOL.md 6, 7 and 9).
+
+
+QUIET = 33_000_000
+"""ns without management traffic before any is sent."""
+_SPREAD = 20_000_000
+_MOST = 64
+
+
+class Detector:
+    """Finds out by listening whose network this is."""
+
+    def __init__(self, wanted: Profile) -> None:
+        self.profile = wanted
+        self._wanted = wanted
+        self._firmware = False
+
+    def start(self) -> None:
+        """Listen anew."""
+        self.profile = self._wanted
+        self._firmware = False
+
+    def firmware_heard(self) -> None:
+        """A frame with high byte 0 that is no sync was heard."""
+        self._firmware = True
+
+    def decide(self, *, synced: bool) -> None:
+        """The time to listen is over; `synced` says whether there are sync frames."""
+        if self.profile is Profile.AUTO:
+            self.profile = Profile.FIRMWARE if self._firmware and not synced else Profile.RTCAN
+
+
+class RateLimiter:
+    """Management messages that wait for silence. `draw(n)` gives a random number below n."""
+
+    def __init__(self, draw: Callable[[int], int], counts: Counter[str]) -> None:
+        self._draw = draw
+        self._counts = counts
+        self.waiting: deque[tuple[bytes, Hashable]] = deque()
+        """Messages and their handles, the next one first."""
+        self._urgent = 0  # so many of them are urgent: the first ones
+        self._quiet_from = LONG_AGO
+        self._delay: int | None = None  # drawn when it is needed: most networks are not of firmware
+
+    def put(self, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Hashable:
+        """Send it when it is quiet, `urgent` ones first, in order.
+
+        The oldest that is not urgent is dropped when there are too many: its handle comes back.
+        """
+        dropped: Hashable = None
+        if len(self.waiting) >= _MOST:
+            self._counts["management dropped"] += 1
+            if self._urgent == len(self.waiting):
+                return handle
+            _, dropped = self.waiting[self._urgent]
+            del self.waiting[self._urgent]
+        if urgent:
+            self.waiting.insert(self._urgent, (data, handle))
+            self._urgent += 1
+        else:
+            self.waiting.append((data, handle))
+        return dropped
+
+    def traffic(self, now: int) -> None:
+        """Somebody, or this node, sent a management frame."""
+        self._quiet_from = now
+        self._delay = None
+
+    @property
+    def due(self) -> int:
+        """When the next one may go."""
+        if not self.waiting:
+            return NEVER
+        if self._delay is None:
+            self._delay = self._draw(_SPREAD)
+        return self._quiet_from + QUIET + self._delay
+
+    def pop(self, now: int) -> tuple[bytes, Hashable] | None:
+        """What may go now, and its handle."""
+        if self.due > now:
+            return None
+        self.traffic(now)
+        self._urgent = max(0, self._urgent - 1)
+        return self.waiting.popleft()
+
+    def __len__(self) -> int:
+        return len(self.waiting)
+
+    def clear(self) -> list[Hashable]:
+        """Forget all; their handles come back."""
+        handles = [handle for _, handle in self.waiting]
+        self.waiting.clear()
+        self._urgent = 0
+        return handles

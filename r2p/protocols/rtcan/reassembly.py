@@ -18,7 +18,7 @@ TIMEOUT = 100_000_000
 _IDLE = -1  # Inlet.expected between two messages
 
 
-class Inlet(msgspec.Struct, eq=False):
+class SourceBuffer(msgspec.Struct, eq=False):
     """What is being received from one publisher. `first` and `size` are those of all its messages.
 
     With `parts`, a message is being received and `expected` is what its next frame says; without, frames from
@@ -41,15 +41,15 @@ class Reassembly:
     def __init__(self) -> None:
         self.losses: dict[int, Counter[str]] = {}
         """What was lost, by id8 of the source and reason."""
-        self._inlets: dict[int, Inlet] = {}
-        self.open: dict[int, Inlet] = {}
+        self._inlets: dict[int, SourceBuffer] = {}
+        self.open: dict[int, SourceBuffer] = {}
         """Unfinished messages by id, the oldest first."""
 
     def subscribe(self, message: int, size: int) -> None:
         """Take messages with this id, of `size` bytes. Raises `MessageError` beyond 1..1024."""
         before = self._inlets.get(message)
         if before is None or before.size != size:
-            inlet = Inlet(rtcan.fragment_count(size) - 1, size)
+            inlet = SourceBuffer(rtcan.fragment_count(size) - 1, size)
             self.unsubscribe(message)
             self._inlets[message] = inlet
 
@@ -108,7 +108,7 @@ class Reassembly:
             self._reset(message, inlet, "interrupted")
             inlet.expected = _IDLE
 
-    def _fragment(self, inlet: Inlet, identifier: int, data: bytes, stamp: int) -> Received | None:
+    def _fragment(self, inlet: SourceBuffer, identifier: int, data: bytes, stamp: int) -> Received | None:
         message, left = identifier >> 7 & 0xFFFF, identifier & 0x7F
         if stamp - inlet.last > TIMEOUT:
             if inlet.parts:
@@ -126,7 +126,7 @@ class Reassembly:
             inlet.expected = left
         return self._begin(inlet, identifier, data, stamp)
 
-    def _begin(self, inlet: Inlet, identifier: int, data: bytes, stamp: int) -> Received | None:
+    def _begin(self, inlet: SourceBuffer, identifier: int, data: bytes, stamp: int) -> Received | None:
         """Nothing is open: the frame is a beginning, or belongs to something of which the beginning is missing."""
         left = identifier & 0x7F
         rest = left == inlet.expected
@@ -141,7 +141,7 @@ class Reassembly:
         inlet.last = stamp
         return None
 
-    def _continue(self, message: int, inlet: Inlet, data: bytes, stamp: int) -> Received | None:
+    def _continue(self, message: int, inlet: SourceBuffer, data: bytes, stamp: int) -> Received | None:
         left = inlet.first - len(inlet.parts)
         inlet.expected = left - 1
         inlet.last = stamp
@@ -158,7 +158,7 @@ class Reassembly:
         inlet.tail = data
         return Received(inlet.identifier, payload, inlet.started)
 
-    def _reset(self, message: int, inlet: Inlet, reason: str) -> None:
+    def _reset(self, message: int, inlet: SourceBuffer, reason: str) -> None:
         self._lose(message << 7, reason)
         self.open.pop(message, None)
         inlet.parts.clear()

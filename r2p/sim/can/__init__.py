@@ -15,22 +15,22 @@ its frame is counted (and cached) by the codec. One seed, one course of events: 
 
 from r2p.sim.can.bus import CanBus
 from r2p.sim.can.controller import CanController
-from r2p.sim.can.node import CanNode, ErrorKind, Latency, LocalAlarm, LocalClock, Record, State
+from r2p.sim.can.node import CanNode, ControllerState, ErrorKind, FrameRecord, Latency, LocalAlarm, LocalClock
 from r2p.sim.can.statistics import Count, Statistics
-from r2p.sim.can.timeline import Timeline, Timer
+from r2p.sim.can.timeline import Timeline, TimelineTimer
 
 __all__ = [
     "CanBus",
     "CanController",
     "CanNode",
+    "ControllerState",
     "Count",
     "ErrorKind",
+    "FrameRecord",
     "Latency",
     "LocalAlarm",
     "LocalClock",
-    "Record",
-    "State",
     "Statistics",
     "Timeline",
-    "Timer",
+    "TimelineTimer",
 ]

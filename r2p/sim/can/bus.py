@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from r2p.codecs.rtcan import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
-from r2p.sim.can.controller import CanController
+from r2p.sim.can.controller import CanController, Recovery
 from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
-from r2p.sim.can.listeners import Listeners
-from r2p.sim.can.node import NEVER, CanNode, ErrorKind, Record, State
-from r2p.sim.can.recovery import Recovery
+from r2p.sim.can.node import NEVER, CanNode, ControllerState, ErrorKind, FrameRecord
 from r2p.sim.can.statistics import Statistics
 from r2p.sim.can.timeline import Timeline
 
@@ -26,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from r2p.codecs.rtcan import Frame
-    from r2p.sim.can.mailboxes import Mailboxes, Request
+    from r2p.sim.can.controller import ControllerMailboxes, Request
 
 _SECOND: Final = 1_000_000_000
 _SUSPEND: Final = 8  # bits that an error passive sender waits longer
@@ -52,8 +50,8 @@ class _Transfer(msgspec.Struct, eq=False):
 class CanBus:
     """A CAN 2.0B bus with extended identifiers.
 
-    `timeline` is true time. `statistics` counts from the start. `observers` get a `Record` of each frame and of each
-    attempt at one, at its end.
+    `timeline` is true time. `statistics` counts from the start. `observers` get a `FrameRecord` of each frame and of
+    each attempt at one, at its end.
     """
 
     def __init__(
@@ -70,7 +68,7 @@ class CanBus:
         self.bit = bit
         self.noise = noise
         self.statistics = Statistics(bit, self.timeline.now())
-        self.observers: list[Callable[[Record], object]] = []
+        self.observers: list[Callable[[FrameRecord], object]] = []
         self._seed = seed
         self._numbers = random.Random(f"{seed}")
         self._names: set[str] = set()
@@ -78,7 +76,7 @@ class CanBus:
         self._noisy = False  # whether a node has noise of its own
         self._disturb: list[int] = []
         self._free = 0  # from when on a frame may start
-        self._contenders: dict[Mailboxes, None] = {}  # may have something to send; nobody else has
+        self._contenders: dict[ControllerMailboxes, None] = {}  # may have something to send; nobody else has
         self._start: int | None = None  # when the next one does
         self._plan = 0  # the number of that plan: it can change until the window is over
         self._transfer: _Transfer | None = None
@@ -145,7 +143,7 @@ class CanBus:
     def left(self, controller: CanController) -> None:
         """A controller takes no part any more: no power, or bus-off."""
         self._listeners.leave(controller)
-        if controller.state is State.DOWN:
+        if controller.state is ControllerState.DOWN:
             self._recovery.forget(controller)
         if self._transfer:
             self._torn(self._transfer, controller)
@@ -258,7 +256,7 @@ class CanBus:
         self._over(transfer, transfer.bits, None, end)
 
     def _over(self, transfer: _Transfer, bits: int, error: ErrorKind | None, end: int) -> None:
-        record = Record(transfer.start, end, transfer.frame, transfer.names, bits, error)
+        record = FrameRecord(transfer.start, end, transfer.frame, transfer.names, bits, error)
         self.statistics.add(record)
         self._transfer = None
         self._busy = False
@@ -284,7 +282,7 @@ class CanBus:
         for node in list(transfer.heard_by):
             if node.node.noise and node.numbers.random() < node.node.noise:
                 node.disturbed(8)
-                if node.state is State.ACTIVE:
+                if node.state is ControllerState.ACTIVE:
                     bit = node.numbers.randrange(1, transfer.bits + 1)
                     self._destroy(transfer, wire_bits(transfer.frame)[:bit], ErrorKind.BIT, [node])
                     return True
@@ -296,7 +294,7 @@ class CanBus:
         wires = [wire_bits(request.frame) for request in requests]
         bit = first_difference(wires)
         hit = [request for request, wire in zip(requests, wires, strict=True) if wire[bit - 1] == "1"]
-        if any(request.owner.state is State.ACTIVE for request in hit):
+        if any(request.owner.state is ControllerState.ACTIVE for request in hit):
             self._transfer = transfer = self._transfer_of(requests, start, deaf)
             self._destroy(transfer, flip(wire_bits(hit[0].frame), bit), ErrorKind.BIT, [r.owner for r in hit])
             return
@@ -315,8 +313,8 @@ class CanBus:
         """After these bits on the bus these nodes know of an error, and say so."""
         transfer.doomed = True
         detected = transfer.start + len(bus) * self.bit
-        active = any(node.state is State.ACTIVE for node in by)
-        others = any(n.state is State.ACTIVE for n in (*transfer.owners, *transfer.heard_by) if n not in by)
+        active = any(node.state is ControllerState.ACTIVE for node in by)
+        others = any(n.state is ControllerState.ACTIVE for n in (*transfer.owners, *transfer.heard_by) if n not in by)
         bits = len(bus) + error_frame_bits(bus, wire_bits(transfer.frame), active=active, others=others)
         end = transfer.start + bits * self.bit
         for request in transfer.requests:
@@ -346,3 +344,65 @@ class CanBus:
             self._destroy(transfer, bus, ErrorKind.STUFF, transfer.heard_by)
         elif transfer.requests and not transfer.heard_by and sent < transfer.bits - _AFTER_ACK:
             self._destroy(transfer, wire[:-_AFTER_ACK], ErrorKind.ACK, transfer.owners)
+
+
+# Who takes part in a bus, who hears whom, and whom a frame matters to: needed for each frame, and seldom changed.
+
+
+_REMEMBERED: Final = 4096  # identifiers of which it is known whom they concern
+
+
+class Listeners:
+    """The controllers with power that are not in bus-off, in the order in which they came.
+
+    `audience[controller]`: its name, and all that hear what it sends alone. `concerned[identifier]`: to whom a good
+    frame with this identifier matters.
+    """
+
+    def __init__(self) -> None:
+        self.live: list[CanController] = []
+        self.audience = _Audience(self.live)
+        self.concerned = _Concerned(self.live)
+
+    def join(self, controller: CanController) -> None:
+        """It takes part from now on."""
+        self.live.append(controller)
+        self.audience.clear()
+        self.concerned.clear()
+
+    def leave(self, controller: CanController) -> None:
+        """It takes no part any more, if it did."""
+        if controller in self.live:
+            self.live.remove(controller)
+            self.audience.clear()
+            self.concerned.clear()
+
+    def reconsider(self) -> None:
+        """Other frames than before may concern a controller."""
+        self.concerned.clear()
+
+
+class _Audience(dict["CanController", tuple[tuple[str, ...], list["CanController"]]]):
+    """Worked out at the first question."""
+
+    def __init__(self, live: list[CanController]) -> None:
+        super().__init__()
+        self._live = live
+
+    def __missing__(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController]]:
+        audience = self[owner] = (owner.name,), [each for each in self._live if each is not owner]
+        return audience
+
+
+class _Concerned(dict[int, list["CanController"]]):
+    """Worked out at the first question."""
+
+    def __init__(self, live: list[CanController]) -> None:
+        super().__init__()
+        self._live = live
+
+    def __missing__(self, identifier: int) -> list[CanController]:
+        if len(self) >= _REMEMBERED:
+            self.clear()
+        concerned = self[identifier] = [each for each in self._live if each.concerned(identifier)]
+        return concerned

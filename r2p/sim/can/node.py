@@ -19,7 +19,7 @@ NEVER: Final = 1 << 63
 _BILLION: Final = 1_000_000_000
 
 
-class State(Enum):
+class ControllerState(Enum):
     """How far a controller trusts itself (its error counters say so), and whether it has power."""
 
     ACTIVE = "error active"
@@ -80,7 +80,7 @@ class CanNode(msgspec.Struct, frozen=True):
     recovery: bool = True
 
 
-class Record(msgspec.Struct, frozen=True, gc=False):
+class FrameRecord(msgspec.Struct, frozen=True, gc=False):
     """What really happened: one frame, or an attempt at one.
 
     `start` and `end` are true time, in ns: start of frame, and end of frame or of the error frame; `bits` lie between

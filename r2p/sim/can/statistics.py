@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from r2p.codecs.rtcan import INTERMISSION
 
 if TYPE_CHECKING:
-    from r2p.sim.can.node import Record
+    from r2p.sim.can.node import FrameRecord
 
 
 class Count:
@@ -65,7 +65,7 @@ class Statistics:
                 counts[name].add(count)
         return dict(counts)
 
-    def add(self, record: Record) -> None:
+    def add(self, record: FrameRecord) -> None:
         """Count one attempt."""
         count = self._counts[record.frame.id >> 7 & 0xFFFF, record.senders]
         if record.error is None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from r2p.sim.loop import Event
 
 
-class Timer:
+class TimelineTimer:
     """One call in the future, which can be cancelled."""
 
     __slots__ = ("_args", "_callback")
@@ -40,7 +40,7 @@ class Timer:
             callback(*self._args)
 
 
-class Source(Protocol):
+class TimelineSource(Protocol):
     """A clock that can be read."""
 
     @property
@@ -60,7 +60,7 @@ class Timeline:
         self._virtual = loop if isinstance(loop, VirtualLoop) and loop.clock.virtual else None
         self._running = False
         self._now = 0
-        self.source: Source = self if self._virtual is None else self._virtual.clock
+        self.source: TimelineSource = self if self._virtual is None else self._virtual.clock
         """Where `now` comes from, for those who ask often: `elapsed` is the same without a call."""
         self.now: Callable[[], int] = self.clock.monotonic if self._virtual else self._present
         """The instant of the event that is being carried out; else what the clock says."""
@@ -77,9 +77,9 @@ class Timeline:
         if not self._running and self._events[0][1] == number:
             self._alarm.set(when)
 
-    def timer(self, when: int, callback: Callable[..., object], *args: Any) -> Timer:
+    def timer(self, when: int, callback: Callable[..., object], *args: Any) -> TimelineTimer:
         """As `at`, and can be cancelled."""
-        timer = Timer(callback, args)
+        timer = TimelineTimer(callback, args)
         self.at(when, timer.fire)
         return timer
 

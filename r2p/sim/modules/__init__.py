@@ -13,16 +13,11 @@ The hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...) are `
 of `r2p.sim.physics`, on any transport; a `Plant` moves the models on. `r2p.sim.robots` makes robots of them.
 """
 
-from r2p.sim.modules.board import Board
+from r2p.sim.modules.boards import Board, GatewayModule, IoModule, MotorModule, PowerModule, ProximityModule
 from r2p.sim.modules.firmware import FirmwareModule, Publishes, Subscribes
-from r2p.sim.modules.gateway import GatewayModule
 from r2p.sim.modules.imu import ImuModule
-from r2p.sim.modules.input_output import IoModule
-from r2p.sim.modules.motor import MotorModule
 from r2p.sim.modules.plant import Plant
 from r2p.sim.modules.power import Powered, Wire
-from r2p.sim.modules.power_supply import PowerModule
-from r2p.sim.modules.proximity import ProximityModule
 
 __all__ = [
     "Board",

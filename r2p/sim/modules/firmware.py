@@ -93,8 +93,8 @@ class FirmwareModule:
         """The last message received on each topic."""
         self.drops: Counter[str] = Counter()
         """Lines and messages that it dropped, by reason."""
-        self._publishers = {topic_name(each.topic): _Publisher(each) for each in publishers}
-        self._subscribers = {topic_name(each.topic): _Subscriber(each) for each in subscribers}
+        self._publishers = {topic_name(each.topic): _FirmwarePublisher(each) for each in publishers}
+        self._subscribers = {topic_name(each.topic): _FirmwareSubscriber(each) for each in subscribers}
         self._repeats = repeats
         self._memory = heap
         self._rounds = 2 if behind_gateway else 1
@@ -282,7 +282,7 @@ class FirmwareModule:
         if subscriber is not None and self._running:
             self._say(now, subscriber.request)
 
-    def _opened(self, now: int, subscriber: "_Subscriber") -> None:
+    def _opened(self, now: int, subscriber: "_FirmwareSubscriber") -> None:
         """A publisher's data may come in, once the response has been seen to."""
         subscriber.responses += 1
         if not self._running:
@@ -302,7 +302,7 @@ class FirmwareModule:
         publisher.joined = True
         self._say(now, management.SubscribeResponse(message.topic, publisher.layout.size))
 
-    def _allocate(self, publisher: "_Publisher", message: management.SubscribeRequest) -> bool:
+    def _allocate(self, publisher: "_FirmwarePublisher", message: management.SubscribeRequest) -> bool:
         """The queue of a remote subscriber; False if that is the end."""
         if not message.queue:
             self.fault = f"SUBSCRIBE_REQUEST of {message.topic} with queue length 0: an assertion fails"
@@ -325,7 +325,7 @@ class FirmwareModule:
         else:
             self._hand_over(now, subscriber, data)
 
-    def _hand_over(self, now: int, subscriber: "_Subscriber", data: bytes) -> None:
+    def _hand_over(self, now: int, subscriber: "_FirmwareSubscriber", data: bytes) -> None:
         try:
             message = subscriber.layout.decode(data)
         except DecodeError:  # a text that is none: firmware has no such types
@@ -337,7 +337,7 @@ class FirmwareModule:
         for where, answer in (subscriber.answer and subscriber.answer(message)) or ():
             self._out.append(self.publish(now, where, answer))
 
-    def _publish(self, now: int, publisher: "_Publisher", message: Message) -> None:
+    def _publish(self, now: int, publisher: "_FirmwarePublisher", message: Message) -> None:
         if publisher.joined:
             data = publisher.layout.encode(message)
             self._out.append(publisher.line(data, self._deadline(now)))
@@ -360,7 +360,7 @@ class FirmwareModule:
         return data
 
 
-class _Publisher:
+class _FirmwarePublisher:
     """A publisher while its module runs."""
 
     def __init__(self, what: Publishes) -> None:
@@ -386,7 +386,7 @@ class _Publisher:
         return self._fill(now - booted) if self.joined else None
 
 
-class _Subscriber:
+class _FirmwareSubscriber:
     """A subscriber while its module runs."""
 
     def __init__(self, what: Subscribes) -> None:

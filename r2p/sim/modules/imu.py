@@ -12,20 +12,20 @@ from collections.abc import Callable, Iterable
 import msgspec
 
 import r2p
+from r2p.modules.supervisor import NodeFunction
 from r2p.msg import IMU, IMURaw9, Pressure, Tilt
-from r2p.sim.modules.board import Board, Via
-from r2p.sim.physics.attitude import ComplementaryFilter
+from r2p.sim.modules.boards import Board, Via
 from r2p.sim.physics.inertial import (
     ACCELEROMETER,
     GRAVITY,
     GYROSCOPE,
     MAGNETOMETER,
     Barometer,
+    ComplementaryFilter,
     MemsSensor,
     Vector,
     altitude_at,
 )
-from r2p.supervisor import NodeFunction
 
 _MDPS = math.degrees(1.0) * 1000  # mdps in one rad/s
 _MG = 1000 / GRAVITY  # mg in one m/s^2

@@ -5,6 +5,7 @@ is a first-order system, so `MotorSpec.gain` and `MotorSpec.time_constant` say a
 """
 
 import math
+from typing import Literal
 
 import msgspec
 
@@ -110,3 +111,142 @@ class Axle:
         """Move on by `dt` seconds, which is short against the motor's time constant."""
         motor = self.motor
         motor.turn(motor.speed + motor.torque() / self.inertia * dt, dt)
+
+
+# The PID controller of the motor module: saturation, and an integrator that waits while it is saturated.
+
+
+class Gains(msgspec.Struct, frozen=True):
+    """V for each tick/s (speed) or tick (position), and for their integral (ki, s) and derivative (kd, 1/s)."""
+
+    kp: float
+    ki: float = 0.0
+    kd: float = 0.0
+    limit: float = 24.0
+    """The output saturates at plus and minus this, V."""
+
+
+class Pid:
+    """The controller."""
+
+    def __init__(self, gains: Gains) -> None:
+        self.gains = gains
+        self._integral = 0.0
+        self._measured: float | None = None
+
+    def reset(self) -> None:
+        """Forget the past."""
+        self._integral = 0.0
+        self._measured = None
+
+    def step(self, setpoint: float, measured: float, dt: float) -> float:
+        """The output for the next `dt` seconds."""
+        gains = self.gains
+        error = setpoint - measured
+        slope = 0.0 if self._measured is None else (measured - self._measured) / dt
+        self._measured = measured
+        integral = self._integral + gains.ki * error * dt
+        wanted = gains.kp * error + integral - gains.kd * slope
+        output = max(-gains.limit, min(gains.limit, wanted))
+        if wanted == output or wanted * error < 0:  # saturated: integrate only what leads out of it
+            self._integral = integral
+        return output
+
+
+def speed_gains(spec: MotorSpec, load: float, *, frequency: float, damping: float) -> Gains:
+    """PI gains that give the closed loop this natural frequency (rad/s) and damping, by placing its two poles.
+
+    `load` is the inertia at the wheel, rotor included, kg m^2. Speeds are in ticks/s. With the motor gain/(time s + 1)
+    the closed loop is (gain kp s + gain ki) / (time s^2 + (1 + gain kp) s + gain ki).
+    """
+    gain, time = spec.gain * spec.ticks_per_radian, spec.time_constant(load)
+    return Gains((2 * damping * frequency * time - 1) / gain, frequency**2 * time / gain, limit=spec.voltage)
+
+
+def step_response(spec: MotorSpec, load: float, gains: Gains, time: float) -> float:
+    """Speed `time` seconds after a step of the setpoint from 0 to 1: what the theory says of `speed_gains`.
+
+    For damping under 1, where neither the voltage nor the current saturates, and without dry friction.
+    """
+    gain, tau = spec.gain * spec.ticks_per_radian, spec.time_constant(load)
+    decay = (1 + gain * gains.kp) / (2 * tau)
+    swing = math.sqrt(gain * gains.ki / tau - decay**2)
+    sine = (gain * gains.kp / tau - decay) / swing
+    return 1 - math.exp(-decay * time) * (math.cos(swing * time) - sine * math.sin(swing * time))
+
+
+# What the motor module's firmware does between the encoder and the bridge (thesis 7.3.2): everything in ticks.
+
+
+Mode = Literal["speed", "position"]
+
+
+class Drive:
+    """Closed-loop control of one motor; before the first setpoint, and when it is stopped, the winding is shorted."""
+
+    def __init__(self, motor: Motor, gains: Gains, *, mode: Mode = "speed") -> None:
+        self.motor = motor
+        self.mode: Mode = mode
+        self.setpoint: float | None = None
+        """Ticks (position) or ticks/s (speed); None: stopped."""
+        self._pid = Pid(gains)
+        self._seen = motor.ticks
+        self._taken = motor.ticks
+
+    def stop(self) -> None:
+        """Short the winding, which brakes, until the next setpoint."""
+        self.setpoint = None
+        self.motor.voltage = 0.0
+        self._pid.reset()
+
+    def take_ticks(self) -> int:
+        """Ticks since the last time this was asked."""
+        ticks = self.motor.ticks
+        taken, self._taken = self._taken, ticks
+        return ticks - taken
+
+    def step(self, dt: float) -> None:
+        """Read the encoder, and set the bridge for the next `dt` seconds."""
+        ticks = self.motor.ticks
+        moved, self._seen = ticks - self._seen, ticks
+        if self.setpoint is not None:
+            measured = ticks if self.mode == "position" else moved / dt
+            self.motor.voltage = self._pid.step(self.setpoint, measured, dt)
+
+
+# A lead battery: its voltage falls with its charge and with the current that is drawn.
+
+
+class BatterySpec(msgspec.Struct, frozen=True, kw_only=True):
+    """Data sheet. Default: two 12 V, 7.2 Ah batteries in series."""
+
+    capacity: float = 7.2
+    """Ah."""
+    full: float = 25.6
+    """Voltage at rest when it is full, V."""
+    empty: float = 23.2
+    """Voltage at rest when it is empty, V."""
+    resistance: float = 60.0
+    """Inside, milliohm."""
+
+
+class Battery:
+    """Charge goes out as current flows; negative current charges it."""
+
+    def __init__(self, spec: BatterySpec | None = None, *, charge: float = 1.0) -> None:
+        """`charge` from 0 (empty) to 1 (full)."""
+        self.spec = spec or BatterySpec()
+        self.charge = charge
+        self.current = 0.0
+        """That flows out of it now, A."""
+
+    @property
+    def voltage(self) -> float:
+        """At its terminals, V."""
+        spec = self.spec
+        rest = spec.empty + (spec.full - spec.empty) * self.charge
+        return rest - self.current * spec.resistance * 1e-3
+
+    def step(self, dt: float) -> None:
+        """Move on by `dt` seconds at the present current."""
+        self.charge = max(0.0, min(1.0, self.charge - self.current * dt / 3600 / self.spec.capacity))

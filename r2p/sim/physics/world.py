@@ -1,7 +1,10 @@
 """A flat world of walls and boxes, and rays through it."""
 
 import math
+import random
 from collections.abc import Iterable, Iterator
+
+import msgspec
 
 Point = tuple[float, float]
 Wall = tuple[Point, Point]
@@ -51,3 +54,56 @@ def _to_wall(x: float, y: float, wall: Wall) -> float:
     along = ((x - ax) * ex + (y - ay) * ey) / ((ex * ex + ey * ey) or 1.0)
     along = max(0.0, min(1.0, along))
     return math.hypot(ax + along * ex - x, ay + along * ey - y)
+
+
+# An infrared range finder of Sharp's GP2Y series, and what the proximity module makes of its voltage.
+
+
+NOTHING = 65535
+"""The reading in mm when nothing is in range."""
+
+_ADC = 4095  # counts of 12 bits
+_REFERENCE = 3.3  # V
+
+
+class RangeSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """Data sheet. Default: about a GP2Y0A21, 100 to 800 mm."""
+
+    shortest: float = 100.0
+    """mm."""
+    longest: float = 800.0
+    """mm."""
+    scale: float = 339.0
+    """Of the curve `scale / (distance + offset)`, V mm."""
+    offset: float = 47.0
+    """mm."""
+    noise: float = 3.0
+    """Of the voltage, one sigma, mV."""
+
+    def voltage(self, distance: float) -> float:
+        """Output at this distance (mm), V; under the shortest one it falls to nothing again."""
+        peak = self.scale / (self.shortest + self.offset)
+        if distance < self.shortest:
+            return peak * distance / self.shortest
+        return self.scale / (distance + self.offset)
+
+
+class RangeFinder:
+    """One sensor and its input of the A/D converter."""
+
+    def __init__(self, spec: RangeSpec, noise: random.Random) -> None:
+        self.spec = spec
+        self._noise = noise
+
+    def read(self, distance: float) -> int:
+        """Counts of the A/D converter for something at this distance (mm; infinite: nothing)."""
+        voltage = self.spec.voltage(distance) + self._noise.gauss(0, self.spec.noise * 1e-3)
+        return max(0, min(_ADC, round(voltage / _REFERENCE * _ADC)))
+
+    def millimetres(self, counts: int) -> int:
+        """What the firmware makes of them, by the sensor's curve; NOTHING beyond its longest range."""
+        voltage = counts * _REFERENCE / _ADC
+        spec = self.spec
+        if voltage <= spec.scale / (spec.longest + spec.offset):
+            return NOTHING
+        return max(0, round(spec.scale / voltage - spec.offset))

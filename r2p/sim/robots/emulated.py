@@ -19,20 +19,20 @@ from typing import Self
 from r2p.bridge import BridgeOptions
 from r2p.durations import timeout_or_none
 from r2p.msg import Speed3
-from r2p.publishers import AnyPublisher
-from r2p.sim.modules.board import Board
-from r2p.sim.modules.gateway import GatewayModule
-from r2p.sim.modules.motor import MotorConfig, MotorModule, Setpoints
+from r2p.runtime.publishers import AnyPublisher
+from r2p.sim.modules.boards import (
+    Board,
+    GatewayModule,
+    MotorConfig,
+    MotorModule,
+    PowerModule,
+    ProximityModule,
+    Setpoints,
+)
 from r2p.sim.modules.plant import Plant
-from r2p.sim.modules.power_supply import PowerModule
-from r2p.sim.modules.proximity import ProximityModule
-from r2p.sim.physics.battery import Battery
-from r2p.sim.physics.drive import Drive
-from r2p.sim.physics.motor import Motor
+from r2p.sim.physics.motor import Battery, Drive, Gains, Motor, speed_gains
 from r2p.sim.physics.omni import OmniBody, OmniSpec, Triple
-from r2p.sim.physics.pid import Gains, speed_gains
-from r2p.sim.physics.rangefinder import RangeSpec
-from r2p.sim.physics.world import World
+from r2p.sim.physics.world import RangeSpec, World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.latest import Traffic
 from r2p.transports.link import Transport

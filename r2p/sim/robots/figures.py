@@ -9,7 +9,7 @@ import msgspec
 
 import r2p
 from r2p.msg import Odometry
-from r2p.publishers import AnyPublisher
+from r2p.runtime.publishers import AnyPublisher
 from r2p.sim import SimCan
 from r2p.sim.physics.omni import Triple
 from r2p.sim.robots.emulated import MOTORS, Triskar2

@@ -16,8 +16,7 @@ import math
 
 import r2p
 from r2p.msg import Battery, Encoder, Odometry, Pose3, Proximity, Speed3, Velocity3
-from r2p.sim.physics.battery import BatterySpec
-from r2p.sim.physics.motor import MotorSpec
+from r2p.sim.physics.motor import BatterySpec, MotorSpec
 from r2p.sim.physics.omni import OmniSpec
 from r2p.sim.robots.latest import Latest, Traffic, sender
 

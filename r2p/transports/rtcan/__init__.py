@@ -3,10 +3,10 @@
 from collections.abc import Callable
 
 from r2p.errors import TransportError
-from r2p.transports.rtcan.options import OPTIONS, Options, checked
-from r2p.transports.rtcan.port import CanPort
+from r2p.transports.can.port import CanPort
+from r2p.transports.rtcan.options import OPTIONS, RtcanOptions, checked
+from r2p.transports.rtcan.status import HOLDABLE
 from r2p.transports.rtcan.transport import RtcanTransport
-from r2p.transports.rtcan.words import HOLDABLE
 from r2p.transports.url import Url
 
 # fmt: off
@@ -22,19 +22,19 @@ INTERFACES = frozenset({
 
 
 def from_url(url: Url) -> RtcanTransport:
-    """`rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`; options as in `Options`, which see."""
+    """`rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`; options as in `RtcanOptions`, which see."""
     make_port, options = _taken_apart(url)
     return RtcanTransport(f"rtcan:{url.address}", make_port, options)
 
 
-def open_port(url: Url) -> tuple[CanPort, Options]:
+def open_port(url: Url) -> tuple[CanPort, RtcanOptions]:
     """The port of such a URL, not running yet, and the options: for who only listens."""
     make_port, options = _taken_apart(url)
     return make_port(), options
 
 
-def _taken_apart(url: Url) -> tuple[Callable[[], CanPort], Options]:
-    options = checked(str(url), url.parsed(OPTIONS), Options())
+def _taken_apart(url: Url) -> tuple[Callable[[], CanPort], RtcanOptions]:
+    options = checked(str(url), url.parsed(OPTIONS), RtcanOptions())
     slot = options.timing.slot
     if options.priority and slot < HOLDABLE:
         raise TransportError(
@@ -52,11 +52,11 @@ def _taken_apart(url: Url) -> tuple[Callable[[], CanPort], Options]:
     return _port(interface, channel, options), options
 
 
-def _port(interface: str, channel: str, options: Options) -> Callable[[], CanPort]:
+def _port(interface: str, channel: str, options: RtcanOptions) -> Callable[[], CanPort]:
     if interface == "socketcan":
-        from r2p.transports.rtcan.socketcan import SocketCanPort
+        from r2p.transports.can.socketcan import SocketCanPort
 
         return lambda: SocketCanPort(channel)
-    from r2p.transports.rtcan.pythoncan import PythonCanPort
+    from r2p.transports.can.pythoncan import PythonCanPort
 
     return lambda: PythonCanPort(interface, channel, options.bitrate)

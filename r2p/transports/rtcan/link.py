@@ -13,41 +13,38 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Any, ClassVar
 
 from r2p.codecs import rtcan
-from r2p.codecs.attachment import Clock
+from r2p.codecs.attachment import ClockOffset
 from r2p.codecs.management import NO_PARAMS
 from r2p.names import MANAGEMENT
-from r2p.protocols.events import Event, ModuleGone, Opened, Shut
-from r2p.protocols.rtcan.election import Role
+from r2p.protocols.discovery.events import Event, ModuleGone, PublisherFound, PublisherGone
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import (
     Action,
     Degraded,
     Done,
     Due,
+    EngineSettings,
     Granted,
     IdConflict,
+    ParameterMismatch,
+    ParametersMatch,
     Ready,
     Received,
     Refused,
-    Silenced,
-    Unsilenced,
 )
-from r2p.protocols.rtcan.settings import Settings
-from r2p.protocols.rtcan.topics import HighBytes
-from r2p.sample import PublisherClass, Sample
-from r2p.topic import Topic
+from r2p.protocols.rtcan.master import Role
+from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
+from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.topic import Topic
+from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, Link, unique_name
-from r2p.transports.rtcan import origins
-from r2p.transports.rtcan.arrivals import Arrived, Samples
-from r2p.transports.rtcan.departures import Departures, Response
-from r2p.transports.rtcan.handover import Handed, Handover
-from r2p.transports.rtcan.inlets import RtcanInlets
-from r2p.transports.rtcan.pacing import discovery_on, pace
-from r2p.transports.rtcan.periodics import Periodics, Slotted, inadmissible
-from r2p.transports.rtcan.port import CanPort
-from r2p.transports.rtcan.shell import Shell
-from r2p.transports.rtcan.translation import Translation
-from r2p.transports.rtcan.words import Words
+from r2p.transports.rtcan import rx as origins
+from r2p.transports.rtcan.driver import EngineDriver
+from r2p.transports.rtcan.options import discovery_on, pace
+from r2p.transports.rtcan.rx import MessageIdMap, ReceivedMessage, SampleBuilder
+from r2p.transports.rtcan.slots import SlottedTopic, SlottedTopics, inadmissible
+from r2p.transports.rtcan.status import LinkStatus, UtcEstimator
+from r2p.transports.rtcan.tx import Handed, Response, Transmitter, TxAccounting
 
 _MANAGEMENT = MANAGEMENT.encode()
 _LOSSES = ("undecodable", "management dropped")  # of what the engine counts: messages lost that were nobody's
@@ -56,27 +53,29 @@ _LOSSES = ("undecodable", "management dropped")  # of what the engine counts: me
 class RtcanLink(Link):
     """A module's place on an RTCAN bus. `utc_error` (ns): how well the module knows UTC; None: not at all."""
 
-    longest: ClassVar[int] = rtcan.PAYLOAD_MAX
+    max_payload: ClassVar[int] = rtcan.PAYLOAD_MAX
 
-    def __init__(self, name: str, hub: Hub, port: CanPort, settings: Settings, utc_error: int | None = None) -> None:
+    def __init__(
+        self, name: str, hub: Hub, port: CanPort, settings: EngineSettings, utc_error: int | None = None
+    ) -> None:
         name = unique_name(name, hub)
         discovery = discovery_on(hub, name)
         super().__init__(name, hub, discovery=discovery)
         self._paced = discovery
         self.engine = Engine(settings)
         self.stats.faults = self.engine.counts
-        self.shell = Shell(self.engine, port, self)
+        self.shell = EngineDriver(self.engine, port, self)
         self.do: Callable[[Sequence[Action]], None] = self.shell.do
         self._now = port.now
         self._utc_error = utc_error
-        self._translation = Translation(self.network_time, self._clock.now, lambda: self.engine.epoch)
-        self._high_bytes = HighBytes()
-        self._samples = Samples(name, self.engine, port, discovery, self._translation, self._clock)
-        self._inlets = RtcanInlets(self.engine, self._intake, self._space, self.stats.lost)
-        self._periodics = Periodics(self, self._clock, port.now, port.monotonic)
-        self._words = Words(self.engine, port, settings)
-        self._handover = Handover(name, self.stats)
-        self._departures = Departures(self.engine, port, self._handover, self._periodics, self._clock)
+        self._translation = UtcEstimator(self.network_time, self._clock.now, lambda: self.engine.epoch)
+        self._high_bytes = TopicIdAllocator()
+        self._samples = SampleBuilder(name, self.engine, port, discovery, self._translation, self._clock)
+        self._inlets = MessageIdMap(self.engine, self._intake, self._space, self.stats.lost)
+        self._periodics = SlottedTopics(self, self._clock, port.now, port.monotonic)
+        self._words = LinkStatus(self.engine, port, settings)
+        self._handover = TxAccounting(name, self.stats)
+        self._departures = Transmitter(self.engine, port, self._handover, self._periodics, self._clock)
         self._on_bus = False
 
     # For the shell
@@ -87,7 +86,7 @@ class RtcanLink(Link):
             if topic is _MANAGEMENT and action.message in self._inlets.shutting:
                 self.stats.lost["not subscribed"] += 1
                 return
-            self._intake.take((Arrived(topic, action.payload, action.message, action),))
+            self._intake.take((ReceivedMessage(topic, action.payload, action.message, action),))
         elif isinstance(action, Done):
             self._done(action)
         elif isinstance(action, Due):
@@ -101,7 +100,7 @@ class RtcanLink(Link):
 
     def bus_down(self, reason: str) -> None:
         self._on_bus = False
-        down = self.went_down if self.up else self.unreachable
+        down = self.on_down if self.up else self.unreachable
         down(reason)
         self._periodics.look()
 
@@ -118,15 +117,15 @@ class RtcanLink(Link):
         match news:
             case Ready():
                 self._ready(news)
-            case Unsilenced() if self.engine.ready:
+            case ParametersMatch() if self.engine.ready:
                 self._notice(news)
                 self._announce()
             case Granted() | Refused() | Degraded():
                 self._periodics.learn(news)
             case _ if not self._closed:
                 text = self._notice(news)
-                if isinstance(news, Silenced) or (isinstance(news, IdConflict) and news.yielded):
-                    self.went_down(text)
+                if isinstance(news, ParameterMismatch) or (isinstance(news, IdConflict) and news.yielded):
+                    self.on_down(text)
                 self._tell_utc()
 
     def _notice(self, news: Action) -> str:
@@ -143,15 +142,15 @@ class RtcanLink(Link):
     def _announce(self) -> None:
         for topic in list(self._space.topics.values()):
             self.stats.lost.guard(self.topic_changed, topic)
-        self.went_up()
+        self.on_up()
 
     # In
 
-    def sample(self, topic: str, arrival: Arrived) -> Sample:
+    def sample(self, topic: str, arrival: ReceivedMessage) -> Sample:
         self.stats.bytes_received += len(arrival.data)
         return self._samples.make(topic, arrival)
 
-    def sender(self, arrival: Arrived) -> Hashable:
+    def sender(self, arrival: ReceivedMessage) -> Hashable:
         return arrival.message
 
     def take_other(self, arrival: Any) -> None:
@@ -186,7 +185,9 @@ class RtcanLink(Link):
 
     def write(self, topic: str, sample: Sample) -> None:
         high = self._high_bytes.pick(topic)
-        if high is None or not 1 <= len(sample.data) <= self.longest:  # only from other links, with topics of any size
+        if (
+            high is None or not 1 <= len(sample.data) <= self.max_payload
+        ):  # only from other links, with topics of any size
             self.stats.lost["impossible message"] += 1
             return
         self.do(self._departures.send(self._outlets.get(topic), topic, high, sample))
@@ -204,11 +205,11 @@ class RtcanLink(Link):
 
     def _done(self, done: Done) -> None:
         handed = done.handle
-        if isinstance(handed, Slotted):
+        if isinstance(handed, SlottedTopic):
             self._periodics.done(handed, done)
         elif isinstance(handed, Handed):
             self._handover.done(handed, done)
-            if self.room:
+            if self.wait_queue:
                 self.made_room()
         elif isinstance(handed, Response):
             for name in self._departures.answered(handed):
@@ -245,10 +246,10 @@ class RtcanLink(Link):
 
     def _act(self, event: Event) -> None:
         match event:
-            case Opened(topic, source, params, size):
+            case PublisherFound(topic, source, params, size):
                 self._inlets.open(self._clock.monotonic(), topic, source, params, size)
                 self.shell.refilter()
-            case Shut(topic, source):
+            case PublisherGone(topic, source):
                 self._inlets.shut(self._clock.monotonic(), topic, source)
                 self.shell.refilter()
             case _:
@@ -264,7 +265,7 @@ class RtcanLink(Link):
         return sum(self.engine.losses.values(), super().losses + ours)
 
     @property
-    def slots(self) -> dict[str, Slotted]:
+    def slots(self) -> dict[str, SlottedTopic]:
         """The periodic topics of this module, and how well their slots are kept."""
         return self._periodics.by_topic
 
@@ -292,7 +293,7 @@ class RtcanLink(Link):
     def network_time(self) -> int | None:
         return self.engine.network_time(self._now())
 
-    def translation(self) -> Clock | None:
+    def translation(self) -> ClockOffset | None:
         return self._translation.clock(self._clock.monotonic())
 
     def utc(self) -> tuple[int, int] | None:
@@ -314,7 +315,7 @@ class RtcanLink(Link):
     # Life
 
     async def drained(self, longest: float) -> None:
-        """Wait until the samples that the engine has are on the bus, at most `longest` seconds."""
+        """Wait until the samples that the engine has are on the bus, at most `max_payload` seconds."""
         await self.shell.drained(longest, lambda: self._handover.waiting)
 
     def close(self) -> None:

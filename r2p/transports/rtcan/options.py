@@ -6,18 +6,20 @@ from typing import Any
 import msgspec
 
 from r2p.errors import TransportError
+from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.rtcan.cycle import Timing, timing
-from r2p.protocols.rtcan.events import Profile
-from r2p.protocols.rtcan.settings import Settings
-from r2p.transports.rtcan.port import CanPort
-from r2p.transports.rtcan.words import HOLDABLE
+from r2p.protocols.rtcan.events import EngineSettings, Profile
+from r2p.transports.can.port import CanPort
+from r2p.transports.link import Hub
+from r2p.transports.receiver import LoggedCounter
+from r2p.transports.rtcan.status import HOLDABLE
 from r2p.transports.url import duration
 
 _CAPACITY = 1024  # messages in the engine's queue: more than a link lets into it
 _SECOND = 1_000_000_000
 
 
-class Options(msgspec.Struct, frozen=True, kw_only=True):
+class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     """What a URL says of RTCAN. Times in s.
 
     `id`: 1 to 255, None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
@@ -38,11 +40,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         """The slots of the network's cycle."""
         return timing(self.slots, round(self.cycle * _SECOND), self.bitrate)
 
-    def settings(self, number: int, port: CanPort) -> Settings:
+    def settings(self, number: int, port: CanPort) -> EngineSettings:
         """Settings of an engine on this port. `number`: 64 random bits."""
         cycle = round(self.cycle * _SECOND)
         slot = self.timing.slot
-        return Settings(
+        return EngineSettings(
             number=number,
             id8=self.id,
             priority=self.priority,
@@ -63,7 +65,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         return None if self.utc is None else round(self.utc * _SECOND)
 
 
-def checked(url: str, values: dict[str, Any], defaults: Options) -> Options:
+def checked(url: str, values: dict[str, Any], defaults: RtcanOptions) -> RtcanOptions:
     """These options of a URL on top of the defaults. Raises TransportError where no frame fits a slot."""
     options = msgspec.structs.replace(defaults, **values)
     try:
@@ -114,3 +116,28 @@ OPTIONS: dict[str, Callable[[str], Any]] = {
     "utc": duration,
 }
 """Converters for `Url.parsed`."""
+
+
+# How much discovery may say on an RTCAN bus. After a start all modules have much to tell at once.
+
+
+_RATE, _BURST = 100.0, 8  # messages a second, and at once: a fifteenth of a bus of 1 Mbit/s, of slower ones the same
+_BIT = 1000  # ns, there
+_LEAST = 4
+_FIRMWARE_RATE, _QUIET = 12.0, 0.033  # a second, and s; all have one id, so they must not collide
+
+
+def discovery_on(hub: Hub, link: str) -> Discovery:
+    """Discovery for a link of this name."""
+    counts = LoggedCounter(link, hub.space.clock)
+    return Discovery(hub.space.module, hub.instance, rate=_RATE, burst=_BURST, observer=hub.observer, counts=counts)
+
+
+def pace(discovery: Discovery, profile: Profile, bit: int) -> float:
+    """Now it is known what the bus bears; `bit` in ns. Returns the announcements a second."""
+    if profile is Profile.FIRMWARE:
+        discovery.pace(_FIRMWARE_RATE, _LEAST, _QUIET)
+        return _FIRMWARE_RATE
+    rate = _RATE * _BIT / bit
+    discovery.pace(rate, max(_LEAST, _BURST * _BIT // bit), 0.0)
+    return rate

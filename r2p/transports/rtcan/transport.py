@@ -3,10 +3,10 @@
 import asyncio
 from collections.abc import Callable
 
+from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.link import RtcanLink
-from r2p.transports.rtcan.options import Options
-from r2p.transports.rtcan.port import CanPort
+from r2p.transports.rtcan.options import RtcanOptions
 
 _DRAINING = 0.5  # seconds for the last messages to get through: their subscribers take nothing after the good-bye
 _CLOSING = 0.5  # ... and for the good-bye
@@ -15,7 +15,7 @@ _CLOSING = 0.5  # ... and for the good-bye
 class RtcanTransport(Transport):
     """An RTCAN link called `name` on the port that `make_port` makes."""
 
-    def __init__(self, name: str, make_port: Callable[[], CanPort], options: Options) -> None:
+    def __init__(self, name: str, make_port: Callable[[], CanPort], options: RtcanOptions) -> None:
         self._name = name
         self._make_port = make_port
         self._options = options
@@ -24,7 +24,7 @@ class RtcanTransport(Transport):
         await run_link(self._name, hub, opened, self._make_port(), self._options)
 
 
-async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanPort, options: Options) -> None:
+async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanPort, options: RtcanOptions) -> None:
     """Run a link on a port until cancelled; the port is closed after the link's last messages and its good-bye."""
     settings = options.settings(hub.random.getrandbits(64), port)
     link = RtcanLink(name, hub, port, settings, options.utc_error)

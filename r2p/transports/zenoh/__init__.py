@@ -12,7 +12,7 @@ zenoh itself is imported when a session is opened, not before.
 """
 
 from r2p.transports.url import Url
-from r2p.transports.zenoh.options import options_of
+from r2p.transports.zenoh.config import options_of
 from r2p.transports.zenoh.transport import ZenohTransport
 
 

@@ -2,11 +2,151 @@
 
 import json
 import re
+import socket
+from collections.abc import Callable
+from pathlib import Path
 
+import msgspec
 import zenoh
 
-from r2p.transports.zenoh.options import Options
-from r2p.transports.zenoh.trouble import Tls, Way
+from r2p.errors import TransportError
+from r2p.transports.url import Url
+from r2p.transports.zenoh.diagnose import ConnectionSettings, Tls
+
+# What a `zenoh:` URL says.
+
+
+MODES = ("peer", "client", "router")
+
+_MOST_NAMED = 8  # networks in one text
+_NETWORK = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_AT_PORTS = ("tcp", "udp", "tls", "quic", "ws")
+_PROTOCOLS = (*_AT_PORTS, "unixsock-stream", "unixpipe", "serial", "vsock")
+_PORT = re.compile(r".+:([0-9]+)(#.*)?")  # behind # are options of the endpoint: its network interface
+_PORT_MAX = 65_535
+
+
+class ZenohOptions(msgspec.Struct, frozen=True):
+    """A URL, checked. What is None is left to the configuration file, or to zenoh; the network to `chosen`."""
+
+    name: str
+    network: str | None = None
+    mode: str | None = None
+    connect: str | None = None
+    listen: str | None = None
+    scouting: bool | None = None
+    batching: bool = True
+    """Whether several messages may share a payload."""
+    config: Path | None = None
+
+    def error(self, text: str) -> TransportError:
+        """What is wrong with it, in words."""
+        return TransportError(f"{self.name.removesuffix(':')}: {text}")
+
+
+def options_of(url: Url) -> ZenohOptions:
+    """Check a URL. Raises TransportError."""
+    given = url.parsed(_PARSERS)
+    endpoint = url.address or None
+    if endpoint is not None:
+        try:
+            _endpoint_text(endpoint)
+        except ValueError as error:
+            raise TransportError(f"{url}: {error}") from None
+    mode = given.get("mode") or (_default_mode(endpoint, given.get("config")))
+    if mode == "client" and given.get("listen"):
+        raise TransportError(f"{url}: a client listens nowhere: leave out listen=, or use mode=peer or mode=router")
+    config = given.get("config")
+    return ZenohOptions(
+        name=f"{url.scheme}:{url.address}",
+        network=given.get("network"),
+        mode=mode,
+        connect=endpoint,
+        listen=given.get("listen"),
+        scouting=None if "scouting" not in given else given["scouting"] == "on",
+        batching=given.get("batching") != "off",
+        config=None if config is None else Path(config),
+    )
+
+
+def default_network() -> str:
+    """The name of a network that has been given none: the host's, without its domain."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "", socket.gethostname().partition(".")[0]) or "robot"
+
+
+def chosen(found: set[str]) -> str:
+    """The network that a tool joins which was not told one: the host's, or else the only one that there is.
+
+    Raises ValueError where there are several others.
+    """
+    own = default_network()
+    others = sorted(found - {own})
+    if own in found or not others:
+        return own
+    if len(others) > 1:
+        raise ValueError(f"there are the networks {listed(others)}: say which, as ?network={others[0]}")
+    return others[0]
+
+
+def listed(networks: list[str]) -> str:
+    """Networks for a text: the first ones by name, where there are many."""
+    more = len(networks) - _MOST_NAMED
+    return ", ".join(networks[:_MOST_NAMED]) + f" and {more} more" * (more > 0)
+
+
+def is_network_name(text: str) -> bool:
+    """Whether a network can have this name; keys of others may hold anything in its place."""
+    return _NETWORK.fullmatch(text) is not None
+
+
+def _default_mode(endpoint: str | None, config: str | None) -> str | None:
+    if endpoint is not None:
+        return "client"
+    return None if config is not None else "peer"
+
+
+def _one_of(*values: str) -> Callable[[str], str]:
+    def check(text: str) -> str:
+        if text not in values:
+            raise ValueError(f"use one of {', '.join(values)}")
+        return text
+
+    return check
+
+
+def _network_name(text: str) -> str:
+    if not is_network_name(text):
+        raise ValueError("a network's name has 1 to 64 letters, digits, dots, dashes and underscores")
+    return text
+
+
+def _endpoint_text(text: str) -> str:
+    protocol, _, address = text.partition("/")
+    if not address:
+        raise ValueError(f"{text!r} is no zenoh endpoint: give it as tcp/ADDRESS:PORT or tls/ADDRESS:PORT")
+    if protocol not in _PROTOCOLS:
+        raise ValueError(f"{protocol!r} is no protocol of zenoh: use one of {', '.join(_PROTOCOLS)}")
+    if protocol in _AT_PORTS:
+        found = _PORT.fullmatch(address)
+        if found is None:
+            raise ValueError(f"the port is missing: {protocol}/{address}:7447")
+        if int(found[1]) > _PORT_MAX:
+            raise ValueError(f"{found[1]} is no port: the last one is {_PORT_MAX}")
+    return text
+
+
+_PARSERS: dict[str, Callable[[str], str]] = {
+    "mode": _one_of(*MODES),
+    "listen": _endpoint_text,
+    "network": _network_name,
+    "scouting": _one_of("on", "off"),
+    "batching": _one_of("on", "off"),
+    "config": str,
+}
+
+
+# config
+
 
 LEASE_MS = 1000
 """A peer that says nothing for so long is gone: one that hangs is noticed within two seconds."""
@@ -17,7 +157,7 @@ _OURS: dict[str, object] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "connect/exit_on_failure": {"router": False, "peer": False, "client": True},
     "transport/unicast/open_timeout": 3000,
-    "transport/link/tx/queue/size/data": 16,  # batches of 64 kB: what r2p.protocols.flow allows to be on the way fits
+    "transport/link/tx/queue/size/data": 16,  # batches of 64 kB: what flow control allows to be on the way fits
     # Urgent messages are batches of their own: what comes while zenoh's threads do not get to run fits.
     "transport/link/tx/queue/size/interactive_high": 16,
     "transport/link/tx/queue/size/real_time": 16,
@@ -41,7 +181,7 @@ _LISTENS: dict[str, object] = {
 }
 
 
-def config_of(options: Options) -> zenoh.Config:
+def config_of(options: ZenohOptions) -> zenoh.Config:
     """Raises TransportError for a file that zenoh can't read, and for what it does not take."""
     config = _from_file(options)
     try:
@@ -52,7 +192,7 @@ def config_of(options: Options) -> zenoh.Config:
     return config
 
 
-def take_any_port(config: zenoh.Config, options: Options) -> bool:
+def take_any_port(config: zenoh.Config, options: ZenohOptions) -> bool:
     """Listen at any port, as the usual one can't be had. False where a place was asked for, or it was tried already."""
     if not _may_choose(options) or json.loads(config.get_json("listen/endpoints")) != _USUAL:
         return False
@@ -72,7 +212,7 @@ def open_to_all(config: zenoh.Config) -> list[str]:
     return [each for each in way_of(config).listens if not each.startswith(certified) and not _LOOPBACK.match(each)]
 
 
-def way_of(config: zenoh.Config) -> Way:
+def way_of(config: zenoh.Config) -> ConnectionSettings:
     """What it connects to, and with what; and where it listens."""
     tls = json.loads(config.get_json("transport/link/tls"))
     user = json.loads(config.get_json("transport/auth/usrpwd"))
@@ -85,10 +225,10 @@ def way_of(config: zenoh.Config) -> Way:
     connects, listens = (json.loads(config.get_json(f"{what}/endpoints")) for what in ("connect", "listen"))
     if isinstance(listens, dict):
         listens = listens.get(json.loads(config.get_json("mode")) or "peer", [])
-    return Way(_texts(connects), names, user["user"], _texts(listens))
+    return ConnectionSettings(_texts(connects), names, user["user"], _texts(listens))
 
 
-def _from_file(options: Options) -> zenoh.Config:
+def _from_file(options: ZenohOptions) -> zenoh.Config:
     config = zenoh.Config()
     ours = _OURS if options.mode == "client" else _OURS | _LISTENS
     for key, value in ours.items():
@@ -107,7 +247,7 @@ def _from_file(options: Options) -> zenoh.Config:
     return theirs
 
 
-def _stated(options: Options) -> dict[str, object]:
+def _stated(options: ZenohOptions) -> dict[str, object]:
     stated: dict[str, object] = {}
     if options.mode is not None:
         stated["mode"] = options.mode
@@ -122,7 +262,7 @@ def _stated(options: Options) -> dict[str, object]:
     return stated
 
 
-def _may_choose(options: Options) -> bool:
+def _may_choose(options: ZenohOptions) -> bool:
     """Whether it is left to us where to listen."""
     return options.listen is None and options.mode == "peer" and options.config is None
 

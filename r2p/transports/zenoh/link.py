@@ -19,25 +19,20 @@ from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_s
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
-from r2p.protocols.events import Declare, Event, Joined, Look, Parted, Undeclare
-from r2p.protocols.presence import Presence
-from r2p.sample import PublisherClass, Sample, Source
-from r2p.topic import Topic
-from r2p.transports.announce import NOTHING
-from r2p.transports.link import Hub, Link, unique_name
-from r2p.transports.losses import Losses
-from r2p.transports.zenoh.burst import Burst
-from r2p.transports.zenoh.credits import Credits
-from r2p.transports.zenoh.farewells import Farewells
-from r2p.transports.zenoh.outlet import ZenohOutlet
-from r2p.transports.zenoh.reach import Reach
-from r2p.transports.zenoh.senders import Senders
-from r2p.transports.zenoh.session import ErrorOfZenoh, Funnel, Session, Tap
-from r2p.transports.zenoh.stream import RING
-from r2p.transports.zenoh.streams import Streams
-from r2p.transports.zenoh.tokens import Tokens
+from r2p.protocols.discovery.events import Declare, Event, Look, SubscriberJoined, SubscriberLeft, Undeclare
+from r2p.protocols.liveliness.session import TOKENS, LivelinessDiscovery
+from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.topic import Topic
+from r2p.transports.link import NOTHING, Hub, Link, unique_name
+from r2p.transports.receiver import LoggedCounter
+from r2p.transports.zenoh.credit import Credits, FinalCredits, Reachability
+from r2p.transports.zenoh.publish import Batcher, PublisherCache, ZenohSubscriber
+from r2p.transports.zenoh.session import ErrorOfZenoh, LoopQueue, SubscriptionReader, ZenohSession
+from r2p.transports.zenoh.subscribe import RING, RxStreams
 
 if TYPE_CHECKING:
+    import asyncio
+
     import zenoh
 
 _EVENTS = 65_536
@@ -65,10 +60,10 @@ _GUARANTEES = {
 class ZenohLink(Link):
     """One module on one zenoh network."""
 
-    longest: ClassVar[int] = SIZE_MAX
+    max_payload: ClassVar[int] = SIZE_MAX
     send_error: ClassVar[type[Exception]] = ErrorOfZenoh
     """What sending raises when the session is closed."""
-    longest_name: ClassVar[int] = NAMESPACED_MAX
+    max_name: ClassVar[int] = NAMESPACED_MAX
     passes_probes: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool) -> None:
@@ -81,26 +76,28 @@ class ZenohLink(Link):
         self._connects = connects
         self.instance = hub.instance
         name = unique_name(name, hub)
-        presence = Presence(hub.space.module, hub.instance, observer=hub.observer, counts=Losses(name, hub.space.clock))
+        presence = LivelinessDiscovery(
+            hub.space.module, hub.instance, observer=hub.observer, counts=LoggedCounter(name, hub.space.clock)
+        )
         super().__init__(name, hub, discovery=presence)
         self._presence = presence
-        self._session: Session | None = None
-        self._funnels: list[Funnel] = []
+        self._session: ZenohSession | None = None
+        self._funnels: list[LoopQueue] = []
         self._transports: set[str] = set()
-        self._tokens = Tokens(hub.space.loop, self._believed, self._refused)
+        self._tokens = TokenDebouncer(hub.space.loop, self._believed, self._refused)
         self._changes = self._funnel(self._token_changed)
         self._overflown = 0
         self._found = self._funnel(self._token_found, most=_TOKENS_FOUND)
-        self.senders = Senders()
-        self.burst = Burst(hub.space.loop, self.stats, self.send_error, batching=batching)
+        self.senders = PublisherCache()
+        self.burst = Batcher(hub.space.loop, self.stats, self.send_error, batching=batching)
         self.credits = Credits(hub.space.loop, self.stats, self.zenoh_outlets, self._left)
-        self._reach = Reach(self, hub.space.loop)
-        self._farewells = Farewells(hub.space.loop, self.credits.look, self._count_unknown)
-        self._streams = Streams(
+        self._reach = Reachability(self, hub.space.loop)
+        self._farewells = FinalCredits(hub.space.loop, self.credits.look, self._count_unknown)
+        self._streams = RxStreams(
             name,
             hub.space.loop,
             self.stats,
-            longest=self.longest,
+            longest=self.max_payload,
             latched=self.latched,
             credit=self._credit,
             subscribe=self._subscribe,
@@ -109,7 +106,7 @@ class ZenohLink(Link):
 
     # For the transport
 
-    def use(self, session: Session, prefix: str) -> None:
+    def use(self, session: ZenohSession, prefix: str) -> None:
         """There is a session: take part in the network."""
         self._session = session
         self.prefix = prefix
@@ -121,15 +118,15 @@ class ZenohLink(Link):
                 self.senders.declare(self._space.topics[name])
         hexed = f"{self.instance:x}"
         if not self._connects:
-            self.went_up()
+            self.on_up()
         session.watch(self._funnel(self._transport_changed))
         session.watch_tokens(f"{self.prefix}/{liveliness.PLACE}", self._changes)
         session.listen(f"{self.prefix}/control", self._funnel(self._controlled))
         session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema, functools.partial(self._funnel, most=_QUERIES))
         self.credits.connect(session, f"{self.prefix}/credit/{hexed}")
 
-    def _funnel(self, take: Callable[[Any], None], most: int = _EVENTS) -> Funnel:
-        funnel = Funnel(self._space.loop, take, self.stats.lost, most=most)
+    def _funnel(self, take: Callable[[Any], None], most: int = _EVENTS) -> LoopQueue:
+        funnel = LoopQueue(self._space.loop, take, self.stats.lost, most=most)
         self._funnels.append(funnel)
         return funnel
 
@@ -161,7 +158,7 @@ class ZenohLink(Link):
 
     def discard(self) -> int:
         for outlet in self._outlets.values():
-            outlet.room().refuse_all("link down")
+            outlet.wait_queue().reject_all("link down")
         return self.burst.discard()
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
@@ -207,7 +204,7 @@ class ZenohLink(Link):
 
     def close(self) -> None:
         self.burst.flush()
-        self._tokens.went_down()
+        self._tokens.on_down()
         super().close()
         self._reach.close()
         self._farewells.close()
@@ -229,9 +226,9 @@ class ZenohLink(Link):
                     self._session.undeclare(f"{self.prefix}/{liveliness.place(key)}")
             case Look():
                 self._look()
-            case Joined(topic, _, window, int(session)):
+            case SubscriberJoined(topic, _, window, int(session)):
                 self._welcome(topic, session, window)
-            case Parted(topic, int(session), gone):
+            case SubscriberLeft(topic, int(session), gone):
                 self._part(topic, session, gone=gone)
             case _:
                 super()._act(event)
@@ -270,10 +267,10 @@ class ZenohLink(Link):
         outlet = self._outlet(name)
         if outlet is not None and outlet.topic is topic:
             outlet.joined(session, window)
-            outlet.welcome()
+            outlet.resend_latched()
         else:
             self.burst.flush()  # of an outlet before it, with whose numbers it goes on
-            outlet = self._outlets[name] = ZenohOutlet(self, topic)
+            outlet = self._outlets[name] = ZenohSubscriber(self, topic)
             outlet.joined(session, window)
             topic.join(outlet)
         if leaving:
@@ -292,12 +289,12 @@ class ZenohLink(Link):
         """Whether this module has anything to do with a topic."""
         return topic in self._space.topics
 
-    def zenoh_outlets(self) -> Iterator[ZenohOutlet]:
-        return (each for each in self._outlets.values() if isinstance(each, ZenohOutlet))
+    def zenoh_outlets(self) -> Iterator[ZenohSubscriber]:
+        return (each for each in self._outlets.values() if isinstance(each, ZenohSubscriber))
 
-    def _outlet(self, name: str) -> ZenohOutlet | None:
+    def _outlet(self, name: str) -> ZenohSubscriber | None:
         outlet = self._outlets.get(name)
-        return outlet if isinstance(outlet, ZenohOutlet) else None
+        return outlet if isinstance(outlet, ZenohSubscriber) else None
 
     # For outlets and streams
 
@@ -311,7 +308,7 @@ class ZenohLink(Link):
         found = (each.discovery.modules.get(module) for each in links)
         return next((info.instance for info in found if info is not None and info.instance is not None), 0)
 
-    def _subscribe(self, topic: str, arrived: Callable[["zenoh.Sample"], None]) -> "Tap | None":
+    def _subscribe(self, topic: str, arrived: Callable[["zenoh.Sample"], None]) -> "SubscriptionReader | None":
         if self._session is None:
             return None
         return self._session.subscribe(f"{self.prefix}/topic/{topic}", RING, arrived)
@@ -330,21 +327,21 @@ class ZenohLink(Link):
         if opened:
             self._transports.add(other)
             if not self.up:
-                self.went_up()
+                self.on_up()
         else:
             self._transports.discard(other)
             if not self._transports:
-                self.went_down("the connection is lost")
+                self.on_down("the connection is lost")
 
-    def went_up(self) -> None:
+    def on_up(self) -> None:
         self._streams.resumed()
-        super().went_up()
-        self._tokens.went_up()
+        super().on_up()
+        self._tokens.on_up()
 
-    def went_down(self, reason: str) -> None:
-        self._tokens.went_down()
+    def on_down(self, reason: str) -> None:
+        self._tokens.on_down()
         self._streams.interrupted()
-        super().went_down(reason)
+        super().on_down(reason)
 
     def _token_changed(self, change: tuple[str, bool]) -> None:
         if self._closed:
@@ -394,3 +391,91 @@ class ZenohLink(Link):
         else:
             if sender != self.instance and self.up:
                 self.manage(data, sender)
+
+
+# When the tokens of others are believed: not while the link is down, and not that they went for a moment.
+
+
+_SETTLE = 0.02
+"""Seconds after which a token that went is believed to: when the network goes, tokens go a moment before it."""
+
+
+class TokenDebouncer:
+    """The tokens of a link as zenoh tells of them; `believed(key, there)` gets what is to be taken for true, and
+    `refused` is called for each that has no room before the link is up.
+    """
+
+    def __init__(
+        self,
+        loop: "asyncio.AbstractEventLoop",
+        believed: Callable[[str, bool], None],
+        refused: Callable[[], None],
+    ) -> None:
+        self._loop = loop
+        self._believed = believed
+        self._refused = refused
+        self._up = False
+        self._early: dict[str, None] = {}
+        self._going: dict[str, asyncio.TimerHandle] = {}
+        self._went: set[str] | None = None  # during a look: answers about these may be older than their end
+
+    def changed(self, key: str, there: bool) -> None:
+        """A token came or went."""
+        if not self._up:
+            self._changed_early(key, there)
+        elif there:
+            timer = self._going.pop(key, None)
+            if timer is not None:  # it has not gone
+                timer.cancel()
+            else:
+                self._believed(key, True)
+        elif key not in self._going:
+            self._going[key] = self._loop.call_later(_SETTLE, self._gone, key)
+            self._note_end(key)
+
+    def look(self) -> None:
+        """All tokens are asked for: what goes from now on is newer than the answers."""
+        self._went = set(self._going)
+
+    def found(self, key: str) -> None:
+        """A token is among the answers."""
+        if self._went is not None and key not in self._went:
+            self._believed(key, True)
+
+    def looked(self) -> bool:
+        """All answers have come. Says whether they could be used."""
+        usable, self._went = self._went is not None, None
+        return usable
+
+    def on_up(self) -> None:
+        """The link is up: what came before is there."""
+        self._up = True
+        early, self._early = self._early, {}
+        for key in early:
+            self._believed(key, True)
+
+    def on_down(self) -> None:
+        """It is down, or closed: nothing that goes now has gone by itself."""
+        self._up = False
+        self._went = None
+        for timer in self._going.values():
+            timer.cancel()
+        self._going.clear()
+
+    def _changed_early(self, key: str, there: bool) -> None:
+        if not there:
+            self._early.pop(key, None)
+        elif key in self._early or len(self._early) < TOKENS:
+            self._early[key] = None
+        else:
+            self._refused()
+
+    def _note_end(self, key: str) -> None:
+        if self._went is not None:
+            self._went.add(key)
+            if len(self._went) > TOKENS:  # too many to remember: the answers are of no use
+                self._went = None
+
+    def _gone(self, key: str) -> None:
+        del self._going[key]
+        self._believed(key, False)

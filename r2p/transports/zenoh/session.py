@@ -20,11 +20,10 @@ from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from r2p.codecs import liveliness
 from r2p.errors import TransportError
-from r2p.transports.intake import TURN
-from r2p.transports.losses import Losses
+from r2p.transports.receiver import TURN, LoggedCounter
 from r2p.transports.zenoh import threads
-from r2p.transports.zenoh.options import is_network_name
-from r2p.transports.zenoh.outbound import Outbound
+from r2p.transports.zenoh.config import is_network_name
+from r2p.transports.zenoh.threads import OutboundThread
 
 T = TypeVar("T")
 
@@ -41,11 +40,11 @@ class Unreachable(Exception):
     """Nobody to connect to, for now."""
 
 
-class Funnel:
+class LoopQueue:
     """The way from zenoh's threads into the loop: what they put in comes out of `take`, in order."""
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, take: Callable[[Any], None], lost: Losses, *, most: int
+        self, loop: asyncio.AbstractEventLoop, take: Callable[[Any], None], lost: LoggedCounter, *, most: int
     ) -> None:
         self._loop = loop
         self._take = take
@@ -81,7 +80,7 @@ class Funnel:
             self._loop.call_soon(self._empty)
 
 
-class Tap:
+class SubscriptionReader:
     """A subscription. A thread waits for samples, and hands them to the loop; when that falls behind, the thread rests,
     and the loop takes what else there is by itself, without a switch of threads for each.
     """
@@ -162,10 +161,10 @@ class Tap:
             self.wait()
 
 
-async def open_session(config: zenoh.Config) -> "Session":
+async def open_session(config: zenoh.Config) -> "ZenohSession":
     """Open it in a thread. Raises Unreachable where it may work later, TransportError where it can't."""
     try:
-        return Session(await _in_thread(lambda: zenoh.open(config), _close))
+        return ZenohSession(await _in_thread(lambda: zenoh.open(config), _close))
     except zenoh.ZError as error:
         text = _plain(error)
         if text.startswith("Unable to connect"):
@@ -173,18 +172,18 @@ async def open_session(config: zenoh.Config) -> "Session":
         raise TransportError(text) from error
 
 
-class Session:
+class ZenohSession:
     """An open session, as the loop sees it. Declarations last until they are undeclared, or the session is closed."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
-        self.outbound = Outbound(asyncio.get_running_loop())
+        self.outbound = OutboundThread(asyncio.get_running_loop())
         self._kept: list[Any] = []
         self._publishers: set[zenoh.Publisher] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._watched = 0
 
-    def watch(self, funnel: Funnel) -> None:
+    def watch(self, funnel: LoopQueue) -> None:
         """Tell of each transport, those that are there included: (id, whether it opened)."""
 
         def changed(event: zenoh.TransportEvent) -> None:
@@ -193,7 +192,7 @@ class Session:
         events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_AT_ONCE)
         self._hear(self._session.info.declare_transport_events_listener(events, history=True), changed, funnel)
 
-    def watch_tokens(self, prefix: str, funnel: Funnel) -> None:
+    def watch_tokens(self, prefix: str, funnel: LoopQueue) -> None:
         """Tell of each token under a prefix, also those that are there: (rest of its key, whether it is there)."""
         start = len(prefix) + 1
 
@@ -207,7 +206,7 @@ class Session:
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
         self._hear(declared, changed, funnel)
 
-    def look_for_tokens(self, prefix: str, timeout: float, funnel: Funnel) -> None:
+    def look_for_tokens(self, prefix: str, timeout: float, funnel: LoopQueue) -> None:
         """Ask for the tokens under a prefix that is watched: the rest of each key, and at last whether these are all.
 
         A thread waits for them, not that of `outbound`: it may take seconds where there are many.
@@ -239,7 +238,7 @@ class Session:
 
         threads.start(look)
 
-    def listen(self, key: str, funnel: Funnel) -> None:
+    def listen(self, key: str, funnel: LoopQueue) -> None:
         """Tell of each message: (its attachment, payload), either of them empty if it is longer than any of ours.
 
         A key without a wildcard: of each session that is closed, zenoh keeps 3 kB for ever in the router if it has
@@ -254,7 +253,7 @@ class Session:
         self._hear(declared, arrived, funnel)
 
     def serve(
-        self, key: str, answer: Callable[[str], bytes | None], funnel_to: Callable[[Callable[[Any], None]], Funnel]
+        self, key: str, answer: Callable[[str], bytes | None], funnel_to: Callable[[Callable[[Any], None]], LoopQueue]
     ) -> None:
         """Answer queries: `answer` gives, in the loop, the payload for a key. `funnel_to` makes a way into the loop."""
 
@@ -270,7 +269,7 @@ class Session:
         queries: FifoChannel[zenoh.Query] = FifoChannel(_AT_ONCE)
         self._hear(self._session.declare_queryable(key, queries), funnel.put, funnel)
 
-    def _hear(self, declared: Any, heard: Callable[[Any], object], funnel: Funnel) -> None:
+    def _hear(self, declared: Any, heard: Callable[[Any], object], funnel: LoopQueue) -> None:
         """Call it, in a thread, with each item that comes; it puts that into the funnel."""
 
         def listen() -> None:
@@ -288,14 +287,16 @@ class Session:
         self._kept.append(declared)
         threads.start(listen)
 
-    def subscribe(self, key: str, most: int, arrived: Callable[[zenoh.Sample], None]) -> "Tap":
+    def subscribe(self, key: str, most: int, arrived: Callable[[zenoh.Sample], None]) -> "SubscriptionReader":
         """Tell in the loop of the first sample that comes; the ones behind it are there to be taken out of the tap.
 
         Of more than `most` that wait, the oldest are lost.
         """
         loop = asyncio.get_running_loop()
         handler: RingChannel[zenoh.Sample] = RingChannel(most)
-        return Tap(self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE), loop, arrived)
+        return SubscriptionReader(
+            self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE), loop, arrived
+        )
 
     def publisher(self, key: str, publisher_class: int) -> zenoh.Publisher:
         """What sends on a key as the class deserves. Never BLOCK: that would stop the loop, not the publisher."""

@@ -5,17 +5,17 @@ import importlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from r2p.backoff import Backoff
+from r2p.clock import Backoff
 from r2p.errors import TransportError
 from r2p.transports.link import Hub, Transport
-from r2p.transports.zenoh.options import Options, chosen, default_network, listed
-from r2p.transports.zenoh.trouble import NOT_US, why, why_not_listening
+from r2p.transports.zenoh.config import ZenohOptions, chosen, default_network, listed
+from r2p.transports.zenoh.diagnose import NOT_US, why, why_not_listening
 
 if TYPE_CHECKING:
     import zenoh
 
     from r2p.transports.zenoh.link import ZenohLink
-    from r2p.transports.zenoh.session import Session
+    from r2p.transports.zenoh.session import ZenohSession
 
 _SCOUTING = 0.5
 """Seconds in which peers find each other."""
@@ -38,7 +38,7 @@ _RARELY = 60.0
 class ZenohTransport(Transport):
     """`zenoh:[ENDPOINT]`."""
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: ZenohOptions) -> None:
         self._options = options
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
@@ -73,7 +73,7 @@ class ZenohTransport(Transport):
 
     async def _open(
         self, config: "zenoh.Config", link: "ZenohLink", backoff: Backoff, opened: Callable[[], object]
-    ) -> "Session":
+    ) -> "ZenohSession":
         from r2p.transports.zenoh.config import take_any_port, way_of
         from r2p.transports.zenoh.session import Unreachable, open_session
 
@@ -90,7 +90,7 @@ class ZenohTransport(Transport):
                 link.unreachable(await why(way_of(config)))
                 await asyncio.sleep(backoff.delay())
 
-    async def _network(self, session: "Session", hub: Hub) -> str:
+    async def _network(self, session: "ZenohSession", hub: Hub) -> str:
         """Its name. A tool looks which there are; a robot's program must not depend on who came first."""
         if self._options.network is not None or not hub.observer:
             return self._options.network or default_network()
@@ -105,7 +105,7 @@ class ZenohTransport(Transport):
         except ValueError as error:
             raise self._options.error(str(error)) from error
 
-    async def _tell_addresses(self, session: "Session", link: "ZenohLink", hub: Hub, exposed: list[str]) -> None:
+    async def _tell_addresses(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, exposed: list[str]) -> None:
         """Where it takes connections. That it does not ask of whom is no news for the user of a tool."""
         addresses = await session.listening() if self._options.listen is not None or exposed else []
         if self._options.listen is not None:
@@ -135,7 +135,7 @@ class ZenohTransport(Transport):
             if not link.up:
                 link.unreachable(reason)
 
-    async def _look_around(self, session: "Session", link: "ZenohLink", hub: Hub, network: str) -> None:
+    async def _look_around(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, network: str) -> None:
         """Until somebody else is on the network: say once on which networks there are others."""
         pause = _TOOL_ALONE if hub.observer else _ALONE
         while True:
@@ -151,7 +151,7 @@ class ZenohTransport(Transport):
                 return
             pause = min(2 * pause, _RARELY)
 
-    async def _others(self, session: "Session", link: "ZenohLink", network: str) -> list[str]:
+    async def _others(self, session: "ZenohSession", link: "ZenohLink", network: str) -> list[str]:
         try:
             return sorted(await session.networks(tools=False) - {network}) if link.up else []
         except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows

@@ -10,8 +10,18 @@ from typing import Any, TypeVar
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import INTERMISSION, Frame
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import NEVER, Action, Due, Mailbox, Outcome, Ready, Received, Transmit, Withdraw
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import (
+    NEVER,
+    Action,
+    Due,
+    EngineSettings,
+    Mailbox,
+    Outcome,
+    Ready,
+    Received,
+    Transmit,
+    Withdraw,
+)
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -25,7 +35,7 @@ class Node:
     Its computer hands a frame over `late` ns after its time.
     """
 
-    def __init__(self, bus: "Bus", settings: Settings, *, offset: int, ppm: int, one_shot: bool) -> None:
+    def __init__(self, bus: "Bus", settings: EngineSettings, *, offset: int, ppm: int, one_shot: bool) -> None:
         self.engine = Engine(settings)
         self.alive = True
         self.one_shot = one_shot
@@ -91,7 +101,7 @@ class Bus:
 
     def add(self, *, offset: int = 0, ppm: int = 0, one_shot: bool = True, **settings: Any) -> Node:
         settings.setdefault("number", 0x1234_5678_9ABC_DEF1 * (len(self.nodes) + 1) & (1 << 64) - 1)
-        node = Node(self, Settings(**settings), offset=offset, ppm=ppm, one_shot=one_shot)
+        node = Node(self, EngineSettings(**settings), offset=offset, ppm=ppm, one_shot=one_shot)
         self.nodes.append(node)
         return node
 

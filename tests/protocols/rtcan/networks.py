@@ -5,13 +5,7 @@ from typing import Any
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import (
-    Due,
-    Outcome,
-    Profile,
-    Transmit,
-)
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import Due, EngineSettings, Outcome, Profile, Transmit
 from tests.protocols.rtcan.bus import SECOND, Bus, Node
 
 CYCLE = 9_960_000
@@ -66,7 +60,7 @@ def counted(node: Node, size: int = 8) -> list[bytes]:
 
 def ready_engine(**settings: Any) -> tuple[Engine, int]:
     """An engine that is ready, without a bus, and has nothing to say for the next second."""
-    engine = Engine(Settings(number=1 << 40, id8=10, profile=Profile.RTCAN, **settings))
+    engine = Engine(EngineSettings(number=1 << 40, id8=10, profile=Profile.RTCAN, **settings))
     actions = list(engine.start(0))
     while (at := engine.next_deadline()) is not None and at < 2 * SECOND:
         actions = list(engine.poll(at))

@@ -3,7 +3,7 @@
 import pytest
 
 from r2p.codecs import rtcan
-from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, Alignment, Cycle, State, following, timing
+from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, Alignment, Cycle, CycleState, following, timing
 from tests.can_vectors import CanCase, can_cases
 
 TIMING = timing()
@@ -32,7 +32,7 @@ def test_the_timing_of_the_thesis() -> None:
 def test_the_reference_is_the_start_of_frame_whatever_the_stuffing(mask: int) -> None:
     cycle = slave()
     assert heard(cycle, START, 200, mask) is Alignment.STARTED
-    assert (cycle.reference, cycle.counter, cycle.mask, cycle.state) == (START, 200, mask, State.FOLLOWING)
+    assert (cycle.reference, cycle.counter, cycle.mask, cycle.state) == (START, 200, mask, CycleState.FOLLOWING)
     assert cycle.slot_at(START + 166_000) == 1
     assert cycle.slot_at(START + 165_999) == 0
     assert cycle.start_of(6) == START + 996_000
@@ -75,7 +75,7 @@ def test_missed_syncs_are_bridged_for_three_cycles() -> None:
     cycle.anchor(255)
     for n in range(1, HOLDOVER + 1):
         assert cycle.roll()
-        assert cycle.state is State.HOLDING
+        assert cycle.state is CycleState.HOLDING
         assert (cycle.counter, cycle.reference, cycle.mask) == (255 + n, START + n * TIMING.cycle, None)
     assert not cycle.roll()
     assert not cycle.running
@@ -89,7 +89,7 @@ def test_resynchronised_after_missed_syncs() -> None:
     cycle.roll()
     cycle.roll()
     assert heard(cycle, START + 3 * TIMING.cycle + 90, 2, 0b100) is Alignment.ALIGNED
-    assert (cycle.counter, cycle.missed, cycle.mask, cycle.state) == (258, 0, 0b100, State.FOLLOWING)
+    assert (cycle.counter, cycle.missed, cycle.mask, cycle.state) == (258, 0, 0b100, CycleState.FOLLOWING)
     assert cycle.measured() == (TIMING.cycle + 30, 60)
 
 

@@ -7,27 +7,11 @@ import pytest
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
-from r2p.protocols.rtcan.election import Role
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import (
-    Action,
-    Done,
-    Fate,
-    LostSync,
-    Profile,
-    Received,
-)
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import Action, Done, EngineSettings, Fate, LostSync, Profile, Received
+from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus
-from tests.protocols.rtcan.networks import (
-    SLOT,
-    TOPIC,
-    counted,
-    firmware_management,
-    network,
-    publish,
-    syncs,
-)
+from tests.protocols.rtcan.networks import SLOT, TOPIC, counted, firmware_management, network, publish, syncs
 
 
 def test_a_network_of_firmware_is_recognised_and_management_waits_for_silence() -> None:
@@ -87,7 +71,7 @@ def test_management_reaches_everybody_and_stop_goes_first() -> None:
 def test_filters_let_through_what_is_needed() -> None:
     bus = Bus()
     a, b = network(bus, 1, 0)
-    assert Engine(Settings(number=1)).filters() == [(0, 0)]
+    assert Engine(EngineSettings(number=1)).filters() == [(0, 0)]
     message = rtcan.message_id(TOPIC, 10)
     b.engine.subscribe(message, 8)
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r2p.protocols.rtcan.election import Role
 from r2p.protocols.rtcan.events import Received
+from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import CYCLE, SLOT, counted, is_sync, network, publish, syncs
 

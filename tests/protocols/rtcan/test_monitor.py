@@ -8,7 +8,7 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import INTERMISSION, Frame, OtherFrame
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.events import Granted
-from r2p.protocols.rtcan.monitor import FrameKind, Monitor, SeenFrame, Tally
+from r2p.protocols.rtcan.monitor import FrameKind, Monitor, SeenFrame, TrafficCount
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import CYCLE, TOPIC, counted, network, publish
 
@@ -254,5 +254,5 @@ def test_frames_that_rtcan_does_not_use_are_counted_as_other_ones() -> None:
     ]
     load = monitor.load(SECOND)
     bits = sum(rtcan.other_frame_bits(frame) + INTERMISSION for frame in frames)
-    assert load.tallies == {("", "", FrameKind.OTHER): Tally(3, bits)}
+    assert load.tallies == {("", "", FrameKind.OTHER): TrafficCount(3, bits)}
     assert load.total == bits * BIT / SECOND

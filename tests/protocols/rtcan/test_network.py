@@ -6,7 +6,6 @@ import pytest
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
-from r2p.protocols.rtcan.election import Role
 from r2p.protocols.rtcan.events import (
     Action,
     Degraded,
@@ -18,11 +17,12 @@ from r2p.protocols.rtcan.events import (
     Mailbox,
     NewMaster,
     Outcome,
+    ParameterMismatch,
+    ParametersMatch,
     Ready,
-    Silenced,
-    Unsilenced,
     Withdraw,
 )
+from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import (
     CYCLE,
@@ -278,12 +278,12 @@ def test_a_node_with_other_parameters_does_not_transmit() -> None:
     other = bus.add(id8=20, slots=50)
     bus.start(other)
     bus.run(3 * SECOND)
-    (silenced,) = other.of(Silenced)
+    (silenced,) = other.of(ParameterMismatch)
     assert silenced.reason == "the network has 60 slots of 166 us, this node 50 of 200 us"
     assert not any(node is other for _, _, node in bus.sent)
     bus.kill(master)
     bus.run(5 * SECOND)
-    assert other.of(Unsilenced)
+    assert other.of(ParametersMatch)
     assert any(node is other for _, _, node in bus.sent)
 
 
@@ -299,7 +299,7 @@ def test_a_master_that_sends_no_network_is_believed_by_its_cycle() -> None:
     bus.start(node)
     bus.run(5 * SECOND)
     assert NewMaster(None, 0, False) in node.of(NewMaster)
-    assert "this node's 10000 us" in other.of(Silenced)[0].reason
+    assert "this node's 10000 us" in other.of(ParameterMismatch)[0].reason
     begin = bus.now
     publish(node, TOPIC, b"x", 50 * MS)
     bus.run(50 * MS)
@@ -314,7 +314,7 @@ def test_a_cycle_of_the_same_length_does_not_make_up_for_other_slots() -> None:
     bus.start(other)
     bus.run(6 * SECOND)
     assert other.engine.timing.cycle == CYCLE
-    assert [each.reason for each in other.of(Silenced)] == [
+    assert [each.reason for each in other.of(ParameterMismatch)] == [
         "the network has 60 slots of 166 us, this node 30 of 332 us"
     ]
     assert [each.id8 for each in other.of(NewMaster)] in ([], [10])

@@ -6,8 +6,8 @@ from r2p.codecs import rtcan
 from r2p.codecs.management import NETWORK
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.cycle import Cycle, timing
-from r2p.protocols.rtcan.election import Role
 from r2p.protocols.rtcan.events import LostSync, NewMaster
+from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import CYCLE, is_sync, network
 

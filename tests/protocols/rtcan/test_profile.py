@@ -7,9 +7,8 @@ import pytest
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import NEVER, Profile, Received
-from r2p.protocols.rtcan.profile import QUIET, Detector, Pacer
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import NEVER, EngineSettings, Profile, Received
+from r2p.protocols.rtcan.network import QUIET, Detector, RateLimiter
 
 MS = 1_000_000
 STOP = management.encode(management.Stop("PC1"))
@@ -45,7 +44,7 @@ def test_where_there_are_sync_frames_it_is_no_network_of_firmware_alone() -> Non
 
 
 def test_it_speaks_when_it_is_quiet_and_a_random_time_later() -> None:
-    pacer = Pacer(lambda below: below - 1, Counter())
+    pacer = RateLimiter(lambda below: below - 1, Counter())
     assert pacer.due == NEVER
     pacer.traffic(100 * MS)
     pacer.put(b"a")
@@ -66,7 +65,7 @@ def test_it_speaks_when_it_is_quiet_and_a_random_time_later() -> None:
 
 def test_it_is_bounded() -> None:
     counts: Counter[str] = Counter()
-    pacer = Pacer(lambda below: 0, counts)
+    pacer = RateLimiter(lambda below: 0, counts)
     for n in range(70):
         pacer.put(bytes([n]))
     assert counts == {"management dropped": 6}
@@ -84,7 +83,7 @@ def hear(engine: Engine, now: int, laxities: list[int], payload: bytes = STOP, m
 
 
 def engine_of(profile: Profile) -> Engine:
-    engine = Engine(Settings(number=1 << 40, id8=10, profile=profile))
+    engine = Engine(EngineSettings(number=1 << 40, id8=10, profile=profile))
     engine.start(0)
     return engine
 
@@ -125,7 +124,7 @@ def test_a_master_does_not_take_the_end_of_management_for_a_foreign_sync() -> No
 
 def test_urgent_ones_keep_their_order_and_are_the_last_to_be_dropped() -> None:
     counts: Counter[str] = Counter()
-    pacer = Pacer(lambda below: 0, counts)
+    pacer = RateLimiter(lambda below: 0, counts)
     pacer.put(b"later", handle="later")
     orders = [bytes([n]) for n in range(64)]
     assert [pacer.put(order, urgent=True, handle=order) for order in orders] == [*[None] * 63, "later"]

@@ -7,11 +7,10 @@ import pytest
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.calendar import Reservation
-from r2p.protocols.rtcan.election import Role
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Action, Due, Outcome, Profile, Transmit
-from r2p.protocols.rtcan.periodic import Periodic
-from r2p.protocols.rtcan.settings import Settings
+from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Outcome, Profile, Transmit
+from r2p.protocols.rtcan.master import Role
+from r2p.protocols.rtcan.plan import PeriodicMessage
 from tests.can_vectors import CanCase, arriving, can_cases, payload
 
 MS = 1_000_000
@@ -33,7 +32,7 @@ class Master:
         self.frames: list[tuple[int, int, Frame]] = []  # cycle, slot, frame
         messages = [step.words for step in case.steps if step.verb in ("hrt", "msg")]
         id8 = int(messages[0][1], 0) & 0xFF if messages else 0x28
-        settings = Settings(
+        settings = EngineSettings(
             number=1, id8=id8, priority=1, profile=Profile.RTCAN, slots=self.slots, cycle=self.slots * SLOT, listen=0
         )
         self.engine = Engine(settings)
@@ -50,7 +49,7 @@ class Master:
         high = rtcan.high_byte(int(message, 0))
         self.data[high] = payload(data)
         size = len(self.data[high])
-        periodic = Periodic(high, int(message, 0), size, rtcan.fragment_count(size), 0, 0, None)
+        periodic = PeriodicMessage(high, int(message, 0), size, rtcan.fragment_count(size), 0, 0, None)
         periodic.reservation = Reservation(periodic.message, int(period), int(slot), periodic.fragments)
         periodic.active, periodic.from_cycle = True, 1
         self.engine._core.periodics[high] = periodic
@@ -175,7 +174,7 @@ def test_recorded_syncs_at_a_slave(case: CanCase) -> None:
     """The original needs many syncs to learn the length of a cycle; we know it, and follow from the first one on."""
     words = {step.verb: step.words for step in case.steps}
     slots = int(words["start"][1])
-    engine = Engine(Settings(number=1, slots=slots, cycle=slots * SLOT))
+    engine = Engine(EngineSettings(number=1, slots=slots, cycle=slots * SLOT))
     engine.start(0)
     now = 0
     for step in case.steps:
@@ -189,7 +188,7 @@ def test_recorded_syncs_at_a_slave(case: CanCase) -> None:
 
 def test_recorded_frames_with_high_byte_0_are_sync_only_with_laxity_0() -> None:
     (case,) = (each for each in can_cases("hrt-slave") if each.name == "slave_id_highbyte0_is_sync")
-    engine = Engine(Settings(number=1, slots=4, cycle=4 * SLOT))
+    engine = Engine(EngineSettings(number=1, slots=4, cycle=4 * SLOT))
     engine.start(0)
     *syncs, no_sync, soft = [arriving(step) for step in case.steps if step.verb == "frame"]
     for n, frame in enumerate(syncs):

@@ -12,18 +12,22 @@ from typing import TYPE_CHECKING
 import pytest
 
 from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
-from r2p.sim.modules.gateway import GatewayModule
+from r2p.sim.modules.boards import (
+    GatewayModule,
+    IoModule,
+    MotorConfig,
+    MotorModule,
+    Pins,
+    PowerModule,
+    ProximityModule,
+    leds,
+    sample,
+)
 from r2p.sim.modules.imu import ImuModule, InertialUnit, Motion
-from r2p.sim.modules.input_output import IoModule, Pins, leds, sample
-from r2p.sim.modules.motor import MotorConfig, MotorModule
 from r2p.sim.modules.plant import Plant
-from r2p.sim.modules.power_supply import PowerModule
-from r2p.sim.modules.proximity import ProximityModule
-from r2p.sim.physics.battery import Battery as Cells
-from r2p.sim.physics.drive import Drive
-from r2p.sim.physics.motor import Axle, Motor, MotorSpec
-from r2p.sim.physics.pid import Gains, speed_gains, step_response
-from r2p.sim.physics.rangefinder import NOTHING
+from r2p.sim.physics.motor import Axle, Drive, Gains, Motor, MotorSpec, speed_gains, step_response
+from r2p.sim.physics.motor import Battery as Cells
+from r2p.sim.physics.world import NOTHING
 
 if TYPE_CHECKING:
     import r2p

@@ -6,17 +6,19 @@ import statistics
 
 import pytest
 
-from r2p.sim.physics.attitude import ComplementaryFilter, to_body, to_world
 from r2p.sim.physics.inertial import (
     ACCELEROMETER,
     GYROSCOPE,
     MAGNETOMETER,
     Barometer,
+    ComplementaryFilter,
     MemsSensor,
     MemsSpec,
     Vector,
     altitude_at,
     pressure_at,
+    to_body,
+    to_world,
 )
 
 DT = 1e-3

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from r2p.sim.physics.motor import Axle, Motor, MotorSpec
-from r2p.sim.physics.pid import Gains, Pid, speed_gains, step_response
+from r2p.sim.physics.motor import Axle, Gains, Motor, MotorSpec, Pid, speed_gains, step_response
 
 DT = 1e-4
 LOAD = 0.03  # kg m^2 at the wheel

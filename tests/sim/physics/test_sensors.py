@@ -6,9 +6,8 @@ import statistics
 
 import pytest
 
-from r2p.sim.physics.battery import Battery, BatterySpec
-from r2p.sim.physics.rangefinder import NOTHING, RangeFinder, RangeSpec
-from r2p.sim.physics.world import World
+from r2p.sim.physics.motor import Battery, BatterySpec
+from r2p.sim.physics.world import NOTHING, RangeFinder, RangeSpec, World
 
 
 def test_a_battery_empties_with_the_charge_that_it_gives() -> None:

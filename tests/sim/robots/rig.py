@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     import r2p
+    from r2p.runtime.subscriber import Subscriber
     from r2p.sim.robots.emulated import Triskar2
-    from r2p.subscriber import Subscriber
 
 WAIT = 5.0
 """Seconds that networks get to find themselves."""

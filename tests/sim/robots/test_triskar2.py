@@ -23,7 +23,7 @@ from r2p.transports.memory import network
 from tests.sim.robots.rig import WAIT, lap_time, odometry_of, until_at_rest, until_driving
 
 if TYPE_CHECKING:
-    from r2p.transports.memory import Frame
+    from r2p.transports.memory import Datagram
 
 pytestmark = pytest.mark.virtual_time
 
@@ -90,12 +90,12 @@ async def turn(node: r2p.Node) -> None:
         await commands.publish(Velocity3(x=0.2, y=-0.2, w=0.5))
 
 
-async def recorded(seed: int, monkeypatch: pytest.MonkeyPatch) -> list[Frame]:
+async def recorded(seed: int, monkeypatch: pytest.MonkeyPatch) -> list[Datagram]:
     """All that is on the network in five seconds of a drive."""
-    frames: list[Frame] = []
+    frames: list[Datagram] = []
     send = network("robot").send
 
-    def record(frame: Frame) -> None:
+    def record(frame: Datagram) -> None:
         frames.append(frame)
         send(frame)
 

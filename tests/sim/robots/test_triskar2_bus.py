@@ -21,7 +21,7 @@ from r2p.sim.robots.square import square
 from tests.sim.robots.rig import WAIT, odometry_of, until_at_rest, until_driving
 
 if TYPE_CHECKING:
-    from r2p.sim.can import Record
+    from r2p.sim.can import FrameRecord
     from r2p.sim.physics.omni import Triple
 
 pytestmark = pytest.mark.virtual_time
@@ -90,7 +90,7 @@ async def run(traffic: Traffic, *, loaded: bool, seconds: float = 8.0) -> Run:
     starts: list[int] = []
     errors: list[float] = []
 
-    def see(record: Record) -> None:
+    def see(record: FrameRecord) -> None:
         if record.error is None and record.frame.id >> 23 == rtcan.HRT:
             starts.append(record.start)
 
@@ -150,9 +150,9 @@ async def test_a_minute_of_squares() -> None:
         assert math.hypot(x, y) < 0.03 * path
 
 
-async def recorded(seed: int) -> list[Record]:
+async def recorded(seed: int) -> list[FrameRecord]:
     """All frames of five seconds of a drive, with their times."""
-    frames: list[Record] = []
+    frames: list[FrameRecord] = []
     bus = sim.can_bus("robot")  # it lives as long as it is held
     bus.bus.observers.append(frames.append)
     world = World([((0.6, -5.0), (0.6, 5.0)), ((-0.6, -5.0), (-0.6, 5.0))])  # something to see

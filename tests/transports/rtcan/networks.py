@@ -8,7 +8,7 @@ import r2p
 from r2p.codecs import rtcan
 from r2p.protocols.rtcan.events import Profile
 from r2p.sim import SimCan
-from r2p.sim.can import Record
+from r2p.sim.can import FrameRecord
 from r2p.sim.transport import DEFAULTS
 from r2p.testing.network import node_in
 from r2p.transports.rtcan.link import RtcanLink
@@ -32,7 +32,7 @@ class Lab:
 
     def __init__(self, **options: object) -> None:
         self.can = SimCan(seed=1, **options)  # type: ignore[arg-type]
-        self.frames: list[Record] = []
+        self.frames: list[FrameRecord] = []
         self.can.bus.observers.append(self.frames.append)
         self._modules: dict[str, r2p.Module] = {}
 
@@ -55,7 +55,7 @@ class Lab:
     def host(self, module: str) -> r2p.Module:
         return self._modules[module]
 
-    def sent(self, accept: Callable[[rtcan.Identifier], bool], module: str = "") -> list[Record]:
+    def sent(self, accept: Callable[[rtcan.Identifier], bool], module: str = "") -> list[FrameRecord]:
         """Frames of one sender (of all) that got through."""
         return [
             each
@@ -65,7 +65,7 @@ class Lab:
             and accept(rtcan.decode_identifier(each.frame.id))
         ]
 
-    def hrt(self, module: str) -> list[Record]:
+    def hrt(self, module: str) -> list[FrameRecord]:
         """Its frames in slots of its own, without syncs."""
         return self.sent(lambda found: found.laxity == rtcan.HRT and rtcan.high_byte(found.message) > 0, module)
 

@@ -10,13 +10,13 @@ import pytest
 import r2p
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import Advertise
-from r2p.events import ModuleEvent
 from r2p.msg import PWM2, Led
-from r2p.protocols.rtcan.election import Role
-from r2p.protocols.rtcan.topics import HighBytes
-from r2p.sim.can import State
-from r2p.transports.rtcan import origins
-from r2p.transports.rtcan.options import Options
+from r2p.protocols.rtcan.master import Role
+from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
+from r2p.runtime.events import ModuleEvent
+from r2p.sim.can import ControllerState
+from r2p.transports.rtcan import rx as origins
+from r2p.transports.rtcan.options import RtcanOptions
 from tests.transports.rtcan.networks import GUARD, Lab, lab, until
 
 pytestmark = pytest.mark.virtual_time
@@ -175,7 +175,7 @@ async def test_bus_off_and_recovery() -> None:
         controller = made.can.port("A").controller
         controller.confinement.transmit = 250
         made.can.bus.noise = 1.0
-        while controller.state is not State.BUS_OFF:
+        while controller.state is not ControllerState.BUS_OFF:
             await publisher.publish(Led())
             await asyncio.sleep(0.001)
         made.can.bus.noise = 0.0
@@ -194,7 +194,7 @@ async def test_two_nodes_of_one_id_the_one_that_came_later_yields() -> None:
     made = Lab()
     async with made.module("A", options={"id": 7}) as alice:
         await until(lambda: made.link("A").up)
-        module = r2p.Module("B", via=made.can.transport(Options(id=7, priority=1)), watchdog=False)
+        module = r2p.Module("B", via=made.can.transport(RtcanOptions(id=7, priority=1)), watchdog=False)
         events = module.events()
         async with module:
             told = await notice(events, "id conflict")
@@ -242,7 +242,7 @@ def _colliding() -> tuple[str, str]:
     seen: dict[int | None, str] = {}
     for number in range(1000):
         name = f"topic{number}"
-        high = HighBytes().pick(name)
+        high = TopicIdAllocator().pick(name)
         if high in seen:
             return seen[high], name
         seen[high] = name

@@ -14,8 +14,8 @@ from contextlib import AsyncExitStack
 from typing import Annotated
 
 import r2p
+from r2p.modules.runner import run_main
 from r2p.msg import Float32, Led
-from r2p.runner import run_main
 
 
 class Page(r2p.Message):

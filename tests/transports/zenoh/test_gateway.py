@@ -9,7 +9,7 @@ from r2p.codecs import attachment, management
 from r2p.codecs.attachment import Header, Origin
 from r2p.msg import Led
 from r2p.testing.network import node_in
-from r2p.transports.zenoh.senders import _reaches
+from r2p.transports.zenoh.publish import _reaches
 from tests.transports.conversation import Script, line, manage
 from tests.transports.test_conformance import until
 from tests.transports.zenoh.cable import Net, guarded, module, plain_session
@@ -27,7 +27,7 @@ async def test_values_that_other_links_can_not_carry_stop_nothing() -> None:
     async with r2p.Module("GW", via=[net.listen, script], bridge=True, watchdog=False) as gateway:
 
         def goes_on(topic: str) -> bool:
-            return topic in gateway.space.topics and bool(gateway.space.topics[topic].outlets)
+            return topic in gateway.space.topics and bool(gateway.space.topics[topic].remote_subscribers)
 
         with plain_session(net) as session:
             live, topics = session.liveliness(), f"r2p/{net.name}/topic"

@@ -10,11 +10,10 @@ import pytest
 
 import r2p
 from r2p.codecs.attachment import Credit, encode_credit
-from r2p.transports.intake import LinkStats
-from r2p.transports.zenoh.credits import Credits
+from r2p.transports.receiver import LinkStats
+from r2p.transports.zenoh.config import ZenohOptions
+from r2p.transports.zenoh.credit import Credits, Reachability
 from r2p.transports.zenoh.link import ZenohLink
-from r2p.transports.zenoh.options import Options
-from r2p.transports.zenoh.reach import Reach
 from r2p.transports.zenoh.transport import ZenohTransport
 from tests.faults import once
 
@@ -24,10 +23,10 @@ pytestmark = [pytest.mark.virtual_time, pytest.mark.internal_errors]
 def outlet(topic: str, **faults: Callable[..., Any]) -> Any:
     """Stands for a topic on its way out, with a subscriber that waits and has not said anything."""
     calls: list[str] = []
-    outlet = SimpleNamespace(topic=SimpleNamespace(name=topic), calls=calls, tries=Counter(), room=lambda: True)
+    outlet = SimpleNamespace(topic=SimpleNamespace(name=topic), calls=calls, tries=Counter(), wait_queue=lambda: True)
     outlet.expects = False
-    outlet.unheard = lambda: {7}
-    for name in ("credited", "refill", "welcome"):
+    outlet.unacknowledged = lambda: {7}
+    for name in ("credited", "refill", "resend_latched"):
         setattr(outlet, name, lambda *_, name=name, **__: calls.append(name))
     for name, fault in faults.items():
         setattr(outlet, name, fault)
@@ -56,7 +55,7 @@ async def test_credits() -> None:
     credits_of.close()
 
 
-@pytest.mark.parametrize("fault", ["reach", "let_in", "unheard"])
+@pytest.mark.parametrize("fault", ["reach", "let_in", "unacknowledged"])
 async def test_subscribers(fault: str) -> None:
     calls: list[str] = []
     outlets = [outlet("a"), outlet("b")]
@@ -69,9 +68,9 @@ async def test_subscribers(fault: str) -> None:
         zenoh_outlets=lambda: outlets,
         tell_unheard=lambda *_: None,
     )
-    place = {"reach": link.senders, "let_in": link, "unheard": outlets[0]}[fault]
+    place = {"reach": link.senders, "let_in": link, "unacknowledged": outlets[0]}[fault]
     setattr(place, fault, once(getattr(place, fault)))
-    reach = Reach(link, asyncio.get_running_loop())
+    reach = Reachability(link, asyncio.get_running_loop())
     reach.came("a", 7, 16)
     reach.came("b", 7, 16)
     await asyncio.sleep(1.0)
@@ -86,7 +85,7 @@ async def test_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
     async with r2p.Module("PC", via=[], watchdog=False) as module:
         assert module._hub is not None
         link = ZenohLink("zenoh:", module._hub, connects=False, batching=True)
-        link.went_up()
+        link.on_up()
         presence = link.discovery
         for call in ("appeared", "disappeared"):
             monkeypatch.setattr(presence, call, once(getattr(presence, call)))
@@ -111,11 +110,11 @@ async def test_looks_around(monkeypatch: pytest.MonkeyPatch) -> None:
         hub = module._hub
         assert hub is not None
         link = ZenohLink("zenoh:", hub, connects=False, batching=True)
-        link.went_up()
+        link.on_up()
         notices: list[str] = []
         monkeypatch.setattr(hub, "link_notice", lambda _link, _kind, text, **_: notices.append(text))
         session: Any = SimpleNamespace(networks=once(networks))
-        await ZenohTransport(Options("zenoh:"))._look_around(session, link, hub, "lab")
+        await ZenohTransport(ZenohOptions("zenoh:"))._look_around(session, link, hub, "lab")
         assert link.losses == {"internal error": 1}
         assert notices[0].startswith("nobody else is on the network lab, but there are modules on field")
         link.close()

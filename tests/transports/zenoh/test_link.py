@@ -19,13 +19,14 @@ from r2p.codecs.liveliness import TopicToken
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import layout
 from r2p.msg import Led, Text
-from r2p.protocols import presence, refused
-from r2p.protocols.flow import NO_LIMIT
+from r2p.protocols.flow_control import NO_LIMIT
+from r2p.protocols.liveliness import refused
+from r2p.protocols.liveliness import session as presence
 from r2p.testing.network import node_in
 from r2p.transports.zenoh.link import ZenohLink
-from r2p.transports.zenoh.outlet import ZenohOutlet
-from r2p.transports.zenoh.session import Session
-from r2p.transports.zenoh.streams import WINDOW
+from r2p.transports.zenoh.publish import ZenohSubscriber
+from r2p.transports.zenoh.session import ZenohSession
+from r2p.transports.zenoh.subscribe import WINDOW
 from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.cable import Net, ZenohCable, guarded, module, plain_session
 
@@ -60,7 +61,8 @@ def link_of(node: r2p.Node) -> ZenohLink:
 def knows(publisher: r2p.Publisher[Any], node: r2p.Node) -> bool:
     """Whether a publisher sends to a module."""
     return any(
-        isinstance(outlet, ZenohOutlet) and outlet.knows(link_of(node).instance) for outlet in publisher._topic.outlets
+        isinstance(outlet, ZenohSubscriber) and outlet.knows(link_of(node).instance)
+        for outlet in publisher._topic.remote_subscribers
     )
 
 
@@ -108,7 +110,9 @@ async def test_what_waits_for_credit_when_the_link_goes_down_is_counted() -> Non
                 await publisher.publish(Led())
 
         sending = asyncio.create_task(send())
-        await until(lambda: bool(publisher._topic.outlets[0].lines.claims))  # as its subscriber does not read
+        await until(
+            lambda: bool(publisher._topic.remote_subscribers[0].lines.deliveries)
+        )  # as its subscriber does not read
         await cable.cut()
         await sending
         assert link.losses["link down"] > 0
@@ -347,14 +351,14 @@ async def test_modules_share_no_wildcard_of_which_zenoh_would_keep_memory(monkey
     keys: Counter[str] = Counter()
 
     def recorded(declare: Callable[..., Any]) -> Callable[..., Any]:
-        def declared(session: Session, key: str, *args: Any) -> Any:
+        def declared(session: ZenohSession, key: str, *args: Any) -> Any:
             keys[key] += 1
             return declare(session, key, *args)
 
         return declared
 
     for name in ("listen", "serve", "subscribe"):
-        monkeypatch.setattr(Session, name, recorded(getattr(Session, name)))
+        monkeypatch.setattr(ZenohSession, name, recorded(getattr(ZenohSession, name)))
     net = Net()
     async with nodes(net, "A", "B") as (alice, bob):
         alice.subscribe("leds", Led)

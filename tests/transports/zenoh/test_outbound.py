@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 
-from r2p.protocols.flow import Outflow
-from r2p.sample import Sample, Source
-from r2p.transports.intake import LinkStats
-from r2p.transports.zenoh.lane import Lane
-from r2p.transports.zenoh.outbound import CROWD, MOST_URGENT, Outbound
-from r2p.transports.zenoh.senders import Senders
-from tests.transports.zenoh.test_burst import ORIGIN
+from r2p.protocols.flow_control import SendWindow
+from r2p.runtime.sample import Sample, Source
+from r2p.transports.receiver import LinkStats
+from r2p.transports.zenoh.publish import PublisherCache, TxStream
+from r2p.transports.zenoh.threads import CROWD, MOST_URGENT, OutboundThread
+from tests.transports.zenoh.test_publish import ORIGIN
 
 pytestmark = pytest.mark.anyio
 
@@ -34,11 +33,11 @@ class Busy:
         return what
 
 
-def outbound() -> Outbound:
-    return Outbound(asyncio.get_running_loop())
+def outbound() -> OutboundThread:
+    return OutboundThread(asyncio.get_running_loop())
 
 
-async def idle(out: Outbound) -> None:
+async def idle(out: OutboundThread) -> None:
     while out.waiting:  # noqa: ASYNC110 - the thread is about to be done
         await asyncio.sleep(0)
 
@@ -91,7 +90,7 @@ async def test_with_many_a_thread_makes_them_in_order_and_the_loop_goes_on() -> 
 async def test_what_does_not_fit_is_counted() -> None:
     out, busy, stats = outbound(), Busy(), LinkStats()
     out.watch(CROWD)
-    lane = Lane(Outflow(), urgent=True)
+    lane = TxStream(SendWindow(), urgent=True)
     lane.prepare(Source("PC1", "talk"), ORIGIN, _putting(out, busy))
     for sequence in range(1, MOST_URGENT + 4):
         lane.flow.serial += 1
@@ -104,7 +103,7 @@ async def test_what_does_not_fit_is_counted() -> None:
     assert len(busy.calls) == MOST_URGENT
 
 
-def _putting(out: Outbound, busy: Busy) -> Callable[..., None]:
+def _putting(out: OutboundThread, busy: Busy) -> Callable[..., None]:
     def put(data: bytes, *, attachment: bytes) -> None:
         out.put(busy.call, MOST_URGENT, data, attachment=attachment)
 
@@ -140,7 +139,7 @@ async def test_it_takes_half_the_crowd_to_go_back() -> None:
 
 
 async def test_whether_messages_reach_a_subscriber_is_asked_in_the_thread() -> None:
-    out, busy, senders = outbound(), Busy(), Senders()
+    out, busy, senders = outbound(), Busy(), PublisherCache()
     session: Any = SimpleNamespace(outbound=out, publisher=lambda *_: Publisher(busy))
     senders.connect(session, "r2p/lab/topic/")
     assert not senders.reach("leds")

@@ -12,9 +12,9 @@ import pytest
 
 import r2p
 from r2p.msg import Float32
-from r2p.protocols.events import ModuleChanged, ModuleGone
+from r2p.protocols.discovery.events import ModuleChanged, ModuleGone
 from r2p.testing.network import node_in
-from r2p.transports.zenoh.outlet import ZenohOutlet
+from r2p.transports.zenoh.publish import ZenohSubscriber
 from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.cable import Net, guarded, module
 from tests.transports.zenoh.peer import MODULES, TOPICS, Page
@@ -103,11 +103,11 @@ async def test_a_router_that_dies_and_comes_back_while_messages_flow() -> None:
 async def _confirmed(publisher: r2p.Publisher[Float32], subscriber: r2p.Subscriber[Float32]) -> None:
     """A message comes, and who sent it knows that: else it would suspect a router's access control."""
     await publisher.wait_subscriber()
-    (outlet,) = publisher._topic.outlets
-    assert isinstance(outlet, ZenohOutlet)
+    (outlet,) = publisher._topic.remote_subscribers
+    assert isinstance(outlet, ZenohSubscriber)
     await publisher.publish(Float32(1.0))
     await subscriber.fetch()
-    await until(lambda: not outlet.unheard())
+    await until(lambda: not outlet.unacknowledged())
 
 
 async def _flow(module: r2p.Module, node: r2p.Node, publisher: r2p.Publisher[Float32], enough: asyncio.Event) -> int:

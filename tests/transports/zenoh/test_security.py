@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 import r2p
-from r2p.events import LinkNotice
 from r2p.msg import Led
+from r2p.runtime.events import LinkNotice
 from r2p.testing.network import node_in
 from tests.ports import free_port
 from tests.transports.test_conformance import first, other, until

@@ -9,16 +9,15 @@ from typing import Any
 import pytest
 import zenoh
 
-from r2p.transports.intake import TURN
-from r2p.transports.losses import Losses
-from r2p.transports.zenoh.session import Funnel, Session, Tap
+from r2p.transports.receiver import TURN, LoggedCounter
+from r2p.transports.zenoh.session import LoopQueue, SubscriptionReader, ZenohSession
 
 pytestmark = pytest.mark.anyio
 
 
 async def test_a_flood_lets_others_have_their_turn() -> None:
     taken: list[int] = []
-    funnel = Funnel(asyncio.get_running_loop(), taken.append, Losses(), most=2 * TURN + 1)
+    funnel = LoopQueue(asyncio.get_running_loop(), taken.append, LoggedCounter(), most=2 * TURN + 1)
     for number in range(2 * TURN + 3):
         funnel.put(number)
     assert funnel.overflown == 2
@@ -72,7 +71,7 @@ class Reader:
         self.more = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         subscriber: Any = channel
-        self.tap = Tap(subscriber, self._loop, self._arrived)
+        self.tap = SubscriptionReader(subscriber, self._loop, self._arrived)
 
     def _arrived(self, item: Any) -> None:
         for _ in range(3):
@@ -117,7 +116,7 @@ async def test_a_tap_gives_everything_once_and_in_order_fast_or_slow() -> None:
 async def test_what_was_handed_over_before_a_tap_waits_comes_before_what_comes_after_it(taken_meanwhile: bool) -> None:
     subscriber: Any = Channel()
     taken: list[int] = []
-    tap = Tap(subscriber, asyncio.get_running_loop(), taken.append)  # type: ignore[arg-type]
+    tap = SubscriptionReader(subscriber, asyncio.get_running_loop(), taken.append)  # type: ignore[arg-type]
     for number in (1, 2):
         tap._hand_over(number, rests=False)  # type: ignore[arg-type]
     tap.wait()
@@ -137,7 +136,7 @@ async def test_the_thread_of_a_tap_ends_with_it(waiting: int) -> None:
     channel = Channel()
     subscriber: Any = channel
     arrived: asyncio.Queue[Any] = asyncio.Queue()
-    tap = Tap(subscriber, asyncio.get_running_loop(), arrived.put_nowait)  # never ready for a second one
+    tap = SubscriptionReader(subscriber, asyncio.get_running_loop(), arrived.put_nowait)  # never ready for a second one
     for number in range(waiting):
         channel.put(number)
     if waiting:
@@ -152,14 +151,14 @@ async def test_the_thread_of_a_tap_ends_with_it(waiting: int) -> None:
 async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
     """Neither in the loop nor, before that, in the thread."""
     taken: list[int] = []
-    losses, loop, ended = Losses(), asyncio.get_running_loop(), asyncio.Event()
+    losses, loop, ended = LoggedCounter(), asyncio.get_running_loop(), asyncio.Event()
 
     def take(item: int) -> None:
         if item == 10:
             ended.set()
         taken.append(10 // item)
 
-    funnel = Funnel(loop, take, losses, most=9)
+    funnel = LoopQueue(loop, take, losses, most=9)
     for number in (5, 0, 2, 0, 1):
         funnel.put(number)
     await asyncio.sleep(0)
@@ -167,7 +166,7 @@ async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
     assert (taken, losses) == ([2, 5, 10], {"internal error": 2})
 
     channel, nothing = Channel(), None
-    session = Session(nothing)  # type: ignore[arg-type]
+    session = ZenohSession(nothing)  # type: ignore[arg-type]
     session._hear(channel, lambda item: funnel.put(len(item)), funnel)
     channel.put_all(["12345", 7, "1234567890"])
     await ended.wait()
@@ -203,7 +202,7 @@ async def test_publishers_are_undeclared_before_their_session_is_closed() -> Non
     """Otherwise zenoh's memory grows with each session."""
     bare = Zenoh()
     stand_in: Any = bare
-    session = Session(stand_in)
+    session = ZenohSession(stand_in)
     session.publisher("stays", 1)
     session.ends(session.publisher("ended", 2))
     await session.close()

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from r2p.transports.zenoh import tokens
-from r2p.transports.zenoh.tokens import Tokens
+from r2p.transports.zenoh import link as tokens
+from r2p.transports.zenoh.link import TokenDebouncer
 
 pytestmark = [pytest.mark.anyio, pytest.mark.virtual_time]
 
@@ -16,9 +16,9 @@ class Believer:
     def __init__(self, *, up: bool = True) -> None:
         self.there: set[str] = set()
         self.refused = 0
-        self.tokens = Tokens(asyncio.get_running_loop(), self._believed, self._count)
+        self.tokens = TokenDebouncer(asyncio.get_running_loop(), self._believed, self._count)
         if up:
-            self.tokens.went_up()
+            self.tokens.on_up()
 
     def _believed(self, key: str, there: bool) -> None:
         (self.there.add if there else self.there.discard)(key)
@@ -47,8 +47,8 @@ async def test_an_answer_that_is_older_than_the_end_of_its_token_is_not_believed
 async def test_answers_are_of_no_use_once_the_link_was_down() -> None:
     believer = Believer()
     believer.tokens.look()
-    believer.tokens.went_down()
-    believer.tokens.went_up()
+    believer.tokens.on_down()
+    believer.tokens.on_up()
     believer.tokens.found("old")
     assert not believer.tokens.looked()
     assert not believer.there
@@ -70,5 +70,5 @@ async def test_what_has_no_room_before_the_link_is_up_is_told(monkeypatch: pytes
     believer = Believer(up=False)
     for key in ("a", "b", "b", "c", "d"):
         believer.tokens.changed(key, True)
-    believer.tokens.went_up()
+    believer.tokens.on_up()
     assert (believer.there, believer.refused) == ({"a", "b"}, 2)

@@ -1,0 +1,400 @@
+"""A module: nodes, the topics between them, and the links that make those topics part of a network.
+
+The module is where everything that runs is owned: one task for each node and each transport, all of which have ended
+when its `async with` block has.
+"""
+
+import asyncio
+import logging
+import os
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from types import TracebackType
+from typing import Self
+
+from r2p.bridge import BridgeOptions, GatewayStatistics
+from r2p.clock import clock_of, random_of
+from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
+from r2p.errors import Closed, Error, NodeCrashed
+from r2p.log_lines import LineLimit, get_logger
+from r2p.modules.graph import NetworkView
+from r2p.modules.link_manager import LinkManager
+from r2p.modules.supervisor import LogTopic, NodeFunction, Supervisor, check_function, name_of
+from r2p.modules.watchdog import Watchdog, watch
+from r2p.names import module_name, module_name_from, module_path, node_name, topic_name
+from r2p.protocols.discovery.events import Command
+from r2p.runtime.events import EventHub, ModuleEvent
+from r2p.runtime.node import Node
+from r2p.runtime.topic import TopicSpace
+from r2p.transports.link import Link, Transport
+from r2p.transports.receiver import LinkStats
+from r2p.transports.url import open_transport
+
+logger = get_logger("r2p.module")
+
+PATIENCE = 1.0
+"""Seconds after which the log names the nodes whose clean-up is being waited for."""
+
+
+class Module:
+    """A module of the robot's network, in this process.
+
+        async with r2p.Module("PC1", via=["tcp:192.168.0.10:23"]) as module:
+            module.start(blink, priority=10)
+            await module.wait()
+
+    `name` has at most 7 characters (default: from the host name). `via` are transport URLs; None takes those of the
+    environment variable R2P_VIA (separated by blanks), and without it the module is local only. `remap` renames
+    topics for all its nodes. An `observer` is a tool that only looks: it sends no ALIVE and has no `log` topic.
+
+    With `bridge` it joins its links: it is a gateway (r2p.bridge), and takes part in each network as the gateways there
+    have agreed. BridgeOptions say what it lets through.
+    """
+
+    def __init__(
+        self,
+        name: str | None = None,
+        *,
+        via: str | Transport | Iterable[str | Transport] | None = None,
+        remap: dict[str, str] | None = None,
+        observer: bool = False,
+        watchdog: bool = True,
+        bridge: bool | BridgeOptions = False,
+    ) -> None:
+        self.name = module_name(name) if name is not None else module_name_from(socket.gethostname())
+        self.observer = observer
+        self.rebooted = False
+        """Whether REBOOT has restarted its nodes."""
+        self.stopped = False
+        """Whether STOP has ended its nodes; REBOOT starts them again."""
+        self.links: list[Link] = []
+        """Its links, also those that are down."""
+        self.refused: dict[str, int] = {}
+        """Commands that were not obeyed, by name."""
+        self.network = NetworkView(self)
+        """What it knows of the network."""
+        self._via = _urls(via)
+        self._remap = _checked_remap(remap)
+        self._with_watchdog = watchdog
+        self._bridging = BridgeOptions() if bridge is True else bridge or None
+        self._supervisors: dict[str, Supervisor] = {}
+        self._crashes: dict[str, Exception] = {}
+        self._events = EventHub()
+        self._hub: LinkManager | None = None
+        self._transports: list[asyncio.Task[None]] = []
+        self._tasks: asyncio.TaskGroup | None = None
+        self._orders = CommandHandler(self.name, self.refused, self.stop, self.reboot)
+        self._open = False
+
+    # Life
+
+    async def __aenter__(self) -> Self:
+        """Open it. Raises TransportError for a URL that can't work, and Error when it was open before."""
+        if self._tasks is not None:
+            raise Error(f"module {self.name} was opened before: make a new one")
+        loop = asyncio.get_running_loop()
+        clock = clock_of(loop)
+        self._hub = LinkManager(
+            TopicSpace(self.name, loop, clock),
+            self.links,
+            random_of(loop),
+            self._events,
+            self._orders.take,
+            observer=self.observer,
+            bridging=self._bridging,
+        )
+        self.instance = self._hub.instance
+        self._changed = asyncio.Event()
+        self._switching = asyncio.Lock()
+        self._log = None if self.observer else LogTopic(self.space, self._remap)
+        self._watchdog: Watchdog | None = None
+        self._tasks = asyncio.TaskGroup()
+        await self._tasks.__aenter__()
+        self._open = True
+        self._orders.tasks = self._tasks
+        try:
+            for via in self._via:
+                await self._open_transport(self._tasks, via)
+        except BaseException:  # cancelled, too: who does not come to the block does not leave it either
+            await self._close(self._tasks)
+            raise
+        if self._with_watchdog and not clock.virtual:  # not before: opening imports the transports' libraries
+            self._watchdog = watch(loop)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the nodes, then the links. Raises NodeCrashed if nodes crashed; another error on its way gets notes."""
+        if self._tasks is not None:
+            await self._close(self._tasks)
+        crashed = list(self._crashes.values())
+        if crashed and (error is None or isinstance(error, asyncio.CancelledError)):
+            raise NodeCrashed(f"{len(crashed)} node(s) of module {self.name} crashed", crashed)
+        for crash in crashed:
+            assert error is not None
+            error.add_note(f"before that: {crash!r} {' '.join(crash.__notes__)}")
+
+    def gateway_statistics(self) -> GatewayStatistics:
+        """What it has forwarded so far, and where.
+
+        Raises Closed before it is open, and Error if it is no gateway (`bridge`).
+        """
+        self._running()
+        bridge = self._opened.bridge
+        if bridge is None:
+            raise Error(f"module {self.name} is no gateway: make it with bridge=True")
+        return bridge.statistics()
+
+    @property
+    def space(self) -> TopicSpace:
+        """Its topics. Raises Closed before it is opened."""
+        return self._opened.space
+
+    @property
+    def addresses(self) -> list[tuple[str, str]]:
+        """Where it takes connections: each URL that was opened, and its address. Raises Closed before it is opened."""
+        return list(self._opened.addresses)
+
+    @property
+    def closed_links(self) -> LinkStats:
+        """The sum of what links have counted that are closed for good, as those of clients of a `tcp-listen:`."""
+        return self._opened.closed_links
+
+    @property
+    def _opened(self) -> LinkManager:
+        if self._hub is None:
+            raise self._not_open()
+        return self._hub
+
+    def _running(self) -> asyncio.TaskGroup:
+        """The owner of its tasks. Raises Closed unless it is open."""
+        if self._tasks is None or not self._open:
+            raise self._not_open()
+        return self._tasks
+
+    def _not_open(self) -> Closed:
+        return Closed(f"module {self.name} is not open: use it in `async with`")
+
+    async def _open_transport(self, tasks: asyncio.TaskGroup, via: str | Transport) -> None:
+        """Let it run, and wait until it works; what it raises cancels the caller, and `_close` raises it."""
+        transport = open_transport(via) if isinstance(via, str) else via
+        opened = self.space.loop.create_future()
+
+        def works() -> None:
+            if not opened.done():
+                opened.set_result(None)
+
+        running = tasks.create_task(transport.run(self._opened, works), name=f"{self.name} {via}")
+        self._transports.append(running)
+        await asyncio.wait([opened, running], return_when=asyncio.FIRST_COMPLETED)
+
+    async def _close(self, tasks: asyncio.TaskGroup) -> None:
+        if not self._open:
+            return
+        self._open = False
+        self._orders.tasks = None
+        try:
+            await self._end_nodes()
+        finally:
+            if self._log is not None:
+                self._log.close()
+            for transport in self._transports:
+                transport.cancel()
+            try:
+                await tasks.__aexit__(None, None, None)
+            except BaseExceptionGroup as group:  # of transports: what a node raises, its supervisor keeps
+                raise group.exceptions[0] if len(group.exceptions) == 1 else group from None
+            finally:
+                self._opened.close()
+                if self._watchdog is not None:
+                    self._watchdog.close()
+                self._changed.set()
+                self._events.close()
+
+    async def _end_nodes(self) -> None:
+        """Cancel all nodes, and wait until each has ended."""
+        tasks = [task for each in self._supervisors.values() if (task := each.cancel()) is not None]
+        if not tasks:
+            return
+        _, pending = await asyncio.wait(tasks, timeout=PATIENCE)
+        if pending:
+            names = ", ".join(sorted(task.get_name() for task in pending))
+            logger.warning("module %s waits for the clean-up of %s", self.name, names)
+            await asyncio.wait(pending)
+
+    # Nodes
+
+    def start(
+        self,
+        function: NodeFunction,
+        *args: object,
+        name: str | None = None,
+        priority: int = 0,
+        remap: dict[str, str] | None = None,
+        restart: bool = False,
+    ) -> Node:
+        """Run `function(node, *args)` as a node; its name is the function's unless given, at most 8 characters.
+
+        Nodes of higher priority get their messages first. With `restart` a crash restarts it, after a pause that grows.
+        Raises NameTooLong, InvalidName, Error if the name is taken, the function none of a node, or the module stopped,
+        and Closed if it is not open.
+        """
+        tasks = self._running()
+        if self.stopped:
+            raise Error(f"module {self.name} is stopped: reboot it first")
+        check_function(function)
+        name = node_name(name) if name is not None else name_of(function)
+        if name in self._supervisors and self._supervisors[name].running:
+            raise Error(f"module {self.name} has a node {name} already: give this one another name=")
+        names = self._remap | _checked_remap(remap)
+        log = self._log.publish if self._log is not None else _no_log
+
+        def make_node() -> Node:
+            return Node(name, self.space, priority=priority, remap=names, log=log, events=self._events)
+
+        supervisor = Supervisor(function, args, make_node, restart=restart)
+        self._supervisors[name] = supervisor
+        supervisor.start(tasks, self._node_ended)
+        return supervisor.node
+
+    @property
+    def nodes(self) -> dict[str, Supervisor]:
+        """Its nodes by name, also the ones that have ended."""
+        return dict(self._supervisors)
+
+    async def wait(self) -> None:
+        """Wait until all nodes have ended by themselves (not by STOP: a stopped module waits for REBOOT)."""
+        while self._open and (self._held or any(each.running for each in self._supervisors.values())):
+            self._changed.clear()
+            await self._changed.wait()
+
+    async def stop(self) -> None:
+        """End all nodes; links and management go on (ALIVE says so)."""
+        async with self._switching:
+            self.stopped = True
+            self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
+            await self._end_nodes()
+
+    async def reboot(self) -> None:
+        """End all nodes and start them from the beginning."""
+        tasks = self._running()
+        await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))  # it ends who asks
+
+    async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
+        async with self._switching:
+            # Others notice each reboot by it, not only the first one.
+            self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
+            await self._end_nodes()
+            if not self._open:
+                return
+            self.stopped = False
+            self.rebooted = True
+            for supervisor in self._supervisors.values():
+                if not supervisor.running:  # one was started meanwhile
+                    supervisor.start(tasks, self._node_ended)
+            self._opened.set_flags(FLAG_REBOOTED)
+
+    @property
+    def _held(self) -> bool:
+        """Whether nodes that have ended may start again."""
+        return self.stopped or self._switching.locked()
+
+    def _node_ended(self, supervisor: Supervisor) -> None:
+        if supervisor.error is not None:
+            self._crashes[supervisor.node.name] = supervisor.error
+        self._changed.set()
+
+    # Network
+
+    def command(self, command: Command, module: str) -> None:
+        """Send STOP, REBOOT or BOOTLOAD to another module, by all links. None of them is an emergency stop.
+
+        Raises NameTooLong or InvalidName, Error for a STOP of a module in boot mode (it would hang its management until
+        its power is cut), and Closed if this module is not open.
+        """
+        self._running()
+        self._opened.order(command, module_path(module))
+
+    def query(self) -> None:
+        """Ask all others to repeat what they publish and subscribe. Raises Closed if this module is not open."""
+        self._running()
+        for link in self.links:
+            link.query()
+
+    def events(self) -> AsyncIterator[ModuleEvent]:
+        """What happens to the links and on the network, from this call on, until the module closes.
+
+        Who reads too slowly loses the oldest of 256 events.
+        """
+        return self._events.listen()
+
+
+def _urls(via: str | Transport | Iterable[str | Transport] | None) -> list[str | Transport]:
+    if via is None:
+        return list(os.environ.get("R2P_VIA", "").split())
+    return [via] if isinstance(via, str | Transport) else list(via)
+
+
+def _checked_remap(remap: dict[str, str] | None) -> dict[str, str]:
+    return {topic_name(old): topic_name(new) for old, new in (remap or {}).items()}
+
+
+def _no_log(level: int, node: str, text: str) -> None:
+    """An observer keeps its log lines to itself."""
+
+
+# Orders from the network to a module: STOP, REBOOT, and BOOTLOAD, which a program on a PC refuses.
+
+
+_LINES = 1
+"""Lines of the log in a second about one kind of order."""
+
+_SECOND = 1_000_000_000
+
+
+class CommandHandler:
+    """Those of one module. `refused` counts the ones that were not obeyed, by name."""
+
+    def __init__(
+        self,
+        module: str,
+        refused: dict[str, int],
+        stop: Callable[[], Awaitable[None]],
+        reboot: Callable[[], Awaitable[None]],
+    ) -> None:
+        self.tasks: asyncio.TaskGroup | None = None
+        """The owner of the module's tasks while it is open: without it nothing is obeyed."""
+        self._module = module
+        self._refused = refused
+        self._stop = stop
+        self._reboot = reboot
+        self._limit = LineLimit(_LINES)
+        self._latest: Command | None = None
+        self._obeying: asyncio.Task[None] | None = None
+
+    def take(self, command: Command) -> None:
+        """An order has come in."""
+        self._log(logging.WARNING, f"module {self._module}: {command.name} from the network")
+        if self.tasks is None:
+            return
+        if command is Command.BOOTLOAD:
+            count = self._refused[command.name] = self._refused.get(command.name, 0) + 1
+            text = f"module {self._module} is a program on a PC, it has no boot loader: BOOTLOAD refused"
+            self._log(logging.ERROR, text, f" ({count} so far)")
+            return
+        self._latest = command
+        if self._obeying is None or self._obeying.done():
+            self._obeying = self.tasks.create_task(self._obey(), name=f"{self._module} orders")
+
+    def _log(self, level: int, text: str, detail: str = "") -> None:
+        """What others can make happen any number of times a second."""
+        more = self._limit.suffix(text, int(asyncio.get_running_loop().time() * _SECOND))
+        if more is not None:
+            logger.log(level, "%s%s%s", text, detail, more)
+
+    async def _obey(self) -> None:
+        """One order at a time; of those that come meanwhile the last one counts."""
+        while self._latest is not None and self.tasks is not None:
+            order, self._latest = self._latest, None
+            await (self._stop() if order is Command.STOP else self._reboot())

@@ -1,0 +1,182 @@
+"""The watchdog: tells which code blocks the event loop, while it blocks it.
+
+A thread asks the loop for a sign of life, four times in each LIMIT. Where none comes for LIMIT seconds, it logs the
+stack that the loop is stuck in, and afterwards how long it took. One block of 100 ms is ten missed periods of a 100 Hz
+node: worth a log line.
+
+All modules of a loop share one watchdog. It reports at most once a second, with the number of blocks in between, and
+each stack only once: later blocks in the same place name its last line.
+
+It blames nobody for what the computer did: where the thread itself did not run either, and nothing in this process
+used the processor meanwhile, the process was stopped (Ctrl-Z, a debugger, a computer that slept), and that is said.
+"""
+
+import asyncio
+import logging
+import os
+import selectors
+import sys
+import threading
+import traceback
+from pathlib import Path
+from types import FrameType
+
+from r2p.clock import clock_of
+from r2p.log_lines import LineLimit
+
+logger = logging.getLogger("r2p.watchdog")
+
+_SECOND = 1_000_000_000
+_REPORTS = 1  # in a second
+_MOST_KNOWN = 256  # stacks that are remembered
+
+LIMIT = 0.1
+"""Seconds that the loop may be blocked."""
+
+_MOMENT = 1.0  # seconds that the process may be stopped without a word
+STOPPED = "this process did not run for %.1f s: it was stopped, or the computer slept or was busy"
+BLOCKED = "%s has blocked the event loop for over %.0f ms%s:\n%s"
+AGAIN = "%s has blocked the event loop for over %.0f ms%s, again in %s"
+NOBODY = "the event loop did not come round for over %.0f ms, and none of its code runs: is the computer busy?"
+_IDLE = 0.5  # of a processor: whatever runs uses more than that, and what waits less
+_RUNS_IT = {each.__file__ for each in (asyncio.base_events, asyncio.events, asyncio.runners)} | {
+    str(Path(__file__).with_name("supervisor.py"))
+}
+
+
+_watchdogs: dict[asyncio.AbstractEventLoop, "Watchdog"] = {}
+_lock = threading.Lock()
+
+
+def watch(loop: asyncio.AbstractEventLoop) -> "Watchdog":
+    """The watchdog of this thread's loop, running; it ends when all who have called this have closed it."""
+    with _lock:
+        watchdog = _watchdogs.get(loop)
+        if watchdog is None:
+            watchdog = _watchdogs[loop] = Watchdog(loop)
+            watchdog.start()
+        else:
+            watchdog.users += 1
+    return watchdog
+
+
+class Watchdog:
+    """Watches the loop of the thread that starts it, for so many `users`."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, limit: float = LIMIT) -> None:
+        self.users = 1
+        self._loop = loop
+        self._limit = limit
+        self._clock = clock_of(loop)
+        self._alive = threading.Event()
+        self._ended = threading.Event()
+        self._watched = 0
+        self._known: set[str] = set()  # stacks that have been logged
+        self._line_limit = LineLimit(_REPORTS)
+        self._base: FrameType | None = None  # whatever runs a loop that is not written in Python
+        self._thread = threading.Thread(target=self._watch, name="r2p-watchdog", daemon=True)
+
+    def start(self) -> None:
+        """Watch from now on."""
+        self._watched = threading.get_ident()
+        self._base = _runner()
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, and wait for its end, if this was the last user."""
+        with _lock:
+            self.users -= 1
+            if self.users:
+                return
+            _watchdogs.pop(self._loop, None)
+        self._ended.set()
+        self._alive.set()
+        self._thread.join()
+        self._base = None
+
+    def _watch(self) -> None:
+        while not self._pause():
+            self._alive.clear()
+            asked, used = self._clock.monotonic(), _used()
+            try:
+                self._loop.call_soon_threadsafe(self._alive.set)
+            except RuntimeError:  # the loop is closed
+                with _lock:
+                    _watchdogs.pop(self._loop, None)
+                return
+            if self._ended.is_set() or self._alive.wait(self._limit):
+                continue
+            if self._was_stopped(asked, used, self._limit) and self._alive.wait(self._limit):
+                self._tell_stopped(asked)
+                continue
+            reported = self._report()
+            self._alive.wait()  # close() sets it too
+            if reported and not self._ended.is_set():
+                took = (self._clock.monotonic() - asked) / 1e6
+                logger.warning("the event loop runs again after %.0f ms", took)
+
+    def _pause(self) -> bool:
+        """Until the next look; True: there is none."""
+        start, used = self._clock.monotonic(), _used()
+        if self._ended.wait(self._limit / 4):
+            return True
+        if self._was_stopped(start, used, _MOMENT):
+            self._tell_stopped(start)
+        return False
+
+    def _was_stopped(self, since: int, used: float, limit: float) -> bool:
+        """Whether this thread, which waited for a moment, was late by more than `limit` seconds, and nobody busy."""
+        passed = (self._clock.monotonic() - since) / _SECOND
+        return passed > 2 * limit and _used() - used < _IDLE * passed
+
+    def _tell_stopped(self, since: int) -> None:
+        passed = (self._clock.monotonic() - since) / _SECOND
+        logger.warning(STOPPED, passed)
+
+    def _report(self) -> bool:
+        """Log where the loop is stuck; False: there was a report less than a second ago."""
+        more = self._line_limit.suffix("", self._clock.monotonic())
+        if more is None:
+            return False
+        frame = sys._current_frames().get(self._watched)  # noqa: SLF001 - documented, for exactly this use
+        stack = _own_part(frame) if frame is not None and frame is not self._base else []
+        if not stack:
+            logger.warning(NOBODY, self._limit * 1e3)
+            return True
+        task = asyncio.current_task(self._loop)
+        who = f"task {task.get_name()}" if task is not None else "a callback"
+        text = "".join(traceback.format_list(stack)).rstrip()
+        if text in self._known:
+            last = stack[-1]
+            logger.warning(AGAIN, who, self._limit * 1e3, more, f"{last.filename}:{last.lineno}, {last.name}")
+        else:
+            self._remember(text)
+            logger.warning(BLOCKED, who, self._limit * 1e3, more, text)
+        return True
+
+    def _remember(self, stack: str) -> None:
+        if len(self._known) >= _MOST_KNOWN:
+            self._known.clear()
+        self._known.add(stack)
+
+
+def _used() -> float:
+    """Seconds of a processor that this process has used so far."""
+    return sum(os.times()[:2])
+
+
+def _runner() -> FrameType | None:
+    """The frame below the task that is running."""
+    task = asyncio.current_task()
+    frame = getattr(task.get_coro(), "cr_frame", None) if task is not None else None
+    return frame.f_back if frame is not None else None
+
+
+def _own_part(frame: FrameType) -> list[traceback.FrameSummary]:
+    """The stack from where a node or a callback begins; what runs it is always the same. Empty: only that."""
+    stack = traceback.extract_stack(frame)
+    begin = max((at for at, each in enumerate(stack, 1) if each.filename in _RUNS_IT), default=0)
+    own = stack[begin:]
+    if begin and stack[begin - 1].name == "_run_once" and all(each.filename == selectors.__file__ for each in own):
+        return []  # it waits for events
+    return own

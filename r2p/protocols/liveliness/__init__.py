@@ -1,0 +1,1 @@
+"""Discovery by liveliness tokens, on networks that keep them (PROTOCOL.md 10)."""

@@ -1,0 +1,132 @@
+"""What this module has, as liveliness tokens: which to declare, and which to take back.
+
+Changes are collected, and become orders in one go: so a publisher that is announced first and gets the name of its node
+a moment later is one token, and a change declares the new token before it takes back the old one.
+"""
+
+import msgspec
+
+from r2p.codecs import liveliness
+from r2p.codecs.liveliness import ModuleToken, TopicToken
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.protocols.discovery.events import Declare, Shape, Undeclare
+
+TopicRole = tuple[str, int]
+"""A topic, and ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
+
+_MODULE: TopicRole = ("", 0)
+_RELAYED: TopicRole = ("", -1)
+
+
+class DeclaredTopic(msgspec.Struct, frozen=True):
+    """A topic that this module publishes, or subscribes with a `window` (messages on the way; 0: it may lose some)."""
+
+    shape: Shape
+    window: int = 0
+
+
+class TokenSet:
+    """The tokens of one module."""
+
+    def __init__(self, module: str, instance: int, *, observer: bool) -> None:
+        self.flags = 0
+        self._module = module
+        self._instance = instance
+        self._observer = observer
+        self._own: dict[TopicRole, DeclaredTopic] = {}
+        self._nodes: dict[TopicRole, dict[str, int]] = {}
+        self._relayed: dict[tuple[str | int, ...], liveliness.Token] = {}
+        self._declared: dict[TopicRole, set[str]] = {}
+        self._dirty: set[TopicRole] = {_MODULE}
+
+    @property
+    def pending(self) -> bool:
+        """Whether something has changed since `changes` was called."""
+        return bool(self._dirty)
+
+    def own(self, topic: str, role: int) -> DeclaredTopic | None:
+        return self._own.get((topic, role))
+
+    def set_flags(self, flags: int) -> None:
+        self.flags = flags
+        self._dirty.add(_MODULE)
+
+    def enter(self, topic: str, role: int, own: DeclaredTopic) -> None:
+        """The module publishes or subscribes the topic."""
+        self._own[topic, role] = own
+        self._dirty.add((topic, role))
+
+    def remove(self, topic: str, role: int) -> None:
+        """It does not any more."""
+        self._own.pop((topic, role), None)
+        self._dirty.add((topic, role))
+
+    def node(self, topic: str, role: int, node: str, publisher_class: int) -> None:
+        """This node does it."""
+        self._nodes.setdefault((topic, role), {})[node] = publisher_class
+        self._dirty.add((topic, role))
+
+    def node_gone(self, topic: str, role: int, node: str) -> None:
+        nodes = self._nodes.get((topic, role), {})
+        nodes.pop(node, None)
+        if not nodes:
+            self._nodes.pop((topic, role), None)
+        self._dirty.add((topic, role))
+
+    def relay(self, key: tuple[str | int, ...], token: liveliness.Token | None) -> None:
+        """Something behind this module, a gateway; None: it is not there any more."""
+        if token is None:
+            self._relayed.pop(key, None)
+        else:
+            self._relayed[key] = token
+        self._dirty.add(_RELAYED)
+
+    def relayed(self, key: tuple[str | int, ...]) -> liveliness.Token | None:
+        return self._relayed.get(key)
+
+    def changes(self) -> list[Declare | Undeclare]:
+        """What is to be done since the last call."""
+        orders: list[Declare | Undeclare] = []
+        dirty, self._dirty = self._dirty, set()
+        for key in dirty:
+            declared, wanted = self._declared.get(key, set()), self._wanted(key)
+            orders += [Declare(token) for token in sorted(wanted - declared)]
+            orders += [Undeclare(token) for token in sorted(declared - wanted)]
+            if wanted:
+                self._declared[key] = wanted
+            else:
+                self._declared.pop(key, None)
+        return orders
+
+    def take_back(self) -> list[Declare | Undeclare]:
+        """The network is away: take back everything, and have it declared anew when that is back."""
+        orders: list[Declare | Undeclare] = [Undeclare(key) for keys in self._declared.values() for key in keys]
+        self._dirty |= self._declared.keys()
+        self._declared.clear()
+        return orders
+
+    def _wanted(self, key: TopicRole) -> set[str]:
+        if key == _MODULE:
+            module = ModuleToken(self._instance, self._module, self._instance, self.flags, self._observer)
+            return {liveliness.encode(module)}
+        if key == _RELAYED:
+            return {liveliness.encode(token) for token in self._relayed.values()}
+        own = self._own.get(key)
+        if own is None:
+            return set()
+        nodes = self._nodes.get(key) or {"": 0}
+        return {self._token(key, own, node, publisher_class) for node, publisher_class in nodes.items()}
+
+    def _token(self, key: TopicRole, own: DeclaredTopic, node: str, publisher_class: int) -> str:
+        topic, role = key
+        size, fingerprint = own.shape.size, own.shape.fingerprint
+        return liveliness.encode(
+            TopicToken(
+                self._instance, role, topic, self._instance, node, publisher_class, size, fingerprint, own.window
+            )
+        )
+
+
+def counterpart(role: int) -> int:
+    """Our side of what another one does."""
+    return ROLE_SUBSCRIBES if role == ROLE_PUBLISHES else ROLE_PUBLISHES

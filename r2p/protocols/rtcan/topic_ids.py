@@ -1,0 +1,159 @@
+"""High bytes for topics: which one a publisher takes (PROTOCOL.md 6).
+
+Firmware subscribers look at the high byte of a message id and nothing else, so no two topics on a bus may share one,
+and all publishers of one topic have to: the one with the lowest id8 leads, or firmware, which can't take another. The
+name decides which byte to try first: modules that know nothing of each other then seldom meet.
+
+What others use is learnt from their ADVERTISE and SUBSCRIBE_RESPONSE. That is a lease: it ends when it is not repeated,
+and at once when the module announces another id for the topic, or another topic for the id.
+"""
+
+import zlib
+from typing import TypeVar
+
+import msgspec
+
+from r2p.codecs import rtcan
+from r2p.protocols.rtcan.events import LONG_AGO
+
+_COUNT = 0x100 - rtcan.FIRST_TOPIC
+_SECOND = 1_000_000_000
+_LEASE = 20 * _SECOND
+_ROUNDS = 2  # that may be missed on a slow bus
+_MESSAGES = 2  # of one topic in a round: its type and its ADVERTISE
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class _AnnouncedId(msgspec.Struct, eq=False):
+    """What a message id of another module carries. `until`: the end of the lease (monotonic ns)."""
+
+    topic: str
+    firmware: bool
+    until: int = LONG_AGO
+
+
+class TopicIdAllocator:
+    """The high bytes in use on one bus: ours by topic, and those of others, at most one topic for each message id."""
+
+    def __init__(self) -> None:
+        self.refused: set[str] = set()
+        """Our topics that have found none."""
+        self._lease = _LEASE
+        self._ours: dict[str, int] = {}
+        self._announced: dict[int, _AnnouncedId] = {}  # by message id; what ends first comes first
+        self._topics: dict[int, dict[int, str]] = {}  # by high byte and id8
+        self._messages: dict[str, dict[int, int]] = {}  # message ids by topic and id8
+        self._freed = False
+
+    def pace(self, rate: float) -> None:
+        """A module on this bus makes so many announcements a second: a lease lasts for all that it may have to say."""
+        self._lease = max(_LEASE, round(_ROUNDS * _MESSAGES * _COUNT / rate * _SECOND))
+
+    def pick(self, topic: str) -> int | None:
+        """The high byte of our topic, always the same one. None: all are in use."""
+        high = self._ours.get(topic)
+        if high is not None:
+            return high
+        leader = self._leader(topic)
+        first = zlib.crc32(topic.encode())
+        tried = [rtcan.FIRST_TOPIC + (first + step) % _COUNT for step in range(_COUNT)]
+        for high in tried if leader is None else [rtcan.high_byte(leader), *tried]:
+            if self._free(high, topic):
+                self._ours[topic] = high
+                self.refused.discard(topic)
+                return high
+        self.refused.add(topic)
+        return None
+
+    def drop(self, topic: str) -> None:
+        """We don't publish it any more."""
+        self._ours.pop(topic, None)
+
+    def heard(self, now: int, topic: str, message: int, own_id8: int, *, firmware: bool = False) -> list[str]:
+        """A module publishes a topic with this message id. Comes back: our topics that have to take another high byte.
+
+        Of two modules that picked the same one for different topics, or different ones for the same topic, the one with
+        the lower id8 keeps it; `firmware` always does.
+        """
+        self._forget_ended(now)
+        self._note(now, topic, message, firmware=firmware)
+        if not firmware and rtcan.id8_of(message) >= own_id8:
+            return []
+        high = rtcan.high_byte(message)
+        moved = [ours for ours, byte in self._ours.items() if byte == high and ours != topic]
+        for ours in moved:
+            del self._ours[ours]
+        mine = self._ours.get(topic)
+        if mine not in (None, high) and self._leader(topic) == message and self._free(high, topic):
+            del self._ours[topic]
+            moved.append(topic)
+        return moved
+
+    def gone(self, id8: int) -> None:
+        """A module left."""
+        for message in [each for each in self._announced if rtcan.id8_of(each) == id8]:
+            self._forget(message)
+
+    def freed(self, now: int) -> list[str]:
+        """Our topics that found no high byte, and may find one now."""
+        self._forget_ended(now)
+        freed, self._freed = self._freed, False
+        return list(self.refused) if freed else []
+
+    def __len__(self) -> int:
+        """How many message ids of others are known."""
+        return len(self._announced)
+
+    def _free(self, high: int, topic: str) -> bool:
+        """Whether nobody has it for another topic."""
+        if high < rtcan.FIRST_TOPIC or high in self._ours.values():
+            return False
+        return all(other == topic for other in self._topics.get(high, {}).values())
+
+    def _leader(self, topic: str) -> int | None:
+        """The message id of the other publisher of a topic whose high byte all of them take."""
+        messages = self._messages.get(topic, {})
+        return min(
+            messages.values(),
+            key=lambda message: (not self._announced[message].firmware, rtcan.id8_of(message)),
+            default=None,
+        )
+
+    def _note(self, now: int, topic: str, message: int, *, firmware: bool) -> None:
+        id8 = rtcan.id8_of(message)
+        known = self._announced.pop(message, None)
+        if known is not None and known.topic != topic:
+            self._announced[message] = known
+            self._forget(message)
+            known = None
+        before = self._messages.get(topic, {}).get(id8)
+        if before is not None and before != message:
+            self._forget(before)
+        if known is None:
+            known = _AnnouncedId(topic, firmware)
+            self._topics.setdefault(rtcan.high_byte(message), {})[id8] = topic
+            self._messages.setdefault(topic, {})[id8] = message
+        known.until = now + self._lease
+        self._announced[message] = known
+
+    def _forget_ended(self, now: int) -> None:
+        while self._announced:
+            message, oldest = next(iter(self._announced.items()))
+            if now < oldest.until:
+                return
+            self._forget(message)
+
+    def _forget(self, message: int) -> None:
+        high, id8 = rtcan.high_byte(message), rtcan.id8_of(message)
+        topic = self._announced.pop(message).topic
+        _remove(self._topics, high, id8)
+        _remove(self._messages, topic, id8)
+        self._freed = True
+
+
+def _remove(table: dict[K, dict[int, V]], key: K, id8: int) -> None:
+    inner = table[key]
+    del inner[id8]
+    if not inner:
+        del table[key]

@@ -1,0 +1,1 @@
+"""What nodes publish and subscribe with, under the transports."""

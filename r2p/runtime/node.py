@@ -1,0 +1,409 @@
+"""A node: one asyncio task of a module, and what it publishes and subscribes.
+
+The function's body is initialisation and loop; cancellation is termination. Whatever the node opened is closed when
+its function ends, however it ends.
+"""
+
+import asyncio
+import logging
+import sys
+import traceback
+from collections.abc import AsyncIterator, Callable
+from typing import Any, NamedTuple, TypeVar, overload
+
+from r2p.clock import Ticker
+from r2p.durations import SHORTEST, seconds, timeout_or_none
+from r2p.errors import Closed, Error, InvalidName, TransportError
+from r2p.messages import Message, layout
+from r2p.names import MANAGEMENT, topic_name
+from r2p.runtime.events import EventHub, ModuleEvent
+from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
+from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
+from r2p.runtime.subscriber import Callback, Keep, Subscriber, check_options
+from r2p.runtime.topic import TopicSpace, pause
+
+M = TypeVar("M", bound=Message)
+
+QUEUE = 16
+"""Messages that a subscriber's queue holds unless it says otherwise."""
+
+_SECOND = 1_000_000_000
+
+
+class Tick(NamedTuple):
+    """One period of `Node.every`: when it was due (monotonic ns), how late it came (s), periods that were skipped."""
+
+    due: int
+    late: float
+    skipped: int
+
+
+class NodeLogger(logging.LoggerAdapter[logging.Logger]):
+    """Logs as usual, under `r2p.MODULE.NODE`; records from INFO up also go to the module's `log` topic."""
+
+    def __init__(self, logger: logging.Logger, publish: Callable[[int, str], None]) -> None:
+        super().__init__(logger)
+        self._publish = publish
+
+    def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
+        kwargs["stacklevel"] = kwargs.get("stacklevel", 1) + 1
+        super().log(level, msg, *args, **kwargs)
+        if level >= logging.INFO:
+            self._publish(level, _text(level, msg, args, kwargs.get("exc_info")))
+
+
+def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -> str:
+    """A log record as `logging` would print it, traceback included."""
+    try:
+        text = logging.LogRecord("", level, "", 0, msg, args, None).getMessage()
+    except (TypeError, ValueError):  # arguments that do not fit; logging itself says so on stderr
+        text = f"{msg} {args}"
+    if not exc_info:
+        return text
+    error = exc_info[1] if isinstance(exc_info, tuple) else exc_info
+    if not isinstance(error, BaseException):  # True: the one that is being handled
+        error = sys.exception()
+    return text if error is None else f"{text}\n{''.join(traceback.format_exception(error))}"
+
+
+class Node:
+    """What a node's function gets: the way to its topics. Made by `Module.start`."""
+
+    def __init__(
+        self,
+        name: str,
+        space: TopicSpace,
+        *,
+        priority: int = 0,
+        remap: dict[str, str] | None = None,
+        log: Callable[[int, str, str], None] = lambda _level, _node, _text: None,
+        events: EventHub | None = None,
+    ) -> None:
+        self.name = name
+        self.module = space.module
+        self.priority = priority
+        self.log = NodeLogger(
+            logging.getLogger(f"r2p.{space.module}.{name}"), lambda level, text: log(level, name, text)
+        )
+        self.publishers: dict[AnyPublisher, None] = {}
+        """Its open publishers, in order; None means nothing."""
+        self.subscribers: dict[Subscriber[Any], None] = {}
+        """Its open subscribers."""
+        self.closed = False
+        self.crashed: Callable[[Exception], None] = self._log_crash
+        """What to do with an error outside the node's own task; its supervisor sets it."""
+        self.unwinds: Callable[[], bool] = lambda: False
+        """Whether its function is on its way out by an exception; its supervisor sets it."""
+        self._ending = False
+        self._space = space
+        self._remap = remap or {}
+        self._events = events or EventHub()
+        self._tickers: set[Ticker] = set()
+        self._entered = False
+
+    @overload
+    def advertise(
+        self, topic: str, type: type[M], klass: NonRealTime = ..., *, latch: bool = ..., strict: bool = ...
+    ) -> Publisher[M]: ...
+
+    @overload
+    def advertise(
+        self, topic: str, type: type[M], klass: Sporadic, *, latch: bool = ..., strict: bool = ...
+    ) -> SporadicPublisher[M]: ...
+
+    @overload
+    def advertise(
+        self, topic: str, type: type[M], klass: Periodic[M], *, latch: bool = ..., strict: bool = ...
+    ) -> PeriodicPublisher[M]: ...
+
+    def advertise(
+        self,
+        topic: str,
+        type: type[M],
+        klass: NonRealTime | Sporadic | Periodic[M] = NonRealTime(),  # noqa: B008 - a frozen value
+        *,
+        latch: bool = False,
+        strict: bool = False,
+    ) -> Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]:
+        """Publish a topic; the class value says how: `NonRealTime()`, `Sporadic(deadline)`, `Periodic(period, fill)`.
+
+        `latch` sends the last value to every subscriber that joins later, and again when its module reboots.
+        `strict` raises TransportError where a link is known not to give what the class asks for.
+        Raises InvalidName or NameTooLong, MessageError (a type without a layout, a class value without sense),
+        TypeMismatch, and Closed once the node has ended.
+        """
+        shape = layout(type)
+        name = self._resolve(topic)
+        check_class(name, klass)
+        _check_links(self._space, self.log, name, shape.size, klass, strict=strict)
+        where = self._space.open(name, shape)
+        publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
+        try:
+            match klass:
+                case NonRealTime():
+                    publisher = Publisher(self._space, self, where, shape, klass, latch=latch)
+                case Sporadic():
+                    publisher = SporadicPublisher(self._space, self, where, shape, klass, latch=latch)
+                case Periodic():
+                    publisher = PeriodicPublisher(self._space, self, where, shape, klass, latch=latch)
+                    publisher.start()
+        except BaseException:  # whatever it was, the topic must not keep the type of a publisher that is not there
+            self._space.release(where)
+            raise
+        where.publishers.append(publisher)
+        for queue in where.queues:
+            queue.publisher_joined()
+        self.publishers[publisher] = None
+        self._space.changed(where)
+        return publisher
+
+    @overload
+    def subscribe(
+        self,
+        topic: str,
+        type: type[M],
+        callback: Callback[M] | None = ...,
+        *,
+        queue: int = ...,
+        lossy: bool = ...,
+        keep: Keep = ...,
+        max_age: float | None = ...,
+        timeout: float | None = ...,
+        on_timeout: Callable[[], object] | None = ...,
+    ) -> Subscriber[M]: ...
+
+    @overload
+    def subscribe(
+        self,
+        topic: str,
+        type: None,
+        callback: Callback[bytes] | None = ...,
+        *,
+        queue: int = ...,
+        lossy: bool = ...,
+        keep: Keep = ...,
+        max_age: float | None = ...,
+        timeout: float | None = ...,
+        on_timeout: Callable[[], object] | None = ...,
+    ) -> Subscriber[bytes]: ...
+
+    def subscribe(
+        self,
+        topic: str,
+        type: type[Message] | None,
+        callback: Callback[Any] | None = None,
+        *,
+        queue: int = QUEUE,
+        lossy: bool = False,
+        keep: Keep = "newest",
+        max_age: float | None = None,
+        timeout: float | None = None,
+        on_timeout: Callable[[], object] | None = None,
+    ) -> Subscriber[Any]:
+        """Subscribe a topic; with the type None messages are packed bytes.
+
+        `queue` messages are held. When it is full, non real-time publishers wait for it, up to their stall time, unless
+        it is `lossy`; whoever does not wait drops its oldest message, or with `keep="oldest"` the new one, counted in
+        `lost`. Messages older than `max_age` seconds are skipped, counted in `stale`: by the publisher's stamp and this
+        computer's clock, so the two have to agree, and a clock that is set makes messages look too old. When nothing
+        comes for `timeout` seconds, `on_timeout` is called once; without it, the iteration raises TimeoutError.
+        A `callback` is called, in this node's task, from `spin()`.
+        Raises InvalidName or NameTooLong, MessageError (a type without a layout, an option without sense),
+        TypeMismatch, and Closed once the node has ended.
+        """
+        check_options(
+            topic,
+            queue=queue,
+            keep=keep,
+            callback=callback,
+            max_age=max_age,
+            timeout=timeout,
+            on_timeout=on_timeout,
+        )
+        shape = None if type is None else layout(type)
+        where = self._space.open(self._resolve(topic), shape)
+        subscriber: Subscriber[Any] = Subscriber(
+            self._space,
+            self,
+            where,
+            shape,
+            queue=queue,
+            lossy=lossy,
+            keep=keep,
+            callback=callback,
+            max_age=max_age,
+            timeout=timeout,
+            on_timeout=on_timeout,
+        )
+        self.subscribers[subscriber] = None
+        subscriber.open()
+        return subscriber
+
+    async def spin(self, timeout: float | None = None) -> bool:
+        """Wait for messages of subscriptions with a callback, and call those; False after `timeout` seconds without.
+
+        Callbacks run in this node's task, one at a time; a coroutine function is awaited. False also when one of the
+        subscriptions has a time-out of its own, no `on_timeout`, and its time is up.
+        A node of periodic publishers spins, too: their `fill` is called meanwhile.
+        Raises Error if there is neither: nothing would ever be called; MessageError for a time-out that is not a number
+        of seconds.
+        """
+        timeout_or_none("the time-out of spin", timeout)
+        deadline = None if timeout is None else self._space.loop.time() + timeout
+        while not await self._serve():
+            try:
+                if deadline is None:  # a time-out costs more than a message
+                    await self._arrival()
+                else:
+                    async with asyncio.timeout_at(deadline):
+                        await self._arrival()
+            except TimeoutError:
+                return False
+        await pause()
+        return True
+
+    def every(self, period: float) -> AsyncIterator[Tick]:
+        """Tick each `period` seconds on absolute phase, first after one period; a slow body skips periods, counted.
+
+        Raises MessageError at once for what is not a number of seconds, of 1e-6 or more.
+        """
+        seconds("the period of every()", period, least=SHORTEST)
+        return self._tick(period)
+
+    async def _tick(self, period: float) -> AsyncIterator[Tick]:
+        loop, clock = self._space.loop, self._space.clock
+        waiter: asyncio.Future[None] | None = None
+        due = skipped = 0
+
+        def on_tick(scheduled: int, _late: int, lost: int) -> None:
+            nonlocal due, skipped
+            skipped += lost + (due > 0)
+            due = scheduled
+            if waiter is not None and not waiter.done():
+                waiter.set_result(None)
+
+        ticker = Ticker(loop, round(period * _SECOND), on_tick)
+        self._tickers.add(ticker)
+        ticker.start()
+        try:
+            while True:
+                if not due:
+                    waiter = loop.create_future()
+                    await waiter
+                tick = Tick(due, (clock.monotonic() - due) / _SECOND, skipped)
+                due = skipped = 0
+                yield tick
+        finally:
+            ticker.close()
+            self._tickers.discard(ticker)
+
+    def now(self) -> int:
+        """UTC in ns; never jumps back."""
+        return self._space.clock.now()
+
+    def network_time(self) -> int | None:
+        """The time in ns that all nodes on the module's RTCAN bus share, of the first one of several.
+
+        None: there is no bus, or no master on it.
+        """
+        return next((time for link in self._space.links if (time := link.network_time()) is not None), None)
+
+    def events(self) -> AsyncIterator[ModuleEvent]:
+        """What happens to the module's links and on the network, from this call on, as `Module.events`."""
+        return self._events.listen()
+
+    def crash(self, error: Exception) -> None:
+        """End this node with an error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
+        self.crashed(error)
+
+    @property
+    def ending(self) -> bool:
+        """Whether its end has begun: it was stopped, has crashed, or its function is in a `finally` by an exception.
+
+        From then on only its function has a say: no `fill`, `on_missed`, `on_timeout` or the like is called.
+        """
+        return self._ending or self.unwinds()
+
+    def end(self) -> None:
+        """Its end begins: periodic publishers fall silent, so that nothing contradicts what its clean-up publishes."""
+        self._ending = True
+        for publisher in self.publishers:
+            if isinstance(publisher, PeriodicPublisher):
+                publisher.silence()
+
+    def forget(self, user: object) -> None:
+        """A publisher or subscriber of the node was closed."""
+        # The type checker wants a key that may be there; it is in one of the two at most.
+        self.publishers.pop(user, None)  # type: ignore[call-overload]
+        self.subscribers.pop(user, None)  # type: ignore[call-overload]
+
+    def enter(self) -> None:
+        """The node's function starts: its priority counts from now on."""
+        self._entered = True
+        self._space.waker.enter(self.priority)
+
+    def close(self) -> None:
+        """Close all its publishers and subscribers; the module does so when the node's function has ended."""
+        self.closed = self._ending = True
+        for each in (*self.publishers, *self.subscribers, *self._tickers):
+            each.close()
+        if self._entered:
+            self._entered = False
+            self._space.waker.leave(self.priority)
+
+    def _log_crash(self, error: Exception) -> None:
+        self.log.error("node %s, which does not run: %r", self.name, error, exc_info=error)
+
+    def _resolve(self, topic: str) -> str:
+        if self.closed:
+            raise Closed(f"node {self.name} has ended: it can't use topic {topic} any more")
+        name = topic_name(topic)
+        name = topic_name(self._remap.get(name, name))
+        if name == MANAGEMENT:
+            raise InvalidName(f"topic {name} is the management's: take another name")
+        return name
+
+    async def _serve(self) -> bool:
+        served = False
+        for subscriber in self._listening():
+            served |= await subscriber.serve()
+        return served
+
+    async def _arrival(self) -> None:
+        """Wait until a subscription with a callback gets a message."""
+        listening = self._listening()
+        if not listening and not any(isinstance(each, PeriodicPublisher) for each in self.publishers):
+            raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
+        waiter = self._space.loop.create_future()
+        try:
+            for subscriber in listening:
+                subscriber.wait_by(waiter)
+            await waiter
+        finally:
+            for subscriber in listening:
+                subscriber.wait_no_more(waiter)
+
+    def _listening(self) -> list[Subscriber[Any]]:
+        return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
+
+
+def _check_links(
+    space: TopicSpace,
+    log: NodeLogger,
+    topic: str,
+    size: int,
+    klass: NonRealTime | Sporadic | Periodic[Any],
+    *,
+    strict: bool,
+) -> None:
+    """Tell of links that do not take the topic; `strict` raises TransportError where they give less than its class."""
+    for link in space.links:
+        reason = link.refusal(size)
+        if reason and not strict:
+            log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
+        elif strict and link.best_effort(klass.publisher_class):
+            reason = link.guarantee(topic, klass.publisher_class)
+        elif strict and isinstance(klass, Periodic):
+            reason = link.inadmissible(size, klass.period)
+        if reason and strict:
+            raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")

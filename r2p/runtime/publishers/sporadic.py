@@ -1,0 +1,117 @@
+"""Sporadic: never waits; what is not in every queue and on every link by its deadline is missed."""
+
+from typing import Generic
+
+from r2p.clock import Alarm
+from r2p.messages import Layout
+from r2p.runtime.backpressure import GIVEN_UP, PendingDelivery, Sink
+from r2p.runtime.publishers.base import BasePublisher, M, where
+from r2p.runtime.qos import Missed, Sporadic
+from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.topic import BURST, Topic, TopicOwner, TopicSpace, pause
+
+_SECOND = 1_000_000_000
+_TOO_LATE = "no room by the deadline"
+
+
+class SporadicPublisher(BasePublisher[M]):
+    """An event-triggered publisher."""
+
+    publisher_class = PublisherClass.SPORADIC
+
+    def __init__(
+        self, space: TopicSpace, node: TopicOwner, topic: Topic, layout: Layout[M], klass: Sporadic, *, latch: bool
+    ) -> None:
+        super().__init__(space, node, topic, layout, latch=latch)
+        self._deadline = round(klass.deadline * _SECOND)
+        self._limit = klass.pending
+        self._send_late = klass.late == "send"
+        self._on_missed = klass.on_missed
+        self._on_late = klass.on_late
+        self._on_degraded = klass.on_degraded
+        self._pending: list[_EventDelivery[M]] = []
+        self._alarm = Alarm(space.loop, self._overdue)
+
+    async def publish(self, message: M) -> None:
+        """Publish an event; returns at once, also where somebody has no room yet.
+
+        Raises MessageError if the message does not fit its type.
+        """
+        self.publish_nowait(message)
+        self._credit -= 1
+        if self._credit <= 0:
+            self._credit = BURST
+            await pause()
+
+    def publish_nowait(self, message: M) -> bool:
+        """Publish an event; False if it has to wait for room somewhere, or can't reach somebody."""
+        sample = self._sample(message, self._deadline)
+        sample.drop_late = not self._send_late
+        blocked = self._topic.deliver(sample)
+        if blocked is None:
+            return True
+        waiting = [sink for sink in blocked if sink.reachable]
+        if waiting:
+            self._wait(_EventDelivery(self, sample, waiting, self._clock.monotonic() + self._deadline))
+        if len(waiting) < len(blocked):
+            self._unreachable(sample, [sink for sink in blocked if sink not in waiting])
+        return False
+
+    def close(self) -> None:
+        super().close()
+        while self._pending:
+            self._give_up(self._pending[0], "publisher closed")
+        self._alarm.close()
+
+    def _wait(self, event: "_EventDelivery[M]") -> None:
+        self._pending.append(event)
+        if len(self._pending) > self._limit:
+            self._give_up(self._pending[0], "too many wait")
+        self._arm()
+
+    def settled(self, event: "_EventDelivery[M]", sink: Sink, refusal: str) -> None:
+        """A sink has got an event that waited, or lost it."""
+        if not event.remaining:
+            self._pending.remove(event)
+            self._arm()
+        if refusal:
+            self._miss(event.sample.sequence, refusal, [sink])
+
+    def _arm(self) -> None:
+        self._alarm.set(next((event.due for event in self._pending if not event.overdue), None))
+
+    def _overdue(self) -> None:
+        now = self._clock.monotonic()
+        for event in [event for event in self._pending if event.due <= now and not event.overdue]:
+            if self._send_late:
+                event.overdue = True
+                self.late += 1
+                late = (now - event.due) / _SECOND
+                self._signal(Missed(self.topic, _TOO_LATE, where(event.remaining), late), self._on_late)
+            else:
+                self._give_up(event, _TOO_LATE)
+        self._arm()
+
+    def _give_up(self, event: "_EventDelivery[M]", reason: str) -> None:
+        if event in self._pending:  # a signal before this one may have closed the publisher
+            self._pending.remove(event)
+            without = event.withdraw()
+            for sink in without:
+                sink.lose(GIVEN_UP)
+            late = max(0, self._clock.monotonic() - event.due) / _SECOND
+            self._miss(event.sample.sequence, reason, without, late)
+
+
+class _EventDelivery(PendingDelivery, Generic[M]):
+    """An event that waits for room; `due` is monotonic ns."""
+
+    __slots__ = ("due", "overdue", "publisher")
+
+    def __init__(self, publisher: SporadicPublisher[M], sample: Sample, sinks: list[Sink], due: int) -> None:
+        self.publisher = publisher
+        self.due = due
+        self.overdue = False
+        super().__init__(sample, sinks)
+
+    def completed(self, sink: Sink, refusal: str) -> None:
+        self.publisher.settled(self, sink, refusal)

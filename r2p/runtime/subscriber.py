@@ -1,0 +1,342 @@
+"""Subscribers: one bounded queue, and the ways to empty it: `async for`, `fetch`, callbacks.
+
+Nothing is awaited between taking a message and handing it out, so a cancelled reader loses none.
+"""
+
+import asyncio
+import inspect
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+from r2p.clock import Alarm
+from r2p.durations import LONGEST, SHORTEST, seconds, timeout_or_none
+from r2p.errors import Closed, DecodeError, MessageError
+from r2p.messages import Layout
+from r2p.runtime.sample import Sample
+from r2p.runtime.topic import BURST, SubscriberQueue, Topic, TopicOwner, TopicSpace, number, pause
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+
+T = TypeVar("T")
+
+Callback = Callable[[T], object]
+Keep = Literal["newest", "oldest"]
+
+_SECOND = 1_000_000_000
+
+
+def check_options(
+    topic: str, *, queue: object, keep: object, callback: object, max_age: object, timeout: object, on_timeout: object
+) -> None:
+    """Raise MessageError for options of `Node.subscribe` without sense."""
+    number(topic, "queue", queue)
+    if keep not in ("newest", "oldest"):
+        raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {keep!r}")
+    if callback is not None and not callable(callback):
+        raise MessageError(f"topic {topic}: a callback is a function, not {callback!r}: options are given by name")
+    if on_timeout is not None and (timeout is None or not callable(on_timeout)):
+        raise MessageError(f"topic {topic}: on_timeout is a function, called after a timeout= without messages")
+    for option, value in (("max_age", max_age), ("timeout", timeout)):
+        if value is not None:
+            seconds(f"topic {topic}: {option}", value, least=SHORTEST)
+
+
+class _GuardedQueue(deque[Sample]):
+    """A queue that notes when the last message that is fresh enough came in; only for subscribers with a time-out."""
+
+    def __init__(self, note: Callable[[Sample], None]) -> None:
+        super().__init__()
+        self._note = note
+
+    def append(self, sample: Sample) -> None:
+        super().append(sample)
+        self._note(sample)
+
+
+class Subscriber(Generic[T]):
+    """One subscription of a node. Made by `Node.subscribe`.
+
+    Iterate it (`async for message in sub`), `fetch()` single messages, or give a callback that `node.spin()` serves.
+    Leaving an `async for` keeps the subscription; `close()` or `async with` ends it.
+    """
+
+    def __init__(
+        self,
+        space: TopicSpace,
+        node: TopicOwner,
+        topic: Topic,
+        layout: Layout[Any] | None,
+        *,
+        queue: int,
+        lossy: bool,
+        keep: Keep,
+        callback: Callback[T] | None,
+        max_age: float | None,
+        timeout: float | None,
+        on_timeout: Callable[[], object] | None,
+    ) -> None:
+        self.topic = topic.name
+        self.callback = callback
+        self.undecodable = 0
+        """Messages whose bytes are none of the type; skipped."""
+        self.stale = 0
+        """Messages older than `max_age` when their turn came; skipped."""
+        self.timeouts = 0
+        """Times that nothing (fresh) came for `timeout` seconds."""
+        self._sink = SubscriberQueue(space.waker, node, queue, node.priority, lossy=lossy, keep_oldest=keep == "oldest")
+        self._node = node
+        self._space = space
+        self._topic = topic
+        self._layout = layout
+        self._type = None if layout is None else layout.cls
+        self._max_age = None if max_age is None else round(max_age * _SECOND)
+        self._on_timeout = on_timeout
+        self._closed = False
+        self._silent = False
+        self._credit = 0
+        self._timeout = 0 if timeout is None else round(timeout * _SECOND)
+        self._heard = space.clock.monotonic()
+        self._alarm = Alarm(space.loop, self._check_silence, background=self._unattended)
+        if timeout is not None:
+            self._sink.queue = _GuardedQueue(self._note)
+            self._alarm.set(self._heard + self._timeout)
+        self.queue = self._sink.queue
+        """What waits to be read, oldest first."""
+
+    @property
+    def lost(self) -> int:
+        """Messages that found the queue full, or were pushed out of it."""
+        return self._sink.lost
+
+    @property
+    def publishers(self) -> int:
+        """Who publishes the topic, as far as this module knows: local publishers and remote ones that answered."""
+        return len(self._topic.publishers) + self._topic.remote_publishers
+
+    async def wait_publisher(self) -> None:
+        """Wait until somebody publishes the topic. Raises Closed if the subscription is closed before."""
+        if self._closed:
+            raise self._is_closed()
+        if not self.publishers:
+            waiter = self._space.loop.create_future()
+            self._sink.matches.append(waiter)
+            try:
+                await waiter
+            finally:
+                self._sink.matches.remove(waiter)
+
+    def __aiter__(self) -> AsyncIterator[T]:
+        return self._iterate(whole=False)
+
+    def samples(self) -> AsyncIterator[Sample]:
+        """Iterate samples: messages with their source, stamp, deadline and packed bytes."""
+        return self._iterate(whole=True)
+
+    async def _iterate(self, *, whole: bool) -> AsyncIterator[Any]:  # noqa: C901 - see below
+        # One long function, because this is where every message passes: calls would take as long as the work.
+        sink, kind, create_future = self._sink, self._type, self._space.loop.create_future
+        queue, waker, fussy = sink.queue, self._space.waker, self._max_age is not None
+        while not self._closed:
+            if not queue:
+                if sink.waiter is not None:
+                    raise self._two_readers()
+                waiter = sink.waiter = create_future()
+                try:
+                    await waiter
+                finally:
+                    if sink.waiter is waiter:
+                        sink.waiter = None
+            credit = BURST if sink.priority >= waker.top else 1
+            while queue:
+                sample = queue.popleft()
+                if sink.lines is not None:
+                    sink.refill()
+                message = sample.message
+                if fussy or message.__class__ is not kind:
+                    message = self._examine(sample)
+                    if message is None:
+                        continue
+                yield sample if whole else message
+                credit -= 1
+                if not credit:
+                    if queue:
+                        await self._give_way()
+                    break
+
+    async def fetch(self, timeout: float | None = None) -> T:
+        """Wait for one message. Raises TimeoutError after `timeout` seconds, Closed if the subscription is closed.
+
+        Raises MessageError for a time-out that is not a number of seconds.
+        """
+        if timeout is not None and (timeout.__class__ is not float or not timeout <= LONGEST):
+            timeout_or_none(f"topic {self.topic}: the time-out of fetch", timeout)
+        if self.queue:
+            await self._use_credit()
+        message = self._next()
+        if message is not None:
+            return message
+        if timeout is None:
+            return await self._fetch_next()
+        async with asyncio.timeout(timeout):
+            return await self._fetch_next()
+
+    async def _fetch_next(self) -> T:
+        while not self._closed:
+            await self._arrival()
+            message = self._next()
+            if message is not None:
+                return message
+        raise self._is_closed()
+
+    def close(self) -> None:
+        """End the subscription; whoever waits for its next message is woken."""
+        if not self._closed:
+            self._closed = True
+            self._alarm.close()
+            self._topic.leave(self._sink)
+            self._space.release(self._topic)
+            self._node.forget(self)
+            self.queue.clear()
+            self._sink.refill()
+            if (reader := self._sink.waiter) is not None and not reader.done():
+                reader.set_result(None)
+            for waiter in self._sink.matches:
+                if not waiter.done():
+                    waiter.set_exception(self._is_closed())
+
+    async def __aenter__(self) -> "Self":
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: "TracebackType | None"
+    ) -> None:
+        self.close()
+
+    # For the node
+
+    def open(self) -> None:
+        """Join the topic; a latched value is there at once."""
+        self._topic.join(self._sink)
+        self._space.changed(self._topic)
+
+    async def serve(self) -> bool:
+        """Hand what waits now to the callback; says whether there was anything. For `Node.spin`."""
+        served = False
+        for _ in range(len(self.queue)):
+            message = self._next()
+            if message is None:
+                break
+            served = True
+            if self.callback is not None and inspect.isawaitable(pending := self.callback(message)):
+                await pending
+            await self._use_credit()
+        return served
+
+    def wait_by(self, waiter: asyncio.Future[None]) -> None:
+        """Wake this future at the next message."""
+        if self._sink.waiter is not None:
+            raise self._two_readers()
+        self._sink.waiter = waiter
+
+    def wait_no_more(self, waiter: asyncio.Future[None]) -> None:
+        """Take it back, if it has not been woken."""
+        if self._sink.waiter is waiter:
+            self._sink.waiter = None
+
+    def _next(self) -> T | None:
+        """The next good message that waits, or None."""
+        sink, queue = self._sink, self.queue
+        while queue:
+            sample = queue.popleft()
+            if sink.lines is not None:
+                sink.refill()
+            message: T | None = self._examine(sample)
+            if message is not None:
+                return message
+        return None
+
+    def _examine(self, sample: Sample) -> Any:
+        """The sample's message as this subscriber's type; None, counted, if it is too old or does not decode."""
+        if self._max_age is not None and self._space.clock.now() - sample.stamp > self._max_age:
+            self.stale += 1
+            return None
+        if self._layout is None:
+            return sample.data
+        message: Any = sample.message
+        if message.__class__ is self._type:
+            return message
+        try:
+            message = self._layout.decode(sample.data)
+        except DecodeError:
+            self.undecodable += 1
+            return None
+        if sample.message is None:
+            sample.message = message
+        return message
+
+    async def _arrival(self) -> None:
+        """Wait until something is in the queue, or the subscription is closed."""
+        self._credit = 0
+        waiter = self._space.loop.create_future()
+        self.wait_by(waiter)
+        try:
+            await waiter
+        finally:
+            self.wait_no_more(waiter)
+
+    def _two_readers(self) -> RuntimeError:
+        return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each")
+
+    def _is_closed(self) -> Closed:
+        return Closed(f"the subscription of {self.topic} is closed: subscribe again")
+
+    async def _use_credit(self) -> None:
+        """Let others run after BURST messages in a row; a node of low priority after each."""
+        self._credit += 1
+        if self._credit >= BURST or self._sink.priority < self._space.waker.top:
+            self._credit = 0
+            await self._give_way()
+
+    async def _give_way(self) -> None:
+        waker, priority = self._space.waker, self._sink.priority
+        if priority >= waker.top:
+            await pause()
+        else:
+            turn = self._space.loop.create_future()
+            waker.queue(priority, turn)
+            await turn
+
+    def _note(self, sample: Sample) -> None:
+        if self._max_age is None or self._space.clock.now() - sample.stamp <= self._max_age:
+            self._heard = self._space.clock.monotonic()
+            if self._silent:
+                self._silent = False
+                self._alarm.set(self._heard + self._timeout)
+
+    def _unattended(self) -> bool:
+        """Whether nothing comes of a time-out now: nobody waits for a message, and there is nothing to call."""
+        return self._sink.waiter is None and self._on_timeout is None
+
+    def _check_silence(self) -> None:
+        now = self._space.clock.monotonic()
+        if now < self._heard + self._timeout:
+            self._alarm.set(self._heard + self._timeout)
+            return
+        self.timeouts += 1
+        if self._on_timeout is not None:
+            self._silent = True
+            if self._node.ending:
+                return
+            try:
+                self._on_timeout()
+            except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
+                self._node.crash(error)
+            return
+        self._heard = now
+        self._alarm.set(now + self._timeout)
+        if (reader := self._sink.waiter) is not None and not reader.done():
+            reader.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / _SECOND} s"))

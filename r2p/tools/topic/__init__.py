@@ -1,0 +1,18 @@
+"""`r2p topic`: the group; its commands lie beside it, by what they do."""
+
+from r2p.tools import session
+from r2p.tools.topic import echo as topic_echo
+from r2p.tools.topic import list as topic_list
+from r2p.tools.topic import pub as topic_pub
+from r2p.tools.topic import rates as topic_rates
+
+app = session.group("List, watch, publish and measure topics.")
+
+session.command(app, "list")(topic_list.list_)
+session.command(app, "info")(topic_list.info)
+session.command(app, "find")(topic_list.find)
+session.command(app, "echo")(topic_echo.echo)
+session.command(app, "pub")(topic_pub.pub)
+session.command(app, "hz")(topic_rates.hz)
+session.command(app, "bw")(topic_rates.bw)
+session.command(app, "delay")(topic_rates.delay)

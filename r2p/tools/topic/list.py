@@ -1,0 +1,154 @@
+"""`r2p topic list`, `info` and `find`: what is known of topics."""
+
+import re
+from typing import Annotated, Any
+
+import typer
+
+import r2p
+from r2p.names import topic_name
+from r2p.tools.output import Output
+from r2p.tools.session import Format, Session, Wait
+from r2p.tools.topic.watching import CLASS_NAMES, Topic, meant
+from r2p.tools.types import Types, load_type, of_size, type_name
+
+_COLUMNS = ["topic", "type", "size", "publishers", "subscribers"]
+
+
+async def list_(session: Session, *, wait: Wait = None, format: Format = None) -> None:
+    """List topics, types, publishers and subscribers."""
+    output = Output(format)
+    await session.settle(wait)
+    views, types = session.module.network.topics().values(), Types(session.settings)
+    await types.learn_all(session, views)
+    rows = [_row(session, view, types) for view in views]
+    await output.table(rows, _COLUMNS)
+    if not rows:
+        session.say(f"no topic is known on {session.where}")
+
+
+async def info(session: Session, topic: Topic, *, wait: Wait = None, format: Format = None) -> None:
+    """Tell all about a topic.
+
+    Its type, its publishers and subscribers by node, and what the links guarantee;
+    with -v also the fields of the type, and how long ago the topic was heard of.
+    """
+    output = Output(format)
+    await session.settle(wait)
+    views = session.module.network.topics()
+    view = views.get(topic_name(topic))
+    if view is None:
+        question = meant(session, topic_name(topic), lambda view: True)
+        known = question or f"; known topics: {', '.join(views) or 'none'}"
+        raise r2p.Error(f"nobody publishes or subscribes {topic}{known}")
+    if view.mismatch:
+        session.say(f"{topic} has different types: some of those below can't hear each other")
+    details = await _details(session, view)
+    if session.verbose:
+        age = None if view.age is None else round(view.age, 3)
+        details["age"] = f"{age} s" if output.format == "text" else age
+    await output.put(details)
+
+
+async def find(
+    session: Session,
+    what: Annotated[str, typer.Argument(metavar="TYPE|FINGERPRINT|SIZE", help="r2p.msg:Led, 16 hex digits, or bytes.")],
+    *,
+    wait: Wait = None,
+    format: Format = None,
+) -> None:
+    """Find the topics of a type.
+
+    Of a topic whose fingerprint nobody tells (firmware does not) only the size is compared; its match is "size".
+    """
+    output = Output(format)
+    size, fingerprint = _wanted(what)
+    await session.settle(wait)
+    views = session.module.network.topics().values()
+    found = [(view, match) for view in views if (match := _match(view, size, fingerprint)) is not None]
+    types = Types(session.settings)
+    await types.learn_all(session, (view for view, _ in found))
+    rows = [_row(session, view, types) | {"match": match} for view, match in found]
+    await output.table(rows, [*_COLUMNS, "match"])
+    if not rows:
+        raise r2p.Error(f"no topic of type {what} is known on {session.where}")
+
+
+def _wanted(what: str) -> tuple[int, bytes | None]:
+    """Size (0: any) and fingerprint (None: any) to look for."""
+    if re.fullmatch(r"[0-9a-fA-F]{16}", what):
+        return 0, bytes.fromhex(what)
+    if what.isdecimal():
+        return int(what), None
+    layout = r2p.layout(load_type(what))
+    return layout.size, layout.fingerprint
+
+
+def _match(view: r2p.TopicView, size: int, fingerprint: bytes | None) -> str | None:
+    if fingerprint is not None and view.fingerprint is not None:
+        return "type" if view.fingerprint == fingerprint else None
+    return "size" if size and view.size == size else None
+
+
+def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
+    cls = types.of(view)
+    return {
+        "topic": view.name,
+        "type": None if cls is None else type_name(cls),
+        "size": view.size or None,
+        "publishers": [each["node"] for each in _endpoints(session, view.publishers, view.published_on)],
+        "subscribers": [each["node"] for each in _endpoints(session, view.subscribers, view.subscribed_on)],
+    }
+
+
+def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) -> list[dict[str, Any]]:
+    """Those known by node; for the other links somebody: the only module there, or `?`."""
+    told = {each.link for each in known}
+    found = [
+        {"node": f"{each.module or '?'}/{each.node}", "class": _class_name(each), "link": each.link} for each in known
+    ]
+    return found + [
+        {"node": f"{session.only_module(link)}/?", "class": None, "link": link} for link in links if link not in told
+    ]
+
+
+def _class_name(endpoint: r2p.Endpoint) -> str | None:
+    return None if endpoint.publisher_class is None else CLASS_NAMES[endpoint.publisher_class]
+
+
+async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
+    cls = await Types(session.settings).learn(session, view)
+    publishers = _endpoints(session, view.publishers, view.published_on)
+    subscribers = _endpoints(session, view.subscribers, view.subscribed_on)
+    details: dict[str, Any] = {
+        "topic": view.name,
+        "type": None if cls is None else type_name(cls),
+        "size": view.size or None,
+        "fingerprint": None if view.fingerprint is None else view.fingerprint.hex(),
+        "publishers": publishers,
+        "subscribers": [{key: each[key] for key in ("node", "link")} for each in subscribers],
+        "guarantees": _guarantees(session, view),
+    }
+    if session.verbose:
+        details |= _fields(cls, view)
+    return details
+
+
+def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> dict[str, Any]:
+    """The kind of each field by its path; of an unknown type the names of the types that have its size."""
+    if cls is not None:
+        pairs = (field.rpartition(":") for field in r2p.layout(cls).schema.split())
+        return {"fields": {path: kind for path, _, kind in pairs}}
+    return {"fields": None, "maybe": of_size(view.size)}
+
+
+def _guarantees(session: Session, view: r2p.TopicView) -> dict[str, str]:
+    """What each link gives to the classes that are published, as far as they are known."""
+    classes = {each.publisher_class for each in view.publishers if each.publisher_class is not None}
+    guarantees = {}
+    for link in session.module.links:
+        for publisher_class in sorted(classes or {r2p.PublisherClass.NON_REAL_TIME}):
+            refusal = link.refusal(view.size)
+            text = f"not carried: {refusal}" if refusal else link.guarantee(view.name, publisher_class)
+            guarantees[f"{link.name} {CLASS_NAMES[publisher_class]}"] = text
+    return guarantees

@@ -1,0 +1,1 @@
+"""CAN controllers: ports to SocketCAN and to the interfaces of python-can."""

@@ -1,0 +1,181 @@
+"""A CAN_RAW socket that is read 64 frames a system call.
+
+Python's socket module lacks `recvmmsg`: one call brings a batch of frames, each with its flags (own or not) and its
+stamp. Its `recvmsg`, which brings the same for one frame, asks the kernel for the interface's name each time besides.
+"""
+
+import ctypes
+import errno
+import os
+import socket
+import struct
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from r2p.codecs.rtcan import Frame
+
+BATCH = 64
+"""Frames that one call brings at most."""
+
+OWN = 0x800
+"""Flag MSG_CONFIRM: this socket sent the frame, and the controller says that it is through."""
+
+ERROR = socket.CAN_ERR_FLAG
+DATA = socket.CAN_EFF_FLAG
+"""Of the flags in an identifier, all that RTCAN's frames have: it is a long one."""
+FLAGS = ERROR | DATA | socket.CAN_RTR_FLAG
+
+Arrived = tuple[int, bytes, int, int]
+"""Identifier with FLAGS, up to 8 bytes, flags, and stamp (ns of the monotonic clock)."""
+
+_SECOND = 1_000_000_000
+_OLDEST = 10 * _SECOND  # ns; a stamp that seems older is from before the computer's clock was set
+_RECEIVE_BUFFER = 1 << 19  # bytes: some hundred frames, tens of ms of a saturated bus
+_KIND = DATA | socket.CAN_RTR_FLAG  # what filters look at besides; with ERROR they would be for error frames
+_FILTERS_MAX = 512  # CAN_RAW_FILTER_MAX; none at all would mean: nothing
+_CAN_RAW_ERR_FILTER, _SO_RXQ_OVFL, _SO_TIMESTAMPNS = 2, 40, 64  # the last one has 64-bit seconds on all machines
+_NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
+
+_FRAME = struct.Struct("=IB3x8s")  # struct can_frame
+_FILTER = struct.Struct("=II")
+_HEAD = "QII" if struct.calcsize("P") == 8 else "III"  # struct cmsghdr
+_CONTROL = struct.Struct(f"={_HEAD}qq{_HEAD}I{'4x' if _HEAD[0] == 'Q' else ''}")  # a stamp, and a count of drops
+_STAMP_ONLY = struct.calcsize(f"={_HEAD}qq")
+
+
+class _IoVec(ctypes.Structure):
+    """struct iovec."""
+
+    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _MsgHdr(ctypes.Structure):
+    """struct msghdr."""
+
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_length", ctypes.c_uint32),
+        ("vectors", ctypes.POINTER(_IoVec)),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _MMsgHdr(ctypes.Structure):
+    """struct mmsghdr."""
+
+    _fields_ = (("header", _MsgHdr), ("length", ctypes.c_uint))
+
+
+class RawSocket:
+    """A socket on one interface. Raises OSError where Python's does."""
+
+    def __init__(self, name: str) -> None:
+        """Opened, but deaf until `set_filters`."""
+        self.dropped = 0
+        """Frames that the kernel threw away because this socket's queue was full."""
+        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
+        try:
+            self._configure()
+            self._socket.bind((name,))
+        except BaseException:  # nobody has it yet who could close it
+            self._socket.close()
+            raise
+        self._batch = _Batch(self._socket.fileno())
+        self._priority = 0
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def set_filters(self, filters: Iterable[tuple[int, int]] | None) -> None:
+        """Take data frames with `id & mask == identifier` of one of these (identifier, mask), 29 bits each; None: all
+        frames, those with 11 bits and remote ones too.
+        """
+        every = [_FILTER.pack(0, 0)]
+        packed = (
+            every
+            if filters is None
+            else [_FILTER.pack(identifier | DATA, mask | _KIND) for identifier, mask in filters]
+        )
+        if len(packed) > _FILTERS_MAX:
+            packed = [_FILTER.pack(DATA, _KIND)]
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(packed))
+
+    def send(self, frame: Frame, priority: int) -> bool:
+        """Hand a frame to the kernel's queue of the interface; False: there is no room."""
+        if priority != self._priority:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, priority)
+            self._priority = priority
+        try:
+            self._socket.send(_FRAME.pack(frame.id | DATA, len(frame.data), frame.data))
+        except OSError as error:
+            if error.errno in _NO_ROOM:
+                return False
+            raise
+        return True
+
+    def receive(self) -> list[Arrived]:
+        """Up to 64 frames that are there; none if nothing is."""
+        arrived, self.dropped = self._batch.receive(self.dropped)
+        return arrived
+
+    def _configure(self) -> None:
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 1)
+        self._socket.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, socket.CAN_ERR_MASK)
+
+
+class _Batch:
+    """Memory that `recvmmsg` writes to, and how it is read."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._recvmmsg: Any = ctypes.CDLL(None, use_errno=True).recvmmsg
+        self._frames = ctypes.create_string_buffer(BATCH * _FRAME.size)
+        self._controls = ctypes.create_string_buffer(BATCH * _CONTROL.size)
+        self._messages = (_MMsgHdr * BATCH)()
+        self._vectors = (_IoVec * BATCH)()
+        for index, (message, vector) in enumerate(zip(self._messages, self._vectors, strict=True)):
+            vector.base, vector.length = ctypes.addressof(self._frames) + index * _FRAME.size, _FRAME.size
+            message.header.vectors, message.header.vector_count = ctypes.pointer(vector), 1
+            message.header.control = ctypes.addressof(self._controls) + index * _CONTROL.size
+            message.header.control_length = _CONTROL.size
+        self._frame_bytes = memoryview(self._frames)
+        self._control_bytes = memoryview(self._controls)
+        self._fresh = bytes(self._messages)  # the kernel overwrites the lengths
+        words = memoryview(self._messages).cast("B").cast("I")
+        self._flags = words[_MsgHdr.flags.offset // 4 :: ctypes.sizeof(_MMsgHdr) // 4]
+
+    def receive(self, dropped: int) -> tuple[list[Arrived], int]:
+        """What is there, and how many frames were dropped so far."""
+        count = self._recvmmsg(self._fd, self._messages, BATCH, socket.MSG_DONTWAIT, None)
+        if count < 0:
+            code = ctypes.get_errno()
+            if code == errno.EAGAIN:
+                return [], dropped
+            raise OSError(code, os.strerror(code))
+        now = time.monotonic_ns()
+        offset = time.time_ns() - now
+        arrived: list[Arrived] = []
+        frames = _FRAME.iter_unpack(self._frame_bytes[: count * _FRAME.size])
+        controls = _CONTROL.iter_unpack(self._control_bytes[: count * _CONTROL.size])
+        flags = self._flags[:count].tolist()
+        oldest = now - _OLDEST
+        for (identifier, length, data), flag, control in zip(frames, flags, controls, strict=True):
+            stamp = control[3] * _SECOND + control[4] - offset
+            if not oldest < stamp < now:
+                stamp = now
+            arrived.append((identifier, data if length == 8 else data[:length], flag, stamp))
+        if self._messages[count - 1].header.control_length > _STAMP_ONLY:
+            dropped = control[8]
+        ctypes.memmove(self._messages, self._fresh, count * ctypes.sizeof(_MMsgHdr))
+        return arrived, dropped

@@ -1,0 +1,251 @@
+"""`r2p.run`: programs in processes of their own, ended by what ends programs."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from typing import TYPE_CHECKING, NamedTuple
+
+import pytest
+
+import r2p
+from r2p.modules.runner import loop_factory, run_main
+from tests.bench import settle
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
+
+PROLOGUE = """
+import asyncio, os, signal, sys, threading, time
+import r2p
+
+def ready() -> None:
+    print("ready", flush=True)
+
+async def waits(node: r2p.Node) -> None:
+    ready()
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await asyncio.sleep(0)
+        print("cleaned up", flush=True)
+"""
+
+
+class Ended(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+def execute(program: str, *signals: int) -> Ended:
+    """Run a program; send it each signal when it has printed one more line."""
+    text = PROLOGUE + textwrap.dedent(program)
+    environment = {name: value for name, value in os.environ.items() if name != "R2P_VIA"}
+    with subprocess.Popen(
+        [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        lines = []
+        try:
+            for number in signals:
+                lines.append(process.stdout.readline())
+                process.send_signal(number)
+            out, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+        return Ended(process.returncode, "".join(lines) + out, err)
+
+
+@pytest.mark.processes
+def test_it_returns_when_all_nodes_have_ended() -> None:
+    ended = execute(
+        """
+        from r2p.msg import Led
+
+        async def sends(node: r2p.Node) -> None:
+            leds = node.advertise("leds", Led)
+            await leds.wait_subscriber()
+            await leds.publish(Led(led=3))
+
+        async def gets(node: r2p.Node) -> None:
+            print(await node.subscribe("lamp", Led).fetch(), node.module)
+
+        r2p.run(sends, gets, module="PC7", remap={"leds": "lamp"})
+        print("end")
+        """
+    )
+    assert ended == (0, "Led(led=3, value=0) PC7\nend\n", "")
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_everything_in_order(number: int) -> None:
+    ended = execute("r2p.run(waits)\nprint('end')", number)
+    assert ended == (0, "ready\ncleaned up\nend\n", "")
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(("first", "second"), [(signal.SIGINT, signal.SIGINT), (signal.SIGINT, signal.SIGTERM)])
+def test_a_second_signal_ends_the_process_at_once(first: int, second: int) -> None:
+    program = """
+        async def hangs(node: r2p.Node) -> None:
+            ready()
+            try:
+                await asyncio.Event().wait()
+            finally:
+                ready()
+                await asyncio.Event().wait()
+
+        sys.modules["r2p.modules.runner"].GRACE = 3600.0
+        r2p.run(hangs)
+    """
+    assert execute(program, first, second).code == -second
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    "hang", ["await asyncio.Event().wait()", "time.sleep(3600)", "await asyncio.to_thread(time.sleep, 3600)"]
+)
+def test_a_program_that_does_not_end_is_ended(hang: str) -> None:
+    program = f"""
+        async def hangs(node: r2p.Node) -> None:
+            ready()
+            try:
+                {hang}
+            finally:
+                {hang}
+
+        sys.modules["r2p.modules.runner"].GRACE = 0.05
+        r2p.run(hangs)
+    """
+    assert execute(program, signal.SIGTERM).code == -signal.SIGTERM
+
+
+@pytest.mark.processes
+def test_a_crash_is_raised_at_the_end_also_after_a_signal() -> None:
+    program = """
+        async def broken(node: r2p.Node) -> None:
+            raise ValueError("no motor")
+
+        r2p.run(broken, waits)
+    """
+    ended = execute(program, signal.SIGINT)
+    assert (ended.code, ended.out) == (1, "ready\ncleaned up\n")
+    assert "NodeCrashed: 1 node(s) of module" in ended.err
+    assert "ValueError: no motor" in ended.err
+    assert "in node broken of module" in ended.err
+
+
+@pytest.mark.processes
+def test_restart_goes_on_after_a_crash() -> None:
+    program = """
+        import itertools
+        runs = itertools.count()
+
+        async def broken(node: r2p.Node) -> None:
+            if next(runs) == 0:
+                raise ValueError("no motor")
+            print("again")
+
+        sys.modules["r2p.modules.supervisor"]._FIRST_RESTART = 0.01
+        r2p.run(broken, restart=True)
+    """
+    assert execute(program)[:2] == (0, "again\n")
+
+
+def handlers() -> list[object]:
+    return [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+
+
+def test_a_signal_ends_run_main_and_the_handlers_are_as_before() -> None:
+    async def main() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        await asyncio.Event().wait()
+
+    before = handlers()
+    run_main(main)
+    assert handlers() == before
+
+
+def test_run_main_gives_the_result_and_raises_what_main_raises() -> None:
+    async def fine() -> int:
+        await asyncio.sleep(0)
+        return 3
+
+    async def broken() -> None:
+        raise LookupError
+
+    async def cancelled() -> None:
+        raise asyncio.CancelledError
+
+    before = handlers()
+    assert run_main(fine) == 3
+    with pytest.raises(LookupError):
+        run_main(broken)
+    with pytest.raises(asyncio.CancelledError):
+        run_main(cancelled)
+    assert handlers() == before
+
+
+def test_run_main_works_in_a_thread() -> None:
+    async def main() -> None:
+        await asyncio.sleep(0)
+        done.append(handlers())
+
+    done: list[list[object]] = []
+    before = handlers()
+    thread = threading.Thread(target=run_main, args=(main,))
+    thread.start()
+    thread.join()
+    assert done == [before]
+
+
+def test_a_program_runs_on_uvloop_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> str:
+        return type(asyncio.get_running_loop()).__module__
+
+    pytest.importorskip("uvloop")
+    assert run_main(main) == "uvloop"
+    monkeypatch.setitem(sys.modules, "uvloop", None)
+    assert loop_factory() is None
+    assert str(run_main(main)).startswith("asyncio")
+
+
+def test_wrong_functions_are_told_before_anything_runs() -> None:
+    async def a_long_name(node: r2p.Node) -> None:
+        await settle()
+
+    with pytest.raises(r2p.NameTooLong, match="function name 'a_long_name' is no node name"):
+        r2p.run(a_long_name)
+
+
+@pytest.mark.processes
+def test_the_example_of_the_package(tmp_path: Path) -> None:
+    """The program at the top of the design, until it has printed two messages."""
+    program = """
+        from r2p.msg import Led
+
+        async def blink(node: r2p.Node) -> None:
+            leds = node.advertise("leds", Led)
+            on = False
+            async for _ in node.every(0.01):
+                on = not on
+                await leds.publish(Led(led=3, value=int(on)))
+
+        async def watch(node: r2p.Node) -> None:
+            async for led in node.subscribe("leds", Led, queue=5):
+                print(led, flush=True)
+
+        r2p.run(blink, watch)
+    """
+    ended = execute(program, 0, signal.SIGINT)
+    assert ended.code == 0
+    assert ended.out.splitlines()[:2] == ["Led(led=3, value=1)", "Led(led=3, value=0)"]

@@ -1,0 +1,122 @@
+"""`r2p bus admit`: what the master's calendar says of a plan."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from typing import TYPE_CHECKING
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from r2p.protocols.rtcan.calendar import Calendar
+from r2p.tools.bus import app, picture
+from r2p.tools.bus.admit import Wanted, admit_all, cells_of, grid, parse, summary
+from r2p.tools.bus.picture import Cell
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def admit(*arguments: str) -> tuple[int, list[dict[str, object]], str]:
+    result = CliRunner().invoke(app, ["admit", *arguments])
+    return result.exit_code, [json.loads(line) for line in result.stdout.splitlines()], result.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("imu:18@200Hz", Wanted("imu", 18, 5_000_000)),
+        ("imu:18@5ms", Wanted("imu", 18, 5_000_000)),
+        ("enc:8@1kHz", Wanted("enc", 8, 1_000_000)),
+        ("e:1024@0.5hz", Wanted("e", 1024, 2_000_000_000)),
+    ],
+)
+def test_a_plan_is_name_bytes_and_rate_or_period(text: str, wanted: Wanted) -> None:
+    assert parse(text) == wanted
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "imu",
+        "imu:18",
+        "imu@5ms",
+        "imu:0@5ms",
+        "imu:1025@5ms",
+        "imu:8@0Hz",
+        "imu:8@x",
+        "imu:8@200",
+        "imu:8@1e-12s",
+        "imu:8@1e300s",
+        "imu:8@1e-300Hz",
+    ],
+)
+def test_what_can_not_be_a_plan_is_refused(text: str) -> None:
+    with pytest.raises(typer.BadParameter):
+        parse(text)
+
+
+def test_a_cycle_that_nobody_can_mean_is_refused() -> None:
+    with pytest.raises(typer.BadParameter):
+        grid(60, 1e300, 1_000_000)
+
+
+def test_the_networks_of_the_thesis_fill_39_of_59_slots() -> None:
+    """Section 4.4: three nodes with a message every 6, 30 and 60 slots each."""
+    plan = [f"{name}{i}:8@{time}" for time, name in (("1000Hz", "a"), ("5ms", "b"), ("10ms", "c")) for i in range(3)]
+    code, rows, _ = admit(*plan)
+    assert code == 0
+    assert [row["period"] for row in rows] == [6] * 3 + [30] * 3 + [60] * 3
+    assert sum(int(str(row["in_cycle"])) for row in rows) == 39
+    wanted, timing = [parse(each) for each in plan], grid(60, None, 1_000_000)
+    calendar = Calendar(timing.slots)
+    admit_all(calendar, wanted, timing)
+    assert summary(calendar, timing).startswith("40 of 60 slots reserved (the sync's included), 20 left")
+
+
+def test_a_refusal_has_its_reason_and_another_order_is_told() -> None:
+    plan = ["imu:18@200Hz", "a1:8@996us", "a2:8@996us", "a3:8@996us", "a4:8@996us"]
+    code, rows, err = admit(*plan)
+    assert code == 1
+    assert "no 1 slots in a row are free every 6 slots" in str(rows[-1]["refused"])
+    assert "2 of 5 messages get no slots" in err
+    _, _, err = admit("b:8@5ms", "c:8@5ms", "d:8@5ms", "e:8@5ms", "f:8@5ms", "a:8@996us")
+    assert "all of them do in this order: a b c d e f" in err
+
+
+def test_slots_that_are_too_short_are_a_wrong_usage() -> None:
+    code, _, err = admit("a:8@1Hz", "--bitrate", "100000")
+    assert code == 2
+    assert "fewer --slots" in err
+
+
+def test_the_drawing_shows_every_slot(tmp_path: Path) -> None:
+    file = tmp_path / "cycle.svg"
+    assert admit("imu:18@200Hz", "slow:12@25Hz", "--svg", str(file))[0] == 0
+    titles = [each.text for each in ET.parse(file).getroot().iter("{http://www.w3.org/2000/svg}title")]
+    assert len(titles) == 60
+    assert titles[0] == "slot 0: sync"
+    assert titles[1:4] == [f"slot {i}: imu" for i in (1, 2, 3)]
+    assert titles[4:6] == [f"slot {i}: slow, every 4 cycles" for i in (4, 5)]
+    code, _, err = admit("a:8@1Hz", "--svg", str(tmp_path / "none" / "x.svg"))
+    assert code == 1
+    assert "can't be written" in err
+
+
+def test_the_picture_marks_what_was_missed_and_what_events_use() -> None:
+    cells = [Cell("sync"), Cell("imu"), Cell("imu", missed=2), Cell(shared=3), Cell()]
+    assert picture.text(cells) == "  0  S  A  A! +  ."
+    calendar = Calendar(60)
+    wanted = [parse("a:8@996us")]
+    admit_all(calendar, wanted, grid(60, None, 1_000_000))
+    assert [i for i, cell in enumerate(cells_of(calendar, wanted, grid(60, None, 1_000_000))) if cell.owner == "a"] == [
+        *range(1, 60, 6)
+    ]
+
+
+def test_more_owners_than_letters_are_still_drawn() -> None:
+    cells = [Cell(f"t{i}") for i in range(80)]
+    assert len(picture.text(cells).splitlines()) == 4
+    assert picture.svg(cells, "x", {}).count("<title>") == 80

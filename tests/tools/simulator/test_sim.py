@@ -1,0 +1,236 @@
+"""`r2p sim`: what it measures, how it shows it, and the command itself."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import io
+import re
+import signal
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+import r2p
+from r2p import sim
+from r2p.msg import Odometry, Pose3
+from r2p.sim import can_bus
+from r2p.sim.physics.world import World, box
+from r2p.sim.robots.emulated import Triskar2
+from r2p.sim.robots.figures import BusFigures, Figures, Gauge, TopicFigures, WheelFigures
+from r2p.sim.robots.square import square
+from r2p.tools.main import app
+from r2p.tools.simulator import screen
+from r2p.tools.simulator.command import outside
+from r2p.tools.simulator.play import Play, play, program
+from r2p.tools.simulator.screen import Chart
+from tests.tools.rig import process
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from r2p.bridge import BridgeOptions
+
+VIA = "sim:gauge"
+
+
+@pytest.mark.virtual_time
+async def test_figures_of_a_drive() -> None:
+    bus = can_bus("gauge")
+    async with Triskar2(VIA, seed=1) as robot, r2p.Module("PC1", via=VIA) as pc:
+        await robot.ready(10)
+        gauge = Gauge(robot, bus, [pc])
+        pc.start(square, 1.0, 0.4, name="square")
+        await asyncio.sleep(2)
+        gauge.read(2.0)
+        await asyncio.sleep(1)
+        figures = gauge.read(3.0)
+        assert figures.path == robot.hardware.body.path
+    topics = {topic.topic: topic for topic in figures.topics}
+    assert topics["velocity_cmd"].rate == pytest.approx(20, abs=1)
+    assert topics["encoder1"].rate == pytest.approx(50, abs=2)
+    assert topics["encoder1"].sent == pytest.approx(150, abs=4)  # not what was sent while the bus settled
+    assert topics["encoder1"].real_time == "hard: in slots"
+    assert topics["odometry"].real_time == "soft: by deadline"
+    assert not {"log", "power", "current1"} & set(topics)
+    assert figures.missed == 0
+    assert figures.bus is not None
+    assert 0.05 < figures.bus.load < 0.5
+    assert figures.bus.frames == pytest.approx(3 * figures.bus.rate, rel=0.2)
+    assert figures.bus.mean == pytest.approx(figures.bus.load, rel=0.2)
+    assert figures.bus.of == 60
+    assert 2.0 < figures.bus.slots < 4.0  # five messages each 20 ms, in cycles of 10 ms
+    assert [wheel.setpoint for wheel in figures.wheels] == pytest.approx([4, 4, -8], abs=0.01)
+    assert [wheel.speed for wheel in figures.wheels] == pytest.approx([4, 4, -8], abs=0.3)
+
+
+@pytest.mark.virtual_time
+async def test_what_was_missed_before_does_not_count_and_what_is_off_says_so() -> None:
+    async with Triskar2(VIA) as robot:
+        await asyncio.sleep(1)
+        publisher = next(iter(robot.modules["PS"].nodes["battery"].node.publishers))
+        publisher.missed += 5
+        gauge = Gauge(robot, None)
+        publisher.missed += 2
+        await robot.switch_off("MOTOR2")
+        figures = gauge.read(1.0)
+    assert figures.missed == 2
+    assert [wheel.on for wheel in figures.wheels] == [True, False, True]
+    assert figures.odometry is None
+    assert figures.bus is None
+    text = "\n".join(screen.state(figures))
+    assert "MOTOR2    switched off" in text
+    assert "a network in memory" in text
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_what_its_gateway_takes_from_outside(monkeypatch: pytest.MonkeyPatch, allowed: bool) -> None:
+    def robot(_via: str, *, options: BridgeOptions, **_others: object) -> Triskar2:
+        raise r2p.Error(f"control: {options.allow_control}")
+
+    monkeypatch.setattr("r2p.tools.simulator.play.Triskar2", robot)
+    result = CliRunner().invoke(app, ["sim", "--via", "memory:lab", *(["--allow-control"] if allowed else [])])
+    assert (result.exit_code, result.stderr) == (1, f"r2p: control: {allowed}\n")
+
+
+def test_the_map_shows_walls_way_and_robot() -> None:
+    chart = Chart(World(box(0, 0, 4, 4)), 20, 10)
+    chart.draw((-1.0, 0.0, 0.0))
+    lines = chart.draw((1.0, 0.0, 1.6)).splitlines()
+    assert len(lines) == 10
+    assert {len(line) for line in lines} == {20}
+    assert set("".join(lines)) == set(" #.^")
+    row = next(line for line in lines if "^" in line)
+    assert row.index(".") < row.index("^")
+    assert row.strip().startswith("#")
+
+
+def test_the_map_grows_with_the_way() -> None:
+    chart = Chart(World(), 20, 10)
+    for step in range(100):
+        picture = chart.draw((step / 2, 0.0, 0.0))
+    assert picture.count(">") == 1
+    assert picture.count(".") == pytest.approx(18, abs=2)
+
+
+def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureFixture[str]) -> None:
+    sim.run(play(Play(duration=20.0, seed=4, laps=1, fast=True, bus=True)), seed=4)
+    fast = capsys.readouterr().out
+    lines = fast.splitlines()
+    assert max(len(line) for line in lines) <= 80
+    assert [line.split()[0] for line in lines if " at " in line and "wheels" in line] == ["10.0", "20.0"]
+    found = re.search(r"^20.0 s, ([\d.]+) m driven; the robot is at x (-?[\d.]+), y (-?[\d.]+) m$", fast, re.MULTILINE)
+    assert found
+    driven, x, y = map(float, found.groups())
+    assert driven == pytest.approx(8.0, rel=0.03)
+    assert abs(x) + abs(y) < 0.1
+    assert re.search(r"messages published, \d+ missed a deadline$", fast, re.MULTILINE)
+    assert not re.search(r"most of them of (encoder|speed)", fast)  # which have slots of their own
+    assert re.search(r"^MOTOR1 +\d+ +\d+% +0 +\d+$", fast, re.MULTILINE)
+
+
+def test_the_state_fits_beside_the_map() -> None:
+    wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
+    bus = BusFigures(1.0, 7654.3, 999_999, 99, 10.5, 60)
+    odometry = Odometry(Pose3(-10.5, -10.5, -3.0))
+    figures = Figures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, 0.123, wheels, (25.6, 10.0, 1.0), [], bus)
+    lines = screen.state(figures)
+    assert len(lines) == 9
+    assert max(len(line) for line in lines) <= 48
+
+
+def moment() -> Figures:
+    """Figures of a robot at rest, with ten topics."""
+    wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
+    bus = BusFigures(0.5, 1000.0, 9999, 0, 2.5, 60)
+    rows = [TopicFigures(f"topic{n}", "MOTOR1", "soft: by deadline", 50.0, 1000, 1) for n in range(10)]
+    return Figures(3.5, (0.0, 0.0, 0.0), 1.0, None, None, wheels, (25.6, 10.0, 1.0), rows, bus)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "topics", "chart"),
+    [(80, 24, 10, True), (120, 40, 10, True), (60, 20, 7, False), (80, 12, 0, True)],
+)
+def test_it_fits_the_terminal_and_always_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, width: int, height: int, topics: int, chart: bool
+) -> None:
+    """A small one has no map, then fewer topics."""
+    text = io.StringIO()
+    monkeypatch.setattr(screen, "Console", functools.partial(Console, file=text, width=width, height=height))
+    shown = screen.SimulatorScreen(World(box(0, 0, 4, 4)), duration=20.0)
+    shown.introduce("Try:", "  r2p topic list")
+    assert text.getvalue() == "Try:\n  r2p topic list\n"
+    shown.console.print(shown.draw(moment()))
+    lines = text.getvalue().splitlines()[2:]
+    assert len(lines) <= height
+    assert max(len(line) for line in lines) <= width
+    assert lines[0].split() == ["Triskar2", "3.5", "of", "20", "s", "1.00", "m", "driven", "10", "deadlines", "missed"]
+    assert sum(line.startswith("topic") for line in lines) == topics
+    assert ("#" in "".join(lines)) == chart
+    assert [line.rstrip() for line in lines[-2:]] == ["Try:", "  r2p topic list"]
+
+
+def test_at_a_terminal_the_figures_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    console = functools.partial(
+        Console, file=text, width=80, height=24, force_terminal=True, _environ={"TERM": "xterm"}
+    )
+    monkeypatch.setattr(screen, "Console", console)
+    with screen.SimulatorScreen(World()) as shown:
+        shown.introduce("Try:", "  r2p topic list")
+        for _ in range(3):
+            shown.show(moment())
+    drawn = text.getvalue()
+    assert drawn.count("deadlines missed") == drawn.count("  r2p topic list") >= 3
+    assert drawn.count("\x1b[?25l") == drawn.count("\x1b[?25h") == 1  # the cursor comes back
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_hints_can_be_pasted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found: bool) -> None:
+    """As a command that the shell finds, or as the file that was started."""
+    (tmp_path / "r2p").touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path) if found else "")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["./r2p", "demo"])
+    assert program() == ("r2p" if found else "./r2p")
+    monkeypatch.setattr(sys, "argv", ["pytest"])
+    assert program() == "r2p"
+
+
+@pytest.mark.processes
+def test_others_reach_it_through_its_gateway() -> None:
+    """By the debug line and by zenoh, in real time, from other processes."""
+    with process("sim", "triskar2", "--square") as robot:
+        assert robot.stdout is not None
+        found = (re.search(r"topic echo odometry --via (\S+)", line) for line in robot.stdout)
+        urls = [next(match[1] for match in found if match) for _ in outside()]
+        assert [url.partition(":")[0] for url in urls] == ["tcp", "zenoh"][: len(urls)]
+        for url in urls:
+            with process("topic", "echo", "odometry", "--via", url, "--type", "Odometry", "--once") as echo:
+                out, err = echo.communicate()
+            assert echo.returncode == 0, err
+            assert '"velocity"' in out
+        robot.send_signal(signal.SIGINT)
+        out, err = robot.communicate()
+    assert (robot.returncode, err) == (0, "")
+    assert "m driven" in out
+
+
+@pytest.mark.processes
+def test_fast_and_a_link_to_the_outside_do_not_go_together() -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from r2p.tools.main import main; main()",
+        "sim",
+        "--fast",
+        "--via",
+        "tcp-listen:0",
+    ]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "--fast runs in virtual time" in ended.stderr

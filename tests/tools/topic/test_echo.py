@@ -1,0 +1,231 @@
+"""`r2p topic echo`."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+import r2p
+from r2p.msg import Led, StampedPose3, Velocity3
+from r2p.tools.session import TimedOut, Usage
+from r2p.tools.topic.echo import QUEUE, echo
+from tests.tools.rig import Firmware, printed, robot, tool
+
+
+class Private(r2p.Message):
+    """A type that the tool does not know by its fingerprint."""
+
+    secret: r2p.u16 = 0
+
+
+async def leds(node: r2p.Node) -> None:
+    publisher = node.advertise("leds", Led)
+    async for _ in node.every(0.1):
+        await publisher.publish(Led(led=publisher.sent, value=1))
+
+
+async def poses(node: r2p.Node) -> None:
+    publisher = node.advertise("poses", StampedPose3)
+    async for _ in node.every(0.25):
+        await publisher.publish(StampedPose3(r2p.Timestamp(5, 6), x=0.1))
+
+
+async def secrets(node: r2p.Node) -> None:
+    publisher = node.advertise("secrets", Private)
+    async for _ in node.every(0.1):
+        await publisher.publish(Private(secret=0x1234))
+
+
+@pytest.mark.virtual_time
+async def test_it_prints_messages_by_the_type_that_the_peer_tells(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(leds), tool() as session:
+        await echo(session, ["/leds"], count=3)
+    first, *_ = records = printed(capsys)
+    assert records == [{"led": first["led"] + n, "value": 1} for n in range(3)]
+
+
+@pytest.mark.virtual_time
+async def test_yaml(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(poses), tool() as session:
+        await echo(session, ["poses"], once=True, format="yaml")
+    assert capsys.readouterr().out == "timestamp:\n  sec: 5\n  nsec: 6\nx: 0.1\ny: 0.0\nw: 0.0\n---\n"
+
+
+@pytest.mark.virtual_time
+async def test_meta_tells_where_and_when(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(leds), tool() as session:
+        await echo(session, ["leds"], once=True, meta=True)
+        now = session.node.now()
+    (record,) = printed(capsys)
+    meta = record.pop("_")
+    assert now - 1_000_000_000 < meta.pop("stamp") <= now
+    assert meta == {"topic": "leds", "stamp_from": "sender", "source": "BOT/leds", "sequence": record["led"] + 1}
+
+
+@pytest.mark.virtual_time
+async def test_several_topics_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(leds, poses), tool() as session:
+        await echo(session, ["leds", "poses", "leds"], count=6)
+    topics = [record["_"]["topic"] for record in printed(capsys)]
+    assert topics.count("poses") in {1, 2}
+    assert topics.count("leds") == 6 - topics.count("poses")
+
+
+@pytest.mark.virtual_time
+async def test_fields(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(poses), tool() as session:
+        await echo(session, ["poses"], once=True, field=["timestamp.nsec", "x"])
+        assert printed(capsys) == [{"timestamp.nsec": 6, "x": 0.1}]
+        await echo(session, ["poses"], count=2, field=["x", "timestamp"], format="csv")
+        assert capsys.readouterr().out == "x,timestamp.sec,timestamp.nsec\n0.1,5,6\n0.1,5,6\n"
+
+
+@pytest.mark.virtual_time
+async def test_an_unknown_field_is_a_mistake() -> None:
+    async with robot(poses), tool() as session:
+        with pytest.raises(ExceptionGroup) as caught:
+            await echo(session, ["poses"], field=["z"])
+    assert caught.group_contains(Usage, match="no field z: there are timestamp.sec, timestamp.nsec, x, y, w")
+
+
+@pytest.mark.virtual_time
+async def test_csv_takes_one_topic() -> None:
+    async with tool() as session:
+        with pytest.raises(Usage):
+            await echo(session, ["a", "b"], format="csv")
+
+
+@pytest.mark.virtual_time
+async def test_an_unknown_type_is_printed_in_hex_and_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(secrets), tool() as session:
+        await echo(session, ["secrets"], count=2)
+    captured = capsys.readouterr()
+    assert captured.out == '{"data": "3412"}\n' * 2
+    assert captured.err.count("the type of secrets is unknown") == 1
+    assert "r2p.msg:PWM" in captured.err  # has two bytes, too
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("by", ["option", "r2p.toml"])
+async def test_a_type_can_be_stated(by: str, capsys: pytest.CaptureFixture[str]) -> None:
+    name = f"{__name__}:Private"
+    types = {"secrets": name} if by == "r2p.toml" else None
+    async with robot(secrets), tool(types=types) as session:
+        await echo(session, ["secrets"], once=True, type=name if by == "option" else None)
+    assert printed(capsys) == [{"secret": 0x1234}]
+
+
+@pytest.mark.virtual_time
+async def test_a_stated_type_that_is_not_the_publishers_is_refused(caplog: pytest.LogCaptureFixture) -> None:
+    async with robot(leds), tool() as session:
+        with pytest.raises(TimedOut):
+            await echo(session, ["leds"], type="r2p.msg:Velocity3", timeout=2)
+    assert "topic leds is refused" in caplog.text
+
+
+@pytest.mark.virtual_time
+async def test_types_in_the_file_are_known_by_fingerprint_on_any_topic(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(secrets), tool(types={"other": f"{__name__}:Private"}) as session:
+        await echo(session, ["secrets"], once=True)
+    assert printed(capsys) == [{"secret": 0x1234}]
+
+
+@pytest.mark.virtual_time
+async def test_firmware_tells_no_type(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        imu = Firmware()
+        loop = asyncio.get_running_loop()
+        loop.call_later(0.1, imu.advertise, "leds", 5)
+        loop.call_later(0.2, imu.publish, "leds", Led(led=3, value=1).encode())
+        await echo(session, ["leds"], once=True)
+        loop.call_later(0.2, imu.publish, "leds", Led(led=3, value=1).encode())
+        await echo(session, ["leds"], once=True, type="Led")
+    assert printed(capsys) == [{"data": "0300000001"}, {"led": 3, "value": 1}]
+
+
+@pytest.mark.virtual_time
+async def test_it_waits_for_a_topic_that_nobody_knows_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot() as module, tool() as session:
+        asyncio.get_running_loop().call_later(30, module.start, leds)
+        await echo(session, ["leds"], once=True)
+        assert asyncio.get_running_loop().time() > 30
+    captured = capsys.readouterr()
+    assert captured.err == "r2p: waiting for a publisher of leds on memory:lab\n"
+    assert captured.out == '{"led": 0, "value": 1}\n'
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("topic", "hint"),
+    [
+        ("ledz", "r2p: nobody publishes ledz: is it one of leds?\n"),
+        ("/robot1/leds", "r2p: nobody publishes robot1/leds: is it one of leds?\n"),
+        ("odometry", ""),
+    ],
+)
+async def test_topics_with_names_much_like_it_are_named_once(
+    topic: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async with robot(leds), tool() as session:
+        with pytest.raises(TimedOut):
+            await echo(session, [topic], timeout=20)
+    assert capsys.readouterr().err == f"r2p: waiting for a publisher of {topic.lstrip('/')} on memory:lab\n{hint}"
+
+
+@pytest.mark.virtual_time
+async def test_silence_is_a_time_out(capsys: pytest.CaptureFixture[str]) -> None:
+    async def three(node: r2p.Node) -> None:
+        publisher = node.advertise("leds", Led, latch=True)
+        for _ in range(3):
+            await publisher.wait_subscriber()
+            await asyncio.sleep(0.9)
+            await publisher.publish(Led())
+        await asyncio.Event().wait()
+
+    async with robot(three), tool() as session:
+        start = asyncio.get_running_loop().time()
+        with pytest.raises(TimedOut, match="nothing on leds for 1 s"):
+            await echo(session, ["leds"], timeout=1)
+        assert asyncio.get_running_loop().time() - start == pytest.approx(3.7, abs=0.1)
+    assert len(printed(capsys)) == 3
+
+
+@pytest.mark.virtual_time
+async def test_a_publisher_that_comes_back_with_another_type(capsys: pytest.CaptureFixture[str]) -> None:
+    async def later(node: r2p.Node) -> None:
+        publisher = node.advertise("leds", Velocity3)
+        await publisher.wait_subscriber()
+        await publisher.publish(Velocity3(x=1.5))
+
+    async def changes(module: r2p.Module) -> None:
+        async def first(node: r2p.Node) -> None:
+            publisher = node.advertise("leds", Led)
+            await publisher.wait_subscriber()
+            await publisher.publish(Led(led=1))
+
+        module.start(first)
+        await module.wait()
+        await asyncio.sleep(10)
+        module.start(later)
+
+    async with robot() as module, tool() as session, asyncio.TaskGroup() as tasks:
+        tasks.create_task(changes(module))
+        await echo(session, ["leds"], count=2)
+    assert printed(capsys) == [{"led": 1, "value": 0}, {"x": 1.5, "y": 0.0, "w": 0.0}]
+
+
+@pytest.mark.virtual_time
+async def test_what_the_tool_itself_loses_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    async def burst(node: r2p.Node) -> None:
+        publisher = node.advertise("leds", Led)
+        await publisher.wait_subscriber()
+        for _ in range(QUEUE + 10):
+            publisher.publish_nowait(Led())
+
+    async with tool() as session:
+        session.module.start(burst)
+        await echo(session, ["leds"], count=QUEUE)
+    captured = capsys.readouterr()
+    assert "10 messages of leds lost: the output was too slow" in captured.err
+    assert len(captured.out.splitlines()) == QUEUE

@@ -1,0 +1,168 @@
+"""`r2p topic list`, `info` and `find`."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import Any
+
+import pytest
+
+import r2p
+from r2p.msg import Led, Velocity3
+from r2p.tools.session import Usage
+from r2p.tools.topic.list import find, info, list_
+from tests.tools.rig import VIA, Firmware, printed, robot, tool
+
+
+async def blink(node: r2p.Node) -> None:
+    node.advertise("leds", Led)
+    node.advertise("speed", Velocity3, r2p.Periodic(0.1, Velocity3))
+    await asyncio.Event().wait()
+
+
+async def watch(node: r2p.Node) -> None:
+    node.subscribe("leds", Led)
+    await asyncio.Event().wait()
+
+
+def by_topic(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {row.pop("topic"): row for row in rows}
+
+
+@pytest.mark.virtual_time
+async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(blink, watch), tool() as session:
+        await list_(session)
+    captured = printed(capsys)
+    assert by_topic(captured) == {
+        "leds": {"type": "r2p.msg:Led", "size": 5, "publishers": ["BOT/blink"], "subscribers": ["BOT/watch"]},
+        "log": {"type": "r2p.msg:Log", "size": 145, "publishers": ["BOT/log"], "subscribers": []},
+        "speed": {"type": "r2p.msg:Velocity3", "size": 12, "publishers": ["BOT/blink"], "subscribers": []},
+    }
+
+
+@pytest.mark.virtual_time
+async def test_list_of_firmware(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        imu = Firmware("IMU")
+        asyncio.get_running_loop().call_later(0.1, imu.alive)
+        asyncio.get_running_loop().call_later(0.6, imu.advertise, "imu", 26)
+        await list_(session)
+        rows = printed(capsys)
+    assert rows == [{"topic": "imu", "type": None, "size": 26, "publishers": ["IMU/?"], "subscribers": []}]
+
+
+@pytest.mark.virtual_time
+async def test_list_behind_a_gateway(capsys: pytest.CaptureFixture[str]) -> None:
+    """It answers at once, but with nothing but its name: what others have it tells once it may forward."""
+    inside = "memory:inside"
+    async with r2p.Module("BOT", via=inside) as module, tool() as session:
+        module.start(blink)
+        async with r2p.Module("GW", via=[inside, VIA], bridge=True):
+            await list_(session)
+    assert set(by_topic(printed(capsys))) == {"leds", "log", "speed"}
+
+
+@pytest.mark.virtual_time
+async def test_list_of_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        await list_(session)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == f"r2p: no topic is known on {VIA}\n"
+
+
+@pytest.mark.virtual_time
+async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(blink, watch), tool() as session:
+        await info(session, "/speed")
+        await info(session, "leds")
+    speed, leds = printed(capsys)
+    assert speed == {
+        "topic": "speed",
+        "type": "r2p.msg:Velocity3",
+        "size": 12,
+        "fingerprint": r2p.layout(Velocity3).fingerprint.hex(),
+        "publishers": [{"node": "BOT/blink", "class": "periodic", "link": VIA}],
+        "subscribers": [],
+        "guarantees": {f"{VIA} periodic": "best effort, in order"},
+    }
+    assert leds["subscribers"] == [{"node": "BOT/watch", "link": VIA}]
+    assert list(leds["guarantees"]) == [f"{VIA} nrt"]
+
+
+@pytest.mark.virtual_time
+async def test_info_with_more(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(blink), tool(verbose=1) as session:
+        await info(session, "leds")
+        Firmware().advertise("raw", 5)
+        await info(session, "raw")
+    leds, raw = printed(capsys)
+    assert leds["fields"] == {"led": "u32", "value": "u8"}
+    assert 0 <= leds["age"] < 5
+    assert raw["type"] is None
+    assert (raw["fields"], raw["maybe"]) == (None, ["r2p.msg:Led"])
+
+
+@pytest.mark.virtual_time
+async def test_info_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    async with robot(blink), tool(verbose=1) as session:
+        await info(session, "leds")
+    out = capsys.readouterr().out
+    assert "\nfields:\n  led: u32\n  value: u8\n" in out
+    assert re.search(r"\nage: [0-9.]+ s\n", out)
+
+
+@pytest.mark.virtual_time
+async def test_info_of_a_topic_that_nobody_knows() -> None:
+    async with robot(blink), tool() as session:
+        with pytest.raises(r2p.Error, match="nobody publishes or subscribes power; known topics: leds, log, speed"):
+            await info(session, "power")
+        with pytest.raises(r2p.Error, match=r"nobody publishes or subscribes led: is it one of leds\?"):
+            await info(session, "led")
+
+
+@pytest.mark.virtual_time
+async def test_info_tells_of_different_types(capsys: pytest.CaptureFixture[str]) -> None:
+    async def other(node: r2p.Node) -> None:
+        node.subscribe("leds", Velocity3)
+        await asyncio.Event().wait()
+
+    async with robot(blink), tool() as session:
+        session.module.start(other)
+        await info(session, "leds")
+    assert "leds has different types" in capsys.readouterr().err
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("what", "found"),
+    [
+        ("r2p.msg:Led", {"leds": "type", "raw": "size"}),
+        ("Led", {"leds": "type", "raw": "size"}),
+        (r2p.layout(Led).fingerprint.hex(), {"leds": "type"}),
+        ("5", {"leds": "size", "raw": "size"}),
+        ("12", {"speed": "size"}),
+    ],
+)
+async def test_find(what: str, found: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(blink), tool() as session:
+        asyncio.get_running_loop().call_later(0.1, Firmware().advertise, "raw", 5)
+        await find(session, what)
+    assert {row["topic"]: row["match"] for row in printed(capsys)} == found
+
+
+@pytest.mark.virtual_time
+async def test_find_nothing() -> None:
+    async with robot(blink), tool() as session:
+        with pytest.raises(r2p.Error, match="no topic of type StampedPose3 is known"):
+            await find(session, "StampedPose3")
+
+
+@pytest.mark.virtual_time
+async def test_find_a_type_that_does_not_exist() -> None:
+    async with tool() as session:
+        with pytest.raises(Usage, match=r"did you mean r2p\.msg:Led\?"):
+            await find(session, "Ledd")

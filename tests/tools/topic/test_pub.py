@@ -1,0 +1,187 @@
+"""`r2p topic pub`."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+from typing import Any
+
+import pytest
+
+import r2p
+from r2p.msg import Led, Velocity3
+from r2p.tools.session import TimedOut, Usage
+from r2p.tools.topic.pub import pub
+from r2p.tools.topic.watching import class_choice
+from tests.tools.rig import robot, tool
+
+
+class Listener:
+    """A node that keeps what it hears, and when."""
+
+    def __init__(self, type: type[r2p.Message] = Led) -> None:
+        self.heard: list[r2p.Message] = []
+        self.samples: list[r2p.Sample] = []
+        self._type = type
+        self._more = asyncio.Event()
+
+    async def listen(self, node: r2p.Node) -> None:
+        async for sample in node.subscribe("cmd", self._type, queue=64).samples():
+            self.samples.append(sample)
+            assert sample.message is not None
+            self.heard.append(sample.message)
+            self._more.set()
+
+    async def got(self, count: int) -> list[r2p.Message]:
+        while len(self.heard) < count:
+            self._more.clear()
+            await self._more.wait()
+        return self.heard
+
+    @property
+    def gaps(self) -> list[float]:
+        """Seconds between messages."""
+        return [
+            (later.stamp - earlier.stamp) / 1e9 for earlier, later in zip(self.samples, self.samples[1:], strict=False)
+        ]
+
+
+@pytest.mark.virtual_time
+async def test_once() -> None:
+    listener = Listener()
+    async with robot(listener.listen):
+        async with tool() as session:
+            await pub(session, "/cmd", ["led=3", "value=1"], type="Led", once=True)
+        assert await listener.got(1) == [Led(led=3, value=1)]
+
+
+@pytest.mark.virtual_time
+async def test_once_waits_for_a_subscriber_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    listener = Listener()
+    async with robot() as module, tool() as session:
+        asyncio.get_running_loop().call_later(60, module.start, listener.listen)
+        await pub(session, "cmd", [], type="Led", once=True)
+        assert await listener.got(1) == [Led()]
+    assert capsys.readouterr().err == "r2p: waiting for a subscriber of cmd on memory:lab\n"
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("once", [True, False])
+async def test_a_topic_with_a_name_much_like_it_is_named(once: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(Listener().listen), tool() as session:
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(5):
+                await pub(session, "cmdd", [], type="Led", once=once)
+    said = capsys.readouterr().err
+    assert said.startswith("r2p: waiting" if once else "r2p: nobody subscribes cmdd yet; publishing all the same:")
+    assert said.count("is it one of cmd?") == 1
+
+
+@pytest.mark.virtual_time
+async def test_a_topic_that_is_subscribed_is_not_guessed_at(capsys: pytest.CaptureFixture[str]) -> None:
+    async def listen(node: r2p.Node) -> None:
+        node.subscribe("cmdd", Led)
+        await Listener().listen(node)
+
+    async with robot(listen), tool() as session:
+        await pub(session, "cmdd", [], type="Led", once=True)
+    assert "is it one of" not in capsys.readouterr().err
+
+
+@pytest.mark.virtual_time
+async def test_nobody_subscribes_in_time() -> None:
+    async with robot(), tool() as session:
+        with pytest.raises(TimedOut, match="nobody subscribed cmd for 2 s"):
+            await pub(session, "cmd", [], type="Led", once=True, timeout=2)
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("options", "gap", "publisher_class"),
+    [
+        ({}, 1.0, r2p.PublisherClass.NON_REAL_TIME),
+        ({"rate": 20}, 0.05, r2p.PublisherClass.NON_REAL_TIME),
+        ({"rate": 20, "klass": class_choice("nrt")}, 0.05, r2p.PublisherClass.NON_REAL_TIME),
+        ({"rate": 20, "klass": class_choice("sporadic:10ms")}, 0.05, r2p.PublisherClass.SPORADIC),
+        ({"klass": class_choice("periodic:250ms")}, 0.25, r2p.PublisherClass.PERIODIC),
+    ],
+)
+async def test_rate_and_class(options: dict[str, Any], gap: float, publisher_class: r2p.PublisherClass) -> None:
+    listener = Listener()
+    async with robot(listener.listen):
+        async with tool() as session:
+            await pub(session, "cmd", ["{led: 3}"], type="Led", count=4, **options)
+        assert await listener.got(4) == [Led(led=3)] * 4
+    assert listener.gaps == pytest.approx([gap] * 3)
+    assert {sample.publisher_class for sample in listener.samples} == {publisher_class}
+
+
+@pytest.mark.virtual_time
+async def test_without_a_number_it_goes_on_and_notes_that_nobody_listens(capsys: pytest.CaptureFixture[str]) -> None:
+    listener = Listener()
+    async with robot() as module, tool() as session:
+        publishing = asyncio.create_task(pub(session, "cmd", [], type="Led", rate=10))
+        await asyncio.sleep(5)
+        assert "nobody subscribes cmd yet" in capsys.readouterr().err
+        module.start(listener.listen)
+        await listener.got(20)
+        publishing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await publishing
+
+
+@pytest.mark.virtual_time
+async def test_the_type_is_the_subscribers() -> None:
+    listener = Listener(Velocity3)
+    async with robot(listener.listen), tool() as session:
+        await pub(session, "cmd", ["x=1.5"], once=True)
+        assert await listener.got(1) == [Velocity3(x=1.5)]
+
+
+@pytest.mark.virtual_time
+async def test_a_type_in_the_file() -> None:
+    listener = Listener(Velocity3)
+    async with robot(listener.listen), tool(types={"cmd": "r2p.msg:Velocity3"}) as session:
+        await pub(session, "cmd", ["x=1.5"], once=True)
+        assert await listener.got(1) == [Velocity3(x=1.5)]
+
+
+@pytest.mark.virtual_time
+async def test_mistakes() -> None:
+    async with robot(), tool() as session:
+        with pytest.raises(Usage, match="the type of cmd is unknown: give --type"):
+            await pub(session, "cmd", [])
+        with pytest.raises(Usage, match="Led has no field x: it has led, value"):
+            await pub(session, "cmd", ["x=1"], type="Led")
+        with pytest.raises(Usage, match="takes neither --rate nor stdin"):
+            await pub(session, "cmd", ["-"], type="Led", klass=class_choice("periodic:1s"))
+
+
+@pytest.mark.virtual_time
+async def test_stdin(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Listener()
+    monkeypatch.setattr("sys.stdin", io.StringIO('{"led": 1}\n\n{led: 2, value: 1}\nled=3\n{"led": 4, "_": {}}'))
+    async with robot(listener.listen):
+        async with tool() as session:
+            await pub(session, "cmd", ["-"], type="Led")
+        assert await listener.got(4) == [Led(led=1), Led(led=2, value=1), Led(led=3), Led(led=4)]
+
+
+@pytest.mark.virtual_time
+async def test_stdin_paced_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Listener()
+    monkeypatch.setattr("sys.stdin", io.StringIO('{"led": 1}\n' * 9))
+    async with robot(listener.listen):
+        async with tool() as session:
+            await pub(session, "cmd", ["-"], type="Led", rate=4, count=3)
+        await listener.got(3)
+    assert listener.gaps == pytest.approx([0.25, 0.25])
+
+
+@pytest.mark.virtual_time
+async def test_a_bad_line_on_stdin_is_told_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = Listener()
+    monkeypatch.setattr("sys.stdin", io.StringIO('{"led": 1}\n\n{"led": -1}\n'))
+    async with robot(listener.listen), tool() as session:
+        with pytest.raises(r2p.MessageError, match=r"line 3: Led\.led takes an integer"):
+            await pub(session, "cmd", ["-"], type="Led")

@@ -1,0 +1,277 @@
+"""The port to python-can's interfaces: its virtual one, and made ones that fail."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
+
+import can
+import pytest
+
+from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.errors import TransportError
+from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
+from r2p.transports.can import pythoncan
+from r2p.transports.can.pythoncan import PythonCanPort
+from r2p.transports.rtcan import INTERFACES
+from r2p.transports.url import open_transport
+from tests.can.rig import GUARD, User, now, using
+from tests.faults import once
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+pytestmark = pytest.mark.anyio
+
+MS = 1_000_000
+SRT = 10 << 23 | 0x0242 << 7
+BITRATE = 1_000_000
+
+_channels = itertools.count()
+
+
+@pytest.fixture
+def channel() -> str:
+    return f"test{next(_channels)}"
+
+
+@pytest.fixture
+def peer(channel: str) -> Iterator[can.BusABC]:
+    """python-can alone, on the same channel."""
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        yield bus
+
+
+def port_on(channel: str) -> PythonCanPort:
+    return PythonCanPort("virtual", channel, BITRATE)
+
+
+def order(identifier: int = SRT, data: bytes = b"", *, wait: int = 0, last: int = NEVER) -> Transmit:
+    begin = now()
+    return Transmit(Frame(identifier, data), Mailbox.SRT, begin + wait, NEVER if last == NEVER else begin + last)
+
+
+async def test_frames_go_out_and_are_confirmed(channel: str, peer: can.BusABC) -> None:
+    port = port_on(channel)
+    async with using(port) as user:
+        sent = []
+        for size in range(9):
+            before = now()
+            sent.append(order(SRT | size, bytes(range(size))))
+            port.transmit(sent[-1])
+            await user.until(lambda: len(user.outcomes) == len(sent))
+            assert before - MS <= user.instants[-1] <= now()  # python-can's stamps are floats of UTC
+        assert user.outcomes == [(Mailbox.SRT, Outcome.SENT)] * 9
+        for size in range(9):
+            message = peer.recv(GUARD)
+            assert message is not None
+            assert (message.arbitration_id, bytes(message.data)) == (SRT | size, bytes(range(size)))
+            assert message.is_extended_id
+    assert (user.frames, user.news) == ([], ["up"])
+
+
+async def test_frames_come_in(channel: str, peer: can.BusABC) -> None:
+    async with using(port_on(channel)) as user:
+        before = now()
+        for size in range(9):
+            peer.send(can.Message(arbitration_id=SRT | size, data=bytes(range(size))))
+        await user.until(lambda: user.has(9))
+        assert user.frames == [Frame(SRT | size, bytes(range(size))) for size in range(9)]
+        assert all(before - MS <= stamp <= now() for stamp in user.stamps)
+
+
+async def test_other_kinds_of_frames(channel: str, peer: can.BusABC) -> None:
+    port = port_on(channel)
+    port.set_filters(None)
+    async with using(port) as user:
+        peer.send(can.Message(arbitration_id=1, is_extended_id=False, data=b"ab"))
+        peer.send(can.Message(arbitration_id=2, is_remote_frame=True, dlc=4))
+        peer.send(can.Message(arbitration_id=3, is_error_frame=True))
+        peer.send(can.Message(arbitration_id=4, is_fd=True))
+        peer.send(can.Message(arbitration_id=5))
+        await user.until(lambda: user.frames)
+        assert (user.frames, user.faults) == ([Frame(5, b"")], ["bus error"])
+        assert user.others == [OtherFrame(1, b"ab"), OtherFrame(2, b"", True, 4)]
+
+
+async def test_only_what_is_needed(channel: str, peer: can.BusABC) -> None:
+    port = port_on(channel)
+    port.set_filters([(SRT, 0x1FFFFFFF)])
+    async with using(port) as user:
+        port.transmit(order())  # once it is confirmed, so is the filter before it
+        await user.until(lambda: user.outcomes)
+        for identifier in (SRT | 1, SRT, SRT | 2, SRT):
+            peer.send(can.Message(arbitration_id=identifier))
+        await user.until(lambda: user.has(2))
+        assert user.frames == [Frame(SRT, b"")] * 2
+
+
+async def test_a_stamp_by_another_clock_is_not_used(channel: str, peer: can.BusABC) -> None:
+    """Adapters count from when they were plugged in."""
+    other = can.Bus(interface="virtual", channel=channel, preserve_timestamps=True)
+    async with using(port_on(channel)) as user:
+        before = now()
+        other.send(can.Message(arbitration_id=1, timestamp=12.5))
+        await user.until(lambda: user.frames)
+        assert before <= user.stamps[0] <= now()
+    other.shutdown()
+
+
+async def test_waiting_frames(channel: str, peer: can.BusABC) -> None:
+    port = port_on(channel)
+    async with using(port) as user:
+        port.transmit(order(last=-1))
+        await user.until(lambda: user.outcomes)
+        port.transmit(order(wait=3600_000 * MS))
+        port.withdraw(Withdraw(Mailbox.SRT))
+        assert user.outcomes == [(Mailbox.SRT, Outcome.LATE)] * 2
+        sent = order(wait=20 * MS)
+        port.transmit(sent)
+        await user.until(lambda: len(user.outcomes) == 3)
+        assert user.outcomes[-1] == (Mailbox.SRT, Outcome.SENT)
+    port.transmit(order())
+    port.withdraw(Withdraw(Mailbox.SRT))
+    port.set_filters([])
+
+
+async def test_an_interface_that_shows_no_own_frames(
+    channel: str, peer: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A frame counts as sent when the driver has it."""
+    monkeypatch.setattr(pythoncan, "ON_REQUEST", frozenset[str]())
+    port = port_on(channel)
+    async with using(port) as user:
+        port.transmit(order())
+        await user.until(lambda: user.outcomes)
+        assert user.outcomes == [(Mailbox.SRT, Outcome.SENT)]
+        assert peer.recv(GUARD) is not None
+
+
+# What goes wrong
+
+
+class Broken:
+    """Stands for `can.Bus`: behaves as it is told, one time after the other."""
+
+    def __init__(self, *behaviours: Exception | tuple[str, Exception]) -> None:
+        self._behaviours = iter(behaviours)
+        self.made: list[Any] = []
+
+    def __call__(self, *_: object, **options: Any) -> can.BusABC:
+        behaviour = next(self._behaviours, None)
+        if isinstance(behaviour, Exception):
+            raise behaviour
+        bus: can.BusABC = _VirtualBus(**{name: options[name] for name in ("channel", "receive_own_messages")})
+        if behaviour is not None:
+            setattr(bus, behaviour[0], Mock(side_effect=behaviour[1]))
+        self.made.append(bus)
+        return bus
+
+
+_VirtualBus = can.interface._get_class_for_interface("virtual")
+
+
+async def test_the_cause_is_told_too(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    error = can.CanInitializationError("could not configure socket")
+    error.__cause__ = OSError(22, "Invalid argument")
+    monkeypatch.setattr(can, "Bus", Broken(error))
+    async with using(port_on(channel)) as user:
+        assert user.news == ["waits: could not configure socket ([Errno 22] Invalid argument)"]
+
+
+async def test_it_waits_until_it_can_be_opened(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can, "Bus", Broken(can.CanInitializationError("no adapter"), OSError(19, "No such device")))
+    async with using(port_on(channel)) as user:
+        await user.until(lambda: user.news[-1] == "up")
+        assert user.news == [
+            "waits: no adapter",
+            "waits: [Errno 19] No such device",
+            "up",
+        ]
+
+
+@pytest.mark.parametrize("method", ["send", "recv"])
+async def test_it_is_opened_again_when_it_failed(method: str, channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = Broken((method, can.CanOperationError("unplugged")))
+    monkeypatch.setattr(can, "Bus", broken)
+    port = port_on(channel)
+    async with using(port) as user:
+        port.transmit(order())
+        await user.until(lambda: len(user.news) == 3)
+        assert user.news == ["up", "down: unplugged", "up"]
+        port.transmit(order(SRT | 1))
+        await user.until(lambda: user.outcomes)
+    assert [bus._open for bus in broken.made] == [False, False]
+
+
+async def test_a_frame_that_was_not_sent_in_time(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Perhaps it was."""
+    monkeypatch.setattr(can, "Bus", Broken(("send", can.CanTimeoutError("full"))))
+    port = port_on(channel)
+    async with using(port) as user:
+        port.transmit(order())
+        await user.until(lambda: user.outcomes)
+        assert (user.outcomes, user.news) == ([(Mailbox.SRT, Outcome.UNKNOWN)], ["up"])
+
+
+@pytest.mark.parametrize(
+    "error",
+    [can.CanInterfaceNotImplementedError("no driver"), ValueError("no bit rate"), TypeError("no option")],
+    ids=str,
+)
+async def test_what_waiting_does_not_mend(error: Exception, channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can, "Bus", Broken(error))
+    with pytest.raises(TransportError, match=f"rtcan:virtual:{channel}: no ") as caught:
+        await port_on(channel).run(User(), lambda: None)
+    assert caught.value.__cause__ is error
+
+
+def test_an_unknown_interface() -> None:
+    with pytest.raises(TransportError, match=r"no interface 'nosuch'; it knows: .*virtual"):
+        PythonCanPort("nosuch", "x", BITRATE)
+
+
+@pytest.mark.parametrize(
+    ("url", "says"),
+    [
+        ("rtcan:slcan", "lacks the channel: rtcan:slcan:/dev/ttyACM0"),
+        ("rtcan:socketcan", "rtcan:socketcan:can0"),
+        ("rtcan:", "lacks the CAN interface"),
+        ("rtcan:can0,priority=abc", "give a number of 0 to 255"),
+        ("rtcan:can0,id=256", "give a number of 1 to 255"),
+        ("rtcan:can0,bitrate=fast", "whole nanoseconds"),
+    ],
+)
+def test_urls_that_can_not_be(url: str, says: str) -> None:
+    with pytest.raises(TransportError, match=says):
+        open_transport(url)
+
+
+def test_all_interfaces_of_python_can_are_known_by_name() -> None:
+    assert set(can.interfaces.BACKENDS) <= INTERFACES
+
+
+def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "can", None)
+    with pytest.raises(TransportError, match=r"pip install 'r2p\[can\]'"):
+        PythonCanPort("virtual", "x", BITRATE)
+
+
+def test_a_pc_is_no_master_of_short_slots() -> None:
+    with pytest.raises(TransportError, match=r"can't be the master with slots of 166 us.*slots=20,cycle=10ms"):
+        open_transport("rtcan:virtual:x?priority=1")
+    open_transport("rtcan:virtual:x?priority=1&slots=20&cycle=10ms")
+
+
+async def test_a_frame_that_raises_does_not_stop_the_others(
+    channel: str, peer: can.BusABC, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = port_on(channel)
+    async with using(port) as user:
+        monkeypatch.setattr(user, "received", once(user.received))
+        for number in range(3):
+            peer.send(can.Message(arbitration_id=SRT | number, is_extended_id=True))
+        await user.until(lambda: user.has(2))
+        assert ([frame.id for frame in user.frames], user.faults) == ([SRT | 1, SRT | 2], ["internal error: injected"])

@@ -1,0 +1,164 @@
+"""Mailboxes in front of a queue, without I/O: a bus that is a list, and time as an argument."""
+
+from __future__ import annotations
+
+from r2p.codecs.rtcan import Frame
+from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit
+from r2p.transports.can.tx_slots import AGAIN, TxSlots
+
+HRT, SRT, NRT = Mailbox
+LATENCY = 100
+PATIENCE = 1_000_000
+
+
+class Bus:
+    """A driver's queue, and what the mailboxes say."""
+
+    def __init__(self, *, singly: bool = False) -> None:
+        self.queue: list[int] = []
+        self.room = True
+        self.said: list[tuple[Mailbox, Outcome, int]] = []
+        self.boxes = TxSlots(self._send, self._confirm, latency=LATENCY, patience=PATIENCE, singly=singly)
+
+    def put(self, now: int, number: int, mailbox: Mailbox = SRT, first: int = 0, last: int = NEVER) -> None:
+        self.boxes.put(now, Transmit(Frame(number, b"x"), mailbox, first, last))
+
+    def seen(self, number: int, now: int) -> bool:
+        return self.boxes.seen(number, b"x", now - 5, now)
+
+    def _send(self, frame: Frame, _mailbox: Mailbox) -> bool:
+        if self.room:
+            self.queue.append(frame.id)
+        return self.room
+
+    def _confirm(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+        self.said.append((mailbox, outcome, at))
+
+
+def test_from_the_mailbox_to_the_bus() -> None:
+    bus = Bus()
+    bus.put(1000, 7)
+    assert (bus.queue, bus.boxes.handed) == ([7], [SRT])
+    assert bus.seen(7, 2000)
+    assert (bus.said, bus.boxes.next_deadline()) == ([(SRT, Outcome.SENT, 1995)], None)
+    assert not bus.seen(7, 2000)
+
+
+def test_only_the_frame_itself_confirms_it() -> None:
+    bus = Bus()
+    bus.put(1000, 7)
+    assert not bus.seen(8, 2000)
+    assert not bus.boxes.seen(7, b"y", 2000, 2000)
+    assert bus.said == []
+
+
+def test_it_waits_for_its_instant_less_the_latency() -> None:
+    bus = Bus()
+    bus.put(1000, 7, first=5000, last=6000)
+    assert bus.boxes.next_deadline() == 4900
+    bus.boxes.poll(4899)
+    assert bus.queue == []
+    bus.boxes.poll(4900)
+    assert bus.queue == [7]
+    bus.boxes.withdraw(5000, SRT)  # too late
+    bus.boxes.poll(6001)  # nor does its last instant count any more
+    assert bus.said == []
+
+
+def test_too_late() -> None:
+    bus = Bus()
+    bus.put(1000, 7, last=1099)
+    bus.put(1000, 8, HRT, last=1100)
+    assert (bus.queue, bus.said) == ([8], [])  # who hears it at once would try again at once, for ever
+    due = bus.boxes.next_deadline()
+    assert due is not None
+    assert due <= 1000
+    bus.boxes.poll(1001)
+    assert bus.said == [(SRT, Outcome.LATE, 1001)]
+
+
+def test_withdrawn() -> None:
+    bus = Bus()
+    bus.put(1000, 7, first=5000)
+    bus.boxes.withdraw(2000, HRT)
+    bus.boxes.withdraw(2000, SRT)
+    bus.boxes.poll(9000)
+    assert (bus.queue, bus.said) == ([], [(SRT, Outcome.LATE, 2000)])
+
+
+def test_no_room_is_tried_again_until_it_is_too_late() -> None:
+    bus = Bus()
+    bus.room = False
+    bus.put(0, 7)
+    bus.put(0, 8, NRT, last=2 * AGAIN)
+    assert bus.boxes.next_deadline() == AGAIN
+    bus.boxes.poll(AGAIN)
+    assert bus.boxes.next_deadline() == 2 * AGAIN - LATENCY + 1
+    bus.boxes.poll(2 * AGAIN - LATENCY + 1)
+    assert bus.said == [(NRT, Outcome.LATE, 2 * AGAIN - LATENCY + 1)]
+    bus.room = True
+    bus.boxes.poll(2 * AGAIN)
+    assert bus.queue == [7]
+
+
+def test_a_confirmation_that_stays_away_is_no_reason_to_send_again() -> None:
+    bus = Bus()
+    bus.put(1000, 7)
+    assert bus.boxes.next_deadline() == 1000 + PATIENCE
+    bus.boxes.poll(999 + PATIENCE)
+    assert bus.said == []
+    bus.boxes.poll(1000 + PATIENCE)
+    assert (bus.queue, bus.said) == ([7], [(SRT, Outcome.UNKNOWN, 1000 + PATIENCE)])
+    assert not bus.seen(7, 3 * PATIENCE)
+
+
+def test_classes_do_not_wait_for_each_other() -> None:
+    bus = Bus()
+    for mailbox in (NRT, SRT, HRT):
+        bus.put(0, mailbox, mailbox)
+    assert bus.queue == [NRT, SRT, HRT]
+
+
+def test_singly_the_most_urgent_goes_next() -> None:
+    bus = Bus(singly=True)
+    bus.put(0, 2, NRT)
+    bus.put(0, 1, SRT, last=1000)
+    bus.put(0, 0, HRT)
+    assert bus.queue == [2]
+    assert bus.boxes.next_deadline() == 1000 - LATENCY + 1
+    assert bus.seen(2, 500)
+    assert bus.queue == [2, 0]
+    bus.boxes.poll(1000)
+    bus.boxes.failed(HRT, Outcome.LOST, 1200)
+    bus.boxes.failed(HRT, Outcome.LOST, 1200)
+    assert bus.said[1:] == [(SRT, Outcome.LATE, 1000), (HRT, Outcome.LOST, 1200)]
+    assert bus.boxes.next_deadline() is None
+
+
+def test_when_the_bus_is_gone_so_are_the_frames() -> None:
+    bus = Bus()
+    bus.put(0, 1)
+    bus.boxes.clear()
+    assert not bus.seen(1, 10)
+    bus.put(20, 2)
+    assert (bus.queue, bus.said) == ([1, 2], [])
+
+
+def test_the_next_frame_may_be_put_while_one_is_confirmed() -> None:
+    bus = Bus()
+    numbers = iter(range(2, 5))
+
+    def confirm(mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+        bus.said.append((mailbox, outcome, at))
+        number = next(numbers, None)
+        if number is not None:
+            boxes.put(at, Transmit(Frame(number, b""), mailbox, 0, 500))
+
+    boxes = TxSlots(bus._send, confirm, latency=LATENCY, patience=PATIENCE)
+    boxes.put(0, Transmit(Frame(1, b""), SRT, 0))
+    assert boxes.seen(1, b"", 100, 100)
+    assert boxes.seen(2, b"", 900, 900)  # 3 and 4 are too late when they come
+    boxes.poll(900)
+    boxes.poll(900)
+    assert bus.queue == [1, 2]
+    assert [outcome for _, outcome, _ in bus.said] == [Outcome.SENT, Outcome.SENT, Outcome.LATE, Outcome.LATE]

@@ -1,0 +1,205 @@
+"""What goes out at once, and what together with the others of a few turns of the event loop."""
+
+import asyncio
+from typing import Any
+
+import msgspec
+import pytest
+
+from r2p.codecs import attachment
+from r2p.codecs.attachment import ClockOffset, Origin
+from r2p.protocols.flow_control import SendWindow
+from r2p.runtime.sample import Sample, Source
+from r2p.transports.receiver import LinkStats
+from r2p.transports.zenoh.publish import FLOOD, MOST_WAITING, TURNS, Batcher, TxStream
+
+pytestmark = pytest.mark.virtual_time
+
+HERE = Source("PC1", "talk")
+ELSEWHERE = Source("IMU", "", "rtcan:can0")
+ORIGIN = Origin(1, 1, 1, bytes(8), "PC1", "talk")
+
+
+class Wire:
+    """Stands for zenoh: notes the payload of each packet, and the serials and sequences that its header stands for."""
+
+    def __init__(self, *, batching: bool = True) -> None:
+        self.sent: list[bytes] = []
+        self.headers: list[attachment.Header] = []
+        self.stats = LinkStats()
+        self.burst = Batcher(asyncio.get_running_loop(), self.stats, ConnectionError, batching=batching)
+        self.lanes = {urgent: TxStream(SendWindow(), urgent=urgent) for urgent in (False, True)}
+        for lane in self.lanes.values():
+            lane.prepare(HERE, ORIGIN, self.put)
+        self.sequence = 0
+
+    def put(self, data: bytes, *, attachment: bytes) -> None:
+        if data[:1] == b"x":
+            raise ConnectionError
+        self.sent.append(data)
+        self.headers.append(_decode(attachment))
+
+    def add(self, data: bytes, *, urgent: bool = False, **fields: Any) -> None:
+        """As an outlet does it."""
+        self.sequence += 1
+        lane = self.lanes[urgent]
+        lane.flow.serial += 1
+        sample = Sample(data, HERE, 1000 + self.sequence, sequence=self.sequence)
+        lane.waiting.append(msgspec.structs.replace(sample, **fields))
+        if urgent or len(lane.waiting) in (1, MOST_WAITING):
+            self.burst.add(lane)
+
+
+_decode = attachment.decode
+
+
+async def turns(count: int) -> None:
+    for _ in range(count):
+        await asyncio.sleep(0)
+
+
+async def test_the_first_goes_at_once_the_others_together_and_the_urgent_never_wait() -> None:
+    wire = Wire()
+    for data in (b"1", b"2", b"3"):
+        wire.add(data)
+    wire.add(b"urgent", urgent=True)
+    assert wire.sent == [b"1", b"urgent"]
+    await turns(2)  # the second one brings nothing more
+    assert wire.sent == [b"1", b"urgent", b"23"]
+    assert (wire.headers[2].serial, wire.headers[2].sequence, wire.headers[2].more) == (2, 2, (1003,))
+    assert (wire.stats.sent, wire.stats.bytes_sent) == (4, len("123urgent"))
+    await turns(2)
+    wire.add(b"4")
+    assert wire.sent[-1] == b"4"
+
+
+async def test_a_flood_goes_out_every_few_turns_and_when_it_ends() -> None:
+    wire = Wire()
+    wire.add(b"0")
+    for _ in range(TURNS + 2):
+        for _ in range(FLOOD):
+            wire.add(b"1")
+        await turns(1)
+    assert wire.sent == [b"0", TURNS * FLOOD * b"1"]
+    await turns(1)
+    assert wire.sent[2:] == [2 * FLOOD * b"1"]
+
+
+async def test_what_comes_slowly_does_not_wait_for_more() -> None:
+    wire = Wire()
+    wire.add(b"0")
+    for _ in range(3):
+        for _ in range(FLOOD - 1):
+            wire.add(b"1")
+        await turns(1)
+    assert wire.sent == [b"0", *3 * [(FLOOD - 1) * b"1"]]
+
+
+async def test_one_topic_can_be_sent_before_the_others() -> None:
+    wire = Wire()
+    other = TxStream(SendWindow(), urgent=False)
+    other.prepare(HERE, ORIGIN, wire.put)
+    for data in (b"0", b"1", b"2"):
+        wire.add(data)
+    wire.burst.send(other)
+    assert wire.sent == [b"0"]
+    wire.burst.send(wire.lanes[False])
+    wire.burst.send(wire.lanes[False])
+    assert wire.sent == [b"0", b"12"]
+
+
+async def test_a_turn_that_does_not_end_is_no_reason_to_keep_all_of_it() -> None:
+    wire = Wire()
+    for _ in range(1 + MOST_WAITING):
+        wire.add(b"1")
+    assert wire.sent == [b"1", MOST_WAITING * b"1"]
+    assert not wire.lanes[False].waiting
+
+
+async def test_a_link_that_goes_down_takes_along_what_waits() -> None:
+    wire = Wire()
+    for data in (b"1", b"2", b"3"):
+        wire.add(data)
+    assert wire.burst.discard() == 2
+    await turns(TURNS)
+    assert wire.sent == [b"1"]
+    wire.add(b"4")
+    assert [each.serial for each in wire.headers] == [1, 2]  # it was counted here, so nobody else has to
+
+
+async def test_what_zenoh_does_not_take_is_counted() -> None:
+    wire = Wire()
+    for data in (b"1", b"x", b"y", b"long", b"2"):
+        wire.add(data)
+    wire.burst.flush()
+    assert wire.sent == [b"1", b"long", b"2"]
+    assert [each.serial for each in wire.headers] == [1, 2, 3]  # they were counted here, so nobody else has to
+    assert wire.lanes[False].flow.serial == 3
+    assert (wire.stats.sent, dict(wire.stats.lost)) == (3, {"link down": 2})
+
+
+CLOCK = ClockOffset(1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "packets"),
+    [
+        ([{}, {}, {}, {}], [b"abcd"]),
+        ([{}, {"sequence": 2}, {}, {}], [b"a", b"b", b"cd"]),  # a latched value, once more
+        ([{}, {"sequence": 9}, {"sequence": 10}, {"sequence": 11}], [b"a", b"bcd"]),  # others had no room
+        ([{"sequence": 0}, {"sequence": 0}, {}, {"sequence": 0}], [b"ab", b"c", b"d"]),
+        ([{}, {"deadline": 7}, {"deadline": 7}, {}], [b"a", b"bc", b"d"]),
+        ([{"hops": 1}, {"hops": 1}, {"hops": 2}, {}], [b"ab", b"c", b"d"]),
+        ([{}, {"stamped": False}, {"stamped": False}, {}], [b"a", b"bc", b"d"]),
+        ([{"clock": CLOCK}, {"clock": CLOCK}, {"clock": ClockOffset(2, 2, 3)}, {}], [b"ab", b"c", b"d"]),
+        ([{"source": ELSEWHERE}] * 4, [b"abcd"]),
+    ],
+)
+async def test_what_shares_a_header(changes: list[dict[str, Any]], packets: list[bytes]) -> None:
+    """Read one by one, the headers say of each message what was to be said of it."""
+    wire = Wire()
+    wire.add(b"0")
+    expected = []
+    for serial, (data, fields) in enumerate(zip((b"a", b"b", b"c", b"d"), changes, strict=True), 2):
+        wire.add(data, **fields)
+        each = wire.lanes[False].waiting[-1]
+        hops = each.hops + bool(each.source.link)
+        expected.append((serial, each.sequence, each.stamp, each.deadline, hops, each.stamped, each.clock))
+    wire.burst.flush()
+    assert wire.sent[1:] == packets
+    told = []
+    for header in wire.headers[1:]:
+        for at, stamp in enumerate((header.stamp, *header.more)):
+            sequence = header.sequence + at if header.sequence else 0
+            rest = header.deadline, header.hops, header.stamped, header.clock
+            told.append((header.serial + at, sequence, stamp, *rest))
+    assert told == expected
+
+
+async def test_for_readers_that_know_nothing_of_r2p_each_message_is_a_payload() -> None:
+    wire = Wire(batching=False)
+    for data in (b"1", b"2", b"3"):
+        wire.add(data)
+    await turns(2)
+    assert wire.sent == [b"1", b"2", b"3"]
+    assert [each.serial for each in wire.headers] == [1, 2, 3]
+
+
+async def test_long_messages_go_alone() -> None:
+    wire = Wire()
+    for size in (1, 5000, 5000, 5000, 5000, 20_000, 20_000):
+        wire.add(bytes(size))
+    wire.burst.flush()
+    assert [len(each) for each in wire.sent] == [1, 15_000, 5000, 20_000, 20_000]
+
+
+@pytest.mark.internal_errors
+async def test_a_packet_that_raises_does_not_stop_the_others() -> None:
+    wire = Wire()
+    wire.add(b"0")
+    wire.add(b"1", stamp=-(2**80))
+    wire.add(b"22")
+    wire.burst.flush()
+    assert wire.sent == [b"0", b"22"]
+    assert [each.serial for each in wire.headers] == [1, 2]
+    assert (wire.stats.sent, wire.stats.lost) == (2, {"internal error": 1})

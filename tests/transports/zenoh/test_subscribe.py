@@ -1,0 +1,421 @@
+"""What comes in of one topic, packet by packet; a stand-in takes zenoh's place."""
+
+import asyncio
+from collections import Counter, deque
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from r2p.clock import clock_of
+from r2p.codecs import attachment
+from r2p.codecs.attachment import Header, Origin
+from r2p.messages import layout
+from r2p.msg import Led
+from r2p.runtime.backpressure import Sink
+from r2p.runtime.sample import Sample
+from r2p.runtime.topic import SubscriberQueue, Topic, WakeScheduler
+from r2p.transports.receiver import LinkStats
+from r2p.transports.zenoh.subscribe import WINDOW, RxStream, RxStreams
+
+pytestmark = pytest.mark.virtual_time
+
+SIZE = layout(Led).size
+
+
+class Ring:
+    """A topic `leds` with a subscriber, and what waits for it in zenoh."""
+
+    def __init__(self, queue: int, *, typed: bool = True, topic: type[Topic] = Topic) -> None:
+        loop = asyncio.get_running_loop()
+        self.credits: list[tuple[int, int]] = []
+        self.last_words = 0
+        self.stats = LinkStats()
+        self.waker = WakeScheduler(loop)
+        self.topic = topic("leds", self.waker)
+        self.topic.layout = layout(Led) if typed else None
+        self._ring: deque[Any] = deque()
+        self._idle = True
+        self.streams = RxStreams(
+            "zenoh:",
+            loop,
+            self.stats,
+            longest=1024,
+            latched=lambda _: False,
+            credit=self._credit,
+            subscribe=self._subscribe,
+        )
+        self.sink = self.subscribe(queue)
+        self.streams.begin(self.topic)
+
+    def subscribe(self, queue: int) -> SubscriberQueue:
+        owner: Any = SimpleNamespace(name="node", priority=0)
+        sink = SubscriberQueue(self.waker, owner, queue, 0, lossy=False, keep_oldest=False)
+        self.topic.join(sink)
+        return sink
+
+    def _subscribe(self, _topic: str, arrived: Any) -> Any:
+        self._arrived = arrived
+        return SimpleNamespace(take=self._take, wait=self._wait, close=lambda: None)
+
+    def _credit(self, _topic: str, _sender: int, publisher_class: int, serial: int, *, leaving: bool = False) -> None:
+        self.credits.append((publisher_class, serial))
+        self.last_words += leaving
+
+    def _take(self) -> Any:
+        return self._ring.popleft() if self._ring else None
+
+    def _wait(self) -> None:
+        self._idle = True
+
+    def idle(self) -> None:
+        """It has been declared anew."""
+        self._idle = True
+        self._ring.clear()
+
+    def put(
+        self,
+        serial: int,
+        count: int = 1,
+        *,
+        publisher_class: int = 1,
+        size: int = SIZE,
+        sender: int = 7,
+        deadline: int = 0,
+    ) -> None:
+        """So many messages in one packet; sequences are as the serials, stamps ten times as much."""
+        origin = Origin(publisher_class, sender, sender, bytes(8), "A", "node")
+        stamps = [10 * (serial + at) for at in range(count)]
+        header = attachment.encode(Header(origin, serial, serial, stamps[0], deadline, more=tuple(stamps[1:])))
+        data = b"".join([(serial + at).to_bytes(size, "little") for at in range(count)])
+        sample = SimpleNamespace(
+            payload=SimpleNamespace(to_bytes=lambda: data), attachment=SimpleNamespace(to_bytes=lambda: header)
+        )
+        if self._idle:
+            self._idle = False
+            self._arrived(sample)
+        else:
+            self._ring.append(sample)
+
+
+async def turns(count: int = 20) -> None:
+    for _ in range(count):
+        await asyncio.sleep(0)
+
+
+def numbers(sink: SubscriberQueue) -> list[int]:
+    return [each.sequence for each in sink.queue]
+
+
+async def test_events_of_one_packet_stay_in_order_where_there_is_no_room() -> None:
+    """Our own senders send each for itself; others need not."""
+    ring = Ring(queue=2)
+    ring.put(1, 4, publisher_class=2)
+    await turns()
+    assert numbers(ring.sink) == [3, 4]
+    assert ring.sink.lost == 2
+
+
+async def test_a_deadline_is_told_by_the_clock_here() -> None:
+    """The sender's clock shows 1970; the second packet was held up for a second, if the stamps are right."""
+    clock = clock_of()
+    ring = Ring(queue=10)
+    ring.put(1, 2, publisher_class=2, deadline=5_000_000_020)
+    await turns()
+    arrived = clock.now()
+    await asyncio.sleep(1)
+    ring.put(3, publisher_class=2, deadline=5_000_000_030)
+    ring.put(4)
+    await turns()
+    assert [each.deadline for each in ring.sink.queue] == [5_000_000_020] * 2 + [5_000_000_030, 0]
+    expected = [arrived + 5_000_000_010, arrived + 5_000_000_000, arrived + 5_000_000_000, 0]
+    assert [each.expires for each in ring.sink.queue] == pytest.approx(expected, abs=2_000_000)
+
+
+async def test_the_rest_of_a_packet_waits_with_the_message_that_has_no_room() -> None:
+    ring = Ring(queue=2)
+    ring.put(1, 5)
+    ring.put(6)
+    taken = []
+    for _ in range(6):
+        await turns()
+        taken.append(ring.sink.queue.popleft().sequence)
+        ring.sink.refill()
+    assert taken == [1, 2, 3, 4, 5, 6]
+    assert (ring.stats.received, ring.stats.lost) == (6, Counter())
+
+
+async def test_what_is_lost_on_the_way_earns_credit() -> None:
+    """Else a publisher would wait for what never came, if that is more than half of a window."""
+    ring = Ring(queue=4 * WINDOW)
+    ring.put(1)
+    ring.put(WINDOW - 100, 10)
+    await turns()
+    assert ring.credits == [(1, 1), (1, WINDOW - 100)]
+    assert ring.stats.lost == {"on the way": WINDOW - 102}
+
+
+async def test_an_event_that_passes_a_message_that_waits_is_told_of() -> None:
+    ring = Ring(queue=1)
+    ring.put(1, 2)
+    await turns()
+    ring.put(1, publisher_class=2)
+    await turns()
+    assert (2, 1) in ring.credits
+    assert ring.sink.lost == 1
+
+
+async def test_a_message_of_the_wrong_size_is_counted_once() -> None:
+    ring = Ring(queue=10)
+    ring.put(1)
+    ring.put(2, 3, size=SIZE + 1)
+    ring.put(5)
+    await turns()
+    assert ring.stats.lost == {"wrong size": 3}
+    assert numbers(ring.sink) == [1, 5]
+
+
+@pytest.mark.parametrize("queue", [4 * WINDOW, 1])
+async def test_messages_that_nobody_can_use_earn_credit(queue: int) -> None:
+    """Else a publisher would wait for those who will never take them. They do so behind what waits for room."""
+    ring = Ring(queue=queue)
+    ring.put(1, 2)
+    for serial in range(3, WINDOW, 64):
+        ring.put(serial, 64, size=SIZE + 1)
+    await turns(2 * WINDOW // 64)
+    last = ring.credits[-1][1]
+    assert (last == 1) == (queue == 1)
+    ring.sink.queue.clear()
+    ring.sink.refill()
+    await turns()
+    assert ring.credits[-1][1] > WINDOW // 2
+    assert ring.stats.lost == {"wrong size": 2048}
+
+
+async def test_serials_are_counted_from_the_first_message_that_can_be_used() -> None:
+    ring = Ring(queue=10)
+    ring.put(7, size=SIZE + 1)
+    ring.put(7)
+    await turns()
+    assert (numbers(ring.sink), ring.stats.lost) == ([7], {"wrong size": 1})
+    assert ring.credits == [(1, 7)]
+
+
+async def test_a_message_of_the_wrong_size_behind_a_gap_is_counted_once() -> None:
+    ring = Ring(queue=10)
+    ring.put(1)
+    ring.put(4, size=SIZE + 1)
+    ring.put(5)
+    await turns()
+    assert ring.stats.lost == {"wrong size": 1, "on the way": 2}
+
+
+async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
+    ring = Ring(queue=10, typed=False)
+    ring.put(1, 2)
+    await turns()
+    ring.topic.layout = layout(Led)
+    ring.streams.begin(ring.topic)
+    ring.put(3, size=SIZE + 1)
+    ring.put(4)
+    await turns()
+    assert ring.stats.lost == {"wrong size": 1}
+    again = attachment.encode(Header(Origin(1, 8, 7, bytes(8), "A", "node"), 1, 4, 40))
+    ring.streams._streams["leds"]._unpack(bytes(SIZE), again)  # by another gateway
+    assert numbers(ring.sink) == [1, 2, 4]
+    assert ring.stats.lost["seen before"] == 1
+
+
+async def test_what_eight_publishers_may_send_is_kept_where_nobody_reads() -> None:
+    ring = Ring(queue=1)
+    for sender in range(1, 9):
+        for serial in range(1, WINDOW, 64):
+            ring.put(serial, 64, sender=sender)
+        await turns(2 * WINDOW // 64)
+    assert not ring.stats.lost
+    assert ring.stats.received == 8 * WINDOW
+
+
+class FaultyTopic(Topic):
+    """Raises at the messages with these sequence numbers."""
+
+    faulty: frozenset[int] = frozenset()
+
+    def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
+        if sample.sequence in self.faulty:
+            raise RuntimeError(sample)
+        return super().deliver(sample, own, driver)
+
+
+@pytest.mark.internal_errors
+@pytest.mark.parametrize("publisher_class", [1, 2])
+@pytest.mark.parametrize("queue", [3, 99])
+async def test_a_message_that_raises_does_not_stop_the_others(queue: int, publisher_class: int) -> None:
+    """It is as good as taken: its publisher does not wait for it."""
+    ring = Ring(queue=queue, topic=FaultyTopic)
+    assert isinstance(ring.topic, FaultyTopic)
+    ring.topic.faulty = frozenset({2, 6, 8})
+    ring.put(1, publisher_class=publisher_class)
+    ring.put(2, 5, publisher_class=publisher_class)
+    ring.put(7, publisher_class=publisher_class)
+    ring.put(8, publisher_class=publisher_class)
+    taken = []
+    for _ in range(12):
+        await turns()
+        taken += numbers(ring.sink)
+        ring.sink.queue.clear()
+        ring.sink.refill()
+    assert taken == [each for each in (1, 3, 4, 5, 7) if each in taken]
+    assert len(taken) + ring.sink.lost == 5
+    assert ring.stats.lost == {"internal error": 3}
+    assert ring.streams._streams["leds"]._blocked is None
+
+
+@pytest.mark.internal_errors
+async def test_a_packet_that_raises_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring = Ring(queue=99)
+    unpack, stream = RxStream._unpack, ring.streams._streams["leds"]
+
+    def faulty(data: bytes, header: bytes) -> int:
+        if data[0] == 2:
+            raise RuntimeError(data)
+        return unpack(stream, data, header)
+
+    monkeypatch.setattr(stream, "_unpack", faulty, raising=False)
+    for serial in range(1, 4):
+        ring.put(serial)
+    await turns()
+    assert numbers(ring.sink) == [1, 3]
+    assert ring.stats.lost == {"internal error": 1, "on the way": 1}
+
+
+@pytest.mark.internal_errors
+async def test_a_sink_that_raises_while_a_message_waits_for_it_does_not_stop_the_stream(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ring = Ring(queue=1)
+    ring.put(1, 2)
+    monkeypatch.setattr(SubscriberQueue, "offer", lambda *_: 1 // 0)
+    await turns(3)
+    monkeypatch.undo()
+    ring.sink.queue.clear()
+    ring.put(3)
+    await turns()
+    assert numbers(ring.sink) == [3]
+    assert ring.stats.lost == {"internal error": 1}
+
+
+def reconnect(ring: Ring) -> None:
+    """The link goes down and comes up; its topics are subscribed anew then."""
+    ring.streams.interrupted()
+    ring.streams.shut("leds", 7)
+    ring.streams.resumed()
+    ring.streams.shut_all("leds")
+    ring.streams.begin(ring.topic)
+
+
+async def test_what_was_sent_while_the_link_was_down_is_counted_when_it_is_back() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    reconnect(ring)
+    ring.idle()
+    ring.put(10)
+    await turns()
+    assert (ring.stats.received, ring.stats.lost) == (4, Counter({"on the way": 6}))
+
+
+async def test_what_was_sent_before_a_topic_is_subscribed_again_is_not_lost() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    reconnect(ring)
+    ring.streams.shut_all("leds")  # nobody here subscribes it any more
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(10)
+    await turns()
+    assert ring.stats.lost == Counter()
+
+
+async def test_what_came_by_another_link_in_the_meantime_is_not_lost() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.interrupted()
+    ring.streams.shut_all("leds")
+    ring.streams.resumed()
+    await asyncio.sleep(11)  # the topic is used elsewhere
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(10)
+    await turns()
+    assert ring.stats.lost == Counter()
+
+
+async def test_a_topic_that_went_on_after_an_outage_begins_anew_when_it_was_closed() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.interrupted()
+    ring.streams.resumed()
+    ring.put(6)
+    await turns()
+    assert ring.stats.lost == {"on the way": 2}
+    ring.streams.shut_all("leds")  # nobody here subscribes it any more
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(500)
+    await turns()
+    assert ring.stats.lost == {"on the way": 2}
+
+
+async def test_a_later_outage_does_not_count_what_was_sent_before_it_to_nobody_here() -> None:
+    ring = Ring(queue=16)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.interrupted()
+    ring.streams.shut_all("leds")
+    ring.streams.resumed()
+    await asyncio.sleep(60)
+    ring.streams.interrupted()
+    ring.streams.resumed()
+    ring.streams.begin(ring.topic)
+    ring.idle()
+    ring.put(500)
+    await turns()
+    assert ring.stats.lost == Counter()
+
+
+@pytest.mark.internal_errors
+async def test_a_last_credit_that_fails_does_not_keep_the_stream() -> None:
+    ring = Ring(queue=1)
+    ring.streams.open(ring.topic, SIZE, 7)
+    ring.put(1, 3)
+    await turns()
+    ring.streams.credit = lambda *_, **__: 1 // 0  # type: ignore[assignment]
+    ring.streams.shut_all("leds")
+    assert (ring.topic.remote_publishers, ring.topic.memories) == (0, [])
+    assert ring.stats.lost == {"internal error": 1, "not subscribed": 1}
+
+
+async def test_who_unsubscribes_tells_those_of_whom_nothing_has_come_yet() -> None:
+    """What they sent may be on the way."""
+    ring = Ring(queue=2)
+    ring.streams.open(ring.topic, SIZE, 7)
+    ring.streams.shut("leds", 7)  # as discovery does, before the stream ends
+    ring.streams.shut_all("leds")
+    assert (ring.last_words, ring.credits) == (1, [(1, 0)])
+
+
+async def test_who_unsubscribes_tells_those_who_publish_and_counts_what_waits() -> None:
+    ring = Ring(queue=2)
+    ring.streams.open(ring.topic, SIZE, 7)
+    for serial in range(1, 5):
+        ring.put(serial)
+    await turns()
+    ring.streams.shut_all("leds")
+    assert ring.last_words == 1
+    assert ring.credits[-1] == (1, 4)
+    assert ring.stats.received == 4
+    assert (len(ring.sink.queue), ring.stats.lost) == (2, Counter({"not subscribed": 1}))  # one was being placed
