@@ -78,9 +78,9 @@ class Bridge:
         """Ports whose place in the tree is another one, which is yet to be told to the rest."""
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
-    def make_topic(self, name: str, waker: WakeScheduler) -> Topic:
+    def make_topic(self, name: str, wake_scheduler: WakeScheduler) -> Topic:
         """For the module's topic space."""
-        return BridgedTopic(name, waker, self.ports, self._clock.monotonic, self._held)
+        return BridgedTopic(name, wake_scheduler, self.ports, self._clock.monotonic, self._held)
 
     # Links
 

@@ -210,19 +210,19 @@ class BridgedTopic(Topic):
     def __init__(
         self,
         name: str,
-        waker: WakeScheduler,
+        wake_scheduler: WakeScheduler,
         ports: dict[str, BridgePort],
         monotonic: Callable[[], int],
         held: HeldMessages,
     ) -> None:
-        super().__init__(name, waker)
+        super().__init__(name, wake_scheduler)
         self.relay: Relay | None = None
         """Set while it is relayed."""
         self.open: dict[str, list[Route]] = {}
         """The ways that messages take now, by the name of the link that they come from, as far as any came since the
         last change. Replaced whole at a change, as a message may be on its way through one of the lists.
         """
-        self.by_carrier: dict[object, RemoteSubscriber] = {}
+        self.by_link: dict[object, RemoteSubscriber] = {}
         """The outlets, by their links."""
         self.reserved: RelayedPeriodic | None = None
         """Set where a bus is to send it in slots of its own."""
@@ -232,7 +232,7 @@ class BridgedTopic(Topic):
         self._held = held
 
     @property
-    def slotted(self) -> Sequence[object]:
+    def slot_publishers(self) -> Sequence[object]:
         return self.publishers if self.reserved is None else [*self.publishers, self.reserved]
 
     @property
@@ -243,14 +243,14 @@ class BridgedTopic(Topic):
     def in_use(self) -> bool:
         return self.relay is not None or super().in_use
 
-    def heard(self, publisher: Hashable) -> LastReceived:
+    def last_received(self, publisher: Hashable) -> LastReceived:
         """Shares nothing: a message dropped because its link is silent now was never here (`DuplicateFilter`)."""
         return LastReceived()
 
-    def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
+    def deliver(self, sample: Sample, own: object = None, slot_link: object = None) -> list[Sink] | None:
         link = sample.source.link
         if not link:
-            return super().deliver(sample, own, driver)
+            return super().deliver(sample, own, slot_link)
         now = self._monotonic()
         port = self._ports[link]
         if now >= port.place.until:
@@ -274,14 +274,14 @@ class BridgedTopic(Topic):
 
     def replay(self, sample: Sample, outlet: RemoteSubscriber) -> None:
         """Send the last message to a subscriber that has joined later, if it comes from another link."""
-        way = None if self.relay is None else self.relay.way(sample.source.link, outlet.link)
+        way = None if self.relay is None else self.relay.way(sample.source.link, outlet.link_name)
         if way is not None and way.outlet is outlet:
             for sink in self._forward(way, sample, self._monotonic(), None) or ():
                 sink.offer_latched(sample)
 
     def join(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
         if isinstance(sink, RemoteSubscriber):
-            self.by_carrier[sink.carrier] = sink
+            self.by_link[sink.link] = sink
             if self.relay is not None:
                 self.relay.outlet_changed(self, sink)
         super().join(sink)
@@ -289,8 +289,8 @@ class BridgedTopic(Topic):
             self.relay.offer_latched(sink)
 
     def leave(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
-        if isinstance(sink, RemoteSubscriber) and self.by_carrier.get(sink.carrier) is sink:
-            del self.by_carrier[sink.carrier]
+        if isinstance(sink, RemoteSubscriber) and self.by_link.get(sink.link) is sink:
+            del self.by_link[sink.link]
             if self.relay is not None:
                 self.relay.outlet_changed(self, sink)
         super().leave(sink)
@@ -323,14 +323,14 @@ class BridgedTopic(Topic):
     def _go_on(self, way: Route, sample: Sample) -> list[Sink] | None:
         return None if way.outlet is None else self._forward(way, sample, self._monotonic(), None)
 
-    def _send(self, sample: Sample, blocked: list[Sink] | None, driver: object) -> list[Sink] | None:
+    def _send(self, sample: Sample, blocked: list[Sink] | None, slot_link: object) -> list[Sink] | None:
         """What is published here goes where we forward, and nowhere else: elsewhere another gateway brings it."""
         now = self._monotonic()
-        silent = [each for each in self.remote_subscribers if now >= self._ports[each.link].place.until]
+        silent = [each for each in self.remote_subscribers if now >= self._ports[each.link_name].place.until]
         if not silent:
-            return super()._send(sample, blocked, driver)
+            return super()._send(sample, blocked, slot_link)
         for outlet in silent:
-            port = self._ports[outlet.link]
+            port = self._ports[outlet.link_name]
             if not (port.resumes and self._held.keep(sample, functools.partial(self._send_held, outlet, sample))):
                 outlet.lost += 1
                 port.lose("converging")
@@ -339,18 +339,18 @@ class BridgedTopic(Topic):
             [each for each in self.remote_subscribers if each not in silent],
         )
         try:
-            return super()._send(sample, blocked, driver)
+            return super()._send(sample, blocked, slot_link)
         finally:
             self.remote_subscribers = outlets
 
     def _send_held(self, outlet: RemoteSubscriber, sample: Sample) -> list[Sink] | None:
-        port = self._ports.get(outlet.link)
+        port = self._ports.get(outlet.link_name)
         if port is None or self._monotonic() >= port.place.until:
             outlet.lost += 1
             if port is not None:
                 port.lose("converging")
             return None
-        return None if not outlet.wait_queue().line(sample) and outlet.offer(sample) else [outlet]
+        return None if not outlet.wait_queue().queue_of(sample) and outlet.offer(sample) else [outlet]
 
 
 class Relay:
@@ -383,7 +383,7 @@ class Relay:
 
     def add(self, source: str, way: Route) -> None:
         """There is one more way; it is not `open` before `changed` is called."""
-        way.outlet = way.target.by_carrier.get(way.port.link)
+        way.outlet = way.target.by_link.get(way.port.link)
         self._from.setdefault(source, {})[way.port.name] = way
         self._into.setdefault(way.port.name, {})[source] = way
 
@@ -413,9 +413,9 @@ class Relay:
 
     def outlet_changed(self, topic: BridgedTopic, outlet: RemoteSubscriber) -> None:
         """A link joined or left."""
-        now = topic.by_carrier.get(outlet.carrier)
-        for way in self._into.get(outlet.link, {}).values():
-            if way.target is topic and way.port.link is outlet.carrier:
+        now = topic.by_link.get(outlet.link)
+        for way in self._into.get(outlet.link_name, {}).values():
+            if way.target is topic and way.port.link is outlet.link:
                 way.outlet = now
         self.changed()
 
@@ -426,7 +426,7 @@ class Relay:
     def offer_latched(self, outlet: RemoteSubscriber) -> None:
         """Send what publishers latch to a subscriber that has joined."""
         for topic in self.topics.values():
-            for memory in topic.memories:
+            for memory in topic.latched_sources:
                 memory.offer_latched(topic, cast("SubscriberQueue", _LatchedReplay(topic, outlet)))
 
 
@@ -444,7 +444,7 @@ class _LatchedReplay:
 def _put(way: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
     outlet = cast("RemoteSubscriber", way.outlet)
     way.forwarded += 1
-    if not outlet.wait_queue().line(sample) and outlet.offer(sample):
+    if not outlet.wait_queue().queue_of(sample) and outlet.offer(sample):
         return blocked
     if not outlet.waits and sample.publisher_class == PublisherClass.NON_REAL_TIME:
         outlet.force(sample)
@@ -497,15 +497,15 @@ class RelayedPeriodic(PeriodicPublisher[Any]):
         self._latest = sample
         return True
 
-    def drive(self, driver: object, period: float) -> bool:
-        if self._by not in (None, driver):
+    def use_slot_clock(self, slot_link: object, period: float) -> bool:
+        if self._by not in (None, slot_link):
             return False
-        self._by = driver
+        self._by = slot_link
         self.period = period
         return True
 
-    def undrive(self, driver: object) -> None:
-        if self._by is driver:
+    def use_own_clock(self, slot_link: object) -> None:
+        if self._by is slot_link:
             self._by = self._latest = None
 
     def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
@@ -513,7 +513,7 @@ class RelayedPeriodic(PeriodicPublisher[Any]):
         latest, self._latest = self._latest, None
         return latest
 
-    def degraded(self, link: str, reason: str) -> None:
+    def link_degraded(self, link: str, reason: str) -> None:
         """The slots are lost: messages go as events, which the link's notices tell."""
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:

@@ -152,7 +152,7 @@ class MultihomedModule:
         for topic in list(self._space.topics.values()):
             if (
                 topic.layout is None
-                and not topic.idle
+                and not topic.unused
                 and self._without.get(topic.name, _ALL) != self._unable_for(topic)
             ):
                 self._retell_topic(topic)
@@ -164,11 +164,11 @@ class MultihomedModule:
         if port.number not in self.homes.by_number:
             return True
         without = self._unable_for(topic)
-        if topic.idle:
+        if topic.unused:
             self._without.pop(topic.name, None)
         else:
             self._without[topic.name] = without
-        topic.guard = self._guard_of(topic) if self._guarding else None
+        topic.drop_filter = self._guard_of(topic) if self._guarding else None
         return port.number in without or port.number in self.homes.used(self._now(), without)
 
     def _unable_for(self, topic: Topic) -> frozenset[int]:
@@ -238,7 +238,7 @@ class MultihomedModule:
             elif port.number in before[_ALL]:
                 port.link.stats.lost["standing by"] += port.link.discard()
         for topic in self._space.topics.values():
-            topic.guard = self._guard_of(topic) if self._guarding else None
+            topic.drop_filter = self._guard_of(topic) if self._guarding else None
         self._retell([port.link for port in ports])
 
     def _retell(self, links: list[Link]) -> None:

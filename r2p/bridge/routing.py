@@ -175,7 +175,7 @@ class RoutingTable:
             here.open = {}
         self._tell(topic, relay.topics)
         for here in relay.topics.values():
-            if here.idle and not here.in_use:
+            if here.unused and not here.in_use:
                 self._space.topics.pop(here.name, None)
 
     def _tell(self, topic: str, topics: dict[str, BridgedTopic] | None = None) -> None:

@@ -113,7 +113,7 @@ class NetworkView:
         """All topics by name, in order."""
         views: dict[str, TopicView] = {}
         for topic in self._module.space.topics.values():
-            if not topic.idle:
+            if not topic.unused:
                 self._add_own(views.setdefault(topic.name, TopicView(topic.name)), topic)
         for link in self._module.links:
             self._add_link(views, link)

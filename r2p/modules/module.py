@@ -32,7 +32,7 @@ from r2p.transports.url import open_transport
 
 logger = get_logger("r2p.module")
 
-PATIENCE = 1.0
+CLEANUP_WARNING_AFTER = 1.0
 """Seconds after which the log names the nodes whose clean-up is being waited for."""
 
 
@@ -217,7 +217,7 @@ class Module:
         tasks = [task for each in self._supervisors.values() if (task := each.cancel()) is not None]
         if not tasks:
             return
-        _, pending = await asyncio.wait(tasks, timeout=PATIENCE)
+        _, pending = await asyncio.wait(tasks, timeout=CLEANUP_WARNING_AFTER)
         if pending:
             names = ", ".join(sorted(task.get_name() for task in pending))
             logger.warning("module %s waits for the clean-up of %s", self.name, names)

@@ -60,7 +60,7 @@ class Sink(abc.ABC):
     def force(self, sample: Sample) -> None:
         """Take the sample even without room, losing and counting one."""
 
-    def lose(self, reason: str) -> None:
+    def count_lost(self, reason: str) -> None:
         """Count a sample that waited for room and does not any more; links count it by reason, too."""
         self.lost += 1
 
@@ -77,10 +77,10 @@ class Sink(abc.ABC):
         room = self.wait_queue()
         if not self.reachable:
             self.force(sample)
-        elif room.line(sample) or not self.offer(sample):
+        elif room.queue_of(sample) or not self.offer(sample):
             room.enqueue_latched(self, sample)
 
-    def give_up(self, refusal: str) -> None:
+    def become_lossy(self, refusal: str) -> None:
         """It made no room in time: lossy until it has."""
         self.waits = False
         self.wait_queue().reject(self, refusal)
@@ -100,7 +100,7 @@ class PendingDelivery(abc.ABC):
         self.remaining = sinks
         """Who has not got it yet."""
         for sink in sinks:
-            sink.wait_queue().enter(sink, self)
+            sink.wait_queue().add(sink, self)
 
     @abc.abstractmethod
     def completed(self, sink: Sink, refusal: str) -> None:
@@ -116,7 +116,7 @@ class PendingDelivery(abc.ABC):
         """Wait no more; says who has not got it."""
         without, self.remaining = self.remaining, []
         for sink in without:
-            sink.wait_queue().leave(sink, self)
+            sink.wait_queue().remove(sink, self)
         return without
 
 
@@ -146,23 +146,23 @@ class WaitQueue:
     def __bool__(self) -> bool:
         return bool(self.events or self.deliveries or self.recoveries)
 
-    def line(self, sample: Sample) -> _Line:
+    def queue_of(self, sample: Sample) -> _Line:
         """The line in which such a sample waits."""
         return self.deliveries if sample.publisher_class == PublisherClass.NON_REAL_TIME else self.events
 
-    def enter(self, sink: Sink, claim: PendingDelivery) -> None:
-        self.line(claim.sample).append((sink, claim))
+    def add(self, sink: Sink, claim: PendingDelivery) -> None:
+        self.queue_of(claim.sample).append((sink, claim))
 
     def enqueue_latched(self, sink: Sink, sample: Sample) -> None:
         """A latched value waits, too; of one publisher only the last."""
-        for each, claim in self.line(sample):
+        for each, claim in self.queue_of(sample):
             if each is sink and isinstance(claim, _LatchedDelivery) and claim.sample.source == sample.source:
                 claim.sample = sample
                 return
         _LatchedDelivery(sample, [sink])
 
-    def leave(self, sink: Sink, claim: PendingDelivery) -> None:
-        line = self.line(claim.sample)
+    def remove(self, sink: Sink, claim: PendingDelivery) -> None:
+        line = self.queue_of(claim.sample)
         if (sink, claim) in line:
             line.remove((sink, claim))
 
@@ -200,9 +200,9 @@ class WaitQueue:
             sink.force(claim.sample)
             claim.complete(sink, refusal)
 
-    def take_earlier(self, sink: Sink, sample: Sample) -> list[PendingDelivery]:
+    def pop_earlier(self, sink: Sink, sample: Sample) -> list[PendingDelivery]:
         """Take out what waits for this sink, and its publisher has published before this sample."""
-        line = self.line(sample)
+        line = self.queue_of(sample)
         earlier = [
             claim
             for each, claim in line

@@ -20,7 +20,7 @@ from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
 from r2p.runtime.subscriber import Callback, Keep, Subscriber, check_options
-from r2p.runtime.topic import TopicSpace, pause
+from r2p.runtime.topic import TopicSpace, checkpoint
 
 M = TypeVar("M", bound=Message)
 
@@ -259,7 +259,7 @@ class Node:
                         await self._arrival()
             except TimeoutError:
                 return False
-        await pause()
+        await checkpoint()
         return True
 
     def every(self, period: float) -> AsyncIterator[Tick]:
@@ -340,7 +340,7 @@ class Node:
     def enter(self) -> None:
         """The node's function starts: its priority counts from now on."""
         self._entered = True
-        self._space.waker.enter(self.priority)
+        self._space.wake_scheduler.enter(self.priority)
 
     def close(self) -> None:
         """Close all its publishers and subscribers; the module does so when the node's function has ended."""
@@ -349,7 +349,7 @@ class Node:
             each.close()
         if self._entered:
             self._entered = False
-            self._space.waker.leave(self.priority)
+            self._space.wake_scheduler.leave(self.priority)
 
     def _log_crash(self, error: Exception) -> None:
         self.log.error("node %s, which does not run: %r", self.name, error, exc_info=error)

@@ -14,7 +14,7 @@ from r2p.durations import LONGEST, SHORTEST, seconds, timeout_or_none
 from r2p.errors import Closed, DecodeError, MessageError
 from r2p.messages import Layout
 from r2p.runtime.sample import Sample
-from r2p.runtime.topic import BURST, SubscriberQueue, Topic, TopicOwner, TopicSpace, number, pause
+from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, SubscriberQueue, Topic, TopicSpace, checkpoint, number
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -67,7 +67,7 @@ class Subscriber(Generic[T]):
     def __init__(
         self,
         space: TopicSpace,
-        node: TopicOwner,
+        node: EndpointOwner,
         topic: Topic,
         layout: Layout[Any] | None,
         *,
@@ -87,7 +87,9 @@ class Subscriber(Generic[T]):
         """Messages older than `max_age` when their turn came; skipped."""
         self.timeouts = 0
         """Times that nothing (fresh) came for `timeout` seconds."""
-        self._sink = SubscriberQueue(space.waker, node, queue, node.priority, lossy=lossy, keep_oldest=keep == "oldest")
+        self._sink = SubscriberQueue(
+            space.wake_scheduler, node, queue, node.priority, lossy=lossy, keep_oldest=keep == "oldest"
+        )
         self._node = node
         self._space = space
         self._topic = topic
@@ -139,7 +141,7 @@ class Subscriber(Generic[T]):
     async def _iterate(self, *, whole: bool) -> AsyncIterator[Any]:  # noqa: C901 - see below
         # One long function, because this is where every message passes: calls would take as long as the work.
         sink, kind, create_future = self._sink, self._type, self._space.loop.create_future
-        queue, waker, fussy = sink.queue, self._space.waker, self._max_age is not None
+        queue, wake_scheduler, fussy = sink.queue, self._space.wake_scheduler, self._max_age is not None
         while not self._closed:
             if not queue:
                 if sink.waiter is not None:
@@ -150,10 +152,10 @@ class Subscriber(Generic[T]):
                 finally:
                     if sink.waiter is waiter:
                         sink.waiter = None
-            credit = BURST if sink.priority >= waker.top else 1
+            credit = YIELD_EVERY if sink.priority >= wake_scheduler.top else 1
             while queue:
                 sample = queue.popleft()
-                if sink.lines is not None:
+                if sink.waiting is not None:
                     sink.refill()
                 message = sample.message
                 if fussy or message.__class__ is not kind:
@@ -252,7 +254,7 @@ class Subscriber(Generic[T]):
         sink, queue = self._sink, self.queue
         while queue:
             sample = queue.popleft()
-            if sink.lines is not None:
+            if sink.waiting is not None:
                 sink.refill()
             message: T | None = self._examine(sample)
             if message is not None:
@@ -295,19 +297,19 @@ class Subscriber(Generic[T]):
         return Closed(f"the subscription of {self.topic} is closed: subscribe again")
 
     async def _use_credit(self) -> None:
-        """Let others run after BURST messages in a row; a node of low priority after each."""
+        """Let others run after YIELD_EVERY messages in a row; a node of low priority after each."""
         self._credit += 1
-        if self._credit >= BURST or self._sink.priority < self._space.waker.top:
+        if self._credit >= YIELD_EVERY or self._sink.priority < self._space.wake_scheduler.top:
             self._credit = 0
             await self._give_way()
 
     async def _give_way(self) -> None:
-        waker, priority = self._space.waker, self._sink.priority
-        if priority >= waker.top:
-            await pause()
+        wake_scheduler, priority = self._space.wake_scheduler, self._sink.priority
+        if priority >= wake_scheduler.top:
+            await checkpoint()
         else:
             turn = self._space.loop.create_future()
-            waker.queue(priority, turn)
+            wake_scheduler.queue(priority, turn)
             await turn
 
     def _note(self, sample: Sample) -> None:

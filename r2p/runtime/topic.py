@@ -24,22 +24,22 @@ from r2p.messages import Layout
 from r2p.runtime.backpressure import NO_ROOM, Sink, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample
 
-BURST = 16
+YIELD_EVERY = 16
 """Messages that publish() or an iteration handles before it lets the event loop run once."""
 
 _NRT = PublisherClass.NON_REAL_TIME
 
-PATIENCE = 4
+FULL_QUEUE_TURNS = 4
 """Turns of the event loop that a link waits for a full queue before it goes on without it."""
 
 
 @types.coroutine
-def pause() -> Generator[None, None, None]:
+def checkpoint() -> Generator[None, None, None]:
     """Let the event loop run once."""
     yield
 
 
-class TopicOwner(Protocol):
+class EndpointOwner(Protocol):
     """The node that a publisher or a subscriber belongs to."""
 
     name: str
@@ -108,13 +108,31 @@ class WakeScheduler:
 class SubscriberQueue(Sink):
     """The bounded queue of one subscriber; the topic fills it, the subscriber empties it."""
 
-    __slots__ = ("_waker", "keep_oldest", "limit", "lines", "lossy", "matches", "node", "priority", "queue", "waiter")
+    __slots__ = (
+        "_wake_scheduler",
+        "keep_oldest",
+        "limit",
+        "lossy",
+        "matches",
+        "node",
+        "priority",
+        "queue",
+        "waiter",
+        "waiting",
+    )
 
     def __init__(
-        self, waker: WakeScheduler, node: TopicOwner, limit: int, priority: int, *, lossy: bool, keep_oldest: bool
+        self,
+        wake_scheduler: WakeScheduler,
+        node: EndpointOwner,
+        limit: int,
+        priority: int,
+        *,
+        lossy: bool,
+        keep_oldest: bool,
     ) -> None:
         super().__init__()
-        self._waker = waker
+        self._wake_scheduler = wake_scheduler
         self.node = node
         self.limit = limit
         self.priority = priority
@@ -126,7 +144,7 @@ class SubscriberQueue(Sink):
         """Its reader, while that waits for a message."""
         self.matches: list[asyncio.Future[None]] = []
         """Those who wait for a publisher."""
-        self.lines: WaitQueue | None = None
+        self.waiting: WaitQueue | None = None
         """Only while somebody waits for room: whoever takes a message out then calls `refill`."""
 
     def offer(self, sample: Sample) -> bool:
@@ -148,7 +166,7 @@ class SubscriberQueue(Sink):
         self.lost += 1
         if self.keep_oldest:
             return
-        overtaken = [] if self.lines is None else self.lines.take_earlier(self, sample)
+        overtaken = [] if self.waiting is None else self.waiting.pop_earlier(self, sample)
         for earlier in (*(claim.sample for claim in overtaken), sample):
             self.queue.popleft()
             self._put(earlier)
@@ -157,17 +175,17 @@ class SubscriberQueue(Sink):
             claim.complete(self, NO_ROOM)
 
     def wait_queue(self) -> WaitQueue:
-        if self.lines is None:
-            self.lines = WaitQueue()
-        return self.lines
+        if self.waiting is None:
+            self.waiting = WaitQueue()
+        return self.waiting
 
     def refill(self) -> None:
-        if (room := self.lines) is not None:
+        if (room := self.waiting) is not None:
             room.serve()
             if len(self.queue) <= self.limit // 2:
                 room.recover()
             if not room:
-                self.lines = None
+                self.waiting = None
 
     @property
     def owner(self) -> str:
@@ -184,41 +202,41 @@ class SubscriberQueue(Sink):
         self.queue.append(sample)
         if (waiter := self.waiter) is not None:
             self.waiter = None
-            self._waker.wake(self.priority, waiter)
+            self._wake_scheduler.wake(self.priority, waiter)
 
 
 class RemoteSubscriber(Sink):
     """A remote subscriber: one topic on its way out by one link."""
 
-    __slots__ = ("carrier", "lines", "link")
+    __slots__ = ("link", "link_name", "waiting")
 
-    def __init__(self, link: str, carrier: object, lines: WaitQueue) -> None:
+    def __init__(self, link_name: str, link: object, lines: WaitQueue) -> None:
         super().__init__()
+        self.link_name = link_name
+        self.waiting = lines
         self.link = link
-        self.lines = lines
-        self.carrier = carrier
         """The link itself; topics only tell one from another."""
 
     @property
     def owner(self) -> str:
         """The name of its link."""
-        return self.link
+        return self.link_name
 
     def wait_queue(self) -> WaitQueue:
-        return self.lines
+        return self.waiting
 
 
 class PublisherHandle(Protocol):
     """A publisher as its topic sees it."""
 
-    node: TopicOwner
+    node: EndpointOwner
     publisher_class: PublisherClass
     latch: bool
 
-    def joined(self, sink: Sink) -> None:
+    def subscriber_joined(self, sink: Sink) -> None:
         """Somebody joined, or came back after a reboot."""
 
-    def degraded(self, link: str, reason: str) -> None:
+    def link_degraded(self, link: str, reason: str) -> None:
         """A link that carried the topic does not any more."""
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
@@ -245,7 +263,7 @@ class LastReceived(msgspec.Struct, eq=False, weakref=True):
 class Topic:
     """One topic in one module."""
 
-    def __init__(self, name: str, waker: WakeScheduler) -> None:
+    def __init__(self, name: str, wake_scheduler: WakeScheduler) -> None:
         self.name = name
         self.layout: Layout[Any] | None = None
         self.publishers: list[PublisherHandle] = []
@@ -253,32 +271,32 @@ class Topic:
         self.remote_subscribers: list[RemoteSubscriber] = []
         self.remote_publishers = 0
         """Remote publishers."""
-        self.memories: list[LatchedSource] = []
-        self.guard: Callable[[str], bool] | None = None
+        self.latched_sources: list[LatchedSource] = []
+        self.drop_filter: Callable[[str], bool] | None = None
         """Decides for each message, by the name of its link, whether it is dropped (`r2p.bridge.multihoming`)."""
-        self._waker = waker
-        self._heard: WeakValueDictionary[Hashable, LastReceived] = WeakValueDictionary()
+        self._wake_scheduler = wake_scheduler
+        self._last_received: WeakValueDictionary[Hashable, LastReceived] = WeakValueDictionary()
 
-    def heard(self, publisher: Hashable) -> LastReceived:
+    def last_received(self, publisher: Hashable) -> LastReceived:
         """What all ways share by which messages of a remote publisher come in, so that doubles are recognised.
 
         It lasts as long as somebody keeps it.
         """
-        heard = self._heard.get(publisher)
+        heard = self._last_received.get(publisher)
         if heard is None:
-            heard = self._heard[publisher] = LastReceived()
+            heard = self._last_received[publisher] = LastReceived()
         return heard
 
-    def deliver(self, sample: Sample, own: object = None, driver: object = None) -> list[Sink] | None:
+    def deliver(self, sample: Sample, own: object = None, slot_link: object = None) -> list[Sink] | None:
         """Queue the sample wherever there is room; the sinks that are worth waiting for come back.
 
         With what is published here those come back, too, that are not any more (`patient` is false): its publisher
         counts what they lose.
-        `own` is the publishing node: its own queues never make it wait. `driver` is a link that gets it another way.
+        `own` is the publishing node: its own queues never make it wait. `slot_link` is a link that gets it another way.
         """
-        if self.guard is not None and self.guard(sample.source.link):
+        if self.drop_filter is not None and self.drop_filter(sample.source.link):
             return None
-        waker = self._waker
+        wake_scheduler = self._wake_scheduler
         blocked: list[Sink] | None = None
         for sink in self.queues:
             queue = sink.queue
@@ -286,7 +304,7 @@ class Topic:
                 if sink.node is not own and (sink.waits or sink.waits_for(sample)):
                     blocked = [sink] if blocked is None else [*blocked, sink]
                     continue
-                if sink.lines is not None or sink.keep_oldest:
+                if sink.waiting is not None or sink.keep_oldest:
                     sink.force(sample)
                     continue
                 sink.lost += 1
@@ -294,19 +312,19 @@ class Topic:
             queue.append(sample)
             if (waiter := sink.waiter) is not None:
                 sink.waiter = None
-                if sink.priority < waker.top:
-                    waker.queue(sink.priority, waiter)
+                if sink.priority < wake_scheduler.top:
+                    wake_scheduler.queue(sink.priority, waiter)
                 elif not waiter.done():
                     waiter.set_result(None)
         if self.remote_subscribers and not sample.source.link:
-            blocked = self._send(sample, blocked, driver)
+            blocked = self._send(sample, blocked, slot_link)
         return blocked
 
-    def _send(self, sample: Sample, blocked: list[Sink] | None, driver: object) -> list[Sink] | None:
+    def _send(self, sample: Sample, blocked: list[Sink] | None, slot_link: object) -> list[Sink] | None:
         for outlet in self.remote_subscribers:
-            lines = outlet.lines
-            queues = (lines.events or lines.deliveries) and lines.line(sample)
-            if outlet.carrier is driver or (not queues and outlet.offer(sample)):
+            lines = outlet.waiting
+            queues = (lines.events or lines.deliveries) and lines.queue_of(sample)
+            if outlet.link is slot_link or (not queues and outlet.offer(sample)):
                 continue
             if blocked is None:
                 blocked = [outlet]
@@ -319,17 +337,17 @@ class Topic:
         if isinstance(sink, SubscriberQueue):
             self.queues.append(sink)
             self.queues.sort(key=lambda queue: -queue.priority)
-            for memory in self.memories:
+            for memory in self.latched_sources:
                 memory.offer_latched(self, sink)
         elif sink not in self.remote_subscribers:
             self.remote_subscribers.append(sink)
         for publisher in self.publishers:
-            publisher.joined(sink)
+            publisher.subscriber_joined(sink)
 
     def resend_latched(self, sink: "SubscriberQueue | RemoteSubscriber") -> None:
         """One more subscriber at the other end of a link that has joined before, or the same one after a restart."""
         for publisher in self.publishers:
-            publisher.joined(sink)
+            publisher.subscriber_joined(sink)
 
     def leave(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
         if isinstance(sink, SubscriberQueue):
@@ -348,12 +366,12 @@ class Topic:
         return None
 
     @property
-    def idle(self) -> bool:
+    def unused(self) -> bool:
         """Nobody in this module publishes or subscribes it."""
         return not (self.publishers or self.queues)
 
     @property
-    def slotted(self) -> Sequence[object]:
+    def slot_publishers(self) -> Sequence[object]:
         """Those for whose messages a link may ask, if they are periodic: a bus with slots of its own."""
         return self.publishers
 
@@ -406,7 +424,7 @@ class TopicSpace:
         self.module = module
         self.loop = loop
         self.clock = clock
-        self.waker = WakeScheduler(loop)
+        self.wake_scheduler = WakeScheduler(loop)
         self.topics: dict[str, Topic] = {}
         self.links: list[LinkView] = []
         self.make_topic: Callable[[str, WakeScheduler], Topic] = Topic
@@ -418,7 +436,7 @@ class TopicSpace:
         """The topic of that name; raises TypeMismatch if it has another layout here (`None` fits any)."""
         topic = self.topics.get(name)
         if topic is None:
-            topic = self.topics[name] = self.make_topic(name, self.waker)
+            topic = self.topics[name] = self.make_topic(name, self.wake_scheduler)
         if layout is not None:
             if topic.layout is None:
                 topic.layout = layout
@@ -432,7 +450,7 @@ class TopicSpace:
     def release(self, topic: Topic) -> None:
         """Tell of a change, and forget the topic's type with its last user."""
         self.changed(topic)
-        if topic.idle:
+        if topic.unused:
             topic.layout = None
             if not topic.in_use:
                 self.topics.pop(topic.name, None)

@@ -277,7 +277,7 @@ class Link(abc.ABC):
         self._apply(self.discovery.link_down(self._down_at))
         self.wait_queue.reject_all(LINK_DOWN)  # whoever waits for it waits for nothing
         for publisher in carried:
-            publisher.degraded(self.name, reason)
+            publisher.link_degraded(self.name, reason)
 
     def close(self) -> None:
         """Say good-bye, and let go of all topics."""
@@ -611,8 +611,8 @@ class LinkSubscriber(RemoteSubscriber):
             self.lost += 1
             link.stats.lost["send buffer full" if link.up else LINK_DOWN] += 1
 
-    def lose(self, reason: str) -> None:
-        super().lose(reason)
+    def count_lost(self, reason: str) -> None:
+        super().count_lost(reason)
         self._link.stats.lost[reason] += 1
 
     def refill(self) -> None:

@@ -1,9 +1,9 @@
 """What comes in by a link, on its way to the topics: only what was opened, and a few messages at a time.
 
-A slow reader must not stop a line that others share, and a fast one should lose nothing. So a full queue gets PATIENCE
-turns of the event loop to make room; one that does not is lossy, for this link, until it has plenty. What a gateway
-passes on from an end that waits while nothing is read gets STALL seconds, as from a publisher of this module: so the
-flow is from end to end.
+A slow reader must not stop a line that others share, and a fast one should lose nothing. So a full queue gets
+FULL_QUEUE_TURNS turns of the event loop to make room; one that does not is lossy, for this link, until it has plenty.
+What a gateway passes on from an end that waits while nothing is read gets STALL seconds, as from a publisher of this
+module: so the flow is from end to end.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from r2p.log_lines import LineLimit, get_logger
 from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.runtime.backpressure import INTERNAL_ERROR, PendingDelivery, Sink
 from r2p.runtime.sample import Sample, Source
-from r2p.runtime.topic import PATIENCE, RemoteSubscriber, SubscriberQueue, Topic
+from r2p.runtime.topic import FULL_QUEUE_TURNS, RemoteSubscriber, SubscriberQueue, Topic
 
 # What a link drops: counted by reason, and told at debug level, in one place for all who count.
 
@@ -241,7 +241,7 @@ class Receiver:
         inlet = self._inlets.get(key)
         if inlet is None:
             inlet = self._inlets[key] = RemotePublishers(topic, {})
-            topic.memories.append(self)
+            topic.latched_sources.append(self)
         is_new = sender not in inlet.senders
         inlet.senders[sender] = size
         if is_new:
@@ -263,7 +263,7 @@ class Receiver:
         inlet = self._inlets.pop(name.encode(), None)
         if inlet is not None:
             inlet.topic.remote_publishers -= len(inlet.senders)
-            inlet.topic.memories.remove(self)
+            inlet.topic.latched_sources.remove(self)
 
     def offer_latched(self, topic: Topic, sink: SubscriberQueue) -> None:
         """Send the last message to a new subscriber, if the publisher latches it."""
@@ -345,7 +345,7 @@ class Receiver:
         patient = [sink for sink in blocked if sink not in self._lossy]
         if not patient:
             return False
-        self._patience = PATIENCE
+        self._patience = FULL_QUEUE_TURNS
         self._loop.call_soon(self._look, _PendingArrival(sample, patient))
         self._read_no_more()
         return True
@@ -390,8 +390,8 @@ class Receiver:
         for sink in list(claim.remaining):
             guard(sink.refill)
         for sink in list(claim.remaining):
-            if not guard(sink.give_up, refusal):
-                sink.wait_queue().leave(sink, claim)
+            if not guard(sink.become_lossy, refusal):
+                sink.wait_queue().remove(sink, claim)
                 claim.complete(sink, INTERNAL_ERROR)  # else the line would stand still for ever
             self._in_vain = self._loop.time()
 

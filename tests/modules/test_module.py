@@ -13,7 +13,7 @@ import pytest
 
 import r2p
 from r2p.codecs.management import ROLE_PUBLISHES
-from r2p.modules.module import PATIENCE
+from r2p.modules.module import CLEANUP_WARNING_AFTER
 from r2p.msg import Encoder, Led, Log, Odometry
 from r2p.protocols.discovery.events import Mismatched, NameConflict, Shape
 from r2p.runtime.events import EVENTS
@@ -189,7 +189,7 @@ async def test_closing_ends_nodes_before_links_and_waits_for_their_clean_up() ->
         try:
             await asyncio.Event().wait()
         finally:
-            await asyncio.sleep(PATIENCE + 1.0)
+            await asyncio.sleep(CLEANUP_WARNING_AFTER + 1.0)
             await commands.publish(led(0))
 
     async with joined("B") as other:
@@ -217,7 +217,7 @@ async def test_clean_up_that_takes_long_is_told_and_waited_for(caplog: pytest.Lo
         module.start(slow)
         await settle(1.0)
         stopping = asyncio.create_task(module.stop())
-        await settle(PATIENCE + 0.5)
+        await settle(CLEANUP_WARNING_AFTER + 0.5)
         assert "module PC1 waits for the clean-up of PC1/slow" in caplog.text
     assert ended == ["slow"]
     await stopping

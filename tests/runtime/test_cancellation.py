@@ -90,7 +90,7 @@ def leftovers(loop: Any, opened: list[r2p.Module]) -> list[str]:
         if hasattr(module, "space"):
             left += [f"topic {name} of {module.name}" for name in module.space.topics]
             left += [f"link {link.name} of {module.name}" for link in module.links]
-            left += [f"priorities of {module.name}"] if module.space.waker._priorities else []
+            left += [f"priorities of {module.name}"] if module.space.wake_scheduler._priorities else []
         left += [f"node {name}" for name, each in module.nodes.items() if each.running or not each.node.closed]
     return left
 

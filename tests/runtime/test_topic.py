@@ -187,8 +187,8 @@ async def test_the_highest_priority_is_that_of_the_nodes_which_still_run() -> No
     async with local() as module:
         important, other = module.start(hold, name="a", priority=9), module.start(hold, name="b", priority=1)
         await settle()
-        assert module.space.waker.top == 9
+        assert module.space.wake_scheduler.top == 9
         await module.nodes["a"].stop()
         assert (important.closed, other.closed) == (True, False)
-        assert module.space.waker.top == 1
-    assert module.space.waker.top == 0
+        assert module.space.wake_scheduler.top == 1
+    assert module.space.wake_scheduler.top == 0

@@ -10,7 +10,7 @@ import pytest
 
 from r2p.runtime.backpressure import WaitQueue
 from r2p.runtime.sample import Sample, Source
-from r2p.runtime.topic import PATIENCE, RemoteSubscriber, Topic, WakeScheduler
+from r2p.runtime.topic import FULL_QUEUE_TURNS, RemoteSubscriber, Topic, WakeScheduler
 from r2p.transports.receiver import STALL, Arrival, LinkStats, Receiver
 
 pytestmark = pytest.mark.virtual_time
@@ -41,14 +41,14 @@ class Other(RemoteSubscriber):
             self.lost += 1
 
     def refill(self) -> None:
-        self.lines.serve()
+        self.waiting.serve()
 
 
 class Passing(Topic):
     """A topic of a gateway: what comes in goes out by the other link."""
 
-    def deliver(self, sample: Sample, own: object = None, driver: object = None) -> Any:
-        return self._send(sample, None, driver)
+    def deliver(self, sample: Sample, own: object = None, slot_link: object = None) -> Any:
+        return self._send(sample, None, slot_link)
 
 
 class End:
@@ -147,7 +147,7 @@ async def test_a_line_that_is_connected_anew_is_held_up_as_the_old_one_was() -> 
 async def test_one_that_does_not_wait_loses_soon() -> None:
     end, intake, other = gateway(waits=False)
     intake.take(LINES)
-    for _ in range(2 * PATIENCE):
+    for _ in range(2 * FULL_QUEUE_TURNS):
         await asyncio.sleep(0)
     assert (other.taken, other.lost, end.reads) == ([], len(LINES), True)
 
@@ -181,10 +181,10 @@ class Faulty(Other):
             raise RuntimeError(sample)
         super().force(sample)
 
-    def give_up(self, refusal: str) -> None:
+    def become_lossy(self, refusal: str) -> None:
         if "give up" in self.faults:
             raise RuntimeError(refusal)
-        super().give_up(refusal)
+        super().become_lossy(refusal)
 
 
 @pytest.mark.internal_errors
@@ -222,4 +222,4 @@ async def test_a_message_that_raises_while_it_waits_for_room_waits_no_more() -> 
     with pytest.raises(RuntimeError):
         other.refill()  # a link guards this, and goes on
     await asyncio.sleep(STALL)
-    assert (other.taken, end.reads, other.lines.deliveries) == (ALL[2:], True, deque())
+    assert (other.taken, end.reads, other.waiting.deliveries) == (ALL[2:], True, deque())

@@ -14,7 +14,7 @@ from r2p.messages import Layout, Message
 from r2p.runtime.backpressure import LINK_DOWN, Sink
 from r2p.runtime.qos import Missed, Signal
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.runtime.topic import BURST, Topic, TopicOwner, TopicSpace
+from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, Topic, TopicSpace
 
 M = TypeVar("M", bound=Message)
 
@@ -29,7 +29,7 @@ class BasePublisher(Generic[M]):
 
     publisher_class: PublisherClass
 
-    def __init__(self, space: TopicSpace, node: TopicOwner, topic: Topic, layout: Layout[M], *, latch: bool) -> None:
+    def __init__(self, space: TopicSpace, node: EndpointOwner, topic: Topic, layout: Layout[M], *, latch: bool) -> None:
         self.topic = topic.name
         self.type = layout.cls
         self.node = node
@@ -47,7 +47,7 @@ class BasePublisher(Generic[M]):
         self._now = space.clock.now
         self._source = Source(space.module, node.name)
         self._last: Sample | None = None
-        self._credit = BURST
+        self._credit = YIELD_EVERY
         self._lines = LineLimit(_LINES)
         self._waiters: list[asyncio.Future[None]] = []
         self._signalling = False
@@ -118,7 +118,7 @@ class BasePublisher(Generic[M]):
 
     # Called by the topic and its links
 
-    def joined(self, sink: Sink) -> None:
+    def subscriber_joined(self, sink: Sink) -> None:
         """Somebody joined, or came back after a reboot: a latched value is sent again."""
         if self._last is not None:
             sink.offer_latched(self._last)
@@ -126,7 +126,7 @@ class BasePublisher(Generic[M]):
             if not waiter.done():
                 waiter.set_result(None)
 
-    def degraded(self, link: str, reason: str) -> None:
+    def link_degraded(self, link: str, reason: str) -> None:
         """A link that carried the topic does not any more."""
         self._signal(Missed(self.topic, reason, where=link, count=0), self._on_degraded)
 

@@ -7,7 +7,7 @@ from r2p.runtime.backpressure import CANCELLED, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M
 from r2p.runtime.qos import NonRealTime
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import BURST, Topic, TopicOwner, TopicSpace, pause
+from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, Topic, TopicSpace, checkpoint
 
 _NRT = PublisherClass.NON_REAL_TIME
 
@@ -18,7 +18,14 @@ class Publisher(BasePublisher[M]):
     publisher_class = PublisherClass.NON_REAL_TIME
 
     def __init__(
-        self, space: TopicSpace, node: TopicOwner, topic: Topic, layout: Layout[M], klass: NonRealTime, *, latch: bool
+        self,
+        space: TopicSpace,
+        node: EndpointOwner,
+        topic: Topic,
+        layout: Layout[M],
+        klass: NonRealTime,
+        *,
+        latch: bool,
     ) -> None:
         super().__init__(space, node, topic, layout, latch=latch)
         self._stall = klass.stall
@@ -44,8 +51,8 @@ class Publisher(BasePublisher[M]):
             await self._wait_for_room(sample, blocked)
         self._credit -= 1
         if self._credit <= 0:
-            self._credit = BURST
-            await pause()
+            self._credit = YIELD_EVERY
+            await checkpoint()
 
     def publish_nowait(self, message: M) -> bool:
         """Publish without waiting: for callbacks. False if somebody had no room and lost a message (counted)."""
@@ -81,7 +88,7 @@ class Publisher(BasePublisher[M]):
             timer.cancel()
             without = wait.withdraw()
             for sink in without:
-                sink.lose(CANCELLED)
+                sink.count_lost(CANCELLED)
             if without:
                 self._miss(sample.sequence, CANCELLED, without)
             if wait.refused:
@@ -111,4 +118,4 @@ class _WaitingDelivery(PendingDelivery):
         for sink in list(self.remaining):
             sink.refill()
         for sink in list(self.remaining):
-            sink.give_up(refusal)
+            sink.become_lossy(refusal)

@@ -8,7 +8,7 @@ from r2p.runtime.backpressure import GIVEN_UP, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Periodic
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import SubscriberQueue, Topic, TopicOwner, TopicSpace
+from r2p.runtime.topic import EndpointOwner, SubscriberQueue, Topic, TopicSpace
 
 _SECOND = 1_000_000_000
 _LATE_SHARE = 2  # a period is late when it is off by more than half of it
@@ -20,7 +20,14 @@ class PeriodicPublisher(BasePublisher[M]):
     publisher_class = PublisherClass.PERIODIC
 
     def __init__(
-        self, space: TopicSpace, node: TopicOwner, topic: Topic, layout: Layout[M], klass: Periodic[M], *, latch: bool
+        self,
+        space: TopicSpace,
+        node: EndpointOwner,
+        topic: Topic,
+        layout: Layout[M],
+        klass: Periodic[M],
+        *,
+        latch: bool,
     ) -> None:
         super().__init__(space, node, topic, layout, latch=latch)
         self.period = klass.period
@@ -32,7 +39,7 @@ class PeriodicPublisher(BasePublisher[M]):
         self._on_late = klass.on_late
         self._on_degraded = klass.on_degraded
         self._own_period = klass.period
-        self._driver: object = None
+        self._slot_link: object = None
         self._waiting: _PeriodDelivery[M] | None = None
         self._ticker = Ticker(space.loop, round(klass.period * _SECOND), self.tick, background=True)
 
@@ -46,26 +53,26 @@ class PeriodicPublisher(BasePublisher[M]):
 
     def close(self) -> None:
         self._ticker.close()
-        self._driver = None
+        self._slot_link = None
         super().close()
         self._give_up("publisher closed")
 
-    def drive(self, driver: object, period: float) -> bool:
+    def use_slot_clock(self, slot_link: object, period: float) -> bool:
         """A link whose slots are the clock calls `tick` from now on, each `period` seconds; again: another period.
 
         False if another link does already, or the publisher is closed.
         """
-        if self._driver not in (None, driver) or self not in self._topic.publishers:
+        if self._slot_link not in (None, slot_link) or self not in self._topic.publishers:
             return False
-        self._driver = driver
+        self._slot_link = slot_link
         self.period = period
         self._ticker.close()
         return True
 
-    def undrive(self, driver: object) -> None:
+    def use_own_clock(self, slot_link: object) -> None:
         """That link does not any more: the publisher's own clock goes on, at the period that was asked for."""
-        if self._driver is driver:
-            self._driver = None
+        if self._slot_link is slot_link:
+            self._slot_link = None
             self.period = self._own_period
             if not self.node.ending:
                 self._ticker.start()
@@ -73,7 +80,8 @@ class PeriodicPublisher(BasePublisher[M]):
     def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
         """One period: due at `scheduled` (monotonic ns), `late` by ns, after so many `skipped` ones.
 
-        Local queues and all other links get the message, the driver gets it from here; None if there is none.
+        Local queues and all other links get the message from here; the link of the slots gets it as the result. None:
+        there is no message.
         """
         self._give_up(NO_ROOM)
         if self._encode == self._closed or self.node.ending:
@@ -92,7 +100,7 @@ class PeriodicPublisher(BasePublisher[M]):
             self.close()
             self.node.crash(error)
             return None
-        blocked = self._topic.deliver(sample, None, self._driver)
+        blocked = self._topic.deliver(sample, None, self._slot_link)
         if blocked is not None:
             self._not_yet(sample, blocked)
         return sample
@@ -111,7 +119,7 @@ class PeriodicPublisher(BasePublisher[M]):
         if down:
             self._unreachable(sample, down)
 
-    def settled(self, waited: "_PeriodDelivery[M]", sink: Sink, refusal: str) -> None:
+    def delivery_completed(self, waited: "_PeriodDelivery[M]", sink: Sink, refusal: str) -> None:
         """A link has got a sample that waited, or lost it."""
         late = self._clock.monotonic() - waited.since
         if refusal:
@@ -126,7 +134,7 @@ class PeriodicPublisher(BasePublisher[M]):
         without = waited.withdraw() if waited is not None else []
         if waited is not None and without:
             for sink in without:
-                sink.lose(GIVEN_UP)
+                sink.count_lost(GIVEN_UP)
             self._miss(waited.sample.sequence, reason, without)
 
 
@@ -141,4 +149,4 @@ class _PeriodDelivery(PendingDelivery, Generic[M]):
         super().__init__(sample, sinks)
 
     def completed(self, sink: Sink, refusal: str) -> None:
-        self.publisher.settled(self, sink, refusal)
+        self.publisher.delivery_completed(self, sink, refusal)

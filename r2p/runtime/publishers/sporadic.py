@@ -8,7 +8,7 @@ from r2p.runtime.backpressure import GIVEN_UP, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Sporadic
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import BURST, Topic, TopicOwner, TopicSpace, pause
+from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, Topic, TopicSpace, checkpoint
 
 _SECOND = 1_000_000_000
 _TOO_LATE = "no room by the deadline"
@@ -20,7 +20,7 @@ class SporadicPublisher(BasePublisher[M]):
     publisher_class = PublisherClass.SPORADIC
 
     def __init__(
-        self, space: TopicSpace, node: TopicOwner, topic: Topic, layout: Layout[M], klass: Sporadic, *, latch: bool
+        self, space: TopicSpace, node: EndpointOwner, topic: Topic, layout: Layout[M], klass: Sporadic, *, latch: bool
     ) -> None:
         super().__init__(space, node, topic, layout, latch=latch)
         self._deadline = round(klass.deadline * _SECOND)
@@ -40,8 +40,8 @@ class SporadicPublisher(BasePublisher[M]):
         self.publish_nowait(message)
         self._credit -= 1
         if self._credit <= 0:
-            self._credit = BURST
-            await pause()
+            self._credit = YIELD_EVERY
+            await checkpoint()
 
     def publish_nowait(self, message: M) -> bool:
         """Publish an event; False if it has to wait for room somewhere, or can't reach somebody."""
@@ -69,7 +69,7 @@ class SporadicPublisher(BasePublisher[M]):
             self._give_up(self._pending[0], "too many wait")
         self._arm()
 
-    def settled(self, event: "_EventDelivery[M]", sink: Sink, refusal: str) -> None:
+    def delivery_completed(self, event: "_EventDelivery[M]", sink: Sink, refusal: str) -> None:
         """A sink has got an event that waited, or lost it."""
         if not event.remaining:
             self._pending.remove(event)
@@ -97,7 +97,7 @@ class SporadicPublisher(BasePublisher[M]):
             self._pending.remove(event)
             without = event.withdraw()
             for sink in without:
-                sink.lose(GIVEN_UP)
+                sink.count_lost(GIVEN_UP)
             late = max(0, self._clock.monotonic() - event.due) / _SECOND
             self._miss(event.sample.sequence, reason, without, late)
 
@@ -114,4 +114,4 @@ class _EventDelivery(PendingDelivery, Generic[M]):
         super().__init__(sample, sinks)
 
     def completed(self, sink: Sink, refusal: str) -> None:
-        self.publisher.settled(self, sink, refusal)
+        self.publisher.delivery_completed(self, sink, refusal)

@@ -105,7 +105,7 @@ class SlottedTopics:
 
     def follow(self, topic: Topic, high: int | None) -> None:
         """The publishers of a topic changed, or its high byte: of those that are periodic the first gets slots."""
-        publisher = next((each for each in topic.slotted if isinstance(each, PeriodicPublisher)), None)
+        publisher = next((each for each in topic.slot_publishers if isinstance(each, PeriodicPublisher)), None)
         known = self.by_topic.get(topic.name)
         if known is not None and (known.publisher, known.high) != (publisher, high):
             self._drop(known)
@@ -152,7 +152,7 @@ class SlottedTopics:
         if isinstance(news, Refused):
             each.refusal = news.reason
         elif self._link.up:  # else the publisher is told that the link is down
-            each.publisher.degraded(self._link.name, f"slots lost: {news.reason}")
+            each.publisher.link_degraded(self._link.name, f"slots lost: {news.reason}")
 
     def due(self, due: Due) -> None:
         """The engine wants data: for a slot, or because the time has come and there is no slot."""
@@ -175,7 +175,7 @@ class SlottedTopics:
     def _tick(self, each: SlottedTopic, due: Due) -> bytes | None:
         """Let the publisher make the message of this slot."""
         if not each.driven:
-            each.driven = each.publisher.drive(self._link, each.interval / _SECOND)
+            each.driven = each.publisher.use_slot_clock(self._link, each.interval / _SECOND)
             each.elsewhere = not each.driven
             self.look()
             if each.elsewhere:
@@ -209,4 +209,4 @@ class SlottedTopics:
         each.period = 0
         if each.driven:
             each.driven = False
-            each.publisher.undrive(self._link)
+            each.publisher.use_own_clock(self._link)

@@ -257,15 +257,15 @@ class ZenohSubscriber(LinkSubscriber):
         self._link.stats.lost[reason] += 1
 
     def refill(self) -> None:
-        while not self._link.stats.lost.guard(self.lines.serve):
+        while not self._link.stats.lost.guard(self.waiting.serve):
             pass  # the one that raised waits no more
-        self.lines.recover()
+        self.waiting.recover()
 
-    def give_up(self, refusal: str) -> None:
+    def become_lossy(self, refusal: str) -> None:
         """Go on without those who have no room; the others are waited for as before."""
         self._lanes[_NRT].flow.give_up()
         self._zenoh.credits.expect()
-        self.lines.reject(self, refusal)
+        self.waiting.reject(self, refusal)
 
     # For the link
 
@@ -308,7 +308,7 @@ class ZenohSubscriber(LinkSubscriber):
     @property
     def expects(self) -> bool:
         """Whether somebody waits for credit, or went on without a subscriber that may give it again."""
-        return bool(self.lines) or not all(each.waited_for for each in self._lanes[_NRT].flow.takers.values())
+        return bool(self.waiting) or not all(each.waited_for for each in self._lanes[_NRT].flow.takers.values())
 
     def unacknowledged(self) -> set[int]:
         """Those to whom something was sent, and who never said that it came."""

@@ -23,7 +23,7 @@ from r2p.protocols.flow_control import ReceiveWindow
 from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import PendingDelivery, Sink
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.runtime.topic import PATIENCE, LastReceived, SubscriberQueue, Topic
+from r2p.runtime.topic import FULL_QUEUE_TURNS, LastReceived, SubscriberQueue, Topic
 from r2p.transports.receiver import TURN, LinkStats
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class _Blocked(msgspec.Struct):
     serial: int
     sample: Sample
     sinks: list[Sink]
-    turns: int = PATIENCE
+    turns: int = FULL_QUEUE_TURNS
     held: _Held | None = None
 
 
@@ -436,7 +436,7 @@ class RxStream:
             self._flow(*key),
             -1,
             False,
-            self.topic.heard((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
+            self.topic.last_received((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
         self._fit(lane)
         return lane
@@ -529,7 +529,7 @@ class RxStreams:
             stream.retype()
             return
         stream = self._streams[topic.name] = RxStream(topic, self, self._flows(topic.name))
-        topic.memories.append(self)
+        topic.latched_sources.append(self)
         stream.tap = self._subscribe(topic.name, stream.arrived)
 
     def connect(self) -> None:
@@ -604,7 +604,7 @@ class RxStreams:
                 self._kept.pop(name, None)
             stream.close()
             stream.topic.remote_publishers -= len(stream.senders)
-            stream.topic.memories.remove(self)
+            stream.topic.latched_sources.remove(self)
 
     def offer_latched(self, topic: Topic, sink: SubscriberQueue) -> None:
         """Send the last message to a new subscriber, if the publisher latches it."""

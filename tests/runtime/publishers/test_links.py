@@ -309,12 +309,12 @@ async def test_the_driver_of_a_periodic_publisher_sends_the_sample_itself() -> N
         leds = b.start(hold).subscribe("leds", Led)
         await publisher.wait_subscriber()
         link = a.links[0]
-        assert publisher.drive(link, 0.1)
+        assert publisher.use_slot_clock(link, 0.1)
         sent = link.stats.sent
         assert publisher.tick(0, 0, 0) is not None
         await settle(1.0)
         assert (link.stats.sent, drain(leds)) == (sent, [])
-        publisher.undrive(link)
+        publisher.use_own_clock(link)
         await settle(0.15)
         assert len(drain(leds)) == 1
 

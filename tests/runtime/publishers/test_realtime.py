@@ -296,23 +296,23 @@ async def test_a_driver_is_the_clock_until_it_lets_go() -> None:
         publisher = node.advertise("leds", Led, r2p.Periodic(0.1, values.__next__, lead=0.002))
         assert publisher.lead == 0.002
         await settle(0.15)
-        assert publisher.drive(slots, 0.05)
-        assert publisher.drive(slots, 0.08)  # another period
-        assert not publisher.drive(other_slots, 0.1)
+        assert publisher.use_slot_clock(slots, 0.05)
+        assert publisher.use_slot_clock(slots, 0.08)  # another period
+        assert not publisher.use_slot_clock(other_slots, 0.1)
         await settle(1.0)
         assert (publisher.period, drain(leds)) == (0.08, [1])
         sample = publisher.tick(module.space.clock.monotonic(), 0, 0)
         assert sample is not None
         assert (Led.decode(sample.data), sample.sequence, drain(leds)) == (led(2), 2, [2])
         assert publisher.tick(module.space.clock.monotonic(), 0, 0) is None
-        publisher.undrive(other_slots)
+        publisher.use_own_clock(other_slots)
         assert publisher.period == 0.08
-        publisher.undrive(slots)
+        publisher.use_own_clock(slots)
         await settle(0.15)
         assert (publisher.period, drain(leds)) == (0.1, [4])
-        assert publisher.drive(other_slots, 0.1)
+        assert publisher.use_slot_clock(other_slots, 0.1)
         publisher.close()
-        assert not publisher.drive(slots, 0.1)
+        assert not publisher.use_slot_clock(slots, 0.1)
         assert publisher.tick(0, 0, 0) is None
 
 

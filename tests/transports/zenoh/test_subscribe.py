@@ -31,8 +31,8 @@ class Ring:
         self.credits: list[tuple[int, int]] = []
         self.last_words = 0
         self.stats = LinkStats()
-        self.waker = WakeScheduler(loop)
-        self.topic = topic("leds", self.waker)
+        self.wake_scheduler = WakeScheduler(loop)
+        self.topic = topic("leds", self.wake_scheduler)
         self.topic.layout = layout(Led) if typed else None
         self._ring: deque[Any] = deque()
         self._idle = True
@@ -50,7 +50,7 @@ class Ring:
 
     def subscribe(self, queue: int) -> SubscriberQueue:
         owner: Any = SimpleNamespace(name="node", priority=0)
-        sink = SubscriberQueue(self.waker, owner, queue, 0, lossy=False, keep_oldest=False)
+        sink = SubscriberQueue(self.wake_scheduler, owner, queue, 0, lossy=False, keep_oldest=False)
         self.topic.join(sink)
         return sink
 
@@ -395,7 +395,7 @@ async def test_a_last_credit_that_fails_does_not_keep_the_stream() -> None:
     await turns()
     ring.streams.credit = lambda *_, **__: 1 // 0  # type: ignore[assignment]
     ring.streams.shut_all("leds")
-    assert (ring.topic.remote_publishers, ring.topic.memories) == (0, [])
+    assert (ring.topic.remote_publishers, ring.topic.latched_sources) == (0, [])
     assert ring.stats.lost == {"internal error": 1, "not subscribed": 1}
 
 
