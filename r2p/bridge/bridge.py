@@ -13,6 +13,7 @@ from r2p.bridge.port import BridgePort, GatewayStatistics, PortStatistics, WaySt
 from r2p.bridge.routing import RoutingTable
 from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management, probes
+from r2p.codecs.management import ManagementType
 from r2p.errors import DecodeError
 from r2p.log_lines import get_logger
 from r2p.names import module_alias
@@ -28,8 +29,6 @@ logger = get_logger("r2p.bridge")
 
 _Order = management.Stop | management.Reboot | management.Bootload
 
-_ORDERS = (0x12, 0x13, 0x14)
-_DENIED = 0x55
 _DENIED_ORDER = 15  # its place
 _DENIED_APART = 200_000_000  # ns between two answers on one link to orders that do not pass
 _REFUSALS = {
@@ -37,10 +36,7 @@ _REFUSALS = {
     management.DENIED_READ_ONLY: "see --read-only",
     management.DENIED_BOOT: "the module is in boot mode, where a STOP hangs it",
 }
-_ALIVE = 0x11
-_HELLO = 0x50
 _HELLO_FLAGS = 12  # its place
-_TREE = (0x60, 0x61, 0x62)
 _NO_GATEWAY = "no gateway may be there: nothing passes; listen with ?gateways=yes where gateways are to join"
 _WORDS = {
     PortState.ALONE: "forwards",
@@ -161,19 +157,19 @@ class Bridge:
 
     def heard(self, port: BridgePort, data: bytes) -> bool:
         """A management message; True if discovery need not see it."""
-        kind = data[-1] if len(data) == management.SIZE else 0
-        if kind in _TREE:
+        kind = management.type_of(data)
+        if kind in management.GATEWAY_TYPES:
             self._heard_gateway(port, data)
             return True
-        if kind in _ORDERS and self._pass_order(port, data):
+        if kind in management.ORDER_TYPES and self._pass_order(port, data):
             return True
-        if kind == _DENIED and data[_DENIED_ORDER]:
+        if kind == ManagementType.DENIED and data[_DENIED_ORDER]:
             self._pass_denial(port, data)
-        if kind in (_ALIVE, _HELLO) and self._is_our_own(port, data):
+        if kind in (ManagementType.ALIVE, ManagementType.HELLO) and self._is_our_own(port, data):
             return True
-        if kind == _HELLO and data[_HELLO_FLAGS] & management.HELLO_QUERY:
+        if kind == ManagementType.HELLO and data[_HELLO_FLAGS] & management.HELLO_QUERY:
             self.presences.asked(port)
-        if kind == _ALIVE and (probe := probes.decode(data)) is not None:
+        if kind == ManagementType.ALIVE and (probe := probes.decode(data)) is not None:
             self._probed(port, *probe)
             return True
         return False

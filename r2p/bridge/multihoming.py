@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management, probes
+from r2p.codecs.management import ManagementType
 from r2p.errors import DecodeError
 from r2p.protocols.bridge.link_selection import LinkSelection
 from r2p.runtime.sample import Source
@@ -16,7 +17,7 @@ from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import NOTHING, Announcement, Link
 from r2p.transports.receiver import TRY_AGAIN, internal_error_of
 
-_KINDS = (0x11, 0x50, 0x60, 0x61, 0x62)  # ALIVE, HELLO, and what gateways say
+_KINDS = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
 _ALL: frozenset[int] = frozenset()
 
 
@@ -113,8 +114,7 @@ class MultihomedModule:
 
     def heard(self, port: StandbyPort, data: bytes) -> bool:
         """A management message; True if discovery need not see it."""
-        kind = data[-1] if len(data) == management.SIZE else 0
-        if kind not in _KINDS:
+        if management.type_of(data) not in _KINDS:
             return False
         try:
             message = management.decode(data)

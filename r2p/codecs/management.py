@@ -25,6 +25,7 @@ Gateways agree on their tree (`r2p.protocols.bridge`) with three more, which sta
 | 0x62 | LEAF | `u32 module; u8 port; u16 count; 3 x {u32 gateway; u16 count} acks` (0: none) |
 """
 
+import enum
 import functools
 
 import msgspec
@@ -34,6 +35,49 @@ from r2p.codecs._records import Codec, Record
 from r2p.errors import MessageError
 
 SIZE = 32
+
+
+class ManagementType(enum.IntEnum):
+    """The type bytes, each the last byte of its message. No other module writes these numbers."""
+
+    ALIVE = 0x11
+    STOP = 0x12
+    REBOOT = 0x13
+    BOOTLOAD = 0x14
+    ADVERTISE = 0x21
+    SUBSCRIBE_REQUEST = 0x22
+    SUBSCRIBE_RESPONSE = 0x23
+    PATH = 0x31
+    NETWORK = 0x40
+    CLAIM = 0x41
+    RESERVE = 0x42
+    GRANT = 0x43
+    REFUSE = 0x44
+    RELEASE = 0x45
+    RENEW = 0x46
+    RENEWED = 0x47
+    HELLO = 0x50
+    TYPE = 0x51
+    UNSUBSCRIBE = 0x52
+    ENDPOINT = 0x53
+    CONFLICT = 0x54
+    DENIED = 0x55
+    NAME = 0x56
+    BRIDGE = 0x60
+    MESH = 0x61
+    LEAF = 0x62
+
+
+R2P_TYPES = range(0x40, 0x100)
+"""The types that firmware does not know."""
+RTCAN_TYPES = range(0x40, 0x50)
+"""The types that concern one RTCAN bus, and that no gateway passes on."""
+PARAMS_TYPES = (ManagementType.ADVERTISE, ManagementType.SUBSCRIBE_REQUEST, ManagementType.SUBSCRIBE_RESPONSE)
+"""The types that have `params`."""
+ORDER_TYPES = (ManagementType.STOP, ManagementType.REBOOT, ManagementType.BOOTLOAD)
+"""The orders that a gateway may deny."""
+GATEWAY_TYPES = (ManagementType.BRIDGE, ManagementType.MESH, ManagementType.LEAF)
+"""The types by which gateways agree on their tree."""
 
 # Alive.flags
 FLAG_STOPPED = 1
@@ -64,6 +108,7 @@ UNANSWERED = bytes(9) + b"\1"
 ANSWERED = bytes(9) + b"\2"
 """The same, after a SUBSCRIBE_RESPONSE: so a publisher knows an r2p module whose HELLO it has not heard yet."""
 ANY_TYPE = bytes(8)
+"""The fingerprint that fits every type."""
 
 QUEUE = 5
 """Entries of a SUBSCRIBE_REQUEST's queue unless something speaks for another number."""
@@ -90,6 +135,8 @@ RENEW_MAX = 24  # high bytes in a Renew
 NO_UTC = 0xFFFF  # Network.utc_error: the offset is not known
 
 _VERSION = 1
+_MARK = b"r2p"
+_MARKED = slice(22, 25)  # of an encoded message: in its params, behind RTCAN's message id
 
 
 class Alive(msgspec.Struct, frozen=True, gc=False):
@@ -379,40 +426,41 @@ Management = (
     | Leaf
 )
 
-NETWORK = 0x40
-RTCAN_TYPES = range(0x40, 0x50)
-"""Type bytes of what concerns the RTCAN bus itself, and no gateway."""
-
 _PUBSUB = "16s H H 10s"
 _CODEC = Codec[Management](
     SIZE,
-    Record(Alive, 0x11, "7s x B"),
-    Record(Stop, 0x12, "7s"),
-    Record(Reboot, 0x13, "7s"),
-    Record(Bootload, 0x14, "7s"),
-    Record(Advertise, 0x21, _PUBSUB),
-    Record(SubscribeRequest, 0x22, _PUBSUB),
-    Record(SubscribeResponse, 0x23, _PUBSUB),
-    Record(Path, 0x31, "7s 8s 16s", may_be_empty=("module", "node", "topic")),
-    Record(Network, NETWORK, "B B I Q B I q H", version=_VERSION),
-    Record(Claim, 0x41, "B Q B B", version=_VERSION),
-    Record(Reserve, 0x42, "H B B I I B", version=_VERSION),
-    Record(Grant, 0x43, "H B B I I Q I H", version=_VERSION),
-    Record(Refuse, 0x44, "H B B B I I H", version=_VERSION),
-    Record(Release, 0x45, "H", version=_VERSION),
-    Record(Renew, 0x46, "B 24s", version=_VERSION),
-    Record(Renewed, 0x47, "B B H 24s", version=_VERSION),
-    Record(Hello, 0x50, "7s I B B H", version=_VERSION),
-    Record(TypeInfo, 0x51, "B 16s 8s H", version=_VERSION),
-    Record(Unsubscribe, 0x52, "16s I", version=_VERSION),
-    Record(Endpoint, 0x53, "B I 8s 16s B", version=_VERSION, may_be_empty=("node",)),
-    Record(Conflict, 0x54, "7s I I", version=_VERSION),
-    Record(Denied, 0x55, "7s 7s B B", version=_VERSION),
-    Record(Name, 0x56, "7s B 22s", version=_VERSION),
-    Record(Bridge, 0x60, "I B H I I 12s", version=_VERSION),
-    Record(Mesh, 0x61, "I H B 18s", version=_VERSION),
-    Record(Leaf, 0x62, "I B H 18s", version=_VERSION),
+    Record(Alive, ManagementType.ALIVE, "7s x B"),
+    Record(Stop, ManagementType.STOP, "7s"),
+    Record(Reboot, ManagementType.REBOOT, "7s"),
+    Record(Bootload, ManagementType.BOOTLOAD, "7s"),
+    Record(Advertise, ManagementType.ADVERTISE, _PUBSUB),
+    Record(SubscribeRequest, ManagementType.SUBSCRIBE_REQUEST, _PUBSUB),
+    Record(SubscribeResponse, ManagementType.SUBSCRIBE_RESPONSE, _PUBSUB),
+    Record(Path, ManagementType.PATH, "7s 8s 16s", may_be_empty=("module", "node", "topic")),
+    Record(Network, ManagementType.NETWORK, "B B I Q B I q H", version=_VERSION),
+    Record(Claim, ManagementType.CLAIM, "B Q B B", version=_VERSION),
+    Record(Reserve, ManagementType.RESERVE, "H B B I I B", version=_VERSION),
+    Record(Grant, ManagementType.GRANT, "H B B I I Q I H", version=_VERSION),
+    Record(Refuse, ManagementType.REFUSE, "H B B B I I H", version=_VERSION),
+    Record(Release, ManagementType.RELEASE, "H", version=_VERSION),
+    Record(Renew, ManagementType.RENEW, "B 24s", version=_VERSION),
+    Record(Renewed, ManagementType.RENEWED, "B B H 24s", version=_VERSION),
+    Record(Hello, ManagementType.HELLO, "7s I B B H", version=_VERSION),
+    Record(TypeInfo, ManagementType.TYPE, "B 16s 8s H", version=_VERSION),
+    Record(Unsubscribe, ManagementType.UNSUBSCRIBE, "16s I", version=_VERSION),
+    Record(Endpoint, ManagementType.ENDPOINT, "B I 8s 16s B", version=_VERSION, may_be_empty=("node",)),
+    Record(Conflict, ManagementType.CONFLICT, "7s I I", version=_VERSION),
+    Record(Denied, ManagementType.DENIED, "7s 7s B B", version=_VERSION),
+    Record(Name, ManagementType.NAME, "7s B 22s", version=_VERSION),
+    Record(Bridge, ManagementType.BRIDGE, "I B H I I 12s", version=_VERSION),
+    Record(Mesh, ManagementType.MESH, "I H B 18s", version=_VERSION),
+    Record(Leaf, ManagementType.LEAF, "I B H 18s", version=_VERSION),
 )
+
+
+def type_of(data: bytes) -> int:
+    """The type byte of an encoded message, which may be one that `ManagementType` does not list; 0: of another size."""
+    return data[-1] if len(data) == SIZE else 0
 
 
 def queue_length(size: int, wanted: int = QUEUE) -> int:
@@ -430,6 +478,46 @@ def encode(message: Management) -> bytes:
 def decode(data: bytes) -> Management:
     """The message in these 32 bytes. Raises `UnknownType` for a type, role or version to ignore, else `DecodeError`."""
     return _decode(bytes(data))
+
+
+# What params hold: on RTCAN a message id and the mark, and in the last byte the state of an r2p subscription.
+
+
+def with_unanswered(params: bytes) -> bytes:
+    """The params of an ADVERTISE to which no r2p module has subscribed yet."""
+    return params[:-1] + UNANSWERED[-1:]
+
+
+def rtcan_params(message_id: int) -> bytes:
+    """The params that offer a topic under this message id."""
+    return message_id.to_bytes(2, "little").ljust(len(NO_PARAMS), b"\0")
+
+
+def rtcan_message_id(params: bytes) -> int:
+    """The message id in the params of an ADVERTISE or a SUBSCRIBE_RESPONSE."""
+    return int.from_bytes(params[:2], "little")
+
+
+def mark(data: bytes) -> bytes:
+    """Mark an encoded message as sent by r2p, for a bus where all management has one message id.
+
+    Only messages with params have room for the mark; other ones stay as they are.
+    """
+    return _with_mark(data, _MARK) if type_of(data) in PARAMS_TYPES else data
+
+
+def unmark(data: bytes) -> bytes:
+    """Take the mark away."""
+    return _with_mark(data, bytes(len(_MARK))) if is_marked(data) else data
+
+
+def is_marked(data: bytes) -> bool:
+    """Whether an encoded message carries the mark."""
+    return type_of(data) in PARAMS_TYPES and data[_MARKED] == _MARK
+
+
+def _with_mark(data: bytes, text: bytes) -> bytes:
+    return data[: _MARKED.start] + text + data[_MARKED.stop :]
 
 
 @functools.lru_cache(maxsize=4096)

@@ -83,3 +83,9 @@ def test_what_is_encoded_decodes(message: m.Management) -> None:
     data = m.encode(message)
     assert len(data) == m.SIZE
     assert m.decode(data) == message
+
+
+def test_params_name_the_message_id() -> None:
+    params = m.rtcan_params(0x1828)
+    assert params == bytes.fromhex("28180000000000000000")
+    assert m.rtcan_message_id(params) == 0x1828

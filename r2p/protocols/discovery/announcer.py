@@ -156,7 +156,7 @@ class Announcer:
     def _advertisement(self, topic: str, own: LocalTopic) -> management.Advertise:
         """Our advertisement; r2p modules are told whether anybody has subscribed yet."""
         unanswered = self.r2p and topic not in self.wanted
-        params = own.params[:-1] + UNANSWERED[-1:] if unanswered else own.params
+        params = management.with_unanswered(own.params) if unanswered else own.params
         return management.Advertise(topic, own.shape.size, 0, params)
 
     def _enter(self, table: dict[str, LocalTopic], kind: Kind, topic: str, own: LocalTopic) -> bool:

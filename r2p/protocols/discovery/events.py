@@ -22,8 +22,8 @@ class Command(enum.Enum):
     BOOTLOAD = "bootload"
 
 
-ORDERS = {0x12: Command.STOP, 0x13: Command.REBOOT, 0x14: Command.BOOTLOAD}
-"""By the type byte of the message."""
+ORDERS: dict[int, Command] = dict(zip(management.ORDER_TYPES, Command, strict=True))
+"""The command by the type of the message that orders it."""
 
 
 class Shape(msgspec.Struct, frozen=True):

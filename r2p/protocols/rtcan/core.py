@@ -212,7 +212,7 @@ class Core:
 
     def hear(self, now: int, received: Received) -> None:
         """A management message came in: ours to handle, or discovery's."""
-        if received.payload[-1] not in management.RTCAN_TYPES:
+        if management.type_of(received.payload) not in management.RTCAN_TYPES:
             self.out.append(received)
             return
         try:

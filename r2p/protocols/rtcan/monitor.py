@@ -354,7 +354,7 @@ class BusDirectory:
         try:
             message = management.decode(data)
         except DecodeError:
-            return f"unknown management 0x{data[-1]:02x}"
+            return f"unknown management 0x{management.type_of(data):02x}"
         match message:
             case management.Hello(module, hops=0):
                 self._greeted.add(source)
@@ -362,7 +362,7 @@ class BusDirectory:
             case management.Alive(module) if source and source not in self._greeted:
                 self.modules[source] = module
             case management.SubscribeResponse(topic, size, _, params):
-                number = int.from_bytes(params[:2], "little")
+                number = management.rtcan_message_id(params)
                 self.topics[number], self.sizes[number] = topic, size
             case management.Network(slots=slots, slot=slot) if 2 <= slots <= rtcan.SLOTS_MAX and slot:
                 self.told = True
@@ -389,7 +389,7 @@ def describe(message: management.Management) -> str:
         if name != "params" and getattr(message, name) not in {"", 0}
     }
     if isinstance(message, management.SubscribeResponse):
-        fields["id"] = f"0x{int.from_bytes(message.params[:2], 'little'):04X}"
+        fields["id"] = f"0x{management.rtcan_message_id(message.params):04X}"
     text = " ".join(f"{name}={_value(value)}" for name, value in fields.items())
     return f"{type(message).__name__} {text}".rstrip()
 

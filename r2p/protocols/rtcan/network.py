@@ -179,7 +179,8 @@ class NetworkMembership:
         if self._election.role is not Role.MASTER or self.epoch is None:
             return
         self._told = now
-        self._sender.withdraw_management(self._identity.id8, management.NETWORK)  # it would tell an old counter
+        # One that still waits has an old counter.
+        self._sender.withdraw_management(self._identity.id8, management.ManagementType.NETWORK)
         self._timers.set("network", now + REPEAT)
         timing, counter = self._cycle.timing, self._cycle.counter
         offset, error = self.utc_offset, self.utc_error
@@ -304,7 +305,7 @@ class NetworkMembership:
 
     def _abdicate(self, now: int, reason: str) -> None:
         self._reign.end()
-        self._sender.withdraw_management(self._identity.id8, management.NETWORK)
+        self._sender.withdraw_management(self._identity.id8, management.ManagementType.NETWORK)
         self._timers.clear("network")
         self._forget_master(now, reason)
         self._out.append(LostSync(reason))

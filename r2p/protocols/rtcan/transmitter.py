@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable
 
 import msgspec
 
-from r2p.codecs import rtcan
+from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import FRAME_MAX, INTERMISSION, Frame
 from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, Cycle, CycleState
 from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Action, Done, Due, Fate, Mailbox, Outcome, Transmit, Withdraw
@@ -235,7 +235,9 @@ class SlotTransmitter:
 
     def withdraw_management(self, id8: int, kind: int) -> None:
         """Management of this type that waits is not true any more."""
-        self._queue.withdraw(rtcan.message_id(rtcan.MANAGEMENT, id8), lambda each: each.payload[-1] == kind)
+        self._queue.withdraw(
+            rtcan.message_id(rtcan.MANAGEMENT, id8), lambda each: management.type_of(each.payload) == kind
+        )
 
     def remove(self, periodic: PeriodicMessage) -> None:
         """There is one less."""

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, ClassVar
 
-from r2p.codecs import rtcan
+from r2p.codecs import management, rtcan
 from r2p.codecs.attachment import ClockOffset
 from r2p.codecs.management import NO_PARAMS
 from r2p.names import MANAGEMENT
@@ -158,7 +158,7 @@ class RtcanLink(Link):
         source = rtcan.id8_of(message)
         if message == rtcan.FIRMWARE_MANAGEMENT:
             source = origins.address(data, self.discovery.modules)
-            data = origins.unmark(data)
+            data = management.unmark(data)
         told = origins.publisher_in(data, source)
         if told is not None:
             firmware = source == origins.FIRMWARE and message == rtcan.FIRMWARE_MANAGEMENT
@@ -224,7 +224,7 @@ class RtcanLink(Link):
         high = self._high_bytes.pick(topic)
         if high is None:
             return None
-        return origins.params_of(rtcan.message_id(high, self.engine.id8 or 0))
+        return management.rtcan_params(rtcan.message_id(high, self.engine.id8 or 0))
 
     def topic_changed(self, topic: Topic) -> None:
         refused = self._high_bytes.refused

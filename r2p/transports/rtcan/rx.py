@@ -6,7 +6,7 @@ import msgspec
 
 from r2p.clock import Clock
 from r2p.codecs import management, rtcan
-from r2p.codecs.management import ROLE_PUBLISHES
+from r2p.codecs.management import ROLE_PUBLISHES, ManagementType
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress
 from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.rtcan.engine import Engine
@@ -111,7 +111,7 @@ class MessageIdMap:
         if topic is None or not topic.wanted:
             return
         size = topic.layout.size if topic.layout is not None else size
-        message = message_of(params)
+        message = management.rtcan_message_id(params)
         if not self._plausible(message, source) or not 1 <= size <= rtcan.PAYLOAD_MAX:
             self._lost["impossible publisher"] += 1
             return
@@ -169,48 +169,18 @@ FIRMWARE = 0
 R2P = 256
 """The address of all r2p modules in a network of theirs."""
 
-_MARK = b"r2p"
-_MARKED = slice(22, 25)  # of a management message with params, which are bytes 20 to 29: behind the message id
-_WITH_PARAMS = range(0x21, 0x24)  # ADVERTISE, SUBSCRIBE_REQUEST, SUBSCRIBE_RESPONSE
-_ALIVE, _ADVERTISE, _RESPONSE = 0x11, 0x21, 0x23
-_OURS = 0x40  # from here on types are r2p's
-
-
-def mark(data: bytes) -> bytes:
-    """A management message of ours for a bus where its sender is not told by its id."""
-    if data[-1] not in _WITH_PARAMS:
-        return data
-    return data[: _MARKED.start] + _MARK + data[_MARKED.stop :]
-
-
-def unmark(data: bytes) -> bytes:
-    """Take the mark away."""
-    if data[-1] not in _WITH_PARAMS or data[_MARKED] != _MARK:
-        return data
-    return data[: _MARKED.start] + bytes(len(_MARK)) + data[_MARKED.stop :]
-
 
 def address(data: bytes, modules: dict[str, ModuleInfo]) -> int:
     """Which kind of module sent this management message with the id of firmware. `modules` are those known."""
-    kind = data[-1]
-    if kind in _WITH_PARAMS:
-        ours = data[_MARKED] == _MARK
-    elif kind == _ALIVE:
+    kind = management.type_of(data)
+    if kind in management.PARAMS_TYPES:
+        ours = management.is_marked(data)
+    elif kind == ManagementType.ALIVE:
         known = modules.get(data[:7].rstrip(b"\0").decode("ascii", "replace"))
         ours = known is not None and known.r2p
     else:
-        ours = kind >= _OURS
+        ours = kind in management.R2P_TYPES
     return R2P if ours else FIRMWARE
-
-
-def message_of(params: bytes) -> int:
-    """The message id in the params of a SUBSCRIBE_RESPONSE."""
-    return int.from_bytes(params[:2], "little")
-
-
-def params_of(message: int) -> bytes:
-    """Params with this message id."""
-    return message.to_bytes(2, "little").ljust(len(management.NO_PARAMS), b"\0")
 
 
 def publisher_in(data: bytes, source: int) -> tuple[str, int] | None:
@@ -218,8 +188,8 @@ def publisher_in(data: bytes, source: int) -> tuple[str, int] | None:
 
     Publishers of r2p tell it in all that they offer, those of firmware only when asked.
     """
-    kind, message = data[-1], message_of(data[20:22])
-    if kind != _RESPONSE and (kind != _ADVERTISE or source == FIRMWARE):
+    kind, message = management.type_of(data), management.rtcan_message_id(data[20:22])
+    if kind != ManagementType.SUBSCRIBE_RESPONSE and (kind != ManagementType.ADVERTISE or source == FIRMWARE):
         return None
     shared = source in (FIRMWARE, R2P)
     if rtcan.high_byte(message) < rtcan.FIRST_TOPIC or not (shared or rtcan.id8_of(message) == source):

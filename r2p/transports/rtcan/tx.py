@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import msgspec
 
 from r2p.clock import Clock
-from r2p.codecs import rtcan
+from r2p.codecs import management, rtcan
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import NEVER, Action, Done, Fate, Profile
 from r2p.runtime.sample import PublisherClass, Sample
@@ -13,7 +13,6 @@ from r2p.runtime.topic import PublisherHandle, Topic
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import LinkSubscriber
 from r2p.transports.receiver import LinkStats
-from r2p.transports.rtcan import rx as origins
 from r2p.transports.rtcan.slots import SlottedTopics
 
 # The samples that an RTCAN engine has, and what becomes of them: one account for each class, so bulk refuses no event.
@@ -109,7 +108,6 @@ class TxAccounting:
 
 
 _DEADLINE = 50_000_000  # ns; of real-time messages that do not say: from other links, or latched
-_RESPONSE = 0x23
 
 
 class Response(msgspec.Struct, eq=False):
@@ -143,10 +141,10 @@ class Transmitter:
     def manage(self, data: bytes, *, urgent: bool) -> Sequence[Action]:
         """A management message; its sender must be told where all have one id."""
         handle = None
-        if data[-1] == _RESPONSE and self._engine.ready:
+        if management.type_of(data) == management.ManagementType.SUBSCRIBE_RESPONSE and self._engine.ready:
             handle = self._response = Response()
         if self._engine.profile is Profile.FIRMWARE:
-            data = origins.mark(data)
+            data = management.mark(data)
         return self._engine.manage(self._now(), data, urgent=urgent, handle=handle)
 
     def follows_response(self, topic: str) -> bool:

@@ -3,7 +3,7 @@
 import pytest
 
 from r2p.codecs import rtcan
-from r2p.codecs.management import NETWORK
+from r2p.codecs.management import ManagementType
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.cycle import Cycle, timing
 from r2p.protocols.rtcan.events import LostSync, NewMaster
@@ -139,7 +139,9 @@ def test_no_old_counter_is_told_when_a_master_wakes_up() -> None:
 
 def waits(node: Node) -> bool:
     """Whether its NETWORK has yet to be sent."""
-    return any(each.payload[-1] == NETWORK for each in node.engine._core.queue.messages() if not each.sent)
+    return any(
+        each.payload[-1] == ManagementType.NETWORK for each in node.engine._core.queue.messages() if not each.sent
+    )
 
 
 @pytest.mark.parametrize("ahead", [-100, -20, 0, 20, 100])

@@ -15,7 +15,6 @@ from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
 from r2p.runtime.events import ModuleEvent
 from r2p.sim.can import ControllerState
-from r2p.transports.rtcan import rx as origins
 from r2p.transports.rtcan.options import RtcanOptions
 from tests.transports.rtcan.networks import GUARD, Lab, lab, until
 
@@ -255,7 +254,7 @@ async def test_message_ids_that_a_broken_node_has_taken_come_free() -> None:
         publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
         await publisher.wait_subscriber()
         for high in range(rtcan.FIRST_TOPIC, 256):
-            advertise = Advertise(f"broken{high}", 8, 0, origins.params_of(rtcan.message_id(high, 1)))
+            advertise = Advertise(f"broken{high}", 8, 0, management.rtcan_params(rtcan.message_id(high, 1)))
             for left, data in rtcan.fragments(management.encode(advertise)):
                 frame = rtcan.Frame(rtcan.encode_identifier(50, 0x0101, left), data)
                 link.shell.received(frame, link.shell.now())

@@ -15,24 +15,19 @@ from r2p.codecs.management import (
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.protocols.discovery.session import Discovery
 from r2p.runtime.sample import Source
-from r2p.transports.rtcan.rx import FIRMWARE, R2P, SenderLookup, address, mark, message_of, params_of, unmark
-
-
-def test_params_name_the_message_id() -> None:
-    assert params_of(0x1828) == bytes.fromhex("28180000000000000000")
-    assert message_of(params_of(0x1828)) == 0x1828
+from r2p.transports.rtcan.rx import FIRMWARE, R2P, SenderLookup, address
 
 
 def test_what_r2p_says_among_firmware_is_marked() -> None:
     request = management.encode(SubscribeRequest("leds", 5, 16, UNANSWERED))
-    response = management.encode(SubscribeResponse("leds", 5, 1, params_of(0x1828)))
+    response = management.encode(SubscribeResponse("leds", 5, 1, management.rtcan_params(0x1828)))
     for data in (request, response, management.encode(Advertise("leds", 5))):
         assert address(data, {}) == FIRMWARE
-        marked = mark(data)
+        marked = management.mark(data)
         assert address(marked, {}) == R2P
-        assert unmark(marked) == data
-        assert unmark(data) == data
-    assert message_of(management.decode(mark(response)).params) == 0x1828  # type: ignore[union-attr]
+        assert management.unmark(marked) == data
+        assert management.unmark(data) == data
+    assert management.rtcan_message_id(management.decode(management.mark(response)).params) == 0x1828  # type: ignore[union-attr]
 
 
 def test_modules_are_known_by_what_they_said_before() -> None:
@@ -42,8 +37,8 @@ def test_modules_are_known_by_what_they_said_before() -> None:
     assert address(alive, {"PC1": firmware}) == FIRMWARE
     assert address(alive, {"PC1": r2p}) == R2P
     assert address(management.encode(Hello("PC1", 1)), {}) == R2P
-    assert mark(alive) == alive
-    assert unmark(alive) == alive
+    assert management.mark(alive) == alive
+    assert management.unmark(alive) == alive
 
 
 def hear(discovery: Discovery, message: management.Management, source: int) -> None:
