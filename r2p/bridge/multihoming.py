@@ -145,7 +145,7 @@ class MultihomedModule:
         """Discovery may have learnt who is at the other end, or how long messages are of which we did not know it."""
         if port.link.lone and port.link.discovery.generation != port.generation:
             port.generation = port.link.discovery.generation
-            self.homes.ended(self._now(), port.number, port.link.discovery.end)
+            self.homes.ended(self._now(), port.number, port.link.discovery.sole_peer)
             self._act()
         if len(self._used[_ALL]) == len(self.homes.by_number):
             return

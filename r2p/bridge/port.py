@@ -99,7 +99,7 @@ class BridgePort:
         return self._owner.source_name(self, source)
 
     def discovery_changed(self) -> None:
-        changed = self.demand.changed()
+        changed = self.demand.pop_changed()
         if changed:
             self._owner.demand_changed(self, changed)
         if self.link.discovery.generation != self._generation:

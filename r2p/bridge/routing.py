@@ -16,7 +16,7 @@ from r2p.bridge.port import BridgePort
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.log_lines import LineLimit, get_logger
 from r2p.names import LOADER_PREFIX
-from r2p.protocols.discovery.events import Shape
+from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import NOTHING, Announcement
 from r2p.transports.receiver import internal_error_of
@@ -43,8 +43,8 @@ class RoutingTable:
         self._idle: set[str] = set()
         """Topics that are offered or wanted, and may go nowhere as long as no other link comes."""
         self._reviewing = False
-        self._shapes: dict[tuple[str, str], tuple[Shape, Shape]] = {}
-        self._known: dict[tuple[str, int], list[tuple[BridgePort, Shape]]] | None = None
+        self._shapes: dict[tuple[str, str], tuple[TopicType, TopicType]] = {}
+        self._known: dict[tuple[str, int], list[tuple[BridgePort, TopicType]]] | None = None
         """What `_known_types` found, while all links are asked about the same topics one after the other."""
         self._too_long: dict[str, None] = {}
         self._limit = LineLimit(_LINES)
@@ -80,7 +80,7 @@ class RoutingTable:
             self._known = None
         self._mark(changed)
 
-    def _is_retyped(self, topic: str, link: str, shape: tuple[Shape, Shape]) -> bool:
+    def _is_retyped(self, topic: str, link: str, shape: tuple[TopicType, TopicType]) -> bool:
         port = self._ports.get(link)
         return port is not None and topic in self.by_name and self._types(topic, port) != shape
 
@@ -218,7 +218,7 @@ class RoutingTable:
             asked=asked,
         )
 
-    def _types(self, topic: str, port: BridgePort) -> tuple[Shape, Shape]:
+    def _types(self, topic: str, port: BridgePort) -> tuple[TopicType, TopicType]:
         """The types in which a link is told that we publish and subscribe: what publishers say of it, if there are any.
 
         Those that it has itself are asked for what they have, so that one of another type elsewhere does not end it.
@@ -227,15 +227,15 @@ class RoutingTable:
         here = self._told(topic, [port], ROLE_PUBLISHES)
         published = self._told_elsewhere(topic, port, relay.offering, ROLE_PUBLISHES)
         asked = self._told_elsewhere(topic, port, relay.wanting, ROLE_SUBSCRIBES)
-        return published or asked or Shape(), here or asked or published or Shape()
+        return published or asked or TopicType(), here or asked or published or TopicType()
 
-    def _told_elsewhere(self, topic: str, port: BridgePort, ports: list[BridgePort], role: int) -> Shape | None:
+    def _told_elsewhere(self, topic: str, port: BridgePort, ports: list[BridgePort], role: int) -> TopicType | None:
         """The type that the first other one of these links tells; where there are none, the first that is known."""
         if ports:
             return self._told(topic, (each for each in ports if each is not port), role)
         return next((shape for each, shape in self._known_types(topic, role) if each is not port), None)
 
-    def _known_types(self, topic: str, role: int) -> list[tuple[BridgePort, Shape]]:
+    def _known_types(self, topic: str, role: int) -> list[tuple[BridgePort, TopicType]]:
         """The first two links that know a type: so each link finds one besides its own, and none looks at all."""
         known = None if self._known is None else self._known.get((topic, role))
         if known is None:
@@ -245,7 +245,7 @@ class RoutingTable:
                 self._known[topic, role] = known
         return known
 
-    def _told(self, topic: str, ports: Iterable[BridgePort], role: int) -> Shape | None:
+    def _told(self, topic: str, ports: Iterable[BridgePort], role: int) -> TopicType | None:
         """The type that the first link tells."""
         infos = (each.link.discovery.topics.get(self._policy.to_link_name(topic, each.name)) for each in ports)
         return next((info.shapes[role] for info in infos if info is not None and role in info.shapes), None)
@@ -253,10 +253,10 @@ class RoutingTable:
     # One topic on one link
 
     def _offers(self, topic: str, port: BridgePort) -> bool:
-        return port.demand.offers(self._policy.to_link_name(topic, port.name))
+        return port.demand.is_published(self._policy.to_link_name(topic, port.name))
 
     def _wants(self, topic: str, port: BridgePort) -> bool:
-        return port.demand.wants(self._policy.to_link_name(topic, port.name))
+        return port.demand.is_subscribed(self._policy.to_link_name(topic, port.name))
 
     def _topic(self, topic: str, port: BridgePort) -> BridgedTopic:
         here = self._space.open(self._policy.to_link_name(topic, port.name), None)

@@ -20,16 +20,16 @@ from r2p.modules.graph import describe_mismatch
 from r2p.names import module_alias
 from r2p.protocols.discovery.events import (
     Command,
+    CommandDenied,
     CommandReceived,
     ConnectionDenied,
-    Echoes,
+    EchoDetected,
     Event,
     Mismatched,
     ModuleChanged,
     ModuleGone,
     ModuleInfo,
     NameConflict,
-    OrderDenied,
 )
 from r2p.runtime.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.runtime.topic import Topic, TopicSpace
@@ -254,7 +254,7 @@ class LinkManager:
             case Mismatched():
                 self._log_mismatch(link, event)
                 self._events.emit(event)
-            case OrderDenied():
+            case CommandDenied():
                 self._tell_denied(link, event)
             case ConnectionDenied():
                 self._connection_denied(link, event)
@@ -262,7 +262,7 @@ class LinkManager:
                 text = f"two modules carry the name {event.module}: rename one (--module)"
                 self._log_limited(link, logging.ERROR, "names", text)
                 self._events.emit(event)
-            case Echoes():
+            case EchoDetected():
                 logger.error("link %s gives back what we send: switch off local echo at the other end", link.title)
             case ModuleChanged():
                 self._end_denial(link)
@@ -271,7 +271,7 @@ class LinkManager:
             case ModuleGone():
                 self._tell_gone(link, event)
 
-    def _tell_denied(self, link: Link, event: OrderDenied) -> None:
+    def _tell_denied(self, link: Link, event: CommandDenied) -> None:
         """To whoever ordered it."""
         at, name = self._ordered.get((event.command, event.module), (-_ANSWERED, ""))
         if self.space.clock.monotonic() - at < _ANSWERED:

@@ -31,9 +31,9 @@ from r2p.protocols.discovery.events import (
     PublisherFound,
     PublisherGone,
     Send,
-    Shape,
     SubscriberJoined,
     SubscribersGone,
+    TopicType,
 )
 from r2p.protocols.discovery.session import Discovery
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
@@ -55,7 +55,7 @@ class Announcement(msgspec.Struct, frozen=True):
     subscribes: bool = False
     size: int = 0
     fingerprint: bytes = bytes(8)
-    asked: Shape = Shape()
+    asked: TopicType = TopicType()
     queue: int = QUEUE
     params: bytes = NO_PARAMS
     endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
@@ -72,7 +72,7 @@ def wish_of(topic: Topic) -> Announcement:
         publisher_class = int(each.publisher_class) | (CLASS_LATCHES if each.latch else 0)
         publishers[key] = max(publisher_class, publishers.get(key, 0))  # a node may have several, of several classes
     subscribers = {(each.owner, ROLE_SUBSCRIBES): 0 for each in topic.queues}
-    shape = Shape() if topic.layout is None else Shape(topic.layout.size, topic.layout.fingerprint)
+    shape = TopicType() if topic.layout is None else TopicType(topic.layout.size, topic.layout.fingerprint)
     return Announcement(
         publishes=bool(publishers),
         subscribes=bool(subscribers),

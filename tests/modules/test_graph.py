@@ -10,7 +10,7 @@ from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import layout
 from r2p.modules.graph import Endpoint, ModuleView, describe_mismatch
 from r2p.msg import Led
-from r2p.protocols.discovery.events import Mismatched, Shape
+from r2p.protocols.discovery.events import Mismatched, TopicType
 from tests.bench import hold, joined, local, settle
 
 NRT, SPORADIC = r2p.PublisherClass.NON_REAL_TIME, r2p.PublisherClass.SPORADIC
@@ -87,7 +87,7 @@ async def test_any_byte_from_outside_makes_a_view() -> None:
 
 
 def test_a_mismatch_is_described_with_what_to_do() -> None:
-    ours, longer, other = Shape(5, b"12345678"), Shape(9), Shape(5, b"abcdefgh")
+    ours, longer, other = TopicType(5, b"12345678"), TopicType(9), TopicType(5, b"abcdefgh")
     by_size = describe_mismatch(Mismatched("leds", None, ROLE_PUBLISHES, ours, longer))
     assert by_size.startswith("others publish messages of 9 bytes, here they have 5; use one message type")
     by_type = describe_mismatch(Mismatched("leds", None, ROLE_SUBSCRIBES, ours, other))

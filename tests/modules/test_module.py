@@ -15,7 +15,7 @@ import r2p
 from r2p.codecs.management import ROLE_PUBLISHES
 from r2p.modules.module import CLEANUP_WARNING_AFTER
 from r2p.msg import Encoder, Led, Log, Odometry
-from r2p.protocols.discovery.events import Mismatched, NameConflict, Shape
+from r2p.protocols.discovery.events import Mismatched, NameConflict, TopicType
 from r2p.runtime.events import EVENTS
 from r2p.transports.link import Transport
 from r2p.transports.memory import network
@@ -308,7 +308,7 @@ async def test_types_that_differ_again_and_again_are_logged_once_a_second(caplog
     async with joined("A") as a:
         for _ in range(3):
             for size in (9, 10):
-                event = Mismatched("leds", None, ROLE_PUBLISHES, Shape(5), Shape(size))
+                event = Mismatched("leds", None, ROLE_PUBLISHES, TopicType(5), TopicType(size))
                 a._opened.discovered(a.links[0], event)
             await settle(1.0)
     lines = [record.getMessage() for record in caplog.records if "topic leds is refused" in record.getMessage()]

@@ -8,14 +8,14 @@ from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.discovery import peers as aliases
 from r2p.protocols.discovery.directory import FOR_EVER, LEASE
-from r2p.protocols.discovery.events import Outbox, Shape
+from r2p.protocols.discovery.events import Outbox, TopicType
 from r2p.protocols.discovery.schedule import Item, Kind, Schedule
 
 
 class LocalTopic(msgspec.Struct, frozen=True):
     """A topic that this module publishes (`params` are the transport's) or subscribes (with a `queue`)."""
 
-    shape: Shape
+    shape: TopicType
     params: bytes = NO_PARAMS
     queue: int = management.QUEUE
 

@@ -10,7 +10,7 @@ from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.directory import FOR_EVER, MOST, Directory
 from r2p.protocols.discovery.events import PeerAddress
-from r2p.protocols.discovery.schedule import DiscoveryTimers
+from r2p.protocols.timers import KeyedTimers
 
 _Entry = tuple[str, int]
 
@@ -22,19 +22,19 @@ class Demand:
         self._who: dict[_Entry, dict[Hashable, None]] = {}
         self._changed: set[str] = set()
 
-    def offers(self, topic: str) -> bool:
+    def is_published(self, topic: str) -> bool:
         """Whether somebody publishes it."""
         return (topic, ROLE_PUBLISHES) in self._who
 
-    def wants(self, topic: str) -> bool:
+    def is_subscribed(self, topic: str) -> bool:
         """Whether somebody subscribes it."""
         return (topic, ROLE_SUBSCRIBES) in self._who
 
-    def who(self, topic: str, role: int) -> list[Hashable]:
+    def sources_of(self, topic: str, role: int) -> list[Hashable]:
         """Those who told so."""
         return list(self._who.get((topic, role), ()))
 
-    def changed(self) -> set[str]:
+    def pop_changed(self) -> set[str]:
         """The topics of which this has changed since the last call."""
         changed, self._changed = self._changed, set()
         return changed
@@ -65,18 +65,18 @@ class Demand:
             del self._who[topic, role]
             self._changed.add(topic)
 
-    def of(self, who: Hashable) -> list[_Entry]:
+    def entries_of(self, who: Hashable) -> list[_Entry]:
         """What he told."""
         return [entry for entry, tellers in self._who.items() if who in tellers]
 
 
-class HeardDemand(Demand):
+class LeasedDemand(Demand):
     """Demand as management messages tell it: of r2p modules for a lease, of firmware for good.
 
     It uses the timers of its discovery, with keys that begin with "demand".
     """
 
-    def __init__(self, timers: DiscoveryTimers, directory: Directory) -> None:
+    def __init__(self, timers: KeyedTimers, directory: Directory) -> None:
         super().__init__()
         self._timers = timers
         self._directory = directory
@@ -109,7 +109,7 @@ class HeardDemand(Demand):
         self.remove(topic, role, source)
 
     def left(self, source: PeerAddress) -> None:
-        for topic, role in self.of(source):
+        for topic, role in self.entries_of(source):
             self.expired(topic, role, source)
 
     def interrupted(self) -> None:

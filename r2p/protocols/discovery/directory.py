@@ -10,8 +10,9 @@ from typing import TypeVar
 import msgspec
 
 from r2p.codecs import management
-from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, Shape
-from r2p.protocols.discovery.schedule import SELDOM, DiscoveryTimers
+from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, TopicType
+from r2p.protocols.discovery.schedule import SELDOM
+from r2p.protocols.timers import KeyedTimers
 
 MOST = 4096
 """Entries in each table."""
@@ -38,16 +39,16 @@ class TopicInfo(msgspec.Struct):
     advertised_at: int | None = None
     requested_at: int | None = None
     mismatch: bool = False
-    shapes: dict[int, Shape] = {}
+    shapes: dict[int, TopicType] = {}
     typed_at: dict[int, int] = {}
 
-    def typed(self, role: int, shape: Shape | None) -> None:
+    def typed(self, role: int, shape: TopicType | None) -> None:
         """Those in this role say so; None: there is nobody any more."""
         if shape is None:
             self.shapes.pop(role, None)
         else:
             self.shapes[role] = shape
-        best = self.shapes.get(management.ROLE_PUBLISHES) or self.shapes.get(management.ROLE_SUBSCRIBES, Shape())
+        best = self.shapes.get(management.ROLE_PUBLISHES) or self.shapes.get(management.ROLE_SUBSCRIBES, TopicType())
         self.size = best.size
         self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
 
@@ -82,7 +83,7 @@ class _Starts(msgspec.Struct):
 class Directory:
     """The tables of one link. Each endpoint has a timer, ("endpoint", its key): it is believed for that long."""
 
-    def __init__(self, timers: DiscoveryTimers, counts: Counter[str]) -> None:
+    def __init__(self, timers: KeyedTimers, counts: Counter[str]) -> None:
         self.modules: dict[str, ModuleInfo] = {}
         self.topics: dict[str, TopicInfo] = {}
         self.endpoints: dict[EndpointKey, EndpointInfo] = {}
@@ -196,15 +197,15 @@ class Directory:
         self._put(self.topics, name, info, "topics forgotten")
         return info
 
-    def typed(self, now: int, topic: str, role: int, shape: Shape) -> TopicInfo:
+    def typed(self, now: int, topic: str, role: int, shape: TopicType) -> TopicInfo:
         """The type of a topic. Of several that differ the first one stays, as long as it is repeated."""
         info = self.topic(topic)
         for each, at in list(info.typed_at.items()):
             if now > at + LEASE:
                 del info.typed_at[each]
                 info.typed(each, None)
-        known = info.shapes.get(role, Shape())
-        if shape != Shape() and known.fits(shape):
+        known = info.shapes.get(role, TopicType())
+        if shape != TopicType() and known.fits(shape):
             if known.fingerprint in {management.ANY_TYPE, shape.fingerprint}:
                 info.typed_at[role] = now
             info.typed(role, known.joined(shape))

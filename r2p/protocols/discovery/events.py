@@ -22,27 +22,27 @@ class Command(enum.Enum):
     BOOTLOAD = "bootload"
 
 
-ORDERS: dict[int, Command] = dict(zip(management.ORDER_TYPES, Command, strict=True))
+COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, Command, strict=True))
 """The command by the type of the message that orders it."""
 
 
-class Shape(msgspec.Struct, frozen=True):
+class TopicType(msgspec.Struct, frozen=True):
     """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (all zero: unknown)."""
 
     size: int = 0
     fingerprint: bytes = management.ANY_TYPE
 
-    def fits(self, other: "Shape") -> bool:
+    def fits(self, other: "TopicType") -> bool:
         """Whether nothing that both know differs."""
         if self.size != other.size and self.size and other.size:
             return False
         typed = self.fingerprint != management.ANY_TYPE and other.fingerprint != management.ANY_TYPE
         return not typed or self.fingerprint == other.fingerprint
 
-    def joined(self, other: "Shape") -> "Shape":
+    def joined(self, other: "TopicType") -> "TopicType":
         """What one of two that fit knows."""
         typed = self.fingerprint != management.ANY_TYPE
-        return Shape(self.size or other.size, self.fingerprint if typed else other.fingerprint)
+        return TopicType(self.size or other.size, self.fingerprint if typed else other.fingerprint)
 
 
 class ModuleInfo(msgspec.Struct, frozen=True):
@@ -119,8 +119,8 @@ class Mismatched(msgspec.Struct, frozen=True):
     topic: str
     source: PeerAddress
     role: int
-    ours: Shape
-    theirs: Shape
+    ours: TopicType
+    theirs: TopicType
 
 
 class NameConflict(msgspec.Struct, frozen=True):
@@ -131,7 +131,7 @@ class NameConflict(msgspec.Struct, frozen=True):
     instance_b: int | None
 
 
-class OrderDenied(msgspec.Struct, frozen=True):
+class CommandDenied(msgspec.Struct, frozen=True):
     """A gateway does not let an order through; `reason` is DENIED_... of management."""
 
     gateway: str
@@ -149,7 +149,7 @@ class ConnectionDenied(msgspec.Struct, frozen=True):
     gateway: bool = False
 
 
-class Echoes(msgspec.Struct, frozen=True):
+class EchoDetected(msgspec.Struct, frozen=True):
     """The line gives back what we send."""
 
 
@@ -178,7 +178,7 @@ class Undeclare(msgspec.Struct, frozen=True):
     key: str
 
 
-class Look(msgspec.Struct, frozen=True):
+class QueryTokens(msgspec.Struct, frozen=True):
     """Ask the network for all tokens: call `Presence.appeared` with each of them, then `Presence.looked`."""
 
 
@@ -202,14 +202,14 @@ Event = (
     | CommandReceived
     | Mismatched
     | NameConflict
-    | OrderDenied
+    | CommandDenied
     | ConnectionDenied
-    | Echoes
+    | EchoDetected
     | ModuleChanged
     | ModuleGone
     | Declare
     | Undeclare
-    | Look
+    | QueryTokens
     | SubscriberLeft
 )
 

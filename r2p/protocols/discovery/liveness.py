@@ -14,7 +14,7 @@ from r2p.codecs import management
 from r2p.protocols.discovery.announcer import Announcer
 from r2p.protocols.discovery.directory import Directory
 from r2p.protocols.discovery.events import (
-    Echoes,
+    EchoDetected,
     ModuleChanged,
     ModuleGone,
     ModuleInfo,
@@ -24,7 +24,8 @@ from r2p.protocols.discovery.events import (
 )
 from r2p.protocols.discovery.negotiation import SubscriptionNegotiation
 from r2p.protocols.discovery.peers import Aliases
-from r2p.protocols.discovery.schedule import DiscoveryTimers, Schedule
+from r2p.protocols.discovery.schedule import Schedule
+from r2p.protocols.timers import KeyedTimers
 
 _SECOND = 1_000_000_000
 _TELL_AGAIN = 5 * _SECOND
@@ -50,7 +51,7 @@ class PeerLiveness:
         exchange: SubscriptionNegotiation,
         announcer: Announcer,
         schedule: Schedule,
-        timers: DiscoveryTimers,
+        timers: KeyedTimers,
         outbox: Outbox,
         counts: Counter[str],
     ) -> None:
@@ -209,7 +210,7 @@ class PeerLiveness:
         self._counts["echo"] += 1
         self._echoing_until = now + _ECHO_MEMORY
         if self._may_tell(now, ""):
-            self._outbox.emit(Echoes())
+            self._outbox.emit(EchoDetected())
 
     def _tell_conflict(self, now: int, module: str, instance_a: int | None, instance_b: int | None) -> None:
         if self._may_tell(now, module):

@@ -20,12 +20,13 @@ from r2p.protocols.discovery.events import (
     PeerAddress,
     PublisherFound,
     PublisherGone,
-    Shape,
     SubscriberJoined,
     SubscribersGone,
+    TopicType,
 )
 from r2p.protocols.discovery.peers import Peer, Peers
-from r2p.protocols.discovery.schedule import DiscoveryTimers, SharedAnswers
+from r2p.protocols.discovery.schedule import SharedAnswers
+from r2p.protocols.timers import KeyedTimers
 
 _SENT_BY_R2P = (UNANSWERED, ANSWERED)
 
@@ -38,7 +39,7 @@ class SubscriptionNegotiation:
     """What flows on one link, by peer and topic."""
 
     def __init__(
-        self, own: Announcer, outbox: Outbox, directory: Directory, timers: DiscoveryTimers, counts: Counter[str]
+        self, own: Announcer, outbox: Outbox, directory: Directory, timers: KeyedTimers, counts: Counter[str]
     ) -> None:
         self._own = own
         self._outbox = outbox
@@ -55,7 +56,7 @@ class SubscriptionNegotiation:
     def advertised(self, now: int, message: management.Advertise, source: PeerAddress) -> None:
         """A publisher: ask for its data if somebody here wants it."""
         topic = message.topic
-        self._directory.typed(now, topic, ROLE_PUBLISHES, Shape(message.size)).advertised_at = now
+        self._directory.typed(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
         own = self._own.subscribers.get(topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -70,7 +71,7 @@ class SubscriptionNegotiation:
     def requested(self, now: int, message: management.SubscribeRequest, source: PeerAddress) -> None:
         """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
         topic = message.topic
-        self._directory.typed(now, topic, ROLE_SUBSCRIBES, Shape(message.size)).requested_at = now
+        self._directory.typed(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
         own = self._own.publishers.get(topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -86,7 +87,7 @@ class SubscriptionNegotiation:
         peer = self._peers.get_or_create(source) if topic in self._own.subscribers else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
             return
-        self._directory.typed(now, topic, ROLE_PUBLISHES, Shape(message.size))
+        self._directory.typed(now, topic, ROLE_PUBLISHES, TopicType(message.size))
         if peer.opened.get(topic) != (message.params, message.size):
             peer.opened[topic] = (message.params, message.size)
             self._own.answered.add(topic)
@@ -94,11 +95,11 @@ class SubscriptionNegotiation:
 
     def typed(self, now: int, message: management.TypeInfo, source: PeerAddress) -> None:
         """A peer's type of a topic: compare it if the topic is ours too."""
-        self._directory.typed(now, message.topic, message.role, Shape(message.size, message.fingerprint))
+        self._directory.typed(now, message.topic, message.role, TopicType(message.size, message.fingerprint))
         own = self._counterpart(message.role).get(message.topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if peer is not None:
-            theirs = peer.types[message.topic, message.role] = Shape(message.size, message.fingerprint)
+            theirs = peer.types[message.topic, message.role] = TopicType(message.size, message.fingerprint)
             self._fits(peer, message.topic, message.role, theirs)
 
     def unsubscribed(self, now: int, message: management.Unsubscribe, source: PeerAddress) -> None:
@@ -264,7 +265,7 @@ class SubscriptionNegotiation:
         """Our side of what a peer in this role tells."""
         return {ROLE_PUBLISHES: self._own.subscribers, ROLE_SUBSCRIBES: self._own.publishers}.get(role, {})
 
-    def _fits(self, peer: Peer, topic: str, role: int, theirs: Shape) -> bool:
+    def _fits(self, peer: Peer, topic: str, role: int, theirs: TopicType) -> bool:
         """Whether a peer's type fits ours; if not, it is told once and nothing flows."""
         ours = self._counterpart(role)[topic].shape
         fits = ours.fits(theirs)
@@ -334,7 +335,7 @@ def _needs_type(now: int, peer: Peer, message: management.SubscribeRequest) -> b
     return message.params == UNANSWERED or peer.requests.get(message.topic) is not False
 
 
-def _theirs(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> Shape:
+def _theirs(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> TopicType:
     """What a publisher's message says of its type, with the TYPE before it if that speaks of the same size."""
     typed = peer.types.get((message.topic, ROLE_PUBLISHES))
-    return typed if typed is not None and typed.size == message.size else Shape(message.size)
+    return typed if typed is not None and typed.size == message.size else TopicType(message.size)

@@ -11,7 +11,7 @@ import msgspec
 from r2p.codecs.management import Name
 from r2p.names import MODULE_PATH_MAX, module_alias
 from r2p.protocols.discovery.directory import FOR_EVER
-from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, Shape, SubscriberJoined
+from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined, TopicType
 
 MOST = 4096
 """Peers on one link."""
@@ -38,8 +38,8 @@ class Peer(msgspec.Struct, eq=False):
     permanent: set[str] = msgspec.field(default_factory=set)
     waiting: dict[str, SubscriberJoined] = msgspec.field(default_factory=dict)
     opened: dict[str, tuple[bytes, int]] = msgspec.field(default_factory=dict)
-    types: dict[tuple[str, int], Shape] = msgspec.field(default_factory=dict)
-    refused: dict[tuple[str, int], Shape] = msgspec.field(default_factory=dict)
+    types: dict[tuple[str, int], TopicType] = msgspec.field(default_factory=dict)
+    refused: dict[tuple[str, int], TopicType] = msgspec.field(default_factory=dict)
 
     def is_r2p(self, now: int) -> bool:
         return bool(self.direct) or now < self.r2p_until

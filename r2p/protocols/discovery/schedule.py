@@ -5,15 +5,14 @@ places to visit without waiting (`_eager`) to a full round: fifty wishes at once
 leaves the ring after its first repetition for one that turns more slowly (`_seldom`), until somebody is new.
 """
 
-import heapq
 from collections import OrderedDict
-from collections.abc import Hashable, Iterator
 from enum import Enum, auto
 from typing import Generic, TypeVar
 
 import msgspec
 
 from r2p.protocols.discovery.events import PeerAddress
+from r2p.protocols.timers import KeyedTimers
 
 _SECOND = 1_000_000_000
 _STEP = _SECOND // 2
@@ -60,7 +59,7 @@ class Item(msgspec.Struct, frozen=True):
     once: bool = False
 
 
-class Bucket:
+class TokenBucket:
     """A token bucket in integer ns: in any span of t seconds at most `burst + rate * t` messages."""
 
     def __init__(self, rate: float, burst: int) -> None:
@@ -100,7 +99,7 @@ class Schedule:
 
     def pace(self, rate: float, burst: int, quiet: int) -> None:
         """Go at another rate from now on."""
-        self._bucket = Bucket(rate, max(burst, _MOST))
+        self._bucket = TokenBucket(rate, max(burst, _MOST))
         self._quiet = quiet
 
     def add(self, item: Item) -> None:
@@ -274,7 +273,7 @@ class SharedAnswers(Generic[M]):
     answer each of n others, and each of those answers would be answered. Timers have keys that begin with "answer".
     """
 
-    def __init__(self, timers: "DiscoveryTimers") -> None:
+    def __init__(self, timers: KeyedTimers) -> None:
         self._timers = timers
         self._full_at: dict[_Asked, int] = {}
         self._waiting: dict[_Asked, dict[PeerAddress, M]] = {}
@@ -317,57 +316,3 @@ class SharedAnswers(Generic[M]):
 
     def _count(self, now: int, key: _Asked, gap: int) -> None:
         self._full_at[key] = max(self._full_at.get(key, 0), now) + gap
-
-
-class DiscoveryTimers:
-    """Keys that run out. Setting a key later costs nothing: its place in the heap is corrected when it comes up."""
-
-    def __init__(self) -> None:
-        self._due: dict[Hashable, int] = {}
-        self._heap: list[tuple[int, int, Hashable]] = []
-        self._pushed = 0
-
-    def __contains__(self, key: Hashable) -> bool:
-        return key in self._due
-
-    def set(self, key: Hashable, due: int) -> None:
-        """The key runs out at `due` (ns), earlier or later than before."""
-        before = self._due.get(key)
-        self._due[key] = due
-        if before is None or due < before:
-            self._push(key, due)
-
-    def clear(self, key: Hashable) -> None:
-        self._due.pop(key, None)
-
-    def next(self) -> int | None:
-        """When the next key runs out."""
-        while self._heap:
-            at, _, key = self._heap[0]
-            due = self._due.get(key)
-            if due == at:
-                return at
-            heapq.heappop(self._heap)
-            if due is not None and due > at:
-                self._push(key, due)
-        return None
-
-    def put_off(self, until: int) -> None:
-        """Nothing runs out before then."""
-        self._due = {key: max(due, until) for key, due in self._due.items()}
-
-    def pop(self, now: int) -> Iterator[Hashable]:
-        """The keys that have run out; each is cleared."""
-        while (due := self.next()) is not None and due <= now:
-            key = heapq.heappop(self._heap)[2]
-            del self._due[key]
-            yield key
-
-    def _push(self, key: Hashable, due: int) -> None:
-        if len(self._heap) > 2 * len(self._due) + 64:  # keys that come and go: their old places would pile up
-            self._heap = [(at, n, each) for n, (each, at) in enumerate(self._due.items())]
-            heapq.heapify(self._heap)
-            self._pushed = len(self._heap)
-            return
-        self._pushed += 1
-        heapq.heappush(self._heap, (due, self._pushed, key))

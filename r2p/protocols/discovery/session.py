@@ -14,39 +14,40 @@ from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBS
 from r2p.errors import DecodeError
 from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic, Relayed
-from r2p.protocols.discovery.demand import Demand, HeardDemand
+from r2p.protocols.discovery.demand import Demand, LeasedDemand
 from r2p.protocols.discovery.directory import Directory, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.discovery.events import (
-    ORDERS,
+    COMMAND_OF_TYPE,
     Command,
+    CommandDenied,
     CommandReceived,
     ConnectionDenied,
-    Echoes,
+    EchoDetected,
     Event,
     Mismatched,
     ModuleChanged,
     ModuleGone,
     ModuleInfo,
     NameConflict,
-    OrderDenied,
     Outbox,
     PeerAddress,
     PublisherFound,
     PublisherGone,
     Send,
-    Shape,
     SubscriberJoined,
     SubscribersGone,
+    TopicType,
 )
 from r2p.protocols.discovery.liveness import PeerLiveness
 from r2p.protocols.discovery.negotiation import SubscriptionNegotiation
-from r2p.protocols.discovery.schedule import DiscoveryTimers, Kind, Schedule
+from r2p.protocols.discovery.schedule import Kind, Schedule
+from r2p.protocols.timers import KeyedTimers
 
 __all__ = [
     "Command",
     "CommandReceived",
     "Discovery",
-    "Echoes",
+    "EchoDetected",
     "EndpointInfo",
     "Event",
     "Mismatched",
@@ -58,10 +59,10 @@ __all__ = [
     "PublisherFound",
     "PublisherGone",
     "Send",
-    "Shape",
     "SubscriberJoined",
     "SubscribersGone",
     "TopicInfo",
+    "TopicType",
 ]
 
 _SECOND = 1_000_000_000
@@ -103,7 +104,7 @@ class Discovery:
         self._instance = instance
         self._outbox = Outbox()
         self._schedule = Schedule(rate, burst, round(quiet * _SECOND))
-        self._timers = DiscoveryTimers()
+        self._timers = KeyedTimers()
         self._directory = Directory(self._timers, self.counts)
         self._announcer = Announcer(
             module, instance, self._schedule, self._outbox, self._directory.size_of, observer=observer
@@ -122,7 +123,7 @@ class Discovery:
             self._outbox,
             self.counts,
         )
-        self._demand: HeardDemand | None = None
+        self._demand: LeasedDemand | None = None
         self._handlers: dict[type, Callable[[int, Any, PeerAddress], None]] = {
             management.Alive: self._neighbours.alive,
             management.Stop: self._stop,
@@ -163,7 +164,7 @@ class Discovery:
         return self._directory.endpoints
 
     @property
-    def end(self) -> int | None:
+    def sole_peer(self) -> int | None:
         """The instance of the one r2p module on the link itself; None if there is none, or more than one."""
         ends = self._directory.ends
         return next(iter(ends.values())) if len(ends) == 1 else None
@@ -186,9 +187,9 @@ class Discovery:
         self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
     ) -> list[Event]:
         """The module publishes this topic: messages of `size` bytes. `params` are the transport's."""
-        if self._announcer.publish(topic, LocalTopic(Shape(size, fingerprint), params)):
+        if self._announcer.publish(topic, LocalTopic(TopicType(size, fingerprint), params)):
             self._exchange.retyped(topic, ROLE_SUBSCRIBES)
-            for source in self._demand.who(topic, ROLE_SUBSCRIBES) if self._demand is not None else ():
+            for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES) if self._demand is not None else ():
                 self._exchange.requested(now, management.SubscribeRequest(topic, size, 1), source)  # was heard before
         return self._go_on(now)
 
@@ -206,7 +207,7 @@ class Discovery:
 
         `queue`: messages that a publisher may have to keep for us, bounded by what firmware bears (`queue_length`).
         """
-        own = LocalTopic(Shape(size, fingerprint), queue=queue)
+        own = LocalTopic(TopicType(size, fingerprint), queue=queue)
         if self._announcer.subscribe(topic, own):
             self._exchange.retyped(topic, ROLE_PUBLISHES)
         return self._go_on(now)
@@ -249,7 +250,7 @@ class Discovery:
     def demand(self) -> Demand:
         """What others offer and want; kept from the first call on."""
         if self._demand is None:
-            self._demand = HeardDemand(self._timers, self._directory)
+            self._demand = LeasedDemand(self._timers, self._directory)
         return self._demand
 
     def relay(self, now: int, message: Relayed) -> list[Event]:
@@ -352,8 +353,8 @@ class Discovery:
     def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
         if message.reason in (management.DENIED_CLIENTS, management.DENIED_GATEWAYS):
             self._outbox.emit(ConnectionDenied(message.gateway, message.reason == management.DENIED_GATEWAYS))
-        elif message.order in ORDERS:
-            denied = OrderDenied(message.gateway, ORDERS[message.order], message.module, message.reason)
+        elif message.order in COMMAND_OF_TYPE:
+            denied = CommandDenied(message.gateway, COMMAND_OF_TYPE[message.order], message.module, message.reason)
             self._outbox.emit(denied)
 
     def _stop(self, now: int, message: management.Stop, source: PeerAddress) -> None:

@@ -16,10 +16,10 @@ from r2p.protocols.discovery.events import (
     Mismatched,
     PublisherFound,
     PublisherGone,
-    Shape,
     SubscriberJoined,
     SubscriberLeft,
     SubscribersGone,
+    TopicType,
 )
 from r2p.protocols.liveliness.tokens import TokenSet, TopicRole, counterpart
 
@@ -29,7 +29,7 @@ class _PeerSession(msgspec.Struct):
 
     tokens: dict[TopicRole, dict[str, TopicToken]] = msgspec.field(default_factory=dict)
     matched: dict[TopicRole, int] = msgspec.field(default_factory=dict)
-    refused: dict[TopicRole, Shape] = msgspec.field(default_factory=dict)
+    refused: dict[TopicRole, TopicType] = msgspec.field(default_factory=dict)
 
 
 class Matching:
@@ -151,7 +151,7 @@ class Matching:
         """The type of a topic is that of the first session that tells one."""
         sessions = self._telling.get((info.name, role), {}).values()
         shapes = (_shape(session.tokens[info.name, role]) for session in sessions)
-        info.typed(role, next((shape for shape in shapes if shape != Shape()), None))
+        info.typed(role, next((shape for shape in shapes if shape != TopicType()), None))
 
     def _mark(self, now: int, info: TopicInfo, role: int) -> None:
         if role == ROLE_PUBLISHES:
@@ -169,11 +169,11 @@ class Matching:
             self.topics[topic].requested_at = None
 
 
-def _shape(tokens: dict[str, TopicToken]) -> Shape:
+def _shape(tokens: dict[str, TopicToken]) -> TopicType:
     """The type that a session tells; the first one that does."""
     size = next((each.size for each in tokens.values() if each.size), 0)
     fingerprint = next((each.fingerprint for each in tokens.values() if each.fingerprint != ANY_TYPE), ANY_TYPE)
-    return Shape(size, fingerprint)
+    return TopicType(size, fingerprint)
 
 
 def _detail(tokens: dict[str, TopicToken], role: int) -> int:

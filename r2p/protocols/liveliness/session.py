@@ -21,17 +21,17 @@ from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.demand import Demand
 from r2p.protocols.discovery.directory import MOST, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.discovery.events import (
-    ORDERS,
+    COMMAND_OF_TYPE,
     Command,
+    CommandDenied,
     CommandReceived,
     Event,
-    Look,
     ModuleInfo,
     NameConflict,
-    OrderDenied,
     PeerAddress,
+    QueryTokens,
     Send,
-    Shape,
+    TopicType,
 )
 from r2p.protocols.liveliness.matching import Matching
 from r2p.protocols.liveliness.modules import ModuleRegistry
@@ -92,7 +92,7 @@ class LivelinessDiscovery:
         return self._census.endpoints
 
     @property
-    def end(self) -> int | None:
+    def sole_peer(self) -> int | None:
         """None: there may always be more than one module."""
         return None
 
@@ -118,7 +118,7 @@ class LivelinessDiscovery:
         self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
     ) -> list[Event]:
         """The module publishes this topic: messages of `size` bytes (0: not known)."""
-        return self._enter(topic, ROLE_PUBLISHES, DeclaredTopic(Shape(size, fingerprint)))
+        return self._enter(topic, ROLE_PUBLISHES, DeclaredTopic(TopicType(size, fingerprint)))
 
     def withdraw(self, now: int, topic: str) -> list[Event]:
         """The module does not publish this topic any more: whoever joined has left."""
@@ -131,7 +131,7 @@ class LivelinessDiscovery:
 
         `queue`: how many messages may be on the way to it; 0: as many as come, it would rather lose some.
         """
-        return self._enter(topic, ROLE_SUBSCRIBES, DeclaredTopic(Shape(size, fingerprint), queue))
+        return self._enter(topic, ROLE_SUBSCRIBES, DeclaredTopic(TopicType(size, fingerprint), queue))
 
     def unsubscribe(self, now: int, topic: str) -> list[Event]:
         """The module does not subscribe this topic any more: what was opened is shut."""
@@ -244,7 +244,7 @@ class LivelinessDiscovery:
         if self._freshen_at is not None and self._freshen_at <= now:
             self._freshen(now)
         if self._refused.due(now, self._free):
-            self._events.append(Look())
+            self._events.append(QueryTokens())
         self._census.poll(now)
         return self._take()
 
@@ -299,7 +299,7 @@ class LivelinessDiscovery:
         return self._take()
 
     def looked(self, now: int, *, complete: bool) -> list[Event]:
-        """All answers to `Look` have come, or, if not `complete`, some of them."""
+        """All answers to `QueryTokens` have come, or, if not `complete`, some of them."""
         self._refused.answered(complete=complete)
         self._review_refused(now)
         return self._take()
@@ -353,8 +353,8 @@ class LivelinessDiscovery:
                 self._events.append(CommandReceived(Command.BOOTLOAD))
             case management.Conflict(self._module, a, b) if self._instance in (a, b):
                 self._events.append(NameConflict(self._module, a, b))
-            case management.Denied(gateway, module, order, reason) if order in ORDERS:
-                self._events.append(OrderDenied(gateway, ORDERS[order], module, reason))
+            case management.Denied(gateway, module, order, reason) if order in COMMAND_OF_TYPE:
+                self._events.append(CommandDenied(gateway, COMMAND_OF_TYPE[order], module, reason))
             case management.Name():
                 self._aliases.heard(message)
             case management.Alive(name, flags):

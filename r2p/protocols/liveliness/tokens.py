@@ -9,7 +9,7 @@ import msgspec
 from r2p.codecs import liveliness
 from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.protocols.discovery.events import Declare, Shape, Undeclare
+from r2p.protocols.discovery.events import Declare, TopicType, Undeclare
 
 TopicRole = tuple[str, int]
 """A topic, and ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
@@ -21,7 +21,7 @@ _RELAYED: TopicRole = ("", -1)
 class DeclaredTopic(msgspec.Struct, frozen=True):
     """A topic that this module publishes, or subscribes with a `window` (messages on the way; 0: it may lose some)."""
 
-    shape: Shape
+    shape: TopicType
     window: int = 0
 
 

@@ -6,7 +6,6 @@ from collections.abc import Hashable, Iterator
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import DecodeError
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.cycle import Cycle, timing
 from r2p.protocols.rtcan.events import NEVER, Action, Done, Due, EngineSettings, Fate, Profile, Ready, Received
 from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
@@ -18,10 +17,11 @@ from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
 from r2p.protocols.rtcan.queue import LaxityQueue, QueuedMessage
 from r2p.protocols.rtcan.reassembly import Reassembly
 from r2p.protocols.rtcan.transmitter import Mailboxes, Mode, SlotTransmitter
+from r2p.protocols.timers import KeyedTimers
 
 
-class Timers(DiscoveryTimers):
-    """As `DiscoveryTimers`, and remembers when the next key runs out."""
+class Timers(KeyedTimers):
+    """As `KeyedTimers`, and remembers when the next key runs out."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -9,11 +9,11 @@ from collections.abc import Callable
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import NO_PHASE, Grant, Refuse, Renew, Renewed, Reserve
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.calendar import Calendar, Reason, Refusal, Reservation
 from r2p.protocols.rtcan.cycle import Cycle
 from r2p.protocols.rtcan.events import LONG_AGO, Action, Degraded, Granted, Refused
 from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
+from r2p.protocols.timers import KeyedTimers
 
 LEASE = 3_000_000_000
 _RENEWAL = 1_000_000_000
@@ -25,7 +25,7 @@ _AHEAD = 1
 class SlotGrants:
     """The master's side: who has which slots, and until when."""
 
-    def __init__(self, cycle: Cycle, timers: DiscoveryTimers) -> None:
+    def __init__(self, cycle: Cycle, timers: KeyedTimers) -> None:
         self.calendar = Calendar(cycle.timing.slots)
         self.collecting = False
         """Only what another master granted is granted now."""
@@ -81,7 +81,7 @@ class SlotRequests:
         self,
         cycle: Cycle,
         agenda: SlotPlan,
-        timers: DiscoveryTimers,
+        timers: KeyedTimers,
         periodics: dict[int, PeriodicMessage],
         out: list[Action],
         ask: Callable[[int, Reserve | Renew], None],

@@ -11,11 +11,11 @@ import enum
 from collections.abc import Callable
 
 from r2p.codecs import rtcan
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.cycle import HOLDOVER, Cycle
 from r2p.protocols.rtcan.events import Outcome
 from r2p.protocols.rtcan.leases import SlotGrants
 from r2p.protocols.rtcan.transmitter import FirstSync, SlotTransmitter
+from r2p.protocols.timers import KeyedTimers
 
 FRESH = 1_500_000_000
 """A candidate counts for this long after it announced itself (ns)."""
@@ -33,7 +33,7 @@ class Role(enum.Enum):
 class Election:
     """The election of one node with this `priority`; `window` is how long announcements are waited for (ns)."""
 
-    def __init__(self, priority: int, window: int, timers: DiscoveryTimers) -> None:
+    def __init__(self, priority: int, window: int, timers: KeyedTimers) -> None:
         self.role = Role.NONE
         self._priority = priority
         self._window = window

@@ -18,7 +18,6 @@ import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.rtcan import Frame
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.cycle import Alignment, Cycle, CycleState
 from r2p.protocols.rtcan.events import (
     LONG_AGO,
@@ -34,6 +33,7 @@ from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
 from r2p.protocols.rtcan.master import Election, MasterRole, Role
 from r2p.protocols.rtcan.node_id import Identity, Stage
 from r2p.protocols.rtcan.transmitter import SlotTransmitter
+from r2p.protocols.timers import KeyedTimers
 
 REPEAT = 1_000_000_000
 """NETWORK is sent this often (ns)."""
@@ -57,7 +57,7 @@ class NetworkMembership:
         election: Election,
         grants: SlotGrants,
         wishes: SlotRequests,
-        timers: DiscoveryTimers,
+        timers: KeyedTimers,
         out: list[Action],
         counts: Counter[str],
         say: Callable[[int, management.Management], None],

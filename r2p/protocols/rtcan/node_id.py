@@ -11,8 +11,8 @@ from collections import Counter
 from collections.abc import Callable
 
 from r2p.codecs.management import CLAIM_FIXED, Claim
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.events import LONG_AGO, Action, IdConflict
+from r2p.protocols.timers import KeyedTimers
 
 OBJECTION = 250_000_000
 """How long others may object to a claim (ns)."""
@@ -46,7 +46,7 @@ class Identity:
         wanted: int | None,
         number: int,
         listen: int,
-        timers: DiscoveryTimers,
+        timers: KeyedTimers,
         out: list[Action],
         counts: Counter[str],
         announce: Callable[[int], None],

@@ -19,7 +19,7 @@ from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_s
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
-from r2p.protocols.discovery.events import Declare, Event, Look, SubscriberJoined, SubscriberLeft, Undeclare
+from r2p.protocols.discovery.events import Declare, Event, QueryTokens, SubscriberJoined, SubscriberLeft, Undeclare
 from r2p.protocols.liveliness.session import TOKENS, LivelinessDiscovery
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
@@ -224,7 +224,7 @@ class ZenohLink(Link):
             case Undeclare(key):
                 if self._session is not None:
                     self._session.undeclare(f"{self.prefix}/{liveliness.place(key)}")
-            case Look():
+            case QueryTokens():
                 self._look()
             case SubscriberJoined(topic, _, window, int(session)):
                 self._welcome(topic, session, window)

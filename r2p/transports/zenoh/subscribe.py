@@ -18,7 +18,7 @@ from r2p.clock import clock_of
 from r2p.codecs import UnknownType
 from r2p.codecs.attachment import SERIAL_WRAP, HeaderReader, Origin
 from r2p.errors import DecodeError
-from r2p.protocols.discovery.events import Shape
+from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.flow_control import ReceiveWindow
 from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import PendingDelivery, Sink
@@ -452,7 +452,7 @@ class RxStream:
         return flow
 
     def _fit(self, lane: RemotePublisher) -> None:
-        lane.fits = self._shape.fits(Shape(0, lane.origin.fingerprint))
+        lane.fits = self._shape.fits(TopicType(0, lane.origin.fingerprint))
         lane.size = (self._shape.size or -1) if lane.fits else -1
         lane.usual = -1
 
@@ -465,8 +465,8 @@ def _parts(data: bytes, count: int) -> list[bytes]:
     return [data[at : at + size] for at in range(0, len(data), size)]
 
 
-def _shape(topic: Topic) -> Shape:
-    return Shape() if topic.layout is None else Shape(topic.layout.size, topic.layout.fingerprint)
+def _shape(topic: Topic) -> TopicType:
+    return TopicType() if topic.layout is None else TopicType(topic.layout.size, topic.layout.fingerprint)
 
 
 # All that comes in by zenoh: a bounded queue for each topic, so that none delays another.

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.session import Discovery, Shape
+from r2p.protocols.discovery.session import Discovery, TopicType
 from tests.protocols.discovery.wire import Line, S, Side, World
 
 TOPICS = ("leds", "cmd", "odometry")
-SHAPES = [Shape(), Shape(5), Shape(5, b"\x01" * 8), Shape(5, b"\x02" * 8), Shape(8, b"\x03" * 8)]
+SHAPES = [TopicType(), TopicType(5), TopicType(5, b"\x01" * 8), TopicType(5, b"\x02" * 8), TopicType(8, b"\x03" * 8)]
 RATE, BURST = 100.0, 8
 SETTLED = 25.0
 """Seconds after the last loss: the longest lease, a round, a lease again, and the longest delay."""
@@ -22,8 +22,8 @@ class Wish(msgspec.Struct, frozen=True):
     """What one side has of one topic."""
 
     topic: str
-    publishes: Shape | None
-    subscribes: Shape | None
+    publishes: TopicType | None
+    subscribes: TopicType | None
 
 
 class Change(msgspec.Struct, frozen=True):
@@ -73,7 +73,9 @@ def apply(world: World, steps: Iterable[Change]) -> dict[tuple[bool, str], Wish]
     return latest
 
 
-def check(publisher: Side, subscriber: Side, topic: str, publishes: Shape | None, subscribes: Shape | None) -> None:
+def check(
+    publisher: Side, subscriber: Side, topic: str, publishes: TopicType | None, subscribes: TopicType | None
+) -> None:
     """One topic in one direction, when all has been said."""
     flows = publishes is not None and subscribes is not None and publishes.fits(subscribes)
     assert (topic in publisher.attached) == flows

@@ -25,11 +25,15 @@ def test_firmware_wants_and_offers_for_good() -> None:
     discovery = made()
     hear(discovery, 0, m.Advertise("leds", 5), m.SubscribeRequest("cmd", 12, 5))
     demand = discovery.demand()
-    assert demand.changed() == {"leds", "cmd"}
+    assert demand.pop_changed() == {"leds", "cmd"}
     discovery.poll(1000 * SECOND)
-    assert (demand.offers("leds"), demand.wants("cmd"), demand.wants("leds")) == (True, True, False)
+    assert (demand.is_published("leds"), demand.is_subscribed("cmd"), demand.is_subscribed("leds")) == (
+        True,
+        True,
+        False,
+    )
     discovery.link_down(1000 * SECOND)
-    assert demand.wants("cmd")
+    assert demand.is_subscribed("cmd")
 
 
 def test_r2p_modules_want_for_a_lease() -> None:
@@ -38,16 +42,16 @@ def test_r2p_modules_want_for_a_lease() -> None:
     demand = discovery.demand()
     hear(discovery, 3, m.SubscribeRequest("leds", 5, 1))
     discovery.poll(7 * SECOND)
-    assert demand.wants("leds")
+    assert demand.is_subscribed("leds")
     discovery.poll(9 * SECOND)
-    assert not demand.wants("leds")
+    assert not demand.is_subscribed("leds")
 
 
 def test_a_request_before_the_first_hello_becomes_a_lease() -> None:
     discovery = made()
     hear(discovery, 0, m.SubscribeRequest("leds", 5, 1), m.Hello("PC1", 7))
     discovery.poll(6 * SECOND)
-    assert not discovery.demand().wants("leds")
+    assert not discovery.demand().is_subscribed("leds")
 
 
 def test_unsubscribe_and_good_bye() -> None:
@@ -55,16 +59,16 @@ def test_unsubscribe_and_good_bye() -> None:
     demand = discovery.demand()
     hear(discovery, 0, m.Hello("PC1", 7), m.SubscribeRequest("leds", 5, 1), m.Advertise("cmd", 12))
     hear(discovery, 1, m.Unsubscribe("leds", 7))
-    assert not demand.wants("leds")
+    assert not demand.is_subscribed("leds")
     hear(discovery, 1, m.Hello("PC1", 7, m.HELLO_LEAVING))
-    assert not demand.offers("cmd")
+    assert not demand.is_published("cmd")
 
 
 def test_two_who_share_a_line_do_not_speak_for_each_other() -> None:
     discovery = made()
     hear(discovery, 0, m.Hello("PC1", 7), m.Hello("PC2", 8), m.SubscribeRequest("leds", 5, 1))
     hear(discovery, 1, m.Unsubscribe("leds", 7), m.Hello("PC1", 7, m.HELLO_LEAVING))
-    assert discovery.demand().wants("leds")
+    assert discovery.demand().is_subscribed("leds")
 
 
 def test_who_has_asked_before_joins_at_once() -> None:

@@ -9,7 +9,7 @@ from r2p.protocols.discovery.session import (
     Command,
     CommandReceived,
     Discovery,
-    Echoes,
+    EchoDetected,
     ModuleChanged,
     ModuleGone,
     NameConflict,
@@ -218,12 +218,12 @@ class TestNames:
         discovery.subscribe(0, "both", 5)
         said = [event.data for event in discovery.link_up(0) if isinstance(event, Send)]
         echoed = [event for data in said for event in discovery.receive(1, data)]
-        assert echoed == [Echoes()]
+        assert echoed == [EchoDetected()]
         assert discovery.counts["echo"] == len(said) == 4
         assert discovery.modules == {}
         for now, event in run(discovery, 1, 60 * S):
             if isinstance(event, Send):
-                assert news(discovery.receive(now, event.data)) in ([], [Echoes()])
+                assert news(discovery.receive(now, event.data)) in ([], [EchoDetected()])
         theirs = hear(discovery, 60 * S, m.SubscribeRequest("both", 5, 5), m.SubscribeRequest("both", 5, 5))
         theirs += discovery.poll(60 * S + GRACE)
         assert news(theirs) == [SubscriberJoined("both", bytes(10), 5)], "the same words from a peer count"

@@ -12,9 +12,9 @@ from r2p.protocols.discovery.session import (
     PublisherFound,
     PublisherGone,
     Send,
-    Shape,
     SubscriberJoined,
     SubscribersGone,
+    TopicType,
 )
 from tests.protocols.discovery.wire import (
     ME,
@@ -83,7 +83,7 @@ class TestHandshake:
     @pytest.mark.parametrize("message", [m.Advertise("cmd", 8), m.SubscribeResponse("cmd", 8)])
     def test_another_size_is_refused_and_told_once(self, message: m.Management) -> None:
         discovery = started()
-        ours, theirs = Shape(12, TWO), Shape(8)
+        ours, theirs = TopicType(12, TWO), TopicType(8)
         expected = Mismatched("cmd", None, m.ROLE_PUBLISHES, ours, theirs)
         assert hear(discovery, S, message, message) == [expected]
         assert discovery.topics["cmd"].mismatch
@@ -496,7 +496,7 @@ class TestTypes:
     def test_a_subscriber_of_another_type_is_refused(self) -> None:
         discovery = started()
         theirs = m.TypeInfo(m.ROLE_SUBSCRIBES, "leds", TWO, 5)
-        told = Mismatched("leds", None, m.ROLE_SUBSCRIBES, Shape(5, ONE), Shape(5, TWO))
+        told = Mismatched("leds", None, m.ROLE_SUBSCRIBES, TopicType(5, ONE), TopicType(5, TWO))
         hear(discovery, S, PC2)
         assert hear(discovery, S, theirs) == [told]
         answer = hear(discovery, S, REQUEST, theirs, REQUEST)
@@ -506,7 +506,7 @@ class TestTypes:
     def test_a_publisher_of_another_type_is_refused(self) -> None:
         discovery = started()
         theirs = m.TypeInfo(m.ROLE_PUBLISHES, "cmd", ONE, 12)
-        told = Mismatched("cmd", None, m.ROLE_PUBLISHES, Shape(12, TWO), Shape(12, ONE))
+        told = Mismatched("cmd", None, m.ROLE_PUBLISHES, TopicType(12, TWO), TopicType(12, ONE))
         hear(discovery, S, PC2)
         assert hear(discovery, S, theirs) == [told]
         answer = hear(discovery, S, m.Advertise("cmd", 12), RESPONSE)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.schedule import Bucket, DiscoveryTimers, Item, Kind, Schedule
+from r2p.protocols.discovery.schedule import Item, Kind, Schedule, TokenBucket
 from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import MS, S, run, sent
 
@@ -18,7 +18,7 @@ from tests.protocols.discovery.wire import MS, S, run, sent
     st.lists(st.tuples(st.integers(0, S), st.integers(1, 2)), max_size=60),
 )
 def test_a_bucket_never_lets_more_pass(rate: float, burst: int, wishes: list[tuple[int, int]]) -> None:
-    bucket = Bucket(rate, burst)
+    bucket = TokenBucket(rate, burst)
     now, passed = 0, list[int]()
     for wait, count in wishes:
         now += wait
@@ -28,38 +28,6 @@ def test_a_bucket_never_lets_more_pass(rate: float, burst: int, wishes: list[tup
     for first, start in enumerate(passed):
         for last in range(first, len(passed)):
             assert last - first + 1 <= burst + (passed[last] - start) / bucket.gap
-
-
-class TestTimers:
-    @given(st.lists(st.tuples(st.integers(0, 9), st.one_of(st.none(), st.integers(0, 100))), max_size=100))
-    def test_like_a_dictionary(self, changes: list[tuple[int, int | None]]) -> None:
-        timers, model = DiscoveryTimers(), dict[int, int]()
-        for key, due in changes:
-            if due is None:
-                timers.clear(key)
-                model.pop(key, None)
-            else:
-                timers.set(key, due)
-                model[key] = due
-            assert timers.next() == min(model.values(), default=None)
-        assert set(timers.pop(50)) == {key for key, due in model.items() if due <= 50}
-        assert list(timers.pop(50)) == []
-        assert set(timers.pop(100)) == {key for key, due in model.items() if due > 50}
-        assert timers.next() is None
-
-    def test_what_comes_and_goes_leaves_nothing_behind(self) -> None:
-        timers = DiscoveryTimers()
-        for n in range(10_000):
-            timers.set(n, 1000)
-            timers.clear(n)
-        assert len(timers._heap) < 200
-
-    def test_a_key_can_be_set_while_keys_run_out(self) -> None:
-        timers = DiscoveryTimers()
-        timers.set("a", 1)
-        for key in timers.pop(5):
-            timers.set(key, 6)
-        assert timers.next() == 6
 
 
 class TestSchedule:

@@ -7,7 +7,7 @@ import pytest
 from r2p.codecs import liveliness
 from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ROLE_PUBLISHES
-from r2p.protocols.discovery.events import Event, Look, ModuleChanged, PublisherFound
+from r2p.protocols.discovery.events import Event, ModuleChanged, PublisherFound, QueryTokens
 from r2p.protocols.liveliness import modules as census
 from r2p.protocols.liveliness import refused
 from r2p.protocols.liveliness import session as presence
@@ -46,7 +46,7 @@ class Network:
             self.now = max(self.now, due)
             events = self.module.poll(self.now)
             self.events += events
-            if Look() in events:
+            if QueryTokens() in events:
                 self._answer()
         self.now = end
 

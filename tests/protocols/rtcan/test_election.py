@@ -1,7 +1,7 @@
 """Who takes over, and when."""
 
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.master import FRESH, Election, Role
+from r2p.protocols.timers import KeyedTimers
 
 MS = 1_000_000
 WINDOW = 30 * MS
@@ -10,7 +10,7 @@ WINDOW = 30 * MS
 class Candidate:
     def __init__(self, id8: int, priority: int) -> None:
         self.id8 = id8
-        self.timers = DiscoveryTimers()
+        self.timers = KeyedTimers()
         self.election = Election(priority, WINDOW, self.timers)
 
     def takes_over_at(self) -> int | None:

@@ -2,12 +2,12 @@
 
 from r2p.codecs import management
 from r2p.codecs.management import Grant, Renew, Renewed, Reserve
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.calendar import Reason
 from r2p.protocols.rtcan.cycle import Cycle, timing
 from r2p.protocols.rtcan.events import Action, Degraded, Granted, Refused
 from r2p.protocols.rtcan.leases import LEASE, SlotRequests
 from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
+from r2p.protocols.timers import KeyedTimers
 
 SECOND = 1_000_000_000
 HIGH, MESSAGE = 5, 0x050A
@@ -20,7 +20,7 @@ class Owner:
         self.out: list[Action] = []
         self.asked: list[Reserve | Renew] = []
         self.abandoned: list[int] = []
-        self.timers = DiscoveryTimers()
+        self.timers = KeyedTimers()
         self.periodic = PeriodicMessage(HIGH, MESSAGE, 8, 1, 10_000_000, 0, None)
         cycle = Cycle(timing())
         self.wishes = SlotRequests(

@@ -5,9 +5,9 @@ from collections import Counter
 import pytest
 
 from r2p.codecs.management import CLAIM_FIXED, Claim
-from r2p.protocols.discovery.schedule import DiscoveryTimers
 from r2p.protocols.rtcan.events import Action, IdConflict
 from r2p.protocols.rtcan.node_id import OBJECTION, Identity, Stage
+from r2p.protocols.timers import KeyedTimers
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -20,7 +20,7 @@ class Node:
 
     def __init__(self, wanted: int | None, number: int = NUMBER) -> None:
         self.now = 0
-        self.timers = DiscoveryTimers()
+        self.timers = KeyedTimers()
         self.out: list[Action] = []
         self.claims: list[tuple[int, int]] = []
         self.stages: list[Stage] = []

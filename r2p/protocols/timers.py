@@ -1,0 +1,62 @@
+"""Timers by key, for protocols that are asked for their next deadline (`next`) and given the time (`pop`).
+
+A heap with late deletion: setting a key to a later time, as each renewed lease does, leaves its old place in the heap.
+That place is corrected when it comes up.
+"""
+
+import heapq
+from collections.abc import Hashable, Iterator
+
+
+class KeyedTimers:
+    """Keys that run out. Setting a key later costs nothing: its place in the heap is corrected when it comes up."""
+
+    def __init__(self) -> None:
+        self._due: dict[Hashable, int] = {}
+        self._heap: list[tuple[int, int, Hashable]] = []
+        self._pushed = 0
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._due
+
+    def set(self, key: Hashable, due: int) -> None:
+        """The key runs out at `due` (ns), earlier or later than before."""
+        before = self._due.get(key)
+        self._due[key] = due
+        if before is None or due < before:
+            self._push(key, due)
+
+    def clear(self, key: Hashable) -> None:
+        self._due.pop(key, None)
+
+    def next(self) -> int | None:
+        """When the next key runs out."""
+        while self._heap:
+            at, _, key = self._heap[0]
+            due = self._due.get(key)
+            if due == at:
+                return at
+            heapq.heappop(self._heap)
+            if due is not None and due > at:
+                self._push(key, due)
+        return None
+
+    def put_off(self, until: int) -> None:
+        """Nothing runs out before then."""
+        self._due = {key: max(due, until) for key, due in self._due.items()}
+
+    def pop(self, now: int) -> Iterator[Hashable]:
+        """The keys that have run out; each is cleared."""
+        while (due := self.next()) is not None and due <= now:
+            key = heapq.heappop(self._heap)[2]
+            del self._due[key]
+            yield key
+
+    def _push(self, key: Hashable, due: int) -> None:
+        if len(self._heap) > 2 * len(self._due) + 64:  # keys that come and go: their old places would pile up
+            self._heap = [(at, n, each) for n, (each, at) in enumerate(self._due.items())]
+            heapq.heapify(self._heap)
+            self._pushed = len(self._heap)
+            return
+        self._pushed += 1
+        heapq.heappush(self._heap, (due, self._pushed, key))
