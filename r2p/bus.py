@@ -24,7 +24,7 @@ from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupie
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import Mailbox, Outcome
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
-from r2p.transports.receiver import LoggedCounter
+from r2p.transports.stats import LoggedCounter
 from r2p.transports.url import parse
 
 if TYPE_CHECKING:

@@ -22,8 +22,9 @@ from r2p.protocols.bridge.clients import FIRST
 from r2p.protocols.bridge.tree import Tree
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace, WakeScheduler
-from r2p.transports.link import Announcement, Link, is_booting
-from r2p.transports.receiver import TRY_AGAIN, internal_error_of
+from r2p.transports.announcement import Announcement
+from r2p.transports.link import Link, is_booting
+from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 logger = get_logger("r2p.bridge")
 
@@ -86,7 +87,7 @@ class Bridge:
         if not link.admits_gateways or number is None:
             number = next(self._numbers)
         port = self.ports[link.name] = self._by_number[number] = BridgePort(self, link, number, self._clock.now)
-        link.gate = port
+        link.gateway_hooks = port
         if link.admits_gateways and number >= FIRST:
             port.state = port.place.state = PortState.REFUSED
             self._told(link, "too many links", f"a gateway joins {MOST_PORTS} links: this one is not", True)
@@ -112,7 +113,7 @@ class Bridge:
         if port.client:
             port.place = self.tree.clients.open(now, port.number)
         elif port.number < FIRST:
-            self.tree.open(now, port.number, private=port.link.private)
+            self.tree.open(now, port.number, private=port.link.fixed_peer)
             port.place = self.tree.ports[port.number]
         port.place.lost = port.link.stats.lost
 
@@ -312,10 +313,10 @@ class Bridge:
             self._act()
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
-            self._alarm.set(now + TRY_AGAIN)
+            self._alarm.set(now + RETRY_AFTER_ERROR)
 
     def _failed(self, error: Exception) -> None:
-        internal_error_of((port.link.stats.lost for port in self.ports.values()), error)
+        count_internal_error((port.link.stats.lost for port in self.ports.values()), error)
 
     def _act(self) -> None:
         """Do what the tree says. Where something raises, that is counted and the rest is done."""
@@ -328,7 +329,7 @@ class Bridge:
             if self._held and not any(port.place.resumes for port in self.ports.values()):
                 self._held.release(self._failed)
         finally:
-            again = self._clock.monotonic() + TRY_AGAIN if self._changed else None
+            again = self._clock.monotonic() + RETRY_AFTER_ERROR if self._changed else None
             dues = [due for due in (self.tree.next_deadline(), again) if due is not None]
             self._alarm.set(min(dues, default=None))
 

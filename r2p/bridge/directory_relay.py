@@ -26,7 +26,7 @@ from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.topic import TopicSpace
-from r2p.transports.receiver import TRY_AGAIN, internal_error_of
+from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 ROUNDS = 5
 """Looks at what has changed in a second, at most."""
@@ -160,8 +160,8 @@ class DirectoryRelay:
         try:
             self._do_due(now)
         except Exception as error:  # noqa: BLE001 - counted and logged
-            internal_error_of((port.link.stats.lost for port in self._ports.values()), error)
-            self._alarm.set(now + TRY_AGAIN)
+            count_internal_error((port.link.stats.lost for port in self._ports.values()), error)
+            self._alarm.set(now + RETRY_AFTER_ERROR)
         else:
             self._set_alarm(now)
 
@@ -251,7 +251,7 @@ class DirectoryRelay:
             try:
                 self._collect(name, port, changed)
             except Exception as error:  # noqa: BLE001 - counted and logged; it is read anew, and the next link follows
-                internal_error_of((each.link.stats.lost for each in self._ports.values()), error)
+                count_internal_error((each.link.stats.lost for each in self._ports.values()), error)
                 self._dirty.add(name)
                 continue
             if port is not None and port.link.up and port.in_tree != (name in self._joined):

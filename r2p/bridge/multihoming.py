@@ -14,8 +14,9 @@ from r2p.errors import DecodeError
 from r2p.protocols.bridge.link_selection import LinkSelection
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.link import NOTHING, Announcement, Link
-from r2p.transports.receiver import TRY_AGAIN, internal_error_of
+from r2p.transports.announcement import NOTHING, Announcement
+from r2p.transports.link import Link
+from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _KINDS = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
 _ALL: frozenset[int] = frozenset()
@@ -80,7 +81,7 @@ class MultihomedModule:
         for key, unable in self._unable.items():
             if _cannot_carry(link, *key):
                 self._unable[key] = unable | {port.number}
-        link.gate = port
+        link.gateway_hooks = port
 
     def detach(self, link: Link) -> None:
         """It does not have it any more."""
@@ -99,7 +100,7 @@ class MultihomedModule:
         if port is None:
             return
         if link.up:
-            self.homes.open(self._now(), port.number, lone=link.lone)
+            self.homes.open(self._now(), port.number, lone=link.point_to_point)
         else:
             self.homes.shut(self._now(), port.number)
             link.stands_by = ""
@@ -143,7 +144,7 @@ class MultihomedModule:
 
     def discovery_changed(self, port: StandbyPort) -> None:
         """Discovery may have learnt who is at the other end, or how long messages are of which we did not know it."""
-        if port.link.lone and port.link.discovery.generation != port.generation:
+        if port.link.point_to_point and port.link.discovery.generation != port.generation:
             port.generation = port.link.discovery.generation
             self.homes.ended(self._now(), port.number, port.link.discovery.sole_peer)
             self._act()
@@ -206,8 +207,8 @@ class MultihomedModule:
             self.homes.poll(self._now())
             self._act()
         except Exception as error:  # noqa: BLE001 - counted and logged
-            internal_error_of((port.link.stats.lost for port in self._ports.values()), error)
-            self._alarm.set(self._now() + TRY_AGAIN)
+            count_internal_error((port.link.stats.lost for port in self._ports.values()), error)
+            self._alarm.set(self._now() + RETRY_AFTER_ERROR)
 
     def _act(self) -> None:
         for number, message in self.homes.take():

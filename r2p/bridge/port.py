@@ -10,7 +10,8 @@ from r2p.log_lines import LineLimit
 from r2p.protocols.bridge.base import PortState, TreePort
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic
-from r2p.transports.link import Announcement, Link
+from r2p.transports.announcement import Announcement
+from r2p.transports.link import Link
 
 _REFUSAL_LINES = 1  # of the log in a second on one link about orders that do not pass
 

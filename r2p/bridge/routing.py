@@ -18,8 +18,8 @@ from r2p.log_lines import LineLimit, get_logger
 from r2p.names import LOADER_PREFIX
 from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.link import NOTHING, Announcement
-from r2p.transports.receiver import internal_error_of
+from r2p.transports.announcement import NOTHING, Announcement
+from r2p.transports.stats import count_internal_error
 
 logger = get_logger("r2p.bridge")
 
@@ -97,7 +97,7 @@ class RoutingTable:
                 try:
                     self._review(topic)
                 except Exception as error:  # noqa: BLE001 - counted and logged; the next topic follows
-                    internal_error_of((port.link.stats.lost for port in self._ports.values()), error)
+                    count_internal_error((port.link.stats.lost for port in self._ports.values()), error)
         finally:
             self._reviewing = False
 

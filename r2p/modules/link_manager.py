@@ -34,7 +34,7 @@ from r2p.protocols.discovery.events import (
 from r2p.runtime.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import Link, is_booting
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 
 logger = get_logger("r2p.module")
 
@@ -242,7 +242,7 @@ class LinkManager:
 
     def _log_change(self, link: Link, level: int, kind: str, text: str) -> None:
         """Clients may come and go by the thousand."""
-        more = self._clients.suffix(kind, self.space.clock.monotonic()) if link.passing else ""
+        more = self._clients.suffix(kind, self.space.clock.monotonic()) if link.transient else ""
         if more is not None:
             logger.log(level, "link %s %s%s", link.title, text, more)
 
@@ -334,5 +334,5 @@ class LinkManager:
             return
         (one, link), (other, _), *_ = heard.items()
         for each in heard.values():
-            each.tell_conflict(name, one, other)
+            each.report_conflict(name, one, other)
         self.discovered(link, NameConflict(name, one, other))

@@ -27,7 +27,7 @@ from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.node import Node
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.link import Link, Transport
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 from r2p.transports.url import open_transport
 
 logger = get_logger("r2p.module")

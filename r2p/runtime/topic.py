@@ -29,9 +29,6 @@ YIELD_EVERY = 16
 
 _NRT = PublisherClass.NON_REAL_TIME
 
-FULL_QUEUE_TURNS = 4
-"""Turns of the event loop that a link waits for a full queue before it goes on without it."""
-
 
 @types.coroutine
 def checkpoint() -> Generator[None, None, None]:

@@ -9,20 +9,23 @@ time. A carrier is attached while it lives; the link stays over reconnects, so i
 import abc
 import asyncio
 import contextlib
+from array import array
+from bisect import bisect_right
 from collections import deque
 from typing import TYPE_CHECKING, ClassVar
 
 from r2p.codecs import debug
-from r2p.codecs.management import FLAG_BOOT
+from r2p.codecs.management import FLAG_BOOT, ROLE_PUBLISHES
 from r2p.errors import MessageError
 from r2p.names import LOADER_PREFIX, MANAGEMENT
+from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.negotiation import GRACE
 from r2p.runtime.backpressure import LINK_DOWN
-from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import PublisherHandle, Topic
-from r2p.transports.link import NOTHING, Hub, Link, is_booting
-from r2p.transports.receiver import PublisherLookup
-from r2p.transports.unconfirmed import UnconfirmedBytes
+from r2p.transports.announcement import NOTHING
+from r2p.transports.buffered_link import BufferedLink
+from r2p.transports.link import Hub, is_booting
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -49,7 +52,7 @@ class Carrier(abc.ABC):
     has none left; in between nothing is given to it, except the last words before `close()`.
     """
 
-    waits: ClassVar[bool] = False
+    flow_controlled: ClassVar[bool] = False
     """Whether the other end waits while nothing is read, and nothing is lost by that."""
 
     @abc.abstractmethod
@@ -97,7 +100,7 @@ class Connection(Carrier):
         await self.ended.wait()
 
 
-class LineLink(Link):
+class LineLink(BufferedLink):
     """A link over the debug line.
 
     `buffer` bytes may wait for the carrier. With `piecemeal` it is given one line at a time: so no more than that waits
@@ -105,7 +108,7 @@ class LineLink(Link):
     """
 
     max_payload: ClassVar[int] = debug.PAYLOAD_MAX
-    lone: ClassVar[bool] = True
+    point_to_point: ClassVar[bool] = True
 
     def __init__(
         self, name: str, hub: Hub, *, management_rate: float = 250.0, buffer: int = BUFFER, piecemeal: bool = False
@@ -125,7 +128,7 @@ class LineLink(Link):
         self._grace: asyncio.TimerHandle | None = None
         self._piecemeal = piecemeal
         self._stamp = 0
-        self._handed = UnconfirmedBytes()
+        self._unconfirmed = UnconfirmedBytes()
         self._given = 0
         self._held: tuple[str, Sample] | None = None
         self._unasked: set[str] = set()
@@ -140,7 +143,7 @@ class LineLink(Link):
         self._carrier = carrier
         self._blocked = False
         self._reader = debug.Reader(self.stats.lost)
-        self._handed = UnconfirmedBytes()
+        self._unconfirmed = UnconfirmedBytes()
         self._given = self.stats.sent
         self._send(OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
@@ -164,7 +167,7 @@ class LineLink(Link):
         except Exception as error:  # noqa: BLE001 - counted and logged; the other lines follow
             self.stats.lost.internal_error(error)
             lines = self._sound_lines(bytes(data))
-        self.take(lines)
+        self.receive(lines)
 
     def _sound_lines(self, data: bytes) -> list[debug.Line]:
         """What there is but for the line whose reading raised: each is read for itself."""
@@ -190,8 +193,8 @@ class LineLink(Link):
 
     # Link
 
-    def _detach(self, name: str) -> None:
-        super()._detach(name)
+    def _remove_subscriber(self, name: str) -> None:
+        super()._remove_subscriber(name)
         self._encoders.pop(name, None)
 
     @property
@@ -242,7 +245,7 @@ class LineLink(Link):
         (self._urgent if urgent else self._management).append(line)
 
     def sample(self, topic: str, arrival: debug.Line) -> Sample:
-        return Sample(arrival.data, self._sources.of(topic), self._stamp, stamped=False)
+        return Sample(arrival.data, self._sources.source_of(topic), self._stamp, stamped=False)
 
     def discard(self) -> int:
         discarded = len(self._samples)
@@ -256,14 +259,14 @@ class LineLink(Link):
         return discarded
 
     @property
-    def waits(self) -> bool:
-        if self._carrier is None or (self.gate is not None and self.gate.has_other_gateways):
+    def flow_controlled(self) -> bool:
+        if self._carrier is None or (self.gateway_hooks is not None and self.gateway_hooks.has_other_gateways):
             return False  # hellos of gateways that come late would part the tree
-        return self._carrier.waits
+        return self._carrier.flow_controlled
 
     @property
-    def private(self) -> bool:
-        return self._carrier is not None and self._carrier.waits
+    def fixed_peer(self) -> bool:
+        return self._carrier is not None and self._carrier.flow_controlled
 
     def pause(self) -> None:
         if self._carrier is not None:
@@ -285,7 +288,7 @@ class LineLink(Link):
     # Firmware drops what comes too soon after a new connection (PROTOCOL.md 4): its subscriptions last, but data wait.
 
     def _begin_grace(self) -> None:
-        if self._outlets.keys() - self._lapsed:
+        if self._subscribers.keys() - self._lapsed:
             self._limit = -1
             self._grace = self._space.loop.call_later(GRACE / _SECOND, self._end_grace)
 
@@ -330,7 +333,7 @@ class LineLink(Link):
 
     def _send(self, data: bytes) -> None:
         if self._carrier is not None:
-            self._handed.note(len(data), self._given)
+            self._unconfirmed.add(len(data), self._given)
             self._given = self.stats.sent - len(self._samples)
             self.stats.bytes_sent += len(data)
             self._carrier.send(data)
@@ -339,7 +342,7 @@ class LineLink(Link):
         """What the connection had taken, and the other end may not have got."""
         if self._carrier is not None and not self._closed:
             held = self._held is not None  # that one is lost
-            unknown = self._handed.within(self._carrier.unconfirmed, self._given) - held
+            unknown = self._unconfirmed.messages_in(self._carrier.unconfirmed, self._given) - held
             if unknown > 0:
                 self.stats.lost["unknown at disconnect"] += unknown
 
@@ -393,17 +396,133 @@ class LineLink(Link):
         name = topic.name
         if self._in_boot_mode(name.removeprefix(LOADER_PREFIX)):
             self._unasked.add(name)
-            if not self._told.get(name, NOTHING).publishes:
-                self._detach(name)
-            elif name not in self._outlets:
-                self._attach(name)
-            self._open(name, 0)
+            if not self._announced.get(name, NOTHING).publishes:
+                self._remove_subscriber(name)
+            elif name not in self._subscribers:
+                self._add_subscriber(name)
+            self._publisher_found(name, 0)
         elif name in self._unasked:
             self._unasked.remove(name)
-            self._detach(name)
-            self._intake.shut_all(name)
+            self._remove_subscriber(name)
+            self.remove_publishers(name)
 
     def _in_boot_mode(self, module: str) -> bool:
         if module == self._space.module:
             return bool(self.discovery.flags & FLAG_BOOT)
         return is_booting(self, module)
+
+
+class PublisherLookup:
+    """The source of what comes in by a line, by topic; looked up anew when discovery has learnt something.
+
+    Lines do not carry it: r2p modules announce which of their nodes publish a topic. A topic that none has announced
+    comes from the only module at the other end, if there is only one.
+    """
+
+    def __init__(self, discovery: DiscoveryProtocol, link: str) -> None:
+        self._discovery = discovery
+        self._link = link
+        self._sources: dict[str, Source] = {}
+        self._generation = -1
+
+    def source_of(self, topic: str) -> Source:
+        """Empty names for what is not known, and for what may be one or another."""
+        if self._generation != self._discovery.generation:
+            self._generation = self._discovery.generation
+            self._sources.clear()
+        source = self._sources.get(topic)
+        if source is None:
+            source = self._sources[topic] = self._find(topic)
+        return source
+
+    def _find(self, topic: str) -> Source:
+        modules = self._discovery.modules.values()
+        names = {info.instance: info.name for info in modules if info.r2p}
+        publishers = {
+            (names.get(each.instance, ""), each.node)
+            for each in self._discovery.endpoints.values()
+            if each.topic == topic and each.role == ROLE_PUBLISHES
+        }
+        candidates = {module for module, _ in publishers} or {info.name for info in modules if not info.observer}
+        module = candidates.pop() if len(candidates) == 1 else ""
+        node = publishers.pop()[1] if len(publishers) == 1 else ""
+        return Source(module, node, self._link)
+
+
+_RECENT = 64
+"""Pieces sent last of which each is known."""
+
+_STEP = 4096
+"""Bytes between two marks before those, for the last 512 kB at least."""
+
+_LONG_STEP = 16 * _STEP
+"""Bytes between two marks before those: 8 MB at least, more than a socket's buffers hold."""
+
+_MARKS = 128
+
+
+class UnconfirmedBytes:
+    """How many messages the last bytes of a connection were: what may be lost when it breaks.
+
+    The longer ago bytes were sent, the fewer of their positions are known, so memory stays small; where the position
+    that is asked for is not known the answer is the count as of the known one before it.
+    """
+
+    def __init__(self) -> None:
+        self._bytes = 0
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
+        self._marks = _Marks()
+        self._next = 0
+        self._old = _Marks()
+        self._next_old = 0
+
+    def add(self, size: int, messages: int) -> None:
+        """Note that `size` bytes are sent now, after `messages` messages."""
+        position = self._bytes
+        self._recent.append((position, messages))
+        if position >= self._next:
+            self._mark(position, messages)
+        self._bytes = position + size
+
+    def _mark(self, position: int, messages: int) -> None:
+        self._next = position + _STEP
+        self._marks.add(position, messages)
+        if position >= self._next_old:
+            self._next_old = position + _LONG_STEP
+            self._old.add(position, messages)
+
+    def messages_in(self, last: int, messages: int) -> int:
+        """How many messages the `last` bytes were, at most; `messages` have been sent by now."""
+        if not last or not self._recent:
+            return 0
+        begin = self._bytes - last
+        for position, before in reversed(self._recent):
+            if position <= begin:
+                return messages - before
+        for marks in (self._marks, self._old):
+            if (found := marks.before(begin)) is not None:
+                return messages - found
+        return messages - self._old.oldest
+
+
+class _Marks:
+    """How many messages had been sent before a byte, at every so many bytes: the last 128 to 256 of them."""
+
+    def __init__(self) -> None:
+        self.positions = array("Q")
+        self._before = array("Q")
+
+    def add(self, position: int, messages: int) -> None:
+        if len(self.positions) == 2 * _MARKS:
+            del self.positions[:_MARKS], self._before[:_MARKS]
+        self.positions.append(position)
+        self._before.append(messages)
+
+    def before(self, position: int) -> int | None:
+        """As of the mark there or just before it; None: that is forgotten."""
+        index = bisect_right(self.positions, position)
+        return self._before[index - 1] if index else None
+
+    @property
+    def oldest(self) -> int:
+        return self._before[0]

@@ -21,7 +21,8 @@ from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.transports.link import Hub, Link, Transport
+from r2p.transports.buffered_link import BufferedLink
+from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url, duration
 
 IN_FLIGHT = 1024
@@ -185,7 +186,7 @@ def network(name: str) -> MemoryNetwork:
     return networks.setdefault(name, MemoryNetwork())
 
 
-class MemoryLink(Link):
+class MemoryLink(BufferedLink):
     """One module's place on a memory network; it can be unplugged, and plugged in again."""
 
     max_payload: ClassVar[int] = 1024
@@ -271,7 +272,7 @@ class MemoryLink(Link):
         self.network.unplug(self._address)
 
     def _receive(self, frame: Datagram) -> None:
-        self.take((frame,))
+        self.receive((frame,))
 
 
 class MemoryTransport(Transport):

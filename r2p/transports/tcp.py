@@ -41,7 +41,7 @@ _DEAD_AFTER = 5  # seconds
 class _TcpConnection(asyncio.BufferedProtocol, Connection):
     """One TCP connection."""
 
-    waits = True
+    flow_controlled = True
 
     def __init__(self) -> None:
         super().__init__()
@@ -299,7 +299,7 @@ class _ServerConnection(_TcpConnection):
 
     def open_link(self, peer: str) -> LineLink:
         link = LineLink(peer, self._hub)
-        link.passing = True
+        link.transient = True
         link.admits_gateways = self._clients.gateways
         self._clients.served.add(self)
         self._hub.attach(link)

@@ -430,18 +430,18 @@ async def test_a_line_with_a_gateway_at_its_other_end_is_read_whoever_has_no_roo
     """Hellos that wait behind messages would part the tree."""
 
     class Line(Script):
-        waits = True
+        flow_controlled = True
 
     line = Line()
     async with r2p.Module("GW", via=[line, "memory:b"], bridge=True):
         await asyncio.sleep(CONVERGED)
-        assert line.link.waits
+        assert line.link.flow_controlled
         for count in range(5):
             line.hear(manage(management.Bridge(7, 0, count, 0, 7, bytes(12))))
             await asyncio.sleep(0.08)
-            assert not line.link.waits
+            assert not line.link.flow_controlled
         await asyncio.sleep(CONVERGED)  # it is gone
-        assert line.link.waits
+        assert line.link.flow_controlled
 
 
 class FirmwareGateway:

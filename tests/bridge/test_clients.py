@@ -21,14 +21,14 @@ pytestmark = pytest.mark.virtual_time
 class Client(Script):
     """The line of a client; its other end is the test."""
 
-    waits = True
+    flow_controlled = True
     admits_gateways = False
 
 
 class Peer(Script):
     """A line that gateways may join by."""
 
-    waits = True
+    flow_controlled = True
 
 
 def state(module: r2p.Module, link: str) -> str:

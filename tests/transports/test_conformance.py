@@ -15,6 +15,7 @@ from r2p.msg import PWM2, Led, Speed3, Text
 from r2p.protocols.discovery.events import Mismatched, ModuleGone, NameConflict
 from r2p.runtime.events import ModuleEvent
 from r2p.testing.network import node_in
+from r2p.transports.line import LineLink
 from tests.transports.cables import Cable, conforms, conforms_lines
 from tests.transports.exchange import EVERY, filled
 
@@ -319,7 +320,7 @@ async def test_a_peer_that_does_not_read(cable: Cable) -> None:
         node_in(b) as bob,
         node_in(c) as carol,
     ):
-        frozen = next(link for link in a.links if not link.name.startswith("memory"))
+        frozen = next(link for link in a.links if isinstance(link, LineLink))
         publisher = alice.advertise("text", Text, r2p.NonRealTime(stall=0.05, on_missed=missed.append))
         bobs = bob.subscribe("text", Text, queue=5)
         carols = carol.subscribe("text", Text, queue=5)

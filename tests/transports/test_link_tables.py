@@ -47,13 +47,14 @@ async def test_a_latched_value_may_overtake_the_answer_that_announces_it() -> No
 
 async def test_what_came_long_before_is_stale() -> None:
     async with Network().module("B") as b, node_in(b) as other:
-        leds, link = other.subscribe("leds", Led), b.links[0]
-        link.take([frame(port, b"leds") for port in (1, 2)])
+        leds = other.subscribe("leds", Led)
+        link: Any = b.links[0]
+        link.receive([frame(port, b"leds") for port in (1, 2)])
         assert link.losses == {"not subscribed": 2}
         await asyncio.sleep(0.9)
-        link._open("leds", 5, 1)
+        link._publisher_found("leds", 5, 1)
         await asyncio.sleep(0.2)
-        link._open("leds", 5, 2)
+        link._publisher_found("leds", 5, 2)
         assert len(leds.queue) == 1
         assert link.losses == {"not subscribed": 1}
 
@@ -61,14 +62,14 @@ async def test_what_came_long_before_is_stale() -> None:
 async def test_what_comes_unasked_is_kept_for_few_senders_and_for_no_other_topic(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("r2p.transports.link._MOST_EARLY", 2)
+    monkeypatch.setattr("r2p.transports.buffered_link._MOST_EARLY", 2)
     net = Network()
     async with net.module("B") as b, node_in(b) as other:
         other.subscribe("leds", Led)
         link: Any = b.links[0]
         for port in range(5):
             for topic in (b"leds", b"other", b"\xff"):
-                link.take([frame(port, topic)])
+                link.receive([frame(port, topic)])
         assert [sender for _, sender in link._early] == [3, 4]
         assert link.losses == {"not subscribed": 15}
         net.disconnect(b)

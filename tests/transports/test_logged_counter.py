@@ -8,7 +8,7 @@ import pytest
 
 import r2p
 from r2p.clock import clock_of
-from r2p.transports.receiver import LinkStats, LoggedCounter
+from r2p.transports.stats import LinkStats, LoggedCounter
 from tests.transports.conversation import Script
 
 pytestmark = pytest.mark.virtual_time

@@ -3,7 +3,7 @@
 from r2p.codecs import management as m
 from r2p.protocols.discovery.session import Discovery
 from r2p.runtime.sample import Source
-from r2p.transports.receiver import PublisherLookup
+from r2p.transports.line import PublisherLookup
 from tests.protocols.discovery.wire import PC2, PEER, S, hear, run
 
 
@@ -15,18 +15,18 @@ def test_a_publisher_that_is_replaced_by_another() -> None:
     discovery = Discovery("PC1", 1)
     discovery.link_up(0)
     sources = PublisherLookup(discovery, "lab")
-    assert sources.of("leds") == Source("", "", "lab")
+    assert sources.source_of("leds") == Source("", "", "lab")
     hear(discovery, S, PC2, publisher("blink"))
-    assert sources.of("leds") == Source("PC2", "blink", "lab")
+    assert sources.source_of("leds") == Source("PC2", "blink", "lab")
     hear(discovery, S, publisher("blink", gone=True), publisher("wink"))
-    assert sources.of("leds") == Source("PC2", "wink", "lab")
+    assert sources.source_of("leds") == Source("PC2", "wink", "lab")
     hear(discovery, S, publisher("blink"))
-    assert sources.of("leds") == Source("PC2", "", "lab"), "one of two"
+    assert sources.source_of("leds") == Source("PC2", "", "lab"), "one of two"
     for now in range(4 * S, 24 * S, 4 * S):
-        assert sources.of("leds") == Source("PC2", "", "lab")
+        assert sources.source_of("leds") == Source("PC2", "", "lab")
         hear(discovery, now, PC2, publisher("blink"))
         run(discovery, now, now + 4 * S)
-    assert sources.of("leds") == Source("PC2", "blink", "lab"), "the other one was not repeated"
+    assert sources.source_of("leds") == Source("PC2", "blink", "lab"), "the other one was not repeated"
 
 
 def test_what_is_only_repeated_is_not_worked_out_again() -> None:
@@ -34,9 +34,9 @@ def test_what_is_only_repeated_is_not_worked_out_again() -> None:
     discovery.link_up(0)
     sources = PublisherLookup(discovery, "lab")
     hear(discovery, S, PC2, publisher("blink"))
-    found = sources.of("leds")
+    found = sources.source_of("leds")
     hear(discovery, 2 * S, PC2, m.Alive("PC2"), publisher("blink"))
-    assert sources.of("leds") is found
+    assert sources.source_of("leds") is found
 
 
 def test_firmware_is_known_where_it_is_alone() -> None:
@@ -44,8 +44,8 @@ def test_firmware_is_known_where_it_is_alone() -> None:
     discovery.link_up(0)
     sources = PublisherLookup(discovery, "lab")
     hear(discovery, S, m.Alive("IMU1"))
-    assert sources.of("leds") == Source("IMU1", "", "lab")
+    assert sources.source_of("leds") == Source("IMU1", "", "lab")
     hear(discovery, S, m.Alive("IMU2"))
-    assert sources.of("leds") == Source("", "", "lab")
+    assert sources.source_of("leds") == Source("", "", "lab")
     discovery.link_down(2 * S)
-    assert sources.of("leds") == Source("", "", "lab")
+    assert sources.source_of("leds") == Source("", "", "lab")

@@ -154,7 +154,7 @@ async def passed_on(session: Session, topic: str) -> None:
 
     What is there may be a gateway of firmware, which passes them on only after a second request (PROTOCOL.md 4).
     """
-    lines = [link for link in session.module.links if link.lone and link.up and not _is_r2p(link)]
+    lines = [link for link in session.module.links if link.point_to_point and link.up and not _is_r2p(link)]
     asked = {link: _requested_at(link, topic) for link in lines}
     end = asyncio.get_running_loop().time() + _SECOND_ROUND
     while any(at is not None and link.up and _requested_at(link, topic) == at for link, at in asked.items()):

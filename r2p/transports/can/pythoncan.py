@@ -22,7 +22,7 @@ from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can.port import CanPortListener, InterfacePort, PortAlarm
 from r2p.transports.can.tx_slots import TxSlots
-from r2p.transports.receiver import TRY_AGAIN
+from r2p.transports.stats import RETRY_AFTER_ERROR
 
 if TYPE_CHECKING:
     import can
@@ -232,7 +232,7 @@ class _PythonCanBus:
             self._mailboxes.poll(now)
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._user.internal_error(error)
-            self._alarm.set(now + TRY_AGAIN)
+            self._alarm.set(now + RETRY_AFTER_ERROR)
         else:
             self._arm()
 

@@ -23,7 +23,7 @@ from r2p.transports.can import netlink as interface
 from r2p.transports.can.port import CanPortListener, InterfacePort, PortAlarm
 from r2p.transports.can.rawsocket import RawSocket
 from r2p.transports.can.tx_slots import TxSlots
-from r2p.transports.receiver import TRY_AGAIN
+from r2p.transports.stats import RETRY_AFTER_ERROR
 
 PRIORITIES = {Mailbox.HRT: 6, Mailbox.SRT: 0, Mailbox.NRT: 2}
 """SO_PRIORITY of each class: the first, second and third band of the queue that CAN interfaces have (pfifo_fast)."""
@@ -247,7 +247,7 @@ class _SocketCanBus:
             self._mailboxes.poll(now)
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._user.internal_error(error)
-            self._alarm.set(now + TRY_AGAIN)
+            self._alarm.set(now + RETRY_AFTER_ERROR)
         else:
             self._arm()
 

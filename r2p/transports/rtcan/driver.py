@@ -16,7 +16,7 @@ from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can.port import CanPort
-from r2p.transports.receiver import TRY_AGAIN
+from r2p.transports.stats import RETRY_AFTER_ERROR
 
 
 class DriverOwner(Protocol):
@@ -136,7 +136,7 @@ class EngineDriver:
         """The engine raised: go on with it, but not at once where a deadline is over that it can't get past."""
         self.internal_error(error)
         deadline = self.engine.next_deadline()
-        self._alarm.set(None if deadline is None else max(deadline, self.now() + TRY_AGAIN))
+        self._alarm.set(None if deadline is None else max(deadline, self.now() + RETRY_AFTER_ERROR))
 
     def _act(self) -> None:
         actions, orders, act = self._actions, self._orders, self._owner.act

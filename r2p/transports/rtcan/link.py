@@ -36,8 +36,9 @@ from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
+from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.can.port import CanPort
-from r2p.transports.link import Hub, Link, unique_name
+from r2p.transports.link import Hub, unique_name
 from r2p.transports.rtcan import rx as origins
 from r2p.transports.rtcan.driver import EngineDriver
 from r2p.transports.rtcan.options import discovery_on, pace
@@ -50,7 +51,7 @@ _MANAGEMENT = MANAGEMENT.encode()
 _LOSSES = ("undecodable", "management dropped")  # of what the engine counts: messages lost that were nobody's
 
 
-class RtcanLink(Link):
+class RtcanLink(BufferedLink):
     """A module's place on an RTCAN bus. `utc_error` (ns): how well the module knows UTC; None: not at all."""
 
     max_payload: ClassVar[int] = rtcan.PAYLOAD_MAX
@@ -71,7 +72,7 @@ class RtcanLink(Link):
         self._translation = UtcEstimator(self.network_time, self._clock.now, lambda: self.engine.epoch)
         self._high_bytes = TopicIdAllocator()
         self._samples = SampleBuilder(name, self.engine, port, discovery, self._translation, self._clock)
-        self._inlets = MessageIdMap(self.engine, self._intake, self._space, self.stats.lost)
+        self._inlets = MessageIdMap(self.engine, self, self._space, self.stats.lost)
         self._periodics = SlottedTopics(self, self._clock, port.now, port.monotonic)
         self._words = LinkStatus(self.engine, port, settings)
         self._handover = TxAccounting(name, self.stats)
@@ -86,7 +87,7 @@ class RtcanLink(Link):
             if topic is _MANAGEMENT and action.message in self._inlets.shutting:
                 self.stats.lost["not subscribed"] += 1
                 return
-            self._intake.take((ReceivedMessage(topic, action.payload, action.message, action),))
+            self.receive((ReceivedMessage(topic, action.payload, action.message, action),))
         elif isinstance(action, Done):
             self._done(action)
         elif isinstance(action, Due):
@@ -153,7 +154,7 @@ class RtcanLink(Link):
     def sender(self, arrival: ReceivedMessage) -> Hashable:
         return arrival.message
 
-    def take_other(self, arrival: Any) -> None:
+    def receive_other(self, arrival: Any) -> None:
         data, message = arrival.data, arrival.message
         source = rtcan.id8_of(message)
         if message == rtcan.FIRMWARE_MANAGEMENT:
@@ -190,18 +191,18 @@ class RtcanLink(Link):
         ):  # only from other links, with topics of any size
             self.stats.lost["impossible message"] += 1
             return
-        self.do(self._departures.send(self._outlets.get(topic), topic, high, sample))
+        self.do(self._departures.send(self._subscribers.get(topic), topic, high, sample))
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         self.do(self._departures.manage(data, urgent=urgent))
 
-    def _attach(self, name: str) -> None:
+    def _add_subscriber(self, name: str) -> None:
         if not self._departures.follows_response(name):
-            super()._attach(name)
+            super()._add_subscriber(name)
 
-    def _detach(self, name: str) -> None:
+    def _remove_subscriber(self, name: str) -> None:
         self._departures.forget(name)
-        super()._detach(name)
+        super()._remove_subscriber(name)
 
     def _done(self, done: Done) -> None:
         handed = done.handle
@@ -214,7 +215,7 @@ class RtcanLink(Link):
         elif isinstance(handed, Response):
             for name in self._departures.answered(handed):
                 if self.up:
-                    super()._attach(name)
+                    super()._add_subscriber(name)
 
     # Topics
 
@@ -234,7 +235,7 @@ class RtcanLink(Link):
         if topic.name in refused and not known:
             text = f"topic {topic.name}: all message ids are taken; it is published as soon as one comes free"
             self._hub.link_notice(self, "no id", text, trouble=True)
-        told = self._told.get(topic.name)
+        told = self._announced.get(topic.name)
         if told is None or not told.publishes:
             self._high_bytes.drop(topic.name)
             self._periodics.follow(topic, None)
@@ -242,7 +243,7 @@ class RtcanLink(Link):
             self._periodics.follow(topic, None if self._words.no_slots else self._high_bytes.pick(topic.name))
 
     def carries(self, topic: str) -> bool:
-        return self.up and topic in self._outlets
+        return self.up and topic in self._subscribers
 
     def _act(self, event: Event) -> None:
         match event:

@@ -11,8 +11,8 @@ from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import EngineSettings, Profile
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub
-from r2p.transports.receiver import LoggedCounter
 from r2p.transports.rtcan.status import HOLDABLE
+from r2p.transports.stats import LoggedCounter
 from r2p.transports.url import duration
 
 _CAPACITY = 1024  # messages in the engine's queue: more than a link lets into it

@@ -13,8 +13,8 @@ from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import LONG_AGO, Mailbox, Profile, Received
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import TopicSpace
+from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.can.port import CanPort
-from r2p.transports.receiver import Intake
 from r2p.transports.rtcan.status import UtcEstimator
 
 _MILLISECOND = 1_000_000
@@ -92,15 +92,15 @@ _SHUTTING = 1_000_000_000
 
 
 class MessageIdMap:
-    """Opens and shuts the ids at the engine and at the intake. `lost` counts what can't be opened."""
+    """Opens and shuts the ids at the engine and at the link. `lost` counts what can't be opened."""
 
-    def __init__(self, engine: Engine, intake: Intake, space: TopicSpace, lost: Counter[str]) -> None:
+    def __init__(self, engine: Engine, link: BufferedLink, space: TopicSpace, lost: Counter[str]) -> None:
         self.topics: dict[int, bytes] = {}
         """Names of topics by message id."""
         self.shutting: dict[int, int] = {}
         """Ids that were shut by their publisher, and until when (monotonic ns) what still comes of them is counted."""
         self._engine = engine
-        self._intake = intake
+        self._link = link
         self._space = space
         self._lost = lost
         self._ids: defaultdict[tuple[str, PeerAddress], set[int]] = defaultdict(set)
@@ -118,7 +118,7 @@ class MessageIdMap:
         self._claim(now, message, name, source)
         self.shutting.pop(message, None)
         self._engine.subscribe(message, size)
-        self._intake.open(topic, size, message)
+        self._link.add_publisher(topic, size, message)
 
     def shut(self, now: int, name: str, source: PeerAddress) -> None:
         """Take no more from this publisher, or from all firmware."""
@@ -158,7 +158,7 @@ class MessageIdMap:
             self._engine.unsubscribe(message)
         for ids in self._ids.values():
             ids.discard(message)
-        self._intake.shut(name, message)
+        self._link.remove_publisher(name, message)
 
 
 # Who is behind a message id on an RTCAN bus, as far as discovery has heard.

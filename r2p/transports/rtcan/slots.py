@@ -19,7 +19,7 @@ from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Degraded, Done, Due, Fate, Granted, Refused
 from r2p.runtime.publishers import PeriodicPublisher
 from r2p.runtime.topic import Topic
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 
 _SECOND = 1_000_000_000
 

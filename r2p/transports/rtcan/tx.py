@@ -12,8 +12,8 @@ from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import PublisherHandle, Topic
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import LinkSubscriber
-from r2p.transports.receiver import LinkStats
 from r2p.transports.rtcan.slots import SlottedTopics
+from r2p.transports.stats import LinkStats
 
 # The samples that an RTCAN engine has, and what becomes of them: one account for each class, so bulk refuses no event.
 

@@ -13,7 +13,7 @@ from r2p.codecs import UnknownType
 from r2p.codecs.attachment import decode_credit
 from r2p.errors import DecodeError
 from r2p.runtime.sample import PublisherClass
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 
 if TYPE_CHECKING:
     import asyncio

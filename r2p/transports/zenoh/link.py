@@ -12,7 +12,7 @@ Keys, all under `r2p/NETWORK/`:
 import functools
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from r2p.codecs import UnknownType, liveliness, schemas
 from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_sender, name_for
@@ -21,10 +21,11 @@ from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
 from r2p.protocols.discovery.events import Declare, Event, QueryTokens, SubscriberJoined, SubscriberLeft, Undeclare
 from r2p.protocols.liveliness.session import TOKENS, LivelinessDiscovery
-from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.sample import PublisherClass, Source
 from r2p.runtime.topic import Topic
-from r2p.transports.link import NOTHING, Hub, Link, unique_name
-from r2p.transports.receiver import LoggedCounter
+from r2p.transports.announcement import NOTHING
+from r2p.transports.link import Hub, Link, unique_name
+from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh.credit import Credits, FinalCredits, Reachability
 from r2p.transports.zenoh.publish import Batcher, PublisherCache, ZenohSubscriber
 from r2p.transports.zenoh.session import ErrorOfZenoh, LoopQueue, SubscriptionReader, ZenohSession
@@ -102,7 +103,6 @@ class ZenohLink(Link):
             credit=self._credit,
             subscribe=self._subscribe,
         )
-        self._intake = self._streams
 
     # For the transport
 
@@ -113,7 +113,7 @@ class ZenohLink(Link):
         session.outbound.failed = self.stats.lost.internal_error
         self.senders.connect(session, f"{prefix}/topic/")
         self._streams.connect()
-        for name, told in self._told.items():
+        for name, told in self._announced.items():
             if told.publishes:
                 self.senders.declare(self._space.topics[name])
         hexed = f"{self.instance:x}"
@@ -137,15 +137,6 @@ class ZenohLink(Link):
         overflown = sum(each.overflown for each in self._funnels)
         return super().losses + Counter({"events overflown": overflown})
 
-    @property
-    def full(self) -> bool:
-        return False
-
-    def write(self, topic: str, sample: Sample) -> None:
-        outlet = self._outlet(topic)
-        if outlet is not None:
-            outlet.force(sample)
-
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         if self._session is not None and self._session.outbound.full and not urgent:
             self.stats.lost["management, send buffer full"] += 1
@@ -153,11 +144,8 @@ class ZenohLink(Link):
             sender = encode_sender(self.instance)
             self._session.put(f"{self.prefix}/control", data, attachment=sender, urgent=urgent)
 
-    def sample(self, topic: str, arrival: Any) -> Sample:
-        raise AssertionError("streams make their samples themselves")
-
     def discard(self) -> int:
-        for outlet in self._outlets.values():
+        for outlet in self._subscribers.values():
             outlet.wait_queue().reject_all("link down")
         return self.burst.discard()
 
@@ -166,7 +154,7 @@ class ZenohLink(Link):
 
     def topic_changed(self, topic: Topic) -> None:
         super().topic_changed(topic)
-        told = self._told.get(topic.name, NOTHING)
+        told = self._announced.get(topic.name, NOTHING)
         if told.publishes:
             self.senders.declare(topic)
         else:
@@ -196,11 +184,19 @@ class ZenohLink(Link):
                 return schemas.encode(topic.layout.cls.__name__, topic.layout.schema)
         return None
 
-    def _open(self, name: str, size: int, sender: Hashable = None) -> None:
-        topic = self._space.topics.get(name)
-        if topic is not None and topic.wanted:
-            self._streams.begin(topic)
-        super()._open(name, size, sender)
+    def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
+        self._streams.begin(topic)
+        self._streams.open(topic, size, source)
+
+    def remove_publisher(self, name: str, source: Hashable) -> None:
+        self._streams.shut(name, source)
+
+    def remove_publishers(self, name: str) -> None:
+        self._streams.shut_all(name)
+
+    def _release_topics(self) -> None:
+        super()._release_topics()
+        self._streams.close()
 
     def close(self) -> None:
         self.burst.flush()
@@ -212,9 +208,9 @@ class ZenohLink(Link):
         self.senders.close()
         self._session = None
 
-    def _detach(self, name: str) -> None:
+    def _remove_subscriber(self, name: str) -> None:
         self.burst.flush()  # before what it is sent with is undeclared
-        super()._detach(name)
+        super()._remove_subscriber(name)
 
     def _act(self, event: Event) -> None:
         match event:
@@ -226,8 +222,6 @@ class ZenohLink(Link):
                     self._session.undeclare(f"{self.prefix}/{liveliness.place(key)}")
             case QueryTokens():
                 self._look()
-            case SubscriberJoined(topic, _, window, int(session)):
-                self._welcome(topic, session, window)
             case SubscriberLeft(topic, int(session), gone):
                 self._part(topic, session, gone=gone)
             case _:
@@ -235,8 +229,9 @@ class ZenohLink(Link):
 
     # Subscribers
 
-    def _welcome(self, name: str, session: int, window: int) -> None:
+    def _subscriber_joined(self, event: SubscriberJoined) -> None:
         """A subscriber is new, or has another window."""
+        name, session, window = event.topic, cast("int", event.source), event.queue
         outlet = self._outlet(name)
         if outlet is not None and outlet.topic is self._space.topics.get(name) and outlet.knows(session):
             outlet.joined(session, window)
@@ -270,7 +265,7 @@ class ZenohLink(Link):
             outlet.resend_latched()
         else:
             self.burst.flush()  # of an outlet before it, with whose numbers it goes on
-            outlet = self._outlets[name] = ZenohSubscriber(self, topic)
+            outlet = self._subscribers[name] = ZenohSubscriber(self, topic)
             outlet.joined(session, window)
             topic.join(outlet)
         if leaving:
@@ -290,17 +285,17 @@ class ZenohLink(Link):
         return topic in self._space.topics
 
     def zenoh_outlets(self) -> Iterator[ZenohSubscriber]:
-        return (each for each in self._outlets.values() if isinstance(each, ZenohSubscriber))
+        return (each for each in self._subscribers.values() if isinstance(each, ZenohSubscriber))
 
     def _outlet(self, name: str) -> ZenohSubscriber | None:
-        outlet = self._outlets.get(name)
+        outlet = self._subscribers.get(name)
         return outlet if isinstance(outlet, ZenohSubscriber) else None
 
     # For outlets and streams
 
     def source_name(self, source: Source) -> str:
         """What the module of a message is called on this network."""
-        return name_for(source.module if self.gate is None else self.gate.source_name(source))
+        return name_for(source.module if self.gateway_hooks is None else self.gateway_hooks.source_name(source))
 
     def instance_of(self, module: str) -> int:
         """The number of a module on any link; 0: firmware, or not known."""

@@ -19,7 +19,7 @@ from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.link import LinkSubscriber
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.threads import MOST, MOST_URGENT
 
 if TYPE_CHECKING:

@@ -20,7 +20,8 @@ from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from r2p.codecs import liveliness
 from r2p.errors import TransportError
-from r2p.transports.receiver import TURN, LoggedCounter
+from r2p.transports.link import MESSAGES_PER_TURN
+from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh import threads
 from r2p.transports.zenoh.config import is_network_name
 from r2p.transports.zenoh.threads import OutboundThread
@@ -74,7 +75,7 @@ class LoopQueue:
     def _empty(self) -> None:
         self._woken = False
         waiting = self._waiting
-        self._lost.drain(waiting, self._take, TURN)
+        self._lost.drain(waiting, self._take, MESSAGES_PER_TURN)
         if waiting and not self._woken:  # a flood; others have their turn in between
             self._woken = True
             self._loop.call_soon(self._empty)

@@ -9,8 +9,8 @@ on without them, is decided by its class, at its side (r2p.protocols.flow_contro
 import asyncio
 import itertools
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING, Protocol
 
 import msgspec
 
@@ -23,8 +23,10 @@ from r2p.protocols.flow_control import ReceiveWindow
 from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import PendingDelivery, Sink
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.runtime.topic import FULL_QUEUE_TURNS, LastReceived, SubscriberQueue, Topic
-from r2p.transports.receiver import TURN, LinkStats
+from r2p.runtime.topic import LastReceived, SubscriberQueue, Topic
+from r2p.transports.link import MESSAGES_PER_TURN
+from r2p.transports.receive_backpressure import FULL_QUEUE_TURNS
+from r2p.transports.stats import LinkStats
 
 if TYPE_CHECKING:
     import zenoh
@@ -160,11 +162,11 @@ class RxStream:
             guard(credit, self.topic.name, session, publisher_class, last, leaving=True)
 
     def arrived(self, arrived: "zenoh.Sample | None") -> None:
-        """In the loop: hand out what is there, about TURN messages in one turn."""
+        """In the loop: hand out what is there, about MESSAGES_PER_TURN messages in a turn."""
         tap = self.tap
         if tap is None:
             return
-        left = TURN
+        left = MESSAGES_PER_TURN
         while arrived is not None and left > 0:
             try:
                 attachment = arrived.attachment
@@ -570,13 +572,7 @@ class RxStreams:
             self.gaps.clear()
         self.gaps[topic, source] = self.gaps.get((topic, source), 0) + gap
 
-    # As Intake
-
-    def take(self, arrivals: Iterable[Any]) -> None:
-        """Each stream takes what comes by itself."""
-
-    def take_first(self, arrival: Any) -> None:
-        """Nothing comes before its stream is open."""
+    # Publishers
 
     def open(self, topic: Topic, size: int, sender: Hashable) -> None:
         """A publisher is there."""

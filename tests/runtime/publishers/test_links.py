@@ -126,7 +126,7 @@ async def test_a_link_that_makes_no_room_in_time_is_lossy_until_it_has(monkeypat
         reasons = ["no room for 1.0 s", *["no room"] * 9]
         assert missed.calls == [r2p.Missed("leds", reason, where="memory:lab") for reason in reasons]
         assert publisher.missed == 10
-        link = a.links[0]
+        link: Any = a.links[0]
         assert link.stats.lost["send buffer full"] == 10
         assert len(link.wait_queue.recoveries) == 1  # it recovers by itself, and nobody else waits
         assert not link.wait_queue.deliveries
@@ -153,7 +153,7 @@ async def test_what_a_link_does_not_get_any_more_is_counted_by_both() -> None:
         events = node.advertise("leds", Led, r2p.Sporadic(deadline=0.5))
         await publisher.wait_subscriber()
         network("lab").delay = 3.0
-        while not module.links[0].full:
+        while not network("lab").full:
             publisher.publish_nowait(led(0))
         for number in range(3):
             with pytest.raises(TimeoutError):
@@ -173,7 +173,7 @@ async def test_events_that_wait_when_a_link_breaks_are_lost_and_counted() -> Non
         await asyncio.gather(event.wait_subscriber(), filler.wait_subscriber())
         await settle(1.0)
         network("lab").delay = 0.5
-        while not a.links[0].full:
+        while not network("lab").full:
             await filler.publish(led(0))
         for number in range(4):
             assert not event.publish_nowait(led(number))
@@ -376,10 +376,10 @@ async def test_a_link_keeps_nothing_of_a_reader_that_left() -> None:
             await publisher.publish(led(number))
             await settle(0.1)
         assert slow.lost == 4
-        intake: Any = b.links[0]._intake
-        assert intake._lossy == {slow._sink}
+        link: Any = b.links[0]
+        assert link._backpressure._lossy == {slow._sink}
         slow.close()
-        assert not intake._lossy
+        assert not link._backpressure._lossy
         await publisher.publish(led(5))
         await settle()
         assert drain(quick) == list(range(6))

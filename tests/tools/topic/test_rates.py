@@ -152,8 +152,8 @@ async def test_delay(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.virtual_time
 async def test_delay_needs_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
     async with tool() as session:
-        link = session.module.links[0]
-        original: Any = link.sample
+        link: Any = session.module.links[0]
+        original = link.sample
 
         def unstamped(*arguments: Any) -> r2p.Sample:
             sample: r2p.Sample = original(*arguments)

@@ -10,7 +10,7 @@ import pytest
 
 import r2p
 from r2p.codecs.attachment import Credit, encode_credit
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.config import ZenohOptions
 from r2p.transports.zenoh.credit import Credits, Reachability
 from r2p.transports.zenoh.link import ZenohLink

@@ -10,7 +10,7 @@ import pytest
 
 from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.sample import Sample, Source
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.publish import PublisherCache, TxStream
 from r2p.transports.zenoh.threads import CROWD, MOST_URGENT, OutboundThread
 from tests.transports.zenoh.test_publish import ORIGIN

@@ -10,7 +10,7 @@ from r2p.codecs import attachment
 from r2p.codecs.attachment import ClockOffset, Origin
 from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.sample import Sample, Source
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.publish import FLOOD, MOST_WAITING, TURNS, Batcher, TxStream
 
 pytestmark = pytest.mark.virtual_time

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from r2p.transports.receiver import TURN, LoggedCounter
+from r2p.transports.link import MESSAGES_PER_TURN
+from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh.session import LoopQueue, SubscriptionReader, ZenohSession
 
 pytestmark = pytest.mark.anyio
@@ -17,16 +18,16 @@ pytestmark = pytest.mark.anyio
 
 async def test_a_flood_lets_others_have_their_turn() -> None:
     taken: list[int] = []
-    funnel = LoopQueue(asyncio.get_running_loop(), taken.append, LoggedCounter(), most=2 * TURN + 1)
-    for number in range(2 * TURN + 3):
+    funnel = LoopQueue(asyncio.get_running_loop(), taken.append, LoggedCounter(), most=2 * MESSAGES_PER_TURN + 1)
+    for number in range(2 * MESSAGES_PER_TURN + 3):
         funnel.put(number)
     assert funnel.overflown == 2
     turns = set()
-    while len(taken) < 2 * TURN + 1:
+    while len(taken) < 2 * MESSAGES_PER_TURN + 1:
         await asyncio.sleep(0)
         turns.add(len(taken))
-    assert taken == list(range(2 * TURN + 1))
-    assert turns >= {TURN, 2 * TURN}
+    assert taken == list(range(2 * MESSAGES_PER_TURN + 1))
+    assert turns >= {MESSAGES_PER_TURN, 2 * MESSAGES_PER_TURN}
     funnel.put(-1)
     await asyncio.sleep(0)
     await asyncio.sleep(0)

@@ -15,7 +15,7 @@ from r2p.msg import Led
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.sample import Sample
 from r2p.runtime.topic import SubscriberQueue, Topic, WakeScheduler
-from r2p.transports.receiver import LinkStats
+from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.subscribe import WINDOW, RxStream, RxStreams
 
 pytestmark = pytest.mark.virtual_time

@@ -2,16 +2,18 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Hashable
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
+from r2p.clock import clock_of
 from r2p.runtime.backpressure import WaitQueue
 from r2p.runtime.sample import Sample, Source
-from r2p.runtime.topic import FULL_QUEUE_TURNS, RemoteSubscriber, Topic, WakeScheduler
-from r2p.transports.receiver import STALL, Arrival, LinkStats, Receiver
+from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace, WakeScheduler
+from r2p.transports.buffered_link import Arrival, BufferedLink
+from r2p.transports.receive_backpressure import FULL_QUEUE_TURNS, LONGEST_STALL
 
 pytestmark = pytest.mark.virtual_time
 
@@ -51,28 +53,30 @@ class Passing(Topic):
         return self._send(sample, None, slot_link)
 
 
-class End:
+class End(BufferedLink):
     """The link where it comes in."""
 
-    def __init__(self, *, waits: bool) -> None:
-        self.waits = waits
+    flow_controlled = False
+    full = False
+
+    def __init__(self, *, flow_controlled: bool) -> None:
+        space = TopicSpace("A", asyncio.get_running_loop(), clock_of())
+        hub: Any = SimpleNamespace(space=space, instance=1, observer=False)
+        super().__init__("line", hub)
+        self.flow_controlled = flow_controlled
         self.reads = True
-        self.stats = LinkStats()
 
     def sample(self, topic: str, arrival: Arrival) -> Sample:
         return Sample(arrival.data, Source(link="line"), 0)
 
-    def sender(self, arrival: Arrival) -> Hashable:
-        return None
-
-    def latched(self, topic: str) -> bool:
-        return False
-
-    def take_other(self, arrival: Arrival) -> None:
+    def receive_other(self, arrival: Arrival) -> None:
         raise AssertionError(arrival)
 
-    def take_unexpected(self, arrival: Arrival) -> None:
-        raise AssertionError(arrival)
+    def write(self, topic: str, sample: Sample) -> None:
+        raise AssertionError(sample)
+
+    def write_management(self, data: bytes, *, urgent: bool = False) -> None:
+        raise AssertionError(data)
 
     def pause(self) -> None:
         self.reads = False
@@ -81,13 +85,12 @@ class End:
         self.reads = True
 
 
-def gateway(*, waits: bool, other: Other | None = None) -> tuple[End, Receiver, Other]:
-    loop = asyncio.get_running_loop()
-    end, other, topic = End(waits=waits), other or Other(), Passing("leds", WakeScheduler(loop))
+def gateway(*, flow_controlled: bool, other: Other | None = None) -> tuple[End, Other]:
+    end, other = End(flow_controlled=flow_controlled), other or Other()
+    topic = Passing("leds", WakeScheduler(asyncio.get_running_loop()))
     topic.join(other)
-    intake = Receiver(end, loop, end.stats)
-    intake.open(topic, 1, None)
-    return end, intake, other
+    end.add_publisher(topic, 1, None)
+    return end, other
 
 
 LINES = [Line(b"leds", bytes((number,))) for number in range(5)]
@@ -95,48 +98,48 @@ ALL = [line.data for line in LINES]
 
 
 async def test_an_end_that_waits_is_made_to_wait_and_nothing_is_lost() -> None:
-    end, intake, other = gateway(waits=True)
-    intake.take(LINES)
-    await asyncio.sleep(STALL / 2)
+    end, other = gateway(flow_controlled=True)
+    end.receive(LINES)
+    await asyncio.sleep(LONGEST_STALL / 2)
     assert (other.taken, end.reads) == ([], False)
     for _ in LINES:
         other.space = 1
         other.refill()
-        await asyncio.sleep(STALL / 2)
+        await asyncio.sleep(LONGEST_STALL / 2)
     assert (other.taken, other.lost, end.reads) == (ALL, 0, True)
 
 
 async def test_a_link_that_hangs_holds_it_up_once() -> None:
-    end, intake, other = gateway(waits=True)
-    intake.take(LINES)
-    await asyncio.sleep(STALL * 1.5)
+    end, other = gateway(flow_controlled=True)
+    end.receive(LINES)
+    await asyncio.sleep(LONGEST_STALL * 1.5)
     assert (other.taken, other.lost, other.waits, end.reads) == ([], len(LINES), False, True)
 
 
 async def test_many_topics_without_room_hold_it_up_hardly_longer_than_one() -> None:
-    end, intake, _ = gateway(waits=True)
+    end, _ = gateway(flow_controlled=True)
     loop = asyncio.get_running_loop()
     others = [Other() for _ in range(8)]
     for number, other in enumerate(others):
         topic = Passing(f"topic{number}", WakeScheduler(loop))
         topic.join(other)
-        intake.open(topic, 1, None)
-    intake.take(Line(f"topic{number}".encode(), b"1") for number in range(len(others)))
-    await asyncio.sleep(STALL * 1.5)
+        end.add_publisher(topic, 1, None)
+    end.receive(Line(f"topic{number}".encode(), b"1") for number in range(len(others)))
+    await asyncio.sleep(LONGEST_STALL * 1.5)
     assert [other.lost for other in others] == [1] * len(others)
     assert end.reads
-    await asyncio.sleep(STALL)
-    intake.take(LINES[:1])
-    await asyncio.sleep(STALL * 0.9)  # it is given its time again
+    await asyncio.sleep(LONGEST_STALL)
+    end.receive(LINES[:1])
+    await asyncio.sleep(LONGEST_STALL * 0.9)  # it is given its time again
     assert not end.reads
 
 
 async def test_a_line_that_is_connected_anew_is_held_up_as_the_old_one_was() -> None:
-    end, intake, other = gateway(waits=True)
-    intake.take(LINES)
-    await asyncio.sleep(STALL / 2)
+    end, other = gateway(flow_controlled=True)
+    end.receive(LINES)
+    await asyncio.sleep(LONGEST_STALL / 2)
     end.reads = True
-    intake.take(LINES)
+    end.receive(LINES)
     assert not end.reads
     other.space = 2 * len(LINES)
     other.refill()
@@ -145,22 +148,22 @@ async def test_a_line_that_is_connected_anew_is_held_up_as_the_old_one_was() -> 
 
 
 async def test_one_that_does_not_wait_loses_soon() -> None:
-    end, intake, other = gateway(waits=False)
-    intake.take(LINES)
+    end, other = gateway(flow_controlled=False)
+    end.receive(LINES)
     for _ in range(2 * FULL_QUEUE_TURNS):
         await asyncio.sleep(0)
     assert (other.taken, other.lost, end.reads) == ([], len(LINES), True)
 
 
 async def test_closed_while_it_waits() -> None:
-    _, intake, other = gateway(waits=True)
-    intake.take(LINES)
-    await asyncio.sleep(STALL / 2)
-    intake.close()
+    end, other = gateway(flow_controlled=True)
+    end.receive(LINES)
+    await asyncio.sleep(LONGEST_STALL / 2)
+    end.close()
     assert not other.wait_queue()
     other.space = len(LINES)
     other.refill()
-    await asyncio.sleep(STALL * 2)
+    await asyncio.sleep(LONGEST_STALL * 2)
     assert (other.taken, other.lost) == ([], 0)
 
 
@@ -188,7 +191,7 @@ class Faulty(Other):
 
 
 @pytest.mark.internal_errors
-@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("flow_controlled", [True, False])
 @pytest.mark.parametrize(
     ("faults", "space", "taken", "errors"),
     [
@@ -198,28 +201,28 @@ class Faulty(Other):
     ],
 )
 async def test_a_message_that_raises_does_not_stop_the_others(
-    faults: list[str], space: int, taken: list[int], errors: int, *, waits: bool
+    faults: list[str], space: int, taken: list[int], errors: int, *, flow_controlled: bool
 ) -> None:
-    end, intake, other = gateway(waits=waits, other=Faulty(*faults))
+    end, other = gateway(flow_controlled=flow_controlled, other=Faulty(*faults))
     other.space = space
-    intake.take(LINES)
-    await asyncio.sleep(10 * STALL)
+    end.receive(LINES)
+    await asyncio.sleep(10 * LONGEST_STALL)
     assert (other.taken, end.reads) == ([LINES[number].data for number in taken], True)
     assert end.stats.lost["internal error"] == errors
     other.space = 1
     other.refill()
-    intake.take(LINES[:1])
-    await asyncio.sleep(10 * STALL)
+    end.receive(LINES[:1])
+    await asyncio.sleep(10 * LONGEST_STALL)
     assert other.taken[-1] == LINES[0].data
 
 
 @pytest.mark.internal_errors
 async def test_a_message_that_raises_while_it_waits_for_room_waits_no_more() -> None:
-    end, intake, other = gateway(waits=True, other=Faulty("offer"))
-    intake.take(LINES[1:])
-    await asyncio.sleep(STALL / 2)
+    end, other = gateway(flow_controlled=True, other=Faulty("offer"))
+    end.receive(LINES[1:])
+    await asyncio.sleep(LONGEST_STALL / 2)
     other.space = 9
     with pytest.raises(RuntimeError):
         other.refill()  # a link guards this, and goes on
-    await asyncio.sleep(STALL)
+    await asyncio.sleep(LONGEST_STALL)
     assert (other.taken, end.reads, other.waiting.deliveries) == (ALL[2:], True, deque())

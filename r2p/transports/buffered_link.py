@@ -1,0 +1,306 @@
+"""A link with one send buffer and one way in for all its topics: the debug line, the memory network and RTCAN.
+
+    publisher  ->  BufferedSubscriber.offer  ->  write     while there is room, else the sample waits in `wait_queue`
+    wire       ->  receive  ->  sample  ->  Topic.deliver  what does not fit is left to `ReceiveBackpressure`
+
+A subclass implements `full`, `write`, `write_management` and `sample`, calls `receive` with what came in, and
+`made_room` when it takes again what it had refused.
+"""
+
+import abc
+from collections import deque
+from collections.abc import Hashable, Iterable
+from typing import Any, ClassVar, Protocol
+
+import msgspec
+
+from r2p.names import MANAGEMENT
+from r2p.protocols.discovery.base import DiscoveryProtocol
+from r2p.protocols.discovery.events import SubscriberJoined
+from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
+from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.topic import SubscriberQueue, Topic
+from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, LinkSubscriber
+from r2p.transports.receive_backpressure import ReceiveBackpressure
+
+_MANAGEMENT = MANAGEMENT.encode()
+_EARLY = 1_000_000_000  # ns by which a message may come before the answer to its subscription
+_MOST_EARLY = 256  # of those
+_NOT_SUBSCRIBED = "not subscribed"
+
+
+class Arrival(Protocol):
+    """What came in: a topic's name as it is on this link, and packed bytes."""
+
+    @property
+    def topic(self) -> bytes: ...
+
+    @property
+    def data(self) -> bytes: ...
+
+
+class _ReceivedTopic(msgspec.Struct):
+    """A topic that is received. `sizes`: bytes of the messages of each publisher, by its address; 0: any.
+
+    The last message is kept for subscribers that come later, as it may be announced after it came that it is latched.
+    """
+
+    topic: Topic
+    sizes: dict[Hashable, int]
+    last: Sample | None = None
+
+
+class BufferedLink(Link):
+    """A link that buffers what it sends, and delivers what it receives in the order in which that came."""
+
+    in_order: ClassVar[bool] = True
+    """Whether what is sent first comes first; else a message may overtake the answer that announces it."""
+
+    def __init__(
+        self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: DiscoveryProtocol | None = None
+    ) -> None:
+        super().__init__(name, hub, management_rate=management_rate, discovery=discovery)
+        self.wait_queue = WaitQueue()
+        """Those who wait for room in the send buffer."""
+        self._received: dict[bytes, _ReceivedTopic] = {}
+        self._arrivals: deque[Any] = deque()
+        self._delivering = False
+        self._paused = False
+        self._backpressure = ReceiveBackpressure(self, self._space.loop)
+        self._early: dict[tuple[bytes, Hashable], tuple[Arrival, int]] = {}
+        """The last message of each publisher that is not announced yet, and when it came (ns)."""
+
+    # For subclasses to implement
+
+    @property
+    @abc.abstractmethod
+    def full(self) -> bool:
+        """Whether the send buffer has no room."""
+
+    @abc.abstractmethod
+    def write(self, topic: str, sample: Sample) -> None:
+        """Put a sample into the send buffer; there is room."""
+
+    @abc.abstractmethod
+    def sample(self, topic: str, arrival: Any) -> Sample:
+        """The sample that came in."""
+
+    def takes(self, sample: Sample) -> bool:
+        """Whether there is room for this very sample now; asked before each `write`."""
+        return not self.full
+
+    def discard(self) -> int:
+        return 0
+
+    def sender(self, arrival: Any) -> Hashable:
+        """The sender's address on a bus; None on a line with one other end."""
+        return None
+
+    @property
+    def flow_controlled(self) -> bool:
+        """Whether the other end waits while nothing is read, and nothing is lost by that."""
+        return False
+
+    def pause(self) -> None:
+        """Stop reading, if possible: what came in is still being delivered."""
+
+    def resume(self) -> None:
+        """Go on reading."""
+
+    # Out
+
+    def made_room(self) -> None:
+        """Call this whenever `takes` may answer differently: samples that wait get the room, in order."""
+        while not self.stats.lost.guard(self.wait_queue.serve):
+            pass  # the one that raised waits no more
+        if not self.full:
+            self.wait_queue.recover()
+
+    def on_down(self, reason: str) -> None:
+        if self.up:
+            self._early.clear()
+            super().on_down(reason)
+            self.wait_queue.reject_all(LINK_DOWN)  # nothing makes room any more
+
+    def _release_topics(self) -> None:
+        self.wait_queue.reject_all("link closed")
+        super()._release_topics()
+        self._arrivals.clear()
+        self._backpressure.close()
+        for name in list(self._received):
+            self.remove_publishers(name.decode())
+
+    def _subscriber_joined(self, event: SubscriberJoined) -> None:
+        self._add_subscriber(event.topic)
+
+    def _add_subscriber(self, name: str) -> None:
+        topic = self._space.topics.get(name)
+        if topic is None:
+            return
+        subscriber = self._subscribers.get(name)
+        if subscriber is None or subscriber.topic is not topic:
+            subscriber = self._subscribers[name] = BufferedSubscriber(self, topic)
+            topic.join(subscriber)
+        else:
+            topic.resend_latched(subscriber)
+
+    # In: which topics, and from whom
+
+    def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
+        key = topic.name.encode()
+        received = self._received.get(key)
+        if received is None:
+            received = self._received[key] = _ReceivedTopic(topic, {})
+            topic.latched_sources.append(self)
+        is_new = source not in received.sizes
+        received.sizes[source] = size
+        if is_new:
+            topic.remote_publishers += 1
+            for queue in topic.queues:
+                queue.publisher_joined()
+
+    def remove_publisher(self, name: str, source: Hashable) -> None:
+        received = self._received.get(name.encode())
+        if received is not None and source in received.sizes:
+            del received.sizes[source]
+            received.topic.remote_publishers -= 1
+            if not received.sizes:
+                self.remove_publishers(name)
+
+    def remove_publishers(self, name: str) -> None:
+        received = self._received.pop(name.encode(), None)
+        if received is not None:
+            received.topic.remote_publishers -= len(received.sizes)
+            received.topic.latched_sources.remove(self)
+
+    def offer_latched(self, topic: Topic, sink: SubscriberQueue) -> None:
+        """Send the last message to a new subscriber, if the publisher latches it."""
+        last = self._received[topic.name.encode()].last
+        if last is not None and self.latched(topic.name):
+            sink.offer_latched(last)
+
+    # In: messages
+
+    def receive(self, arrivals: Iterable[Arrival]) -> None:
+        """Deliver what came in, at most MESSAGES_PER_TURN messages in one turn of the loop."""
+        if self._closed:
+            return
+        self._arrivals.extend(arrivals)
+        if not self._delivering:
+            self._deliver()
+        elif self._paused:
+            self.pause()  # the connection is a new one, which still reads
+
+    def receive_other(self, arrival: Any) -> None:
+        """Handle what is of no topic that is received: management, or something unexpected."""
+        if arrival.topic == _MANAGEMENT:
+            self.manage(arrival.data, self.sender(arrival))
+        else:
+            self._receive_unexpected(arrival)
+
+    def _deliver(self) -> None:
+        self._delivering = True
+        arrivals, received, lost = self._arrivals, self._received, self.stats.lost
+        # All in one loop, as this is done for each message. What nobody subscribes costs one look into a dictionary.
+        for _ in range(MESSAGES_PER_TURN):
+            if not arrivals:
+                self._delivering = False
+                self._resume_reading()
+                return
+            arrival = arrivals.popleft()
+            try:
+                origin = received.get(arrival.topic)
+                if origin is None:
+                    self.receive_other(arrival)
+                    continue
+                size = origin.sizes.get(self.sender(arrival))
+                if size is None:
+                    self._receive_unexpected(arrival)
+                elif size and len(arrival.data) != size:
+                    lost["wrong size"] += 1
+                else:
+                    self.stats.received += 1
+                    origin.last = sample = self.sample(origin.topic.name, arrival)
+                    blocked = origin.topic.deliver(sample)
+                    if blocked is not None and self._backpressure.wait(sample, blocked):
+                        self._pause_reading()
+                        return
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
+                lost.internal_error(error)
+        self._space.loop.call_soon(self._deliver)
+        self._pause_reading()
+
+    def _pause_reading(self) -> None:
+        if not self._paused:
+            self._paused = True
+            self.pause()
+
+    def _resume_reading(self) -> None:
+        if self._paused:
+            self._paused = False
+            self.resume()
+
+    def room_found(self) -> None:
+        """The message that had no room has been delivered, or given up: go on with those behind it."""
+        if not self._closed:
+            self._deliver()
+
+    # In: a message may overtake the answer that announces its publisher, and a latched one would not come again
+
+    def _receive_unexpected(self, arrival: Arrival) -> None:
+        self.stats.lost[_NOT_SUBSCRIBED] += 1
+        topic = None if self.in_order else self._space.topics.get(arrival.topic.decode("ascii", "replace"))
+        if topic is None or not topic.wanted:
+            return
+        key = arrival.topic, self.sender(arrival)
+        self._early.pop(key, None)
+        if len(self._early) >= _MOST_EARLY:
+            del self._early[next(iter(self._early))]
+        self._early[key] = arrival, self._clock.monotonic()
+
+    def _publisher_found(self, name: str, size: int, source: Hashable = None) -> None:
+        super()._publisher_found(name, size, source)
+        if name.encode() in self._received:
+            self._receive_early(name.encode(), source)
+
+    def _receive_early(self, name: bytes, source: Hashable) -> None:
+        arrival, at = self._early.pop((name, source), (None, 0))
+        alone = len(self._space.links) == 1  # else the same message may have come by another link meanwhile
+        if arrival is not None and alone and not self._closed and self._clock.monotonic() - at <= _EARLY:
+            self.stats.lost[_NOT_SUBSCRIBED] -= 1
+            self._arrivals.appendleft(arrival)
+            if not self._delivering:
+                self._deliver()
+
+
+class BufferedSubscriber(LinkSubscriber):
+    """One topic on its way into the send buffer of a link, which it shares with the link's other topics."""
+
+    __slots__ = ("_buffer",)
+
+    def __init__(self, link: BufferedLink, topic: Topic) -> None:
+        super().__init__(link, topic, link.wait_queue)
+        self._buffer = link
+
+    def offer(self, sample: Sample) -> bool:
+        link = self._buffer
+        if not link.up:
+            if sample.publisher_class != PublisherClass.NON_REAL_TIME:
+                return False  # its publisher signals each sample; the others were told when the link went down
+            self.force(sample)
+            return True
+        if not link.takes(sample):
+            return False
+        link.write(self.topic.name, sample)
+        return True
+
+    def force(self, sample: Sample) -> None:
+        link = self._buffer
+        if link.up and not link.full:
+            link.write(self.topic.name, sample)
+        else:
+            self.lost += 1
+            link.stats.lost["send buffer full" if link.up else LINK_DOWN] += 1
+
+    def refill(self) -> None:
+        self._buffer.made_room()
