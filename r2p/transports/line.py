@@ -1,9 +1,12 @@
 """The debug line: one other end that speaks in lines of ASCII (PROTOCOL.md 3), whatever carries the bytes.
 
-The first line that is written in a turn of the event loop goes out at once, the others of that turn in one piece. While
+The first line that is written in a turn of the event loop is sent at once, the others of that turn in one piece. While
 the carrier (TCP connection, serial port) takes no more, lines wait here, where management can overtake samples. Those
-of real-time publishers never do: each goes out at once, before all that wait, or its publisher keeps it and watches the
-time. A carrier is attached while it lives; the link stays over reconnects, so its subscriptions and counters do too.
+of real-time publishers never wait: each is sent at once, before all that wait, or its publisher keeps it and watches
+the time. A carrier is attached while it lives. The link outlasts it, and so do its subscriptions and counters.
+
+`PublisherLookup` finds out who sent what comes in, and `UnconfirmedBytes` how many messages a broken connection may
+have lost.
 """
 
 import abc
@@ -37,19 +40,19 @@ OPENING = b"\r\n\r\n"
 """Ends whatever the reader at the other end has begun to read."""
 
 _MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
-_URGENT_MOST = 96  # urgent messages that wait, whatever else does: another 8 KiB
-_CLOSING = 0.5  # seconds for the other end to take what is still buffered
+_MOST_URGENT = 96  # urgent messages that wait, whatever else does: another 8 KiB
+_CLOSING = 0.5  # seconds for the other end to read what is still buffered
 _SECOND = 1_000_000_000
-_NO_DEADLINE = 0x7FFFFFFF
-_WRAP = 0xFFFFFFFF
+_NO_DEADLINE = 0x7FFFFFFF  # us after the stamp, where there is none: as firmware does it
+_MANAGEMENT = MANAGEMENT.encode()
 _NRT = PublisherClass.NON_REAL_TIME
 
 
 class Carrier(abc.ABC):
     """A connection that carries the bytes of a line link.
 
-    It tells its link `carrier_full()` when it holds bytes that could not be sent at once, `carrier_ready()` when it
-    has none left; in between nothing is given to it, except the last words before `close()`.
+    It calls `carrier_full()` of its link when it holds bytes that could not be sent at once, and `carrier_ready()` when
+    it has none left; in between it is given nothing, except the last lines before `close()`.
     """
 
     flow_controlled: ClassVar[bool] = False
@@ -61,15 +64,15 @@ class Carrier(abc.ABC):
 
     @abc.abstractmethod
     def pause(self) -> None:
-        """Read no more for now."""
+        """Stop reading for now."""
 
     @abc.abstractmethod
     def resume(self) -> None:
-        """Read on."""
+        """Go on reading."""
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Send what is held, as far as the other end takes it, and close."""
+        """Send what is held, as far as the other end reads it, and close."""
 
     @property
     def unconfirmed(self) -> int:
@@ -78,7 +81,7 @@ class Carrier(abc.ABC):
 
 
 class Connection(Carrier):
-    """A carrier that can break. Whoever opened it waits for its end, and closes it in order."""
+    """A carrier that can break. Its transport waits until it has ended, and closes it."""
 
     def __init__(self) -> None:
         self.ended = asyncio.Event()
@@ -89,7 +92,7 @@ class Connection(Carrier):
         """Close at once; does nothing when it is closed."""
 
     async def aclose(self) -> None:
-        """Close, and wait until it is over; what the other end does not take soon is not sent."""
+        """Close, and wait until it has ended; what the other end does not read soon is not sent."""
         self.close()
         try:
             with contextlib.suppress(TimeoutError):
@@ -103,8 +106,8 @@ class Connection(Carrier):
 class LineLink(BufferedLink):
     """A link over the debug line.
 
-    `buffer` bytes may wait for the carrier. With `piecemeal` it is given one line at a time: so no more than that waits
-    behind one that it has not taken entirely.
+    `buffer` bytes may wait for the carrier. With `piecemeal` the carrier is given one line at a time, so that no more
+    than one line is past being overtaken or discarded.
     """
 
     max_payload: ClassVar[int] = debug.PAYLOAD_MAX
@@ -116,24 +119,32 @@ class LineLink(BufferedLink):
         super().__init__(name, hub, management_rate=management_rate)
         self._reader = debug.Reader(self.stats.lost)
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
-        self._sources = PublisherLookup(self.discovery, self.name)
+        self._publishers = PublisherLookup(self.discovery, self.name)
+        self._received_at = 0
+        """When the bytes that are being read came in (UTC, ns)."""
         self._carrier: Carrier | None = None
         self._urgent: deque[bytes] = deque()
         self._management: deque[bytes] = deque()
         self._samples: deque[bytes] = deque()
         self._waiting = 0
+        """Bytes in these three queues."""
         self._corked = False
+        """Whether a line was sent in this turn of the loop, so that others wait for its end."""
         self._blocked = False
+        """Whether the carrier is full."""
         self._limit = self._buffer = buffer
+        """Bytes that may wait; -1 while samples have to wait for the grace period."""
         self._grace: asyncio.TimerHandle | None = None
         self._piecemeal = piecemeal
-        self._stamp = 0
         self._unconfirmed = UnconfirmedBytes()
-        self._given = 0
-        self._held: tuple[str, Sample] | None = None
-        self._unasked: set[str] = set()
+        self._messages_given = 0
+        """Samples that have been given to carriers, as `stats.sent` counts them."""
+        self._unsent: tuple[str, Sample] | None = None
+        """The sample of a real-time publisher that the carrier has not sent entirely, and its topic."""
+        self._loader_topics: set[str] = set()
+        """Those that flow without a handshake now."""
 
-    # Carrier
+    # For the carrier
 
     def connected(self, carrier: Carrier) -> None:
         """Bytes flow from now on."""
@@ -144,7 +155,7 @@ class LineLink(BufferedLink):
         self._blocked = False
         self._reader = debug.Reader(self.stats.lost)
         self._unconfirmed = UnconfirmedBytes()
-        self._given = self.stats.sent
+        self._messages_given = self.stats.sent
         self._send(OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
             self._begin_grace()
@@ -156,21 +167,21 @@ class LineLink(BufferedLink):
         self._carrier = None
         self._end_grace()
         self.on_down(reason)
-        self._lose_held()
+        self._lose_unsent()
 
     def fed(self, data: bytes | memoryview) -> None:
         """Bytes came in."""
         self.stats.bytes_received += len(data)
-        self._stamp = self._clock.now()
+        self._received_at = self._clock.now()
         try:
             lines = self._reader.feed(bytes(data))
         except Exception as error:  # noqa: BLE001 - counted and logged; the other lines follow
             self.stats.lost.internal_error(error)
-            lines = self._sound_lines(bytes(data))
+            lines = self._readable_lines(bytes(data))
         self.receive(lines)
 
-    def _sound_lines(self, data: bytes) -> list[debug.Line]:
-        """What there is but for the line whose reading raised: each is read for itself."""
+    def _readable_lines(self, data: bytes) -> list[debug.Line]:
+        """All lines but the one whose reading raised, each read separately."""
         lines: list[debug.Line] = []
         self._reader.drops = {}  # up to what raised they are counted already
         for piece in data.splitlines(keepends=True):
@@ -182,20 +193,18 @@ class LineLink(BufferedLink):
         return lines
 
     def carrier_full(self) -> None:
+        """The carrier holds bytes that it could not send."""
         self._blocked = True
 
     def carrier_ready(self) -> None:
+        """The carrier has sent all that it held."""
         self._blocked = False
-        self.stats.lost.guard(self._see_held_off)
+        self.stats.lost.guard(self._unsent_is_sent)
         self.made_room()  # before the bytes that wait fill the carrier again
         if not self._corked:
             self._uncork()
 
-    # Link
-
-    def _remove_subscriber(self, name: str) -> None:
-        super()._remove_subscriber(name)
-        self._encoders.pop(name, None)
+    # For `BufferedLink`
 
     @property
     def full(self) -> bool:
@@ -214,7 +223,7 @@ class LineLink(BufferedLink):
         except KeyError:
             encode = self._encoders[topic] = debug.encoder(topic.encode())
         try:
-            line = encode(sample.data, deadline & _WRAP)
+            line = encode(sample.data, deadline)
         except MessageError:  # only from another link, with a topic of any size
             self.stats.lost["impossible message"] += 1
             return
@@ -227,17 +236,17 @@ class LineLink(BufferedLink):
                 self._flush()
             return
         if real_time:
-            self._held = topic, sample  # lost if the carrier breaks by it
+            self._unsent = topic, sample  # before it is sent: it is lost if the carrier breaks by it
         self._send_at_once(line)
         if real_time:
-            self._see_sent()
+            self._realtime_given()
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        if len(self._urgent) >= _URGENT_MOST if urgent else self._waiting >= self._limit + _MANAGEMENT_BUFFER:
+        if len(self._urgent) >= _MOST_URGENT if urgent else self._waiting >= self._limit + _MANAGEMENT_BUFFER:
             self.stats.lost["management, send buffer full"] += 1
             return
         deadline = self._clock.now() // 1000 + _NO_DEADLINE
-        line = debug.encode(MANAGEMENT.encode(), data, deadline & _WRAP)
+        line = debug.encode(_MANAGEMENT, data, deadline)
         if not (self._corked or self._blocked):
             self._send_at_once(line)
             return
@@ -245,17 +254,14 @@ class LineLink(BufferedLink):
         (self._urgent if urgent else self._management).append(line)
 
     def sample(self, topic: str, arrival: debug.Line) -> Sample:
-        return Sample(arrival.data, self._sources.source_of(topic), self._stamp, stamped=False)
+        return Sample(arrival.data, self._publishers.source_of(topic), self._received_at, stamped=False)
 
     def discard(self) -> int:
         discarded = len(self._samples)
         self.stats.sent -= discarded
         if self._urgent:  # other management is repeated
             self.stats.lost["orders not sent"] += len(self._urgent)
-        self._urgent.clear()
-        self._management.clear()
-        self._samples.clear()
-        self._waiting = 0
+        self._clear_buffer()
         return discarded
 
     @property
@@ -278,14 +284,19 @@ class LineLink(BufferedLink):
 
     def close(self) -> None:
         self._end_grace()
-        self._flush(last_words=True)  # the carrier gets all that waits, and after it our good-bye
+        self._flush(closing=True)  # the carrier gets all that waits, and after it the announcement of our end
         super().close()
-        self._flush(last_words=True)
+        self._flush(closing=True)
         carrier, self._carrier = self._carrier, None
         if carrier is not None:
             carrier.close()
 
-    # Firmware drops what comes too soon after a new connection (PROTOCOL.md 4): its subscriptions last, but data wait.
+    def _remove_subscriber(self, name: str) -> None:
+        super()._remove_subscriber(name)
+        self._encoders.pop(name, None)
+
+    # Firmware drops what comes too soon after a new connection (PROTOCOL.md 4). Its subscriptions outlast the old one,
+    # so samples wait for as long.
 
     def _begin_grace(self) -> None:
         if self._subscribers.keys() - self._lapsed:
@@ -299,6 +310,8 @@ class LineLink(BufferedLink):
             self._limit = self._buffer
             if self.up and self._carrier is not None:  # else what waits for room is lost with the connection
                 self.made_room()
+
+    # The send buffer. The fewer pieces the better: each is a system call, which takes longer than all else here.
 
     def _send_at_once(self, line: bytes) -> None:
         if not self._corked:
@@ -315,8 +328,8 @@ class LineLink(BufferedLink):
         if self.wait_queue:
             self.made_room()
 
-    def _flush(self, *, last_words: bool = False) -> None:
-        while self._waiting and (last_words or not self._blocked):
+    def _flush(self, *, closing: bool = False) -> None:
+        while self._waiting and (closing or not self._blocked):
             self._send(self._next_piece())
 
     def _next_piece(self) -> bytes:
@@ -325,55 +338,58 @@ class LineLink(BufferedLink):
             self._waiting -= len(piece)
             return piece
         piece = b"".join([*self._urgent, *self._management, *self._samples])
+        self._clear_buffer()
+        return piece
+
+    def _clear_buffer(self) -> None:
         self._urgent.clear()
         self._management.clear()
         self._samples.clear()
         self._waiting = 0
-        return piece
 
     def _send(self, data: bytes) -> None:
         if self._carrier is not None:
-            self._unconfirmed.add(len(data), self._given)
-            self._given = self.stats.sent - len(self._samples)
+            self._unconfirmed.add(len(data), self._messages_given)
+            self._messages_given = self.stats.sent - len(self._samples)
             self.stats.bytes_sent += len(data)
             self._carrier.send(data)
 
     def _count_unknown(self) -> None:
-        """What the connection had taken, and the other end may not have got."""
+        """Count what the connection had been given, and the other end may not have received."""
         if self._carrier is not None and not self._closed:
-            held = self._held is not None  # that one is lost
-            unknown = self._unconfirmed.messages_in(self._carrier.unconfirmed, self._given) - held
+            lost = self._unsent is not None  # that one certainly is, and is counted as such
+            unknown = self._unconfirmed.messages_in(self._carrier.unconfirmed, self._messages_given) - lost
             if unknown > 0:
                 self.stats.lost["unknown at disconnect"] += unknown
 
-    # The sample of a real-time publisher that the carrier could not send at once: it is on its way when all is sent.
+    # A real-time sample that the carrier could not send at once: it is on its way only when all its bytes are sent.
 
-    def _see_sent(self) -> None:
+    def _realtime_given(self) -> None:
         if not self.up:
-            self._lose_held()
+            self._lose_unsent()
         elif not self._blocked:
-            self._held = None
+            self._unsent = None
 
-    def _see_held_off(self) -> None:
-        held, self._held = self._held, None
-        if held is not None:
-            topic, sample = held
+    def _unsent_is_sent(self) -> None:
+        unsent, self._unsent = self._unsent, None
+        if unsent is not None:
+            topic, sample = unsent
             late = self._clock.now() - sample.deadline
             if sample.deadline and late > 0 and (publisher := self._publisher(topic, sample)) is not None:
                 publisher.link_late(self.name, "sent late", late / _SECOND)
 
-    def _lose_held(self) -> None:
-        held, self._held = self._held, None
-        if held is not None:
+    def _lose_unsent(self) -> None:
+        unsent, self._unsent = self._unsent, None
+        if unsent is not None:
             self.stats.sent -= 1
             self.stats.lost[LINK_DOWN] += 1
-            publisher = self._publisher(*held)
+            publisher = self._publisher(*unsent)
             if publisher is not None:
-                publisher.link_missed(self.name, LINK_DOWN, sequence=held[1].sequence)
+                publisher.link_missed(self.name, LINK_DOWN, sequence=unsent[1].sequence)
 
-    def _publisher(self, topic: str, sample: Sample) -> PublisherHandle | None:
-        where = self._space.topics.get(topic)
-        return None if where is None else where.publisher_of(sample)
+    def _publisher(self, name: str, sample: Sample) -> PublisherHandle | None:
+        topic = self._space.topics.get(name)
+        return None if topic is None else topic.publisher_of(sample)
 
     # The loader's topic flows without a handshake while its module is in boot mode (PROTOCOL.md 5): that of a module at
     # the other end, or our own.
@@ -395,14 +411,14 @@ class LineLink(BufferedLink):
     def _match_loader(self, topic: Topic) -> None:
         name = topic.name
         if self._in_boot_mode(name.removeprefix(LOADER_PREFIX)):
-            self._unasked.add(name)
+            self._loader_topics.add(name)
             if not self._announced.get(name, NOTHING).publishes:
                 self._remove_subscriber(name)
             elif name not in self._subscribers:
                 self._add_subscriber(name)
             self._publisher_found(name, 0)
-        elif name in self._unasked:
-            self._unasked.remove(name)
+        elif name in self._loader_topics:
+            self._loader_topics.remove(name)
             self._remove_subscriber(name)
             self.remove_publishers(name)
 
