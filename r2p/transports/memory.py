@@ -1,4 +1,4 @@
-"""The in-memory network: modules of one process on a bus that loses, delays, doubles and reorders as it is told.
+"""The in-memory network: modules of one process on a bus that loses, delays, duplicates and reorders on request.
 
 All modules that open `memory:NAME` in one event loop share the network NAME; `MemoryNetwork.transport()` joins one
 without a name. What happens to a message is drawn from one seeded generator, so under virtual time a run with the same
@@ -47,20 +47,25 @@ class Datagram(msgspec.Struct, frozen=True, gc=False):
 
 
 class MemoryPort:
-    """One module's socket on a network. A module that is slow to take holds its messages there, still on their way."""
+    """A socket on a network. While its reader has paused it holds what comes: that is still on its way.
 
-    def __init__(self, network: "MemoryNetwork", receive: Callable[[Datagram], None], room: Callable[[], None]) -> None:
+    `made_room` is called when the network is no longer full.
+    """
+
+    def __init__(
+        self, network: "MemoryNetwork", receive: Callable[[Datagram], None], made_room: Callable[[], None]
+    ) -> None:
         self.network = network
         self.receive = receive
-        self.room = room
+        self.made_room = made_room
         self.held: deque[Datagram] = deque()
         self.paused = False
 
     def resume(self) -> None:
-        """Take what was held."""
+        """Hand on what was held."""
         self.paused = False
         while self.held and not self.paused:
-            self.network.landed()
+            self.network.arrived()
             self.receive(self.held.popleft())
 
 
@@ -114,24 +119,24 @@ class MemoryNetwork:
     def unplug(self, address: int) -> None:
         port = self._ports.pop(address, None)
         if port is not None:
-            self.landed(len(port.held))
+            self.arrived(len(port.held))
             port.held.clear()
 
-    def send(self, frame: Datagram) -> None:
+    def send(self, datagram: Datagram) -> None:
         """Send to all other ports."""
         for address in self._ports:
-            if address != frame.port:
-                self._send_to(address, frame)
+            if address != datagram.port:
+                self._send_to(address, datagram)
 
-    def landed(self, count: int = 1) -> None:
+    def arrived(self, count: int = 1) -> None:
         """Messages are not on their way any more."""
         was_full = self.full
         self._in_flight -= count
         if was_full and not self.full:
             for port in list(self._ports.values()):
-                port.room()
+                port.made_room()
 
-    def _send_to(self, address: int, frame: Datagram) -> None:
+    def _send_to(self, address: int, datagram: Datagram) -> None:
         if self._happens(self.loss):
             self.counts["lost"] += 1
             return
@@ -144,7 +149,7 @@ class MemoryNetwork:
             if self._happens(self.reorder):
                 self.counts["reordered"] += 1
                 delay += 2 * (self.delay + self.jitter) + 1e-3
-            self._schedule(delay, address, frame)
+            self._schedule(delay, address, datagram)
 
     def _happens(self, probability: float) -> bool:
         return probability > 0 and self._draw() < probability
@@ -154,25 +159,25 @@ class MemoryNetwork:
             self._random = random.Random(random_of().getrandbits(64) if self.seed is None else self.seed)
         return self._random.random()
 
-    def _schedule(self, delay: float, address: int, frame: Datagram) -> None:
+    def _schedule(self, delay: float, address: int, datagram: Datagram) -> None:
         loop = asyncio.get_running_loop()
         self._in_flight += 1
         if delay:
-            in_background(loop.call_later(delay, self._arrive, address, frame))
+            in_background(loop.call_later(delay, self._arrive, address, datagram))
         else:
-            loop.call_soon(self._arrive, address, frame)
+            loop.call_soon(self._arrive, address, datagram)
 
-    def _arrive(self, address: int, frame: Datagram) -> None:
+    def _arrive(self, address: int, datagram: Datagram) -> None:
         port = self._ports.get(address)
         if port is None:
-            self.landed()
+            self.arrived()
             return
         self.counts["delivered"] += 1
         if port.paused:
-            port.held.append(frame)
+            port.held.append(datagram)
             return
-        self.landed()
-        port.receive(frame)
+        self.arrived()
+        port.receive(datagram)
 
 
 _networks: "weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, MemoryNetwork]]" = (
@@ -200,12 +205,12 @@ class MemoryLink(BufferedLink):
         self._times_left = TimesLeft()
 
     def connect(self) -> None:
-        """Plug in."""
+        """Plug it in."""
         self.network.plug_in(self._address, self._port)
         self.on_up()
 
     def disconnect(self, reason: str = "unplugged") -> None:
-        """Pull the plug."""
+        """Unplug it."""
         self.network.unplug(self._address)
         self.on_down(reason)
 
@@ -216,7 +221,7 @@ class MemoryLink(BufferedLink):
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
         self.stats.bytes_sent += len(sample.data)
-        frame = Datagram(
+        datagram = Datagram(
             self._address,
             topic.encode(),
             sample.data,
@@ -230,7 +235,7 @@ class MemoryLink(BufferedLink):
             sample.hops + bool(sample.source.link),
             sample.clock,
         )
-        self.network.send(frame)
+        self.network.send(datagram)
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         self.network.send(Datagram(self._address, MANAGEMENT.encode(), data))
@@ -252,7 +257,7 @@ class MemoryLink(BufferedLink):
         )
 
     def _expiry(self, arrival: Datagram) -> int:
-        """The deadline by the clock here."""
+        """The deadline by the clock of this computer."""
         publisher = (arrival.port, arrival.module, arrival.node)
         left = self._times_left.of(publisher).left(self._clock.monotonic(), arrival.stamp, arrival.deadline)
         return self._clock.now() + left
@@ -271,8 +276,8 @@ class MemoryLink(BufferedLink):
         super().close()
         self.network.unplug(self._address)
 
-    def _receive(self, frame: Datagram) -> None:
-        self.receive((frame,))
+    def _receive(self, datagram: Datagram) -> None:
+        self.receive((datagram,))
 
 
 class MemoryTransport(Transport):

@@ -1,8 +1,8 @@
-"""The debug line over a serial port: a device that vanishes is awaited.
+"""The debug line over a serial port; where the device vanishes, the transport waits until it is back.
 
 pyserial configures the port; reading and writing go straight to its file descriptor in the event loop. A slow line must
-not hide its queue in the kernel, where nothing can be overtaken or thrown away: that gets IN_KERNEL seconds only. What
-real-time publishers have to say waits with them until then.
+not have its queue in the kernel, where nothing can be overtaken or discarded, so the kernel gets only IN_KERNEL seconds
+of it. What real-time publishers send waits with them until there is room.
 """
 
 import asyncio
@@ -31,15 +31,15 @@ BUFFERED = 0.05
 """Seconds of line time that may wait in the link before publishers wait."""
 
 IN_KERNEL = 0.02
-"""Seconds of line time that may wait in the kernel: so late a sample may be that was taken in time."""
+"""Seconds of line time that may wait in the kernel: a sample that was accepted in time is at most that late."""
 
-_CHUNK = 4096
+_CHUNK = 4096  # bytes read at once
 _BITS_A_BYTE = 10  # 8N1
 _LONGEST_LINE = 576  # bytes
-_SMALLEST_WINDOW = 32  # bytes
-_MANAGEMENT_SHARE = 0.2
+_SMALLEST_WINDOW = 32  # bytes in the kernel: fewer, and a late timer leaves the line idle
+_MANAGEMENT_SHARE = 0.2  # of the line that management gets
 _MANAGEMENT_LINE = 96  # bytes
-_LONGEST_WAIT = 0.5  # seconds between looks for a device that is not there
+_LONGEST_WAIT = 0.5  # seconds between attempts to open a device that is not there
 
 
 class SerialTransport(Transport):
@@ -75,7 +75,7 @@ class SerialTransport(Transport):
             hub.detach(link)
 
     async def _connect(self, link: LineLink, bytes_a_second: float) -> bool:
-        """Use the device until it is gone; False if it can't be had."""
+        """Use the device until it is gone; returns False if it can't be opened."""
         try:
             device = self._open()
         except (OSError, ValueError, termios.error) as error:
@@ -86,7 +86,7 @@ class SerialTransport(Transport):
             port.start()
             await port.ended.wait()
         except asyncio.CancelledError:
-            link.close()  # while there is a device to say good-bye on
+            link.close()  # while there is a device to announce that on
             raise
         finally:
             await port.aclose()
@@ -96,8 +96,8 @@ class SerialTransport(Transport):
         device: serial.Serial = self._serial.Serial(self._device, self._baud, timeout=0, exclusive=True)
         try:
             os.set_blocking(device.fileno(), False)
-            _tell_end_from_silence(device.fileno())
-        except BaseException:  # nobody has it yet who could close it
+            _end_differs_from_silence(device.fileno())
+        except BaseException:  # nothing else knows of it yet that could close it
             device.close()
             raise
         return device
@@ -122,7 +122,7 @@ class _SerialConnection(Connection):
         self._unconfirmed = 0
 
     def start(self) -> None:
-        """Begin to read, and tell the link."""
+        """Begin to read, and connect the link."""
         self.resume()
         self._link.connected(self)
 
@@ -176,7 +176,7 @@ class _SerialConnection(Connection):
 
     def _write(self) -> None:
         """Fill the kernel's queue up to the window; go on when there is room again."""
-        self._wait_no_more()
+        self._stop_waiting()
         try:
             while self._unsent:
                 queued = _queued(self._fd)
@@ -198,7 +198,7 @@ class _SerialConnection(Connection):
             self._full = False
             self._link.carrier_ready()
 
-    def _wait_no_more(self) -> None:
+    def _stop_waiting(self) -> None:
         self._loop.remove_writer(self._fd)
         if self._timer is not None:
             self._timer.cancel()
@@ -209,7 +209,7 @@ class _SerialConnection(Connection):
             return
         self.ended.set()
         self.pause()
-        self._wait_no_more()
+        self._stop_waiting()
         self._unconfirmed = len(self._unsent) + _queued(self._fd)
         self._device.close()
         self._link.disconnected(reason)
@@ -225,19 +225,19 @@ def _pyserial() -> Any:
 def _baud(text: str) -> int:
     baud = int(text)
     if baud <= 0:
-        raise ValueError("bits a second, more than 0")
+        raise ValueError("give bits per second, more than 0")
     return baud
 
 
-def _tell_end_from_silence(fd: int) -> None:
-    """Let a read of nothing say "try again": pyserial sets the port so that it looks like the end."""
+def _end_differs_from_silence(fd: int) -> None:
+    """Let a read of nothing raise EAGAIN: as pyserial sets the port it returns no bytes, as at the end."""
     attributes = termios.tcgetattr(fd)
     attributes[6][termios.VMIN] = 1
     termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
 
 def _queued(fd: int) -> int:
-    """Bytes that the kernel has not sent yet; 0 where the driver does not tell, or its device is gone."""
+    """Bytes that the kernel has not sent yet; 0 where the driver can't say, or its device is gone."""
     try:
         return int.from_bytes(fcntl.ioctl(fd, termios.TIOCOUTQ, bytes(4)), "little")
     except OSError:
@@ -249,7 +249,7 @@ def _reason(error: OSError) -> str:
 
 
 def _explain(device: str, error: Exception) -> str:
-    """Why the device can't be had, and what to do."""
+    """Why the device can't be opened, and what to do."""
     if isinstance(error, OSError) and error.errno == errno.EACCES:
         return f"{device}: permission denied; add yourself to its group: sudo usermod -aG dialout $USER"
     if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):

@@ -1,4 +1,8 @@
-"""The debug line over TCP: a client that comes back, and a server for many clients, each a peer of its own."""
+"""The debug line over TCP: a client that reconnects, and a server for many clients, each on a link of its own.
+
+Lines must not wait where nothing can be overtaken or discarded: asyncio's buffer holds only what the socket did not take
+of the last piece, and the rest waits in the link. A client for which the server has no place is sent that as the reason.
+"""
 
 import abc
 import array
@@ -25,17 +29,17 @@ from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url, yes_or_no
 
 PORT = 2323
-"""Where `tcp-listen:` listens, and `tcp:HOST` connects, unless told otherwise."""
+"""Where `tcp-listen:` listens, and `tcp:HOST` connects, unless the URL says otherwise."""
 
 MAX_CLIENTS = 200
 """Connections that `tcp-listen:` serves at once, unless `max_clients=` says otherwise."""
 
-_REFUSED = 8  # refused clients that are being told why at a time; others are cut off
-_REFUSED_FOR = 0.5  # seconds for a refused client to read it and close
+_MOST_REFUSED = 8  # refused clients that are sent the reason at a time; others are cut off
+_REFUSED_FOR = 0.5  # seconds for a refused client to read the reason and close
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
 _CONNECT_TIMEOUT = 5.0  # seconds
 _STABLE = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
-_DEAD_AFTER = 5  # seconds
+_DEAD_AFTER = 5  # seconds of silence
 
 
 class _TcpConnection(asyncio.BufferedProtocol, Connection):
@@ -53,7 +57,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
 
     @abc.abstractmethod
     def open_link(self, peer: str) -> LineLink:
-        """The link that it carries; the other end is there."""
+        """The link that the connection carries, now that its other end is there."""
 
     # Carrier
 
@@ -88,7 +92,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
         return self._unconfirmed
 
     def forget(self) -> None:
-        """It was given up while it was made: the event loop closes it, and uvloop's never tells its end."""
+        """Count it as ended: it was given up while it was made. The event loop closes it, and uvloop reports no end."""
         self._transport = None
         self.ended.set()
 
@@ -101,7 +105,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
         if self.ended.is_set() or not peer or peer == own:  # given up, gone again, or connected to itself
             self._transport.abort()
             return
-        _find_dead_peers(self._transport.get_extra_info("socket"))
+        _set_options(self._transport.get_extra_info("socket"))
         self.opened(self._transport, f"tcp:{_address(peer[0], peer[1])}")
 
     def opened(self, transport: asyncio.Transport, peer: str) -> None:
@@ -145,9 +149,9 @@ def _unacknowledged(transport: asyncio.Transport) -> int:
     return max(0, answer[0])
 
 
-def _find_dead_peers(sock: socket.socket) -> None:
-    """A peer whose cable is pulled says nothing: let the kernel ask."""
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+def _set_options(sock: socket.socket) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # the link gathers lines itself
+    # Let the kernel probe the peer: one whose cable is pulled sends nothing, not even an end.
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     if sys.platform == "linux":
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
@@ -157,7 +161,7 @@ def _find_dead_peers(sock: socket.socket) -> None:
 
 
 class TcpTransport(Transport):
-    """`tcp:HOST:PORT`: connects, and connects again."""
+    """`tcp:HOST:PORT`: connects, and reconnects."""
 
     def __init__(self, url: Url) -> None:
         url.parsed({})
@@ -182,7 +186,7 @@ class TcpTransport(Transport):
             hub.detach(link)
 
     async def _connect(self, link: LineLink) -> float:
-        """One connection from beginning to end; says how many seconds it lasted."""
+        """Run one connection from beginning to end; returns how many seconds it lasted."""
         loop = asyncio.get_running_loop()
         connection = _ClientConnection(link)
         try:
@@ -199,21 +203,21 @@ class TcpTransport(Transport):
             link.unreachable(_explain(error))
             return 0.0
         except asyncio.CancelledError:
-            link.close()  # while there is a connection to say good-bye on
+            link.close()  # while there is a connection to announce that on
             raise
         finally:
             await connection.aclose()
 
 
 class _ClientConnection(_TcpConnection):
-    """A connection of the client, for a link that was there before it."""
+    """A connection of the client, for a link that outlasts it."""
 
     def __init__(self, link: LineLink) -> None:
         super().__init__()
-        self._given = link
+        self._link = link
 
     def open_link(self, peer: str) -> LineLink:
-        return self._given
+        return self._link
 
 
 class TcpListenTransport(Transport):
@@ -265,9 +269,9 @@ class _Clients:
         self._url = url
 
     def refuse(self, client: "_ServerConnection", transport: asyncio.Transport) -> None:
-        """Tell an r2p client why (PROTOCOL.md 9): when it has read that, it closes."""
+        """Send an r2p client the reason (PROTOCOL.md 9): when it has read that, it closes."""
         self.hub.connection_refused(self._url, f"all {self.most} connections are in use: see max_clients=")
-        if len(self.refused) >= _REFUSED:
+        if len(self.refused) >= _MOST_REFUSED:
             transport.abort()
             return
         self.refused.add(client)
@@ -315,7 +319,7 @@ class _ServerConnection(_TcpConnection):
             self.link = None
 
     async def leave(self) -> None:
-        """The server closes."""
+        """Close it, as the server closes."""
         if self.link is not None:
             self.link.close()
         await self.aclose()
@@ -335,23 +339,23 @@ def _explain(error: Exception) -> str:
 
 
 _HINTS = {
-    errno.ECONNREFUSED: "nobody listens there; is the program running, is the port the right one?",
+    errno.ECONNREFUSED: "nothing listens there; is the program running, is the port the right one?",
     errno.EHOSTUNREACH: "is the computer on, is it on this network?",
     errno.ENETUNREACH: "is this computer on that network?",
-    errno.EADDRINUSE: "another program listens there; end it, or take another port",
+    errno.EADDRINUSE: "another program listens there; end it, or use another port",
     errno.EADDRNOTAVAIL: "this machine does not have that address",
-    errno.EACCES: "ports below 1024 are for root; take another",
+    errno.EACCES: "ports below 1024 are for root; use another",
 }
 
 
 def _client_count(text: str) -> int:
     if not text.isdecimal() or not int(text):
-        raise ValueError("it is a number of connections, 1 or more")
+        raise ValueError("must be a number of connections, 1 or more")
     return int(text)
 
 
 def _address(host: str, port: int) -> str:
-    """As it stands in a URL."""
+    """The address as URLs write it."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -360,7 +364,7 @@ _NAME = re.compile(rb"[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
 
 
 def _host_port(url: Url) -> tuple[str, int]:
-    """The address's host (may be empty) and port."""
+    """The host (may be empty) and the port of an address."""
     if url.address.startswith("//"):
         raise TransportError(f"{url}: leave out the //: {url.scheme}:{url.address.lstrip('/')}")
     if url.address.isdecimal():
@@ -371,7 +375,7 @@ def _host_port(url: Url) -> tuple[str, int]:
         brackets = f"{url.scheme}:[::1]:{PORT}"
         raise TransportError(f"{url}: give it as {url.scheme}:HOST:PORT; an IPv6 address needs brackets: {brackets}")
     if not (port.isascii() and port.isdecimal()) or int(port) > 0xFFFF:
-        raise TransportError(f"{url}: {port!r} is no port: give it as {url.scheme}:HOST:PORT")
+        raise TransportError(f"{url}: {port!r} is not a valid port: give it as {url.scheme}:HOST:PORT")
     return _checked_host(url, host), int(port)
 
 
@@ -387,6 +391,6 @@ def _checked_host(url: Url, host: str) -> str:
         is_name = False
     if not is_name:
         raise TransportError(
-            f"{url}: {host!r} is no host name: between its dots are 1 to 63 letters, digits or hyphens"
+            f"{url}: {host!r} is not a valid host name: between its dots are 1 to 63 letters, digits or hyphens"
         )
     return host

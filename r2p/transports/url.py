@@ -1,4 +1,4 @@
-"""Transport URLs: `SCHEME:ADDRESS`, with options as `?baud=115200&x=1` or `,baud=115200` (a `?` is a shell pattern).
+"""Transport URLs: `SCHEME:ADDRESS`, with options as `?baud=115200&x=1` or `,baud=115200` (shells expand a `?`).
 
 The built-in schemes are a table of import strings, so that a transport's library is loaded only when it is used; other
 packages add theirs through the entry-point group `r2p.transports`.
@@ -35,11 +35,11 @@ GROUP = "r2p.transports"
 
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")
-_CLOSE = 0.65  # how much of a name must be right (difflib): of can and rtcan it is 0.75
+_CLOSE = 0.65  # how alike a name must be to be suggested (difflib): can and rtcan are 0.75
 
 
 class Url(msgspec.Struct, frozen=True):
-    """A transport's URL, taken apart."""
+    """A transport's URL in its parts."""
 
     scheme: str
     address: str
@@ -50,7 +50,7 @@ class Url(msgspec.Struct, frozen=True):
         return f"{self.scheme}:{self.address}" + (f",{options}" if options else "")
 
     def parsed(self, known: dict[str, Callable[[str], T]]) -> dict[str, T]:
-        """Options converted by `known`: name -> converter. Raises TransportError for an unknown or a bad one."""
+        """Convert the options by `known`: name -> converter. Raises TransportError for an unknown or a bad one."""
         values: dict[str, T] = {}
         for name, value in self.options.items():
             if name not in known:
@@ -64,7 +64,7 @@ class Url(msgspec.Struct, frozen=True):
 
 
 def parse(text: str) -> Url:
-    """Take a URL apart. Raises TransportError if it has no scheme or an option without `=`."""
+    """Parse a URL. Raises TransportError if it has no scheme or an option without `=`."""
     scheme, colon, rest = text.partition(":")
     if not colon or not scheme:
         hint = f"did you mean rtcan:{text}?" if _CAN.match(text) else "for example tcp:192.168.0.10:23"
@@ -94,7 +94,7 @@ def open_transport(text: str) -> Transport:
 
 def schemes() -> list[str]:
     """All schemes that can be used, the ones of other packages included."""
-    return sorted({*BUILT_IN, *(entry.name for entry in _added())})
+    return sorted({*BUILT_IN, *(entry.name for entry in _entry_points())})
 
 
 def yes_or_no(text: str) -> bool:
@@ -108,7 +108,7 @@ def _factory(url: Url) -> Callable[[Url], Transport]:
     if url.scheme in BUILT_IN:
         module, _, name = BUILT_IN[url.scheme].partition(":")
         return cast("Callable[[Url], Transport]", getattr(importlib.import_module(module), name))
-    for entry in _added():
+    for entry in _entry_points():
         if entry.name == url.scheme:
             return cast("Callable[[Url], Transport]", entry.load())
     known = schemes()
@@ -119,8 +119,8 @@ def _factory(url: Url) -> Callable[[Url], Transport]:
     raise TransportError(f"unknown transport {url.scheme!r}: use one of {', '.join(known)}{hint}")
 
 
-def _added() -> "EntryPoints":
-    """What other packages add."""
+def _entry_points() -> "EntryPoints":
+    """The transports of other packages."""
     from importlib import metadata  # not at the top: it takes as long as the rest of r2p
 
     return metadata.entry_points(group=GROUP)

@@ -196,7 +196,7 @@ def test_silence_does_not_look_like_the_end(board: Board) -> None:
     board.plug()
     with serial.Serial(str(board.device), timeout=0) as device:
         os.set_blocking(device.fileno(), False)
-        port._tell_end_from_silence(device.fileno())
+        port._end_differs_from_silence(device.fileno())
         with pytest.raises(BlockingIOError):
             os.read(device.fileno(), 1)
 
@@ -239,7 +239,7 @@ async def test_a_device_that_is_no_serial_port(tmp_path: Path) -> None:
     ("url", "text"),
     [
         ("serial:", "give the device, for example serial:/dev/ttyUSB0"),
-        ("serial:/dev/x,baud=0", "baud=0: bits a second, more than 0"),
+        ("serial:/dev/x,baud=0", "baud=0: give bits per second, more than 0"),
         ("serial:/dev/x,baud=fast", "baud=fast"),
         ("serial:/dev/x,speed=9600", "has no option 'speed'; it knows: baud"),
     ],

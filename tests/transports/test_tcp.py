@@ -208,7 +208,7 @@ async def test_why_there_is_no_connection_yet_is_told_once() -> None:
     module = r2p.Module("A", via=f"tcp:127.0.0.1:{port}", watchdog=False)
     events = module.events()
     async with asyncio.timeout(GUARD), module:
-        reason = "Connection refused: nobody listens there; is the program running, is the port the right one?"
+        reason = "Connection refused: nothing listens there; is the program running, is the port the right one?"
         assert await anext(events) == r2p.LinkWaits(f"tcp:127.0.0.1:{port}", reason)
         server = await asyncio.start_server(_ignore, "127.0.0.1", port)
         up = await anext(events)
@@ -445,7 +445,7 @@ def test_an_ipv6_address_without_brackets_is_told_how_it_is_written() -> None:
 
 @pytest.mark.parametrize("count", ["0", "-1", "many", "1.5"])
 def test_a_number_of_clients_that_is_none(count: str) -> None:
-    with pytest.raises(TransportError, match="it is a number of connections, 1 or more"):
+    with pytest.raises(TransportError, match="must be a number of connections, 1 or more"):
         TcpListenTransport(parse(f"tcp-listen:,max_clients={count}"))
 
 
@@ -471,7 +471,7 @@ def test_slashes_are_no_part_of_it(transport: type[TcpTransport] | type[TcpListe
 def test_what_can_not_be_a_host_name_is_said_at_once(
     transport: type[TcpTransport] | type[TcpListenTransport], host: str
 ) -> None:
-    with pytest.raises(TransportError, match="is no host name"):
+    with pytest.raises(TransportError, match="is not a valid host name"):
         transport(parse(f"tcp:{host}:23"))
 
 
