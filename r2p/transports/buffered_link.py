@@ -4,7 +4,7 @@
     wire       ->  receive  ->  sample  ->  Topic.deliver  what does not fit is left to `ReceiveBackpressure`
 
 A subclass implements `full`, `write`, `write_management` and `sample`, calls `receive` with what came in, and
-`made_room` when it takes again what it had refused.
+`made_room` when it accepts again what it had rejected.
 """
 
 import abc
@@ -61,7 +61,7 @@ class BufferedLink(Link):
     ) -> None:
         super().__init__(name, hub, management_rate=management_rate, discovery=discovery)
         self.wait_queue = WaitQueue()
-        """Those who wait for room in the send buffer."""
+        """The samples that wait for room in the send buffer, of all topics."""
         self._received: dict[bytes, _ReceivedTopic] = {}
         self._arrivals: deque[Any] = deque()
         self._delivering = False
@@ -110,9 +110,9 @@ class BufferedLink(Link):
     # Out
 
     def made_room(self) -> None:
-        """Call this whenever `takes` may answer differently: samples that wait get the room, in order."""
+        """Give the room to the samples that wait, in order; to be called whenever `takes` may answer differently."""
         while not self.stats.lost.guard(self.wait_queue.serve):
-            pass  # the one that raised waits no more
+            pass  # the sample that raised waits no more
         if not self.full:
             self.wait_queue.recover()
 
@@ -228,7 +228,7 @@ class BufferedLink(Link):
             except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
                 lost.internal_error(error)
         self._space.loop.call_soon(self._deliver)
-        self._pause_reading()
+        self._pause_reading()  # what comes in meanwhile would only wait here
 
     def _pause_reading(self) -> None:
         if not self._paused:
@@ -286,7 +286,7 @@ class BufferedSubscriber(LinkSubscriber):
         link = self._buffer
         if not link.up:
             if sample.publisher_class != PublisherClass.NON_REAL_TIME:
-                return False  # its publisher signals each sample; the others were told when the link went down
+                return False  # its publisher signals each sample; that of others has signalled the outage
             self.force(sample)
             return True
         if not link.takes(sample):

@@ -160,7 +160,7 @@ class Link(abc.ABC):
         self._hub = hub
         self._space = hub.space
         self._clock = hub.space.clock
-        self._alarm = Alarm(hub.space.loop, self._poll, background=True)
+        self._alarm = Alarm(hub.space.loop, self._poll, background=True)  # announcements keep no program going
         self._subscribers: dict[str, LinkSubscriber] = {}
         """By topic: those at the other end, as publishers here see them."""
         self._announced: dict[str, Announcement] = {}
@@ -183,7 +183,7 @@ class Link(abc.ABC):
         self._unreachable = ""
         self.stats.ups += 1
         self._hub.link_changed(self, "", outage, lost)
-        for name in self._lapsed:
+        for name in self._lapsed:  # before discovery finds out who subscribes now
             self._remove_subscriber(name)
         self._lapsed.clear()
         self._apply(self.discovery.link_up(self._clock.monotonic()))
@@ -204,6 +204,7 @@ class Link(abc.ABC):
         lost = self.discard()  # which may count some itself
         self.stats.lost[LINK_DOWN] += lost
         self._hub.link_changed(self, reason, 0.0, 0)
+        # Before discovery forgets who subscribed, and so which topics the link carried.
         carried = [publisher for each in self._subscribers.values() for publisher in each.topic.publishers]
         self._apply(self.discovery.link_down(self._down_at))
         for publisher in carried:
@@ -213,7 +214,7 @@ class Link(abc.ABC):
         """Announce the end, and release all topics."""
         if self._closed:
             return
-        self._apply(self.discovery.leave(self._clock.monotonic()))
+        self._apply(self.discovery.leave(self._clock.monotonic()))  # while the link can still send that
         self._closed = True
         self.up = False
         self._alarm.close()
@@ -342,7 +343,7 @@ class Link(abc.ABC):
         if self.gateway_hooks is not None:
             desired = self.gateway_hooks.desired_state(topic, desired)
         if len(topic.name) > self.max_name:
-            desired = NOTHING
+            desired = NOTHING  # management messages have no place for longer names
         params = self.params(topic.name) if desired.publishes and not self.refusal(desired.size) else None
         queue = self.window(topic) if desired.subscribes else QUEUE
         desired = msgspec.structs.replace(
@@ -350,6 +351,7 @@ class Link(abc.ABC):
         )
         if desired != known:
             self._apply(announce(self.discovery, now, topic.name, known, desired))
+        # Discovery reports nothing of what this module has withdrawn itself.
         if not desired.publishes:
             self._remove_subscriber(topic.name)
         if not desired.subscribes:
@@ -444,7 +446,7 @@ def is_booting(link: Link, module: str) -> bool:
 
 
 def unique_name(name: str, hub: Hub) -> str:
-    """A name that tells apart links to the same place; all that a link makes refers to it by this one."""
+    """A name that no other link has, though it may lead to the same place; all parts of the link use this one."""
     used = {each.name for each in hub.space.links}
     names = itertools.chain((name,), (f"{name}#{n}" for n in itertools.count(2)))
     return next(each for each in names if each not in used)
@@ -453,6 +455,5 @@ def unique_name(name: str, hub: Hub) -> str:
 def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
     """That of a line or a bus; `rate` is in messages/s."""
     counts = LoggedCounter(link, hub.space.clock)
-    return Discovery(
-        hub.space.module, hub.instance, rate=rate, burst=max(4, int(rate / 4)), observer=hub.observer, counts=counts
-    )
+    burst = max(4, int(rate / 4))  # what a quarter of a second carries
+    return Discovery(hub.space.module, hub.instance, rate=rate, burst=burst, observer=hub.observer, counts=counts)

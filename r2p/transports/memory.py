@@ -148,7 +148,7 @@ class MemoryNetwork:
             delay = self.delay + (self.jitter * self._draw() if self.jitter else 0.0)
             if self._happens(self.reorder):
                 self.counts["reordered"] += 1
-                delay += 2 * (self.delay + self.jitter) + 1e-3
+                delay += 2 * (self.delay + self.jitter) + 1e-3  # longer than any message takes that comes after it
             self._schedule(delay, address, datagram)
 
     def _happens(self, probability: float) -> bool:

@@ -30,7 +30,7 @@ grows with the time that has passed since."""
 
 
 class ReceivingLink(Protocol):
-    """The link whose messages are delivered. While one waits for room the link delivers no other."""
+    """The link whose messages are delivered. While one waits for room, the link delivers no other."""
 
     stats: LinkStats
 
@@ -43,7 +43,7 @@ class ReceivingLink(Protocol):
 
 
 class _PendingArrival(PendingDelivery):
-    """A message that came in, and waits in line with what this module publishes."""
+    """A message that came in, and waits in line with what this module publishes: first come, first served."""
 
     __slots__ = ("over",)
 
@@ -96,6 +96,7 @@ class ReceiveBackpressure:
             self._loop.call_soon(self._look, pending)
             return
         may_stall = self._link.flow_controlled and not self._closed
+        # Only other links stall the line: a slow reader in this module loses messages, and the topics of others go on.
         links: list[Sink] = [sink for sink in pending.remaining if may_stall and isinstance(sink, RemoteSubscriber)]
         for sink in pending.withdraw():
             if sink not in links:
@@ -128,7 +129,7 @@ class ReceiveBackpressure:
     def _give_up(self, pending: _PendingArrival, refusal: str) -> None:
         guard = self._link.stats.lost.guard
         for sink in list(pending.remaining):
-            guard(sink.refill)
+            guard(sink.refill)  # a last attempt
         for sink in list(pending.remaining):
             if not guard(sink.become_lossy, refusal):
                 sink.wait_queue().remove(sink, pending)

@@ -181,6 +181,7 @@ class _SerialConnection(Connection):
             while self._unsent:
                 queued = _queued(self._fd)
                 if queued >= self._window:
+                    # Half of the time that it takes to empty, so that the line never runs dry.
                     self._timer = self._loop.call_later(queued / self._bytes_a_second / 2, self._write)
                     return
                 del self._unsent[: os.write(self._fd, self._unsent[: self._window - queued])]
