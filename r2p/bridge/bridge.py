@@ -156,7 +156,7 @@ class Bridge:
 
     # What comes in
 
-    def heard(self, port: BridgePort, data: bytes) -> bool:
+    def handle_management(self, port: BridgePort, data: bytes) -> bool:
         """A management message; True if discovery need not see it."""
         kind = management.type_of(data)
         if kind in management.GATEWAY_TYPES:

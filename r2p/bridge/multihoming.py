@@ -32,8 +32,8 @@ class StandbyPort:
         """Of what was known of the modules there when it was looked at last."""
         self._standby = standby
 
-    def heard(self, data: bytes) -> bool:
-        return self._standby.heard(self, data)
+    def handle_management(self, data: bytes) -> bool:
+        return self._standby.handle_management(self, data)
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
         return own if self._standby.uses(topic, self) else NOTHING
@@ -113,7 +113,7 @@ class MultihomedModule:
 
     # What comes in
 
-    def heard(self, port: StandbyPort, data: bytes) -> bool:
+    def handle_management(self, port: StandbyPort, data: bytes) -> bool:
         """A management message; True if discovery need not see it."""
         if management.type_of(data) not in _KINDS:
             return False

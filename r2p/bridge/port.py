@@ -23,7 +23,7 @@ class PortOwner(Protocol):
     def gateway(self) -> int:
         """Its number in the tree."""
 
-    def heard(self, port: "BridgePort", data: bytes) -> bool:
+    def handle_management(self, port: "BridgePort", data: bytes) -> bool:
         """A management message; True if discovery need not see it."""
 
     def desired_state(self, port: "BridgePort", topic: Topic, own: Announcement) -> Announcement:
@@ -82,8 +82,8 @@ class BridgePort:
 
     # Gate
 
-    def heard(self, data: bytes) -> bool:
-        return self._owner.heard(self, data)
+    def handle_management(self, data: bytes) -> bool:
+        return self._owner.handle_management(self, data)
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
         return self._owner.desired_state(self, topic, own)

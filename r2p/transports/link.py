@@ -92,8 +92,8 @@ class Hub(Protocol):
 class GatewayHooks(Protocol):
     """What a gateway decides for one of its links, and a module with several links to networks that gateways join."""
 
-    def heard(self, data: bytes) -> bool:
-        """See a management message before discovery does; True if it concerns gateways only."""
+    def handle_management(self, data: bytes) -> bool:
+        """Handle a management message before discovery does; returns True if it concerns gateways only."""
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
         """What the other ends are to know of a topic, with what is wanted for other links."""
@@ -222,7 +222,7 @@ class Link(abc.ABC):
 
     def manage(self, data: bytes, source: Hashable) -> None:
         """Handle a management message from this address."""
-        if self.gateway_hooks is None or not self.gateway_hooks.heard(data):
+        if self.gateway_hooks is None or not self.gateway_hooks.handle_management(data):
             self._apply(self.discovery.receive(self._clock.monotonic(), data, source))
 
     # For the two kinds of links
