@@ -7,6 +7,7 @@ import msgspec
 from r2p.clock import Clock
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import ROLE_PUBLISHES, ManagementType
+from r2p.errors import DecodeError
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress
 from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.rtcan.engine import Engine
@@ -173,13 +174,12 @@ R2P = 256
 def address(data: bytes, modules: dict[str, ModuleInfo]) -> int:
     """Which kind of module sent this management message with the id of firmware. `modules` are those known."""
     kind = management.type_of(data)
-    if kind in management.PARAMS_TYPES:
-        ours = management.is_marked(data)
-    elif kind == ManagementType.ALIVE:
-        known = modules.get(data[:7].rstrip(b"\0").decode("ascii", "replace"))
+    if kind == ManagementType.ALIVE:
+        alive = _decoded(data)
+        known = modules.get(alive.module) if isinstance(alive, management.Alive) else None
         ours = known is not None and known.r2p
     else:
-        ours = kind in management.R2P_TYPES
+        ours = kind in management.R2P_TYPES or management.is_marked(data)
     return R2P if ours else FIRMWARE
 
 
@@ -188,13 +188,23 @@ def publisher_in(data: bytes, source: int) -> tuple[str, int] | None:
 
     Publishers of r2p tell it in all that they offer, those of firmware only when asked.
     """
-    kind, message = management.type_of(data), management.rtcan_message_id(data[20:22])
+    kind = management.type_of(data)
     if kind != ManagementType.SUBSCRIBE_RESPONSE and (kind != ManagementType.ADVERTISE or source == FIRMWARE):
         return None
-    shared = source in (FIRMWARE, R2P)
+    offer = _decoded(data)
+    if not isinstance(offer, management.SubscribeResponse | management.Advertise):
+        return None
+    message, shared = management.rtcan_message_id(offer.params), source in (FIRMWARE, R2P)
     if rtcan.high_byte(message) < rtcan.FIRST_TOPIC or not (shared or rtcan.id8_of(message) == source):
         return None
-    return data[:16].partition(b"\0")[0].decode("ascii", "replace"), message
+    return offer.topic, message
+
+
+def _decoded(data: bytes) -> management.Management | None:
+    try:
+        return management.decode(data)
+    except DecodeError:
+        return None
 
 
 class SenderLookup:
