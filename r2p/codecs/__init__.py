@@ -1,11 +1,16 @@
 """Bytes <-> values: pure functions over frozen structs, without I/O, clocks or state beyond one unfinished message.
 
-Each codec is a pair, `encode` and `decode`. A value that does not fit is the caller's mistake (`MessageError`); bytes
-that are no such message are a `DecodeError`, which whoever reads the wire counts and drops.
+Each codec is a pair, `encode` and `decode`, with the layout in its docstrings. A value that does not fit is a mistake
+of the caller (`MessageError`). Bytes that are not such a message raise `DecodeError`: links count them, and go on.
+
+- `debug`: the lines of the debug transport; `rtcan`: the identifiers and frames of RTCAN.
+- `management`: the messages of the topic `R2P`; `loader`: those of `BOOT_<module>`; both in terms of `_records`.
+- `attachment`, `liveliness`: what accompanies messages on zenoh, and the tokens there.
+- `schemas`: answers to the question for a type; `probes`: how gateways look for loops.
 """
 
 from r2p.errors import DecodeError
 
 
 class UnknownType(DecodeError):
-    """A type byte, or the version of an r2p type, from another time: ignored, as firmware does (PROTOCOL.md 4)."""
+    """A type byte, or the version of an r2p type, that is not known: ignored, as firmware does (PROTOCOL.md 4)."""

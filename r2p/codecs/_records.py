@@ -1,8 +1,8 @@
 """Messages of a fixed size: a packed body, then a type byte, as on the topics `R2P` and `BOOT_<module>`.
 
-One table says it all: for each frozen struct its type byte and, attribute by attribute, the kinds of the `struct`
-module (`x` is a byte without an attribute). A `str` attribute is a name: NUL padded, without a terminator when it fills
-its field.
+One table describes all of them: for each frozen struct its type byte and, attribute by attribute, the formats of the
+`struct` module (`x` is a byte without an attribute). A `str` attribute is a name: padded with NUL, and without a
+terminator when it fills its field.
 """
 
 import struct
@@ -17,10 +17,9 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Record(Generic[T]):
-    """The wire format of one struct, without padding and little-endian: `Record(Alive, 0x11, "7s x B")`.
+    """The wire format of one struct, little-endian and without gaps: `Record(Alive, ManagementType.ALIVE, "7s x B")`.
 
-    `version` is the body's first byte, for types that have one. Attributes in `may_be_empty` are names that may be
-    missing.
+    `version` is the body's first byte, for types that have one. `may_be_empty` lists the names that may be empty.
     """
 
     def __init__(
@@ -43,7 +42,7 @@ class Record(Generic[T]):
         return self.cls(*(self._name(field[0], value) if is_name else value for field, is_name, value in named))
 
     def _packable(self, message: T, name: str, kind: str) -> int | bytes:
-        """The value as `struct` takes it without cutting or filling it in silence."""
+        """The value of an attribute, checked: `struct` itself would cut and pad bytes without an error."""
         value: int | str | bytes = getattr(message, name)
         where = f"{self.cls.__name__}.{name} = {value!r}"
         if isinstance(value, int):
@@ -61,12 +60,12 @@ class Record(Generic[T]):
     def _name(self, name: str, field: bytes) -> str:
         text = field.partition(b"\0")[0].decode("latin-1")
         if not (text or name in self._may_be_empty) or not _is_plain(text):
-            raise DecodeError(f"{self.cls.__name__}.{name}: {text!r} is no name")
+            raise DecodeError(f"{self.cls.__name__}.{name}: {text!r} is not a valid name")
         return text
 
 
 class Codec(Generic[T]):
-    """Encodes and decodes a family of records, told apart by their last byte; each is `size` bytes."""
+    """Encodes and decodes a family of records of `size` bytes each, which differ in their last byte."""
 
     def __init__(self, size: int, *records: Record[T]) -> None:
         self._size = size

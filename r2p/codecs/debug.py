@@ -1,11 +1,11 @@
 r"""The debug transport's lines: `@DDDDDDDD:LLname:PPpayload:CC\r\n` (PROTOCOL.md 3).
 
-The reader takes a line that lies whole and sound in its buffer with one regular expression. Anything else - a line cut
-by the end of a chunk, damage, noise - goes field by field, as firmware reads. Both ways give the same lines, however
-the bytes are cut into chunks.
+The reader matches a line that is complete in its buffer with one regular expression. Anything else - a line cut by the
+end of a chunk, damage, noise - it reads field by field, as firmware does. Both ways give the same lines, however the
+bytes are cut into chunks.
 
-Two things we do otherwise than firmware: a wrong checksum drops the message, and so does a character in a topic name
-that is not printable, so that a line end always ends the damage.
+The reader differs from firmware in two points: it drops a message with a wrong checksum, and one with a character in
+its topic name that is not printable. So a line end always ends the damage.
 """
 
 import re
@@ -29,10 +29,10 @@ _NOISE = re.compile(rb"[^\r\n]+")
 
 
 class Line(msgspec.Struct, frozen=True, gc=False):
-    """One message as it goes over the line.
+    """One message on the line.
 
-    `topic` is 1 to 16 bytes of printable ASCII, `data` 1 to 255 bytes; `deadline`, an unsigned 32-bit number of
-    microseconds, means something to its sender only.
+    `topic` is 1 to 16 bytes of printable ASCII, `data` is 1 to 255 bytes. `deadline` is an unsigned 32-bit number of
+    microseconds, which has a meaning for the sender only.
     """
 
     topic: bytes
@@ -41,15 +41,18 @@ class Line(msgspec.Struct, frozen=True, gc=False):
 
 
 def encode(topic: bytes, data: bytes, deadline: int) -> bytes:
-    """One line, with its end. Raises `MessageError` when the topic or the payload does not fit; the deadline wraps."""
+    """Encode one line, with its end. Raises `MessageError` for a topic or a payload that does not fit.
+
+    The deadline wraps.
+    """
     return encoder(topic)(data, deadline)
 
 
 def encoder(topic: bytes) -> Callable[[bytes, int], bytes]:
-    """`encode` for many messages of one topic: takes payload and deadline."""
+    """Return a function of payload and deadline that encodes many messages of one topic faster than `encode`."""
     if not 1 <= len(topic) <= TOPIC_MAX or topic.strip(_PRINTABLE):
         raise MessageError(f"topic {topic!r}: a line carries 1 to {TOPIC_MAX} printable characters")
-    name = b":%02X%b:" % (len(topic), topic)
+    name = b":%02X%b:" % (len(topic), topic)  # what all messages of the topic share is worked out once
     name_sum = len(topic) + sum(topic)
 
     def encode_message(data: bytes, deadline: int) -> bytes:
@@ -64,36 +67,36 @@ def encoder(topic: bytes) -> Callable[[bytes, int], bytes]:
 
 
 class Reader:
-    """Turns a stream into lines and never fails: what is no message is counted by reason in `drops`.
+    """Turns a stream into lines. It never fails: bytes that are not a message are counted by reason in `drops`.
 
     | reason | what came |
     | --- | --- |
     | garbage | anything between messages but line ends, once for each run up to a line end or an `@` |
     | cut short | a line end inside a message |
     | bad hex, bad separator, bad name | another wrong character in that place |
-    | topic length | no name, or one of over 16 bytes |
+    | topic length | no name, or one of more than 16 bytes |
     | empty payload | a payload length of 0 |
-    | checksum | a sum that is wrong; firmware does not look |
+    | checksum | a wrong sum, which firmware does not check |
 
     What follows a dropped message up to the line end belongs to it, and is not counted again. The reader holds at most
-    one unfinished message, under 600 bytes.
+    one unfinished message, less than 600 bytes.
     """
 
     def __init__(self, drops: dict[str, int] | None = None) -> None:
-        """`drops` to count in, where more than one reader's losses belong together."""
+        """`drops` is the counter to use, where several readers share one."""
         self.drops: dict[str, int] = {} if drops is None else drops
         self._held = b""
         self._counted = False  # the noise that comes next, up to a line end, is already counted
 
     def feed(self, data: bytes) -> list[Line]:
-        """The messages that these bytes complete, in order."""
+        """Return the messages that these bytes complete, in order."""
         buffer = self._held + data
         lines: list[Line] = []
         at = 0
         while at < len(buffer):
             if buffer[at] != _AT:
                 at = self._skip_noise(buffer, at)
-            elif (whole := _WHOLE.match(buffer, at)) and (line := _sound(whole)):
+            elif (whole := _WHOLE.match(buffer, at)) and (line := _checked(whole)):
                 lines.append(line)
                 self._counted = False
                 at = whole.end()
@@ -118,7 +121,7 @@ class Reader:
         return end
 
     def _read(self, buffer: bytes, start: int, lines: list[Line]) -> int:
-        """Read one message field by field and return where to go on: firmware looks on after the wrong character."""
+        """Read one message field by field; returns where to go on: behind the wrong character, as in firmware."""
         fields = _Fields(buffer, start + 1)
         try:
             lines.append(fields.line())
@@ -132,27 +135,29 @@ class Reader:
         self.drops[reason] = self.drops.get(reason, 0) + count
 
 
-def _sound(whole: re.Match[bytes]) -> Line | None:
+def _checked(whole: re.Match[bytes]) -> Line | None:
+    """The line of a match, if its hex digits, lengths and checksum are right."""
     deadline, name_size, topic, payload, checksum = whole.groups()
     try:
         raw = unhexlify(deadline + name_size + payload + checksum)
     except BadHex:
         return None
+    # raw: 4 bytes of deadline, the length of the name, that of the payload, the payload, the checksum
     if raw[4] != len(topic) or raw[5] != len(raw) - 7 or (sum(raw) + sum(topic)) & 0xFF:
         return None
     return Line(topic, raw[6:-1], int.from_bytes(raw[:4], "big"))
 
 
 class _Unfinished(Exception):
-    """Right so far, but the rest is yet to come."""
+    """The message is valid so far, and its rest has yet to come."""
 
 
 class _Wrong(Exception):
-    """No message; says why."""
+    """These bytes are not a message; the argument is the reason."""
 
 
 class _Fields:
-    """A place in the buffer that moves field by field, and past the first wrong character."""
+    """A position in the buffer, which moves field by field, and behind the first wrong character."""
 
     def __init__(self, buffer: bytes, at: int) -> None:
         self.at = at
@@ -164,7 +169,7 @@ class _Fields:
         name_size = self._hex(1)
         if not 1 <= name_size[0] <= TOPIC_MAX:
             raise _Wrong("topic length")
-        topic = self._take(name_size[0], _PRINTABLE, "bad name")
+        topic = self._accept(name_size[0], _PRINTABLE, "bad name")
         self._separator()
         size = self._hex(1)
         if not size[0]:
@@ -176,12 +181,12 @@ class _Fields:
         return Line(topic, data, int.from_bytes(deadline, "big"))
 
     def _separator(self) -> None:
-        self._take(1, b":", "bad separator")
+        self._accept(1, b":", "bad separator")
 
     def _hex(self, size: int) -> bytes:
-        return unhexlify(self._take(2 * size, _HEX, "bad hex"))
+        return unhexlify(self._accept(2 * size, _HEX, "bad hex"))
 
-    def _take(self, count: int, allowed: bytes, otherwise: str) -> bytes:
+    def _accept(self, count: int, allowed: bytes, otherwise: str) -> bytes:
         text = self._buffer[self.at : self.at + count]
         if wrong := text.lstrip(allowed):
             self.at += len(text) - len(wrong) + 1

@@ -1,7 +1,7 @@
 """The messages of a module's loader, topic `BOOT_<module>`: a 30-byte body and a type byte (PROTOCOL.md 5).
 
-Unsigned 32-bit addresses and lengths are in the module's memory and in bytes. Fields of raw bytes have their full size
-in both directions: what is not used of them is for the session to know.
+Addresses are in the module's memory, lengths in bytes; both are unsigned 32-bit numbers. Fields of raw bytes have their
+full size in both directions: how much of them is used depends on the messages before.
 """
 
 import msgspec
@@ -9,6 +9,7 @@ import msgspec
 from r2p.codecs._records import Codec, Record
 
 SIZE = 31
+"""Bytes of a message."""
 
 # Nack.reason
 REASON_UNKNOWN = 0
@@ -31,7 +32,7 @@ CHUNK = 16  # bytes of an IhexRecord or a ParamChunk
 
 
 class Nack(msgspec.Struct, frozen=True, gc=False):
-    """No. `line` is the refusing line of the firmware's source: the only field that firmware fills."""
+    """Refuse. `line` is the line of the firmware's source that refused: the only field that firmware fills."""
 
     line: int = 0
     reason: int = REASON_UNKNOWN
@@ -40,19 +41,19 @@ class Nack(msgspec.Struct, frozen=True, gc=False):
 
 
 class Ack(msgspec.Struct, frozen=True, gc=False):
-    """Yes; the next one, please."""
+    """Accept, and ask for the next message."""
 
 
 class BeginLoader(msgspec.Struct, frozen=True, gc=False):
-    """Opens a session that loads or removes."""
+    """Open a session that loads or removes apps."""
 
 
 class EndLoader(msgspec.Struct, frozen=True, gc=False):
-    """Closes it."""
+    """Close the session."""
 
 
 class LinkingSetup(msgspec.Struct, frozen=True, gc=False):
-    """What an app needs: the lengths of its sections and stack, its name (8), FLAG_ENABLED."""
+    """The lengths of an app's sections and stack, its name (8 characters), and FLAG_ENABLED or 0."""
 
     pgmlen: int
     bsslen: int
@@ -63,7 +64,7 @@ class LinkingSetup(msgspec.Struct, frozen=True, gc=False):
 
 
 class LinkingAddresses(msgspec.Struct, frozen=True, gc=False):
-    """Where the module wants an app linked to."""
+    """The addresses that an app is to be linked to."""
 
     infoadr: int
     pgmadr: int
@@ -74,7 +75,7 @@ class LinkingAddresses(msgspec.Struct, frozen=True, gc=False):
 
 
 class LinkingOutcome(msgspec.Struct, frozen=True, gc=False):
-    """What the linker made of it."""
+    """The addresses and lengths that came out of linking."""
 
     mainadr: int
     cfgadr: int
@@ -88,7 +89,7 @@ class LinkingOutcome(msgspec.Struct, frozen=True, gc=False):
 class IhexRecord(msgspec.Struct, frozen=True, gc=False):
     """One record of an Intel hex file: `kind` is its record type, `checksum` its own, `data` 16 bytes.
 
-    The record's bytes are the first `count` of `data`; a lying peer may say more than 16.
+    The record's bytes are the first `count` of `data`; a faulty peer may say more than 16.
     """
 
     count: int
@@ -99,23 +100,23 @@ class IhexRecord(msgspec.Struct, frozen=True, gc=False):
 
 
 class RemoveLast(msgspec.Struct, frozen=True, gc=False):
-    """Removes the app that was loaded last."""
+    """Remove the app that was loaded last."""
 
 
 class RemoveAll(msgspec.Struct, frozen=True, gc=False):
-    """Removes all apps."""
+    """Remove all apps."""
 
 
 class BeginAppinfo(msgspec.Struct, frozen=True, gc=False):
-    """Opens a listing."""
+    """Open a listing of the apps."""
 
 
 class EndAppinfo(msgspec.Struct, frozen=True, gc=False):
-    """Closes it."""
+    """Close the listing."""
 
 
 class AppinfoSummary(msgspec.Struct, frozen=True, gc=False):
-    """How many apps are installed, and the bounds of the memory for apps."""
+    """The number of installed apps, and the bounds of the memory for apps."""
 
     numapps: int
     freeadr: int
@@ -126,23 +127,23 @@ class AppinfoSummary(msgspec.Struct, frozen=True, gc=False):
 
 
 class BeginSetparam(msgspec.Struct, frozen=True, gc=False):
-    """Opens the setting of a parameter."""
+    """Open the setting of a parameter."""
 
 
 class EndSetparam(msgspec.Struct, frozen=True, gc=False):
-    """Closes it."""
+    """Close the setting."""
 
 
 class BeginGetparam(msgspec.Struct, frozen=True, gc=False):
-    """Opens the reading of a parameter."""
+    """Open the reading of a parameter."""
 
 
 class EndGetparam(msgspec.Struct, frozen=True, gc=False):
-    """Closes it."""
+    """Close the reading."""
 
 
 class ParamRequest(msgspec.Struct, frozen=True, gc=False):
-    """Which parameter: `length` bytes at `offset` of the configuration of this app, or FLAGS_WORD."""
+    """Select a parameter: `length` bytes at `offset` in the configuration of an app, or its flags (FLAGS_WORD)."""
 
     offset: int
     appname: str
@@ -202,10 +203,10 @@ _CODEC = Codec[Loader](
 
 
 def encode(message: Loader) -> bytes:
-    """The 31 bytes of a message. Raises `MessageError`, which names the field, when a value does not fit."""
+    """Encode a message to 31 bytes. Raises `MessageError`, which names the field, for a value that does not fit."""
     return _CODEC.encode(message)
 
 
 def decode(data: bytes) -> Loader:
-    """The message in these 31 bytes. Raises `UnknownType` for a type to ignore, else `DecodeError`."""
+    """Decode 31 bytes. Raises `UnknownType` for a type to ignore, else `DecodeError`."""
     return _CODEC.decode(data)

@@ -1,8 +1,10 @@
 """The messages of the management topic `R2P`: a 31-byte body and a type byte (PROTOCOL.md 4 and 9).
 
-What firmware leaves open is read with tolerance: what stands behind a name's NUL, reserved and unused bytes mean
-nothing, and STOP, REBOOT and BOOTLOAD, of which a tool of 2013 has a layout of its own, are read for their name only.
-Types from 0x40 are r2p's own; their body begins with a version. Those up to 0x4F stay on an RTCAN bus, among the
+Modules find each other and agree on what flows with these messages. Where firmware leaves something open, `decode` is
+tolerant: it ignores what stands behind the NUL of a name and reserved bytes, and of STOP, REBOOT and BOOTLOAD, of which
+a tool of 2013 has a layout of its own, it reads the name only.
+
+Types from 0x40 on are r2p's own. Their body begins with a version. Those up to 0x4F stay on one RTCAN bus, among the
 modules that are directly on it. After the version, without gaps (`slot` and `utc_offset` in ns, `utc_error` in us):
 
 | type | name | body |
@@ -16,7 +18,7 @@ modules that are directly on it. After the version, without gaps (`slot` and `ut
 | 0x46 | RENEW | `u8 serial; u8 highs[24]` (of the messages, 0: none) |
 | 0x47 | RENEWED | `u8 id8; u8 serial; u16 lease_ms; u8 highs[24]` |
 
-Gateways agree on their tree (`r2p.protocols.bridge`) with three more, which stay on their network as well:
+Gateways agree on their tree (`r2p.protocols.bridge`) with three more types, which stay on their network as well:
 
 | type | name | body |
 | --- | --- | --- |
@@ -33,12 +35,14 @@ import msgspec
 from r2p.codecs import UnknownType
 from r2p.codecs._records import Codec, Record
 from r2p.errors import MessageError
+from r2p.names import module_alias
 
 SIZE = 32
+"""Bytes of a message."""
 
 
 class ManagementType(enum.IntEnum):
-    """The type bytes, each the last byte of its message. No other module writes these numbers."""
+    """The type byte of each message, which is its last one."""
 
     ALIVE = 0x11
     STOP = 0x12
@@ -71,7 +75,7 @@ class ManagementType(enum.IntEnum):
 R2P_TYPES = range(0x40, 0x100)
 """The types that firmware does not know."""
 RTCAN_TYPES = range(0x40, 0x50)
-"""The types that concern one RTCAN bus, and that no gateway passes on."""
+"""The types that concern one RTCAN bus, and that gateways don't pass on."""
 PARAMS_TYPES = (ManagementType.ADVERTISE, ManagementType.SUBSCRIBE_REQUEST, ManagementType.SUBSCRIBE_RESPONSE)
 """The types that have `params`."""
 ORDER_TYPES = (ManagementType.STOP, ManagementType.REBOOT, ManagementType.BOOTLOAD)
@@ -85,14 +89,14 @@ FLAG_REBOOTED = 2
 FLAG_BOOT = 4
 
 # Hello.flags
-HELLO_QUERY = 1  # I am new here: repeat yourself
+HELLO_QUERY = 1  # asks all modules to repeat what they have: this one is new
 HELLO_TOOL = 2  # an observer, which sends no ALIVE
 HELLO_LEAVING = 4
 
 # TypeInfo.role and Endpoint.role
 ROLE_PUBLISHES = 1
 ROLE_SUBSCRIBES = 2
-ROLE_GONE = 128  # added to an Endpoint's role: withdrawn
+ROLE_GONE = 128  # added to an Endpoint's role: it has ended
 _ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
 
 # Endpoint.publisher_class
@@ -104,70 +108,73 @@ CLASS_LATCHES = 128  # added to the others: new subscribers get its last message
 
 NO_PARAMS = bytes(10)
 UNANSWERED = bytes(9) + b"\1"
-"""Params of a SUBSCRIBE_REQUEST between r2p modules: no SUBSCRIBE_RESPONSE has been heard yet."""
+"""Params of an r2p module's SUBSCRIBE_REQUEST while it has not received a SUBSCRIBE_RESPONSE."""
 ANSWERED = bytes(9) + b"\2"
-"""The same, after a SUBSCRIBE_RESPONSE: so a publisher knows an r2p module whose HELLO it has not heard yet."""
+"""The same, after a SUBSCRIBE_RESPONSE: so a publisher recognises an r2p module before its first HELLO."""
 ANY_TYPE = bytes(8)
 """The fingerprint that fits every type."""
 
 QUEUE = 5
-"""Entries of a SUBSCRIBE_REQUEST's queue unless something speaks for another number."""
+"""Entries of a SUBSCRIBE_REQUEST's queue by default."""
 QUEUE_MOST = 16
+"""Entries of such a queue at most."""
 QUEUE_BYTES = 1024
-"""Firmware has 20 kB of RAM in all and takes a queue from its heap; where there is no room left it writes to NULL."""
+"""Bytes of such a queue at most. Firmware has 20 kB of RAM and takes the queue from its heap; where there is no room
+left it writes to NULL."""
 QUEUE_ENTRY = 8
 """Bytes that firmware needs for an entry besides its message."""
 
 # Denied.reason
-DENIED_CONTROL = 1  # the gateway takes it from nobody on this link
-DENIED_READ_ONLY = 2  # nothing goes onto the link of the module
+DENIED_CONTROL = 1  # the gateway accepts no orders from this link
+DENIED_READ_ONLY = 2  # the gateway sends nothing on the link of the module
 DENIED_CLIENTS = 3  # the server of a debug line serves as many clients as it may: `order` is 0
-DENIED_GATEWAYS = 5  # no gateway may join by this line: `order` is 0
 DENIED_BOOT = 4  # STOP would hang a module in boot mode
+DENIED_GATEWAYS = 5  # the server of a debug line accepts no gateway: `order` is 0
 
 # Claim.flags
 CLAIM_FIXED = 1  # the module can't take another id8
-CLAIM_ELECTING = 2  # it knows no master
+CLAIM_ELECTING = 2  # the module knows no master
 
-NO_PHASE = 0xFFFFFFFF  # Reserve.phase: any
-RESERVE_ROUND_DOWN = 1  # Reserve.flags: or the longest possible period below it
+NO_PHASE = 0xFFFFFFFF  # Reserve.phase: any will do
+RESERVE_ROUND_DOWN = 1  # Reserve.flags: a shorter period will do, the longest possible one
 RENEW_MAX = 24  # high bytes in a Renew
-NO_UTC = 0xFFFF  # Network.utc_error: the offset is not known
+NO_UTC = 0xFFFF  # Network.utc_error: the offset is unknown
 
 _VERSION = 1
+_PIECE = 22  # characters of Name.piece
 _MARK = b"r2p"
 _MARKED = slice(22, 25)  # of an encoded message: in its params, behind RTCAN's message id
 
 
 class Alive(msgspec.Struct, frozen=True, gc=False):
-    """A module is there; `flags` are FLAG_..."""
+    """A module lives; `flags` are FLAG_..."""
 
     module: str
     flags: int = 0
 
 
 class Stop(msgspec.Struct, frozen=True, gc=False):
-    """The nodes of this module end."""
+    """Order a module to stop: its nodes end."""
 
     module: str
 
 
 class Reboot(msgspec.Struct, frozen=True, gc=False):
-    """This module restarts."""
+    """Order a module to restart."""
 
     module: str
 
 
 class Bootload(msgspec.Struct, frozen=True, gc=False):
-    """This module restarts into its loader."""
+    """Order a module to restart into its loader."""
 
     module: str
 
 
 class Advertise(msgspec.Struct, frozen=True, gc=False):
-    """A publisher appeared or is still there. `size` is the payload's, in bytes; `queue` means nothing here.
+    """A topic has a publisher. `size` is the payload's, in bytes; `queue` means nothing here.
 
-    `params` belong to the transport the message travels on: on RTCAN bytes 0 and 1 are the message id.
+    `params` belong to the transport that the message travels on: on RTCAN bytes 0 and 1 are the message id.
     """
 
     topic: str
@@ -177,7 +184,7 @@ class Advertise(msgspec.Struct, frozen=True, gc=False):
 
 
 class SubscribeRequest(msgspec.Struct, frozen=True, gc=False):
-    """Send me this topic. Fields as `Advertise`, but `queue` is 1 or more: 0 halts firmware, so `encode` refuses it.
+    """Request the messages of a topic. Fields as in `Advertise`, but `queue` is 1 or more: 0 halts firmware.
 
     Firmware must not get a size of 0 either, nor a queue that its heap can't hold: see `queue_length`.
     """
@@ -189,7 +196,7 @@ class SubscribeRequest(msgspec.Struct, frozen=True, gc=False):
 
 
 class SubscribeResponse(msgspec.Struct, frozen=True, gc=False):
-    """I will, with these parameters. Fields as `Advertise`."""
+    """Accept a SubscribeRequest: the publisher will send, with these params. Fields as in `Advertise`."""
 
     topic: str
     size: int
@@ -198,7 +205,7 @@ class SubscribeResponse(msgspec.Struct, frozen=True, gc=False):
 
 
 class Path(msgspec.Struct, frozen=True, gc=False):
-    """`module/node/topic`; each part may be empty."""
+    """The path `module/node/topic`; each part may be empty."""
 
     module: str
     node: str
@@ -206,7 +213,7 @@ class Path(msgspec.Struct, frozen=True, gc=False):
 
 
 class Hello(msgspec.Struct, frozen=True, gc=False):
-    """An r2p module tells r2p modules of itself: which start of it this is, for how long (ms) to believe it."""
+    """An r2p module lives. `instance` is the random number of its start; it is gone after `lease_ms` of silence."""
 
     module: str
     instance: int
@@ -216,7 +223,7 @@ class Hello(msgspec.Struct, frozen=True, gc=False):
 
 
 class TypeInfo(msgspec.Struct, frozen=True, gc=False):
-    """The layout fingerprint (8 bytes) and payload size (bytes) of a topic, as ROLE_... `ANY_TYPE` fits all."""
+    """The type of a topic in the role ROLE_...: the fingerprint (8 bytes) of its layout, and its size (bytes)."""
 
     role: int
     topic: str
@@ -225,14 +232,14 @@ class TypeInfo(msgspec.Struct, frozen=True, gc=False):
 
 
 class Unsubscribe(msgspec.Struct, frozen=True, gc=False):
-    """The r2p module that started as `instance` has no subscriber of this topic any more."""
+    """The r2p module that started as `instance` does not subscribe this topic any more."""
 
     topic: str
     instance: int
 
 
 class Endpoint(msgspec.Struct, frozen=True, gc=False):
-    """A node's publisher or subscriber, or (role + ROLE_GONE) its end. `publisher_class` is CLASS_..., a sum."""
+    """A node has a publisher or subscriber (ROLE_...), or had one (plus ROLE_GONE). `publisher_class` sums CLASS_..."""
 
     role: int
     instance: int
@@ -242,7 +249,7 @@ class Endpoint(msgspec.Struct, frozen=True, gc=False):
 
 
 class Conflict(msgspec.Struct, frozen=True, gc=False):
-    """Two modules carry one name."""
+    """Two modules have one name."""
 
     module: str
     instance_a: int
@@ -250,9 +257,9 @@ class Conflict(msgspec.Struct, frozen=True, gc=False):
 
 
 class Denied(msgspec.Struct, frozen=True, gc=False):
-    """A gateway does not let an order through to this module: `order` is the order's type byte, `reason` DENIED_...
+    """A gateway does not let an order through to a module: `order` is the type byte of the order, `reason` DENIED_...
 
-    Or a server does not serve one more client: `order` is 0.
+    Or the server of a debug line does not accept a connection: `order` is 0.
     """
 
     gateway: str
@@ -262,18 +269,27 @@ class Denied(msgspec.Struct, frozen=True, gc=False):
 
 
 class Name(msgspec.Struct, frozen=True, gc=False):
-    """What an alias stands for: a part of the name. `part`: the high four bits number it, the low four the last one."""
+    """A piece of the name that an alias stands for. `part`: its number (high 4 bits), that of the last (low 4)."""
 
     alias: str
     part: int
     piece: str
 
+    @property
+    def number(self) -> int:
+        return self.part >> 4
+
+    @property
+    def last(self) -> int:
+        """The number of the last piece."""
+        return self.part & 15
+
 
 class Bridge(msgspec.Struct, frozen=True, gc=False):
-    """A gateway is there: `count` numbers what it sends, `agreement` is the hash of what it takes the network for.
+    """A gateway lives: `count` numbers its messages, `agreement` is the hash of the network as the gateway sees it.
 
     `root` is the lowest gateway of its mesh. `acks` are 2 times the sender (u32) and `count` (u16) of the last BRIDGE
-    or LEAF that it got on this network.
+    or LEAF that it received on this network.
     """
 
     gateway: int
@@ -285,10 +301,10 @@ class Bridge(msgspec.Struct, frozen=True, gc=False):
 
 
 class Mesh(msgspec.Struct, frozen=True, gc=False):
-    """Whom a gateway hears at its ports, once more with a new `serial` when that changes.
+    """The gateways that a gateway hears at its ports, again with a new `serial` when they change.
 
-    `part`: the high four bits number this part, the low four the last one. `heard` is 3 times the own port (u8), the
-    other gateway (u32) and its port (u8).
+    `part`: the high four bits are the number of this part, the low four the last. `heard` is 3 times the own port (u8),
+    the other gateway (u32) and its port (u8).
     """
 
     gateway: int
@@ -298,10 +314,10 @@ class Mesh(msgspec.Struct, frozen=True, gc=False):
 
 
 class Leaf(msgspec.Struct, frozen=True, gc=False):
-    """A module that is no gateway has links to several networks with gateways: `module` is the instance of its start.
+    """A module that is not a gateway has links to several networks with gateways: `module` is its instance.
 
-    `count` numbers what it sends; `acks` are 3 times the gateway (u32) and `count` (u16) of the last BRIDGE that it got
-    on this network.
+    `count` numbers its messages; `acks` are 3 times the gateway (u32) and `count` (u16) of the last BRIDGE that it
+    received on this network.
     """
 
     module: int
@@ -311,7 +327,7 @@ class Leaf(msgspec.Struct, frozen=True, gc=False):
 
 
 class Network(msgspec.Struct, frozen=True, gc=False):
-    """The RTCAN master tells what all must agree on, and anchors the cycle counter. `slot` is the length of one (ns).
+    """The parameters of an RTCAN network, from its master; `cycle` anchors the cycle counter. `slot` is in ns.
 
     `utc_offset` is UTC less network time (ns), `utc_error` how far off it may be (us).
     """
@@ -327,8 +343,9 @@ class Network(msgspec.Struct, frozen=True, gc=False):
 
 
 class Claim(msgspec.Struct, frozen=True, gc=False):
-    """A module uses this id8; who claimed it with the lower `number` (64 random bits) keeps it. `priority` is that for
-    the election of a master, 0: never; `flags` are CLAIM_...
+    """A module uses this id8. Of two that claim it, the one with the lower `number` (64 random bits) keeps it.
+
+    `priority` is that for the election of a master, 0: never; `flags` are CLAIM_...
     """
 
     id8: int
@@ -338,7 +355,7 @@ class Claim(msgspec.Struct, frozen=True, gc=False):
 
 
 class Reserve(msgspec.Struct, frozen=True, gc=False):
-    """Slots for a periodic message are wanted or, with a `phase`, still wanted. Periods and phases are in slots."""
+    """Request slots for a periodic message or, with a `phase`, keep those it has. Periods and phases are in slots."""
 
     message: int
     serial: int
@@ -349,8 +366,10 @@ class Reserve(msgspec.Struct, frozen=True, gc=False):
 
 
 class Grant(msgspec.Struct, frozen=True, gc=False):
-    """The slots whose number, counted from the start of cycle 0, is `phase` modulo `period` (and the next ones, for
-    more fragments) belong to the message for `lease_ms`, from the cycle `from_cycle` on. `serial` is the request's.
+    """Grant slots to a message for `lease_ms`, from the cycle `from_cycle` on. `serial` is the request's.
+
+    The slots are those whose number, counted from the start of cycle 0, is `phase` modulo `period`, and for more
+    fragments the next ones.
     """
 
     message: int
@@ -364,7 +383,7 @@ class Grant(msgspec.Struct, frozen=True, gc=False):
 
 
 class Refuse(msgspec.Struct, frozen=True, gc=False):
-    """There are no slots; `reason` and what follows are those of `r2p.protocols.rtcan.calendar.Refusal`."""
+    """Refuse slots; `reason` and the fields after it are those of `r2p.protocols.rtcan.calendar.Refusal`."""
 
     message: int
     serial: int
@@ -376,20 +395,20 @@ class Refuse(msgspec.Struct, frozen=True, gc=False):
 
 
 class Release(msgspec.Struct, frozen=True, gc=False):
-    """The message does not need its slots any more."""
+    """Give back the slots of a message."""
 
     message: int
 
 
 class Renew(msgspec.Struct, frozen=True, gc=False):
-    """The sender still wants the slots that it was granted for its topics with these high bytes (24 bytes, 0: none)."""
+    """Keep the slots that were granted to the sender for its topics with these high bytes (24 bytes, 0: none)."""
 
     serial: int
     highs: bytes
 
 
 class Renewed(msgspec.Struct, frozen=True, gc=False):
-    """Those of `highs` are granted to the module `id8` for `lease_ms` more; what it asked for besides is not."""
+    """Extend the leases of those `highs` of the module `id8` by `lease_ms`. Other ones that it asked for have none."""
 
     id8: int
     serial: int
@@ -458,26 +477,46 @@ _CODEC = Codec[Management](
 )
 
 
-def type_of(data: bytes) -> int:
-    """The type byte of an encoded message, which may be one that `ManagementType` does not list; 0: of another size."""
-    return data[-1] if len(data) == SIZE else 0
-
-
-def queue_length(size: int, wanted: int = QUEUE) -> int:
-    """The entries to ask firmware for, of messages of `size` bytes: 1 to 16, and one or 1024 bytes at most."""
-    return max(1, min(wanted, QUEUE_MOST, QUEUE_BYTES // (size + QUEUE_ENTRY)))
-
-
 def encode(message: Management) -> bytes:
-    """The 32 bytes of a message. Raises `MessageError`, which names the field, when a value does not fit."""
+    """Encode a message to 32 bytes. Raises `MessageError`, which names the field, for a value that does not fit."""
     if isinstance(message, SubscribeRequest) and not message.queue:
         raise MessageError("SubscribeRequest.queue = 0 halts firmware: ask for 1 or more messages")
     return _CODEC.encode(message)
 
 
 def decode(data: bytes) -> Management:
-    """The message in these 32 bytes. Raises `UnknownType` for a type, role or version to ignore, else `DecodeError`."""
+    """Decode 32 bytes. Raises `UnknownType` for a type, role or version to ignore, else `DecodeError`."""
     return _decode(bytes(data))
+
+
+@functools.lru_cache(maxsize=4096)
+def _decode(data: bytes) -> Management:
+    """`decode`, cached: modules repeat themselves byte by byte, and all modules of a process receive the same bytes."""
+    message = _CODEC.decode(data)
+    if isinstance(message, TypeInfo | Endpoint):
+        gone = ROLE_GONE if isinstance(message, Endpoint) else 0
+        if message.role & ~gone not in _ROLES:
+            raise UnknownType(f"role {message.role} of {type(message).__name__}")
+    return message
+
+
+def type_of(data: bytes) -> int:
+    """The type byte of an encoded message, which `ManagementType` need not list; 0 if it has not 32 bytes."""
+    return data[-1] if len(data) == SIZE else 0
+
+
+def queue_length(size: int, wanted: int = QUEUE) -> int:
+    """The entries of a queue to request of firmware, for messages of `size` bytes: 1 to 16, and 1024 bytes at most."""
+    return max(1, min(wanted, QUEUE_MOST, QUEUE_BYTES // (size + QUEUE_ENTRY)))
+
+
+def alias_messages(name: str) -> list[Name]:
+    """The messages that say what the alias of a module's name stands for; none if the name fits into a message."""
+    alias = module_alias(name)
+    if alias == name:
+        return []
+    pieces = [name[at : at + _PIECE] for at in range(0, len(name), _PIECE)]
+    return [Name(alias, number << 4 | len(pieces) - 1, piece) for number, piece in enumerate(pieces)]
 
 
 # What params hold: on RTCAN a message id and the mark, and in the last byte the state of an r2p subscription.
@@ -518,14 +557,3 @@ def is_marked(data: bytes) -> bool:
 
 def _with_mark(data: bytes, text: bytes) -> bytes:
     return data[: _MARKED.start] + text + data[_MARKED.stop :]
-
-
-@functools.lru_cache(maxsize=4096)
-def _decode(data: bytes) -> Management:
-    """Modules repeat themselves byte by byte, and all modules of a process hear the same: most was decoded before."""
-    message = _CODEC.decode(data)
-    if isinstance(message, TypeInfo | Endpoint):
-        gone = ROLE_GONE if isinstance(message, Endpoint) else 0
-        if message.role & ~gone not in _ROLES:
-            raise UnknownType(f"role {message.role} of {type(message).__name__}")
-    return message

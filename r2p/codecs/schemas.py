@@ -1,4 +1,4 @@
-"""Answers to the question for a type by its fingerprint (PROTOCOL.md 10): the name of its class, and its schema.
+"""Answers to a query for a type by its fingerprint (PROTOCOL.md 10): the name of its class, then its schema.
 
 Wheel
 speed:f32 currents:f32[2]
@@ -9,21 +9,22 @@ from hashlib import blake2b
 from r2p.errors import DecodeError
 
 LONGEST = 40_000
-"""Bytes of an answer."""
+"""Bytes of the longest answer that is read."""
 
 FINGERPRINT = 8
+"""Bytes of a fingerprint, which is the BLAKE2b hash of the schema."""
 
 
 def encode(name: str, schema: str) -> bytes:
-    """The answer of a module that has the type."""
+    """Encode the answer of a module that has the type."""
     return f"{name}\n{schema}".encode()
 
 
 def decode(data: bytes, fingerprint: bytes) -> tuple[str, str]:
-    """Name and schema. Raises DecodeError for an answer that lies: whose schema is not that of the fingerprint."""
+    """Decode name and schema. Raises DecodeError for a schema that does not have this fingerprint."""
     if len(data) > LONGEST or not data.isascii():
-        raise DecodeError("no schema")
+        raise DecodeError("not a schema")
     name, _, schema = data.decode().partition("\n")
     if blake2b(schema.encode(), digest_size=FINGERPRINT).digest() != fingerprint:
-        raise DecodeError(f"a schema that is not that of {fingerprint.hex()}")
+        raise DecodeError(f"a schema without the fingerprint {fingerprint.hex()}")
     return name, schema

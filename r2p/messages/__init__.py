@@ -1,6 +1,6 @@
 """Messages: frozen values with a fixed layout, little-endian and packed (PROTOCOL.md 2).
 
-A message class is plain annotations. At the first `layout(T)` they become a small tree of shapes, and the tree becomes
+A message class is plain annotations. The first `layout(T)` turns them into a small tree of shapes, and the tree into
 two Python functions around one `struct.Struct`, so that packing costs little more than the struct itself.
 
     class Wheel(r2p.Message):
@@ -10,12 +10,16 @@ two Python functions around one `struct.Struct`, so that packing costs little mo
         name: Annotated[str, r2p.Len(8)] = ""                   # ASCII, padded with NUL
         stamp: r2p.Timestamp = r2p.Timestamp()                  # a message in the message
 
-The order on the wire is the order of definition, base classes first; a field defined again keeps its place.
+The order on the wire is the order of definition, base classes first; a field that is defined again keeps its place.
 
-A value is packed exactly or refused with a MessageError: no number is wrapped or cut, no text shortened. Numbers are
-what the struct module takes as such: a bool, or an object with `__index__`, is an integer, and an integer is a float;
-an f32 is rounded to its 24 bits; NaN and infinities pass. A bool has to be a bool, an array a tuple, and a message of
-the very class. Reading, any byte but 0 is True, and a text ends at its first NUL: firmware leaves rubbish behind it.
+A value is packed exactly or refused with a MessageError: no number is wrapped or cut, no text is shortened. Numbers are
+what the struct module accepts: a bool, or an object with `__index__`, is an integer, and an integer is a float; an f32
+is rounded to its 24 bits; NaN and infinities pass. A bool has to be a bool, an array a tuple, and a nested message an
+instance of exactly its class. When a message is unpacked, any byte but 0 is True, and a text ends at its first NUL:
+firmware leaves rubbish behind it.
+
+`layouts` has the classes and compiles them, `shapes` is what a layout is made of, `packing` generates the functions,
+and `schemas` builds a class from its schema.
 """
 
 from r2p.messages.layouts import SIZE_MAX, Layout, Message, Timestamp, layout

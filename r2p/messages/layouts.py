@@ -1,6 +1,7 @@
 """Message classes, and the layout that is compiled from their annotations at first use.
 
-A layout is kept in its class, so that a class that a tool has built from a schema can go again, layout and all.
+A layout is kept in its class, not in a table: so a class that a tool has built from a schema can be collected, with its
+layout.
 """
 
 import keyword
@@ -53,11 +54,11 @@ M = TypeVar("M", bound=Message)
 
 
 class Layout(msgspec.Struct, Generic[M], frozen=True, eq=False):
-    """How the messages of one class lie in bytes.
+    """How the messages of one class are laid out in bytes.
 
-    `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with the path of what
-    is nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` its BLAKE2b-64 (8 bytes).
-    `encode` raises MessageError that names the field; `decode` raises DecodeError.
+    `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with their path where
+    they are nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` is its BLAKE2b-64 (8 bytes). `encode`
+    raises MessageError, which names the field; `decode` raises DecodeError.
     """
 
     cls: type[M]
@@ -70,7 +71,7 @@ class Layout(msgspec.Struct, Generic[M], frozen=True, eq=False):
 
     @property
     def zero(self) -> M:
-        """The message of zero bytes. It is not kept: a class that holds an instance of itself is never collected."""
+        """The message of zero bytes, made anew: a class that kept an instance of itself would never be collected."""
         return self.decode(bytes(self.size))
 
     def __repr__(self) -> str:
@@ -78,54 +79,56 @@ class Layout(msgspec.Struct, Generic[M], frozen=True, eq=False):
 
 
 def layout(cls: type[M]) -> Layout[M]:
-    """The layout of a message class, compiled at first use.
+    """Return the layout of a message class, compiled at first use.
 
-    Raises MessageError for a class without a fixed layout of 1 to `SIZE_MAX` bytes, saying what to write instead.
+    Raises MessageError, which says what to write instead, for a class without a fixed layout of 1 to `SIZE_MAX` bytes.
     """
     return _layout(cls, ())
 
 
 class Timestamp(Message):
-    """An instant inside a message: seconds and nanoseconds since 1970, up to 2106 (PROTOCOL.md 2)."""
+    """A time stamp in a message: seconds and nanoseconds since 1970, up to 2106 (PROTOCOL.md 2)."""
 
     sec: u32 = 0
     nsec: u32 = 0
 
     @property
     def ns(self) -> int:
-        """The instant in nanoseconds."""
+        """Nanoseconds since 1970."""
         return self.sec * 1_000_000_000 + self.nsec
 
     @classmethod
     def from_ns(cls, ns: int) -> Self:
-        """The timestamp of an instant in nanoseconds; raises MessageError outside of 1970 to 2106."""
+        """The time stamp of an instant in ns since 1970. Raises MessageError outside of 1970 to 2106."""
         sec, nsec = divmod(ns, 1_000_000_000)
         if not 0 <= sec < 1 << 32:
-            raise MessageError(f"{show(ns)} ns is no instant between 1970 and 2106, the years of a Timestamp")
+            raise MessageError(f"{show(ns)} ns is not between 1970 and 2106, the years of a Timestamp")
         return cls(sec, nsec)
 
 
 def check_field_name(path: str, name: str) -> None:
-    """Raises MessageError for a name that can't be a field's."""
+    """Raise MessageError for a name that a field can't have."""
     if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name) or name in _METHODS:
-        raise MessageError(f"{path}: name a field in ASCII, a letter first; no Python keyword, not encode, not decode")
+        raise MessageError(
+            f"{path}: a field is named in ASCII, a letter first; it can't be a Python keyword, encode or decode"
+        )
 
 
 def _layout(cls: Any, outer: tuple[type, ...]) -> Layout[Any]:
-    """The layout of a class that is met inside of the classes `outer`."""
+    """The layout of a class that is nested in the classes `outer`."""
     found: Layout[Any] | None = vars(cls).get("_layout") if isinstance(cls, type) else None  # not a base class's
     if found is None:
         if not (isinstance(cls, type) and issubclass(cls, Message)):
-            raise MessageError(f"{show(cls)} is no message class: subclass r2p.Message")
+            raise MessageError(f"{show(cls)} is not a message class: subclass r2p.Message")
         cls._layout = found = _compile(cls, outer)
     return found
 
 
 def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
     if cls in outer:
-        raise MessageError(f"{cls.__name__} holds itself: a message has a fixed size")
+        raise MessageError(f"{cls.__name__} contains itself: a message has a fixed size")
     if not cls.__struct_config__.frozen:
-        raise MessageError(f"{cls.__name__} is not frozen, but subscribers share the very object: no frozen=False here")
+        raise MessageError(f"{cls.__name__} is not frozen, but subscribers share one object: remove frozen=False")
     fields = tuple(Field(name, _shape(hint, f"{cls.__name__}.{name}", (*outer, cls))) for name, hint in _hints(cls))
     size = sum(field.shape.size for field in fields)
     _check_size(cls.__name__, size)
@@ -133,7 +136,7 @@ def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
     try:
         decode(bytes(size))
     except DecodeError as error:
-        raise MessageError(f"{cls.__name__} refuses to be all zero, which any module may send: {error}") from error
+        raise MessageError(f"{cls.__name__} can't be all zero, which any module may send: {error}") from error
     schema = " ".join(leaf for field in fields for leaf in _leaves(field.shape, field.name))
     return Layout(cls, fields, size, schema, blake2b(schema.encode(), digest_size=8).digest(), encode, decode)
 
@@ -207,7 +210,7 @@ def _instead(base: Any) -> str:
 
 
 def _leaves(shape: Shape, path: str) -> Iterator[str]:
-    """The schema's `path:kind` of all that a field holds."""
+    """The schema's `path:kind` of each leaf of a field."""
     match shape:
         case Nested(inner):
             for field in inner.fields:

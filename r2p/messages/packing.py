@@ -1,6 +1,6 @@
 """The two functions that pack and unpack one message class: generated source around one `struct.Struct`.
 
-The generated `encode` only notices that something is wrong; what it was is found by a slow walk through the shapes.
+The generated `encode` only detects that a value does not fit; a slow walk through the shapes finds out which one.
 """
 
 import struct
@@ -10,8 +10,8 @@ from typing import Any
 from r2p.errors import DecodeError, MessageError
 from r2p.messages.shapes import Array, Chars, Field, Nested, Scalar, Shape, show
 
-# `encode` catches everything: users put objects of any kind into messages, and what these raise when they are checked
-# or packed (OverflowError, AttributeError, something of their own) means that they do not fit.
+# `encode` catches everything: users put objects of any kind into messages, and whatever these raise when they are
+# checked or packed (OverflowError, AttributeError, something of their own) means that they do not fit.
 _SOURCE = """
 def encode(message):
     try:
@@ -29,7 +29,7 @@ def decode(data):
 
 
 def functions(cls: type[Any], fields: tuple[Field, ...]) -> tuple[Callable[[Any], bytes], Callable[[bytes], Any]]:
-    """The `encode` and the `decode` of a message class with these fields."""
+    """Generate the `encode` and the `decode` of a message class with these fields."""
     packed = struct.Struct("<" + "".join(field.shape.format for field in fields))
     source = _SourceCode()
     value, slots = source.add_message(cls, fields, "message"), ", ".join(source.slots)
@@ -59,7 +59,7 @@ def functions(cls: type[Any], fields: tuple[Field, ...]) -> tuple[Callable[[Any]
 
 
 class _SourceCode:
-    """The parts of the source: checks first, then what `pack` takes; the slots are what `unpack` gives."""
+    """The parts of the source: checks, then the arguments of `pack`; the slots are the results of `unpack`."""
 
     def __init__(self) -> None:
         self.names: dict[str, Any] = {"chars": _chars, "text": _text}
@@ -68,7 +68,7 @@ class _SourceCode:
         self.slots: list[str] = []
 
     def add(self, shape: Shape, value: str) -> str:
-        """Add what packs the expression `value`; returns the expression that builds it back."""
+        """Add the packing of the expression `value`; returns the expression that rebuilds it from slots."""
         match shape:
             case Array(item, count):
                 return self.add_array(item, count, value)
@@ -130,19 +130,19 @@ def _text(data: bytes) -> str:
 
 
 def _misfit(cls: type[Any], fields: tuple[Field, ...], message: object) -> MessageError:
-    """What it is that did not pack."""
+    """The error that names what did not pack."""
     if type(message) is not cls:
-        return MessageError(f"{show(message)} is no {cls.__name__}")
+        return MessageError(f"{show(message)} is not a {cls.__name__}")
     for field in fields:
         try:
             _check(field.shape, getattr(message, field.name), f"{cls.__name__}.{field.name}")
         except MessageError as error:
             return error
-    return MessageError(f"{show(message)} does not pack")
+    return MessageError(f"{show(message)} can't be packed")
 
 
 def _check(shape: Shape, value: Any, path: str) -> None:
-    """Raises MessageError for the first part that does not fit."""
+    """Raise MessageError for the first part that does not fit."""
     parts: Iterable[tuple[Shape, Any, str]] = ()
     match shape:
         case Array(item, count):

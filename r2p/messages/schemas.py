@@ -1,7 +1,7 @@
-"""Message classes built back from their schema, for tools that meet a topic whose type they don't have.
+"""Message classes built from their schema, for tools that find a topic whose type they don't have.
 
-A schema may come from anybody. It is read without looking at details, within bounds; then the schema of the new class
-is compared with it, and whatever was odd makes a difference.
+A schema comes from the network, so it may be anything. It is parsed leniently, within bounds; then the schema of the
+new class is compared with it, which finds whatever was wrong.
 """
 
 import keyword
@@ -15,7 +15,7 @@ from r2p.messages.layouts import Message, Timestamp, check_field_name, layout
 from r2p.messages.shapes import HINTS, Len, show
 
 SCHEMA_MAX = 32_768
-"""Characters of the longest schema that is read back."""
+"""Characters of the longest schema that is read."""
 
 _DEPTH_MAX = 16  # parts of a path
 _CLASSES_MAX = 64  # different nested messages
@@ -30,16 +30,16 @@ _KIND = re.compile(r"([a-z0-9]{1,8})(?:\[([0-9]{1,4})\])?")
 def message_type(name: str, schema: str) -> type[Message]:
     """Build a message class from its schema ("led:u32 value:u8").
 
-    All fields are required; a nested message of `sec:u32 nsec:u32` is a Timestamp, the other ones get made-up names.
-    Raises MessageError for what is not exactly the schema of a message class, or longer than `SCHEMA_MAX`.
+    All fields are required. A nested message of `sec:u32 nsec:u32` becomes a Timestamp; other ones get made-up names.
+    Raises MessageError for a text that is not exactly the schema of a message class, or longer than `SCHEMA_MAX`.
     """
     if not _CLASS_NAME.fullmatch(name) or keyword.iskeyword(name):
-        raise MessageError(f"{show(name)} is no name for a message class")
+        raise MessageError(f"{show(name)} is not a valid name of a message class")
     if len(schema) > SCHEMA_MAX:
         raise MessageError(f"the schema of {name} has {len(schema)} characters, more than {SCHEMA_MAX}")
     cls = _SchemaReader().message(name, tuple(_leaf(text) for text in schema.split(" ")))
     if layout(cls).schema != schema:
-        raise MessageError(f"{show(schema)} is no schema of a message class")
+        raise MessageError(f"{show(schema)} is not the schema of a message class")
     return cls
 
 
@@ -52,7 +52,7 @@ def _leaf(text: str) -> _Leaf:
 
 
 class _SchemaReader:
-    """Groups leaves by the first part of their path, and the groups by the next one."""
+    """Groups leaves by the first part of their path, and each group by the next part."""
 
     def __init__(self) -> None:
         self.classes: dict[tuple[_Leaf, ...], type[Message]] = {
@@ -94,7 +94,7 @@ def _hint(kind: str) -> Any:
     if base == "char" and count:
         return Annotated[str, Len(int(count))]
     if base not in HINTS:
-        raise MessageError(f"{show(kind)} is no kind of field")
+        raise MessageError(f"{show(kind)} is not a kind of field")
     return HINTS[base] if count is None else _array(HINTS[base], int(count))
 
 

@@ -1,7 +1,7 @@
-"""Shapes: what a field is made of. Packing is generated from them, and tools turn text into fields by them.
+"""Shapes: what fields are made of. Packing is generated from them, and tools use them to turn text into fields.
 
-A field is a number, a text, an array of one shape, or a message. All shapes say their `kind` (as in schemas), the
-`format` and `size` (bytes) that they pack to, and the values that are `allowed`, for people; a tool walks them with one
+A field is a number, a text, an array of one shape, or a message. Each shape has its `kind` (as in schemas), the
+`format` and `size` (bytes) that it packs to, and the values that are `allowed`, in words. A tool walks the tree with
 
     match field.shape:
         case Scalar(kind): ...
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from r2p.messages.layouts import Layout
 
 UNFIT = (struct.error, ArithmeticError, AttributeError, TypeError, ValueError)
-"""What packing raises for a value that does not fit."""
+"""The errors that packing raises for a value that does not fit."""
 
 
 class Scalar(msgspec.Struct, frozen=True):
@@ -171,7 +171,7 @@ HINTS: dict[str, Any] = {
 
 
 def show(value: object) -> str:
-    """A value in an error text: it may be anything, so it is cut."""
+    """Format a value for an error text. It may be anything, so the result is cut at 80 characters."""
     try:
         text = repr(value)
     except ValueError:  # an integer of more digits than Python prints

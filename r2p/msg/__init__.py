@@ -1,6 +1,6 @@
-"""The standard messages: the firmware's own, and those of the modules of thesis 7.
+"""The standard messages: those of the firmware, those of the modules of thesis 7 (`robot`), texts, and gateways.
 
-All fields default to zero. For other data define your own `r2p.Message`; a changed layout is a new topic.
+All fields default to zero. For other data define your own `r2p.Message`. A changed layout needs a new topic.
 """
 
 from r2p.messages import Timestamp

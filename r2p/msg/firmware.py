@@ -1,7 +1,7 @@
 """The messages of the R2P firmware, byte for byte (PROTOCOL.md 2).
 
-The names are the firmware's, without `Msg`, and with `Stamped` for its `t`. It publishes no units: those given here are
-the ones that thesis 7 and 8 use. `timestamp` is the instant of the measurement in RTCAN's network time.
+The names are the firmware's, without `Msg`, and with `Stamped` for its `t`. The firmware does not say which units it
+uses; those given here are the ones of thesis 7 and 8. `timestamp` is the network time (RTCAN) of the measurement.
 """
 
 from r2p.messages import Message, Timestamp, f32, i16, u8, u16, u32
@@ -157,8 +157,8 @@ class Tilt(Message):
 class IMURaw9(Message):
     """Unfiltered readings of accelerometer, gyroscope and magnetometer (topic `imu_raw`).
 
-    Counts of the sensors; what a count is depends on the full scale they are set to: at best 1 mg, 8.75 mdps and
-    0.9 mgauss (thesis 7.4.1).
+    In counts of the sensors. What a count is depends on their full scale: at best 1 mg, 8.75 mdps and 0.9 mgauss
+    (thesis 7.4.1).
     """
 
     acc_x: i16 = 0

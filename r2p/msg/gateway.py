@@ -1,4 +1,4 @@
-"""What a gateway tells of itself."""
+"""The state of gateways, as they publish it."""
 
 from typing import Annotated
 
@@ -6,8 +6,10 @@ from r2p.messages import Len, Message, f32, u64
 
 
 class GatewayStatus(Message):
-    """Once a second, for each link (`topic` and `target` are empty) and for each topic and way (`state` is empty) of a
-    gateway; topic `gateway`. 12 CAN fragments.
+    """The counters of a gateway, once a second (topic `gateway`). 12 CAN fragments.
+
+    There is one message for each link, where `topic` and `target` are empty, and one for each topic and pair of links
+    that it takes, where `state` is empty.
     """
 
     topic: Annotated[str, Len(16)] = ""
@@ -16,7 +18,7 @@ class GatewayStatus(Message):
     target: Annotated[str, Len(24)] = ""
     """The link that they go to."""
     state: Annotated[str, Len(12)] = ""
-    """What a link does: listening, alone, forwarding, blocked, converging, loop, down."""
+    """The state of a link: listening, alone, forwarding, blocked, converging, loop, down."""
     forwarded: u64 = 0
     """Messages since the gateway started."""
     dropped: u64 = 0

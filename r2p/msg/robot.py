@@ -1,7 +1,7 @@
-"""What the modules of thesis 7 publish without a published layout: defined here, in SI units, in few CAN fragments.
+"""The messages of the modules of thesis 7 that have no published layout: in SI units, and in few CAN fragments.
 
-An RTCAN fragment carries 8 bytes; each class says how many its message takes. `timestamp` is the instant of the
-measurement in RTCAN's network time. Angles are in rad, counter-clockwise, but for geographic ones.
+An RTCAN fragment carries 8 bytes; each class says how many its message takes. `timestamp` is the network time (RTCAN)
+of the measurement. Angles are in rad, counter-clockwise, except geographic ones.
 """
 
 from r2p.messages import Message, Timestamp, f32, f64, i16, i32, u8, u16
@@ -64,7 +64,7 @@ class Battery(Message):
 
 
 class Pressure(Message):
-    """Air pressure and the altitude it means (topic `pressure`, thesis 7.4.2). 1 fragment."""
+    """Air pressure, and the altitude that follows from it (topic `pressure`, thesis 7.4.2). 1 fragment."""
 
     pressure: f32 = 0.0
     """Pa."""
@@ -73,7 +73,7 @@ class Pressure(Message):
 
 
 class GPS(Message):
-    """What the GPS receiver says (topic `gps`, thesis 7.4.2). 4 fragments."""
+    """A fix of the GPS receiver (topic `gps`, thesis 7.4.2). 4 fragments."""
 
     latitude: f64 = 0.0
     """Degrees, north is positive (WGS 84)."""
@@ -94,7 +94,7 @@ class GPS(Message):
 
 
 class StampedGPS(Message):
-    """What the GPS receiver says, with the time of the fix (topic `gps`). 5 fragments."""
+    """A fix of the GPS receiver, with its time (topic `gps`). 5 fragments."""
 
     timestamp: Timestamp = Timestamp()
     latitude: f64 = 0.0
@@ -116,9 +116,9 @@ class StampedGPS(Message):
 
 
 class Setpoint(Message):
-    """What a motor controller shall reach: position or speed, as it is configured (topic `setpoint`, thesis 7.3.2).
+    """The position or speed that a motor controller is to reach, as configured (topic `setpoint`, thesis 7.3.2).
 
-    The controller counts encoder ticks; what a tick is belongs to the kinematics. 1 fragment.
+    The controller counts encoder ticks; how far a tick is, the kinematics know. 1 fragment.
     """
 
     ticks: i32 = 0
@@ -137,7 +137,7 @@ class Pose3(Message):
 
 
 class Odometry(Message):
-    """How the robot has moved, by forward kinematics (topic `odometry`, thesis 8.1). 3 fragments."""
+    """The movement of the robot, by forward kinematics (topic `odometry`, thesis 8.1). 3 fragments."""
 
     pose: Pose3 = Pose3()
     """Since the start, in the frame of the start."""
@@ -146,7 +146,7 @@ class Odometry(Message):
 
 
 class StampedOdometry(Message):
-    """How the robot has moved, with the time (topic `odometry`). 4 fragments."""
+    """The movement of the robot, with its time (topic `odometry`). 4 fragments."""
 
     timestamp: Timestamp = Timestamp()
     pose: Pose3 = Pose3()

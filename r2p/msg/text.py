@@ -1,4 +1,4 @@
-"""Texts. A message has a fixed size, so that a short text costs as much as a long one: keep them off a busy CAN bus."""
+"""Texts. A message has a fixed size, so a short text costs as much as a long one: keep texts off a busy CAN bus."""
 
 from typing import Annotated
 

@@ -81,7 +81,7 @@ LAYOUTS = [
 
 
 @pytest.mark.parametrize(("message", "data"), LAYOUTS, ids=lambda value: type(value).__name__)
-def test_layouts_that_nobody_recorded(message: m.Management, data: bytes) -> None:
+def test_layouts_without_a_recording(message: m.Management, data: bytes) -> None:
     assert m.encode(message) == data
     assert m.decode(data) == message
 

@@ -27,6 +27,6 @@ def test_an_answer_is_read_back() -> None:
         b"x" * 50_000,
     ],
 )
-def test_an_answer_that_lies(data: bytes) -> None:
+def test_an_answer_with_another_schema(data: bytes) -> None:
     with pytest.raises(DecodeError):
         schemas.decode(data, LED.fingerprint)

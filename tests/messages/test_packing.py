@@ -215,7 +215,7 @@ def test_only_the_very_class_packs() -> None:
 
     encode: Any = layout(Velocity3).encode
     for other in (Velocity4(), StampedVelocity3(), Led(), None, 5):
-        with pytest.raises(MessageError, match=r"is no Velocity3$"):
+        with pytest.raises(MessageError, match=r"is not a Velocity3$"):
             encode(other)
 
 
@@ -277,7 +277,7 @@ def test_nothing_is_hidden_when_no_field_is_wrong() -> None:
                 raise TypeError("not now")
             return 5
 
-    with pytest.raises(MessageError, match=r"^One\(x=.*does not pack"):
+    with pytest.raises(MessageError, match=r"^One\(x=.*can't be packed"):
         one("u8")(Moody()).encode()
 
 

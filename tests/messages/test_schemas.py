@@ -116,7 +116,7 @@ def test_odd_schemas_are_refused(schema: str) -> None:
 
 @pytest.mark.parametrize("name", ["", "0", "a b", "class", "größe", "x" * 65, "A\n", "A.B"])
 def test_odd_names_are_refused(name: str) -> None:
-    with pytest.raises(MessageError, match="is no name for a message class"):
+    with pytest.raises(MessageError, match="is not a valid name of a message class"):
         message_type(name, "x:u8")
 
 

@@ -574,7 +574,7 @@ async def test_user_code_that_raises_does_not_harm_the_link() -> None:
 
 @pytest.mark.internal_errors
 async def test_a_line_whose_reading_raises_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    sound = debug._sound
+    sound = debug._checked
 
     def faulty(whole: re.Match[bytes]) -> debug.Line | None:
         found = sound(whole)
@@ -582,7 +582,7 @@ async def test_a_line_whose_reading_raises_does_not_stop_the_others(monkeypatch:
             raise RuntimeError(found)
         return found
 
-    monkeypatch.setattr(debug, "_sound", faulty)
+    monkeypatch.setattr(debug, "_checked", faulty)
     async with scripted() as (script, _, node):
         subscriber = node.subscribe("leds", None, lossy=True)
         script.hear(manage(m.SubscribeResponse("leds", 1, 1)))
