@@ -248,7 +248,7 @@ class RoutingTable:
     def _told(self, topic: str, ports: Iterable[BridgePort], role: int) -> TopicType | None:
         """The type that the first link tells."""
         infos = (each.link.discovery.topics.get(self._policy.to_link_name(topic, each.name)) for each in ports)
-        return next((info.shapes[role] for info in infos if info is not None and role in info.shapes), None)
+        return next((info.types[role] for info in infos if info is not None and role in info.types), None)
 
     # One topic on one link
 

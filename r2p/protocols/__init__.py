@@ -1,1 +1,7 @@
-"""State machines without I/O: `now` (monotonic ns) and bytes come in, events and `next_deadline()` come out."""
+"""State machines without I/O: time (`now`, monotonic ns) and bytes go in, events and `next_deadline()` come out.
+
+- `discovery`: modules, topics and subscriptions on a link, by management messages; `liveliness`: the same on zenoh.
+- `rtcan`: the CAN protocol, with its cycle, its master and its slots.
+- `bridge`: how gateways agree on a tree, and which link a module with several of them uses.
+- `flow_control`, `time_left`, `timers`: parts that several links or protocols use.
+"""

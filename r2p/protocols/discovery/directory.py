@@ -1,36 +1,41 @@
-"""What one link told about the network: modules, topics, endpoints. Nothing here decides what flows.
+"""What the modules on one link have said: their names, topics and endpoints. Nothing here decides what flows.
 
-Every table is bounded: when it is full, what was not heard for longest is forgotten, so that lies on the wire push out
-the truth only until it is repeated.
+Every table is bounded. When it is full, the entry that was not repeated for longest is forgotten: a flood of made-up
+messages pushes out true entries only until they are repeated.
 """
 
 from collections import Counter
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
 from r2p.codecs import management
+from r2p.names import MODULE_PATH_MAX, module_alias
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, TopicType
-from r2p.protocols.discovery.schedule import SELDOM
+from r2p.protocols.discovery.schedule import SLOW_ROUNDS
 from r2p.protocols.timers import KeyedTimers
 
 MOST = 4096
 """Entries in each table."""
 
 LEASE = 5_000_000_000
-"""How long an r2p module may be silent at least (ns)."""
+"""Ns that an r2p module may be silent at least, whatever its HELLO says: three rounds of repetition, and some more."""
 
 FOR_EVER = 0xFFFF * 1_000_000
 """The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
+
+_UNFINISHED_MAX = 256
+"""Aliases of which some parts were received, and not all."""
 
 K = TypeVar("K")
 V = TypeVar("V")
 
 
 class TopicInfo(msgspec.Struct):
-    """A topic as heard on the link. Instants are in monotonic ns, None: never; `size` in bytes, 0: not said.
+    """A topic on the link. Instants are in monotonic ns, None: never; `size` is in bytes, 0: unknown.
 
-    `shapes` are its type by the role of those who said it; `size` and `fingerprint` are the publishers', if they did.
+    `types` has what the peers in each role (ROLE_...) say, and `typed_at` when they said it last. `size` and
+    `fingerprint` are those of the publishers, or of the subscribers while publishers have said nothing.
     """
 
     name: str
@@ -39,22 +44,25 @@ class TopicInfo(msgspec.Struct):
     advertised_at: int | None = None
     requested_at: int | None = None
     mismatch: bool = False
-    shapes: dict[int, TopicType] = {}
+    types: dict[int, TopicType] = {}
     typed_at: dict[int, int] = {}
 
-    def typed(self, role: int, shape: TopicType | None) -> None:
-        """Those in this role say so; None: there is nobody any more."""
-        if shape is None:
-            self.shapes.pop(role, None)
+    def set_type(self, role: int, known: TopicType | None) -> None:
+        """Set what the peers in this role say; None: nothing any more."""
+        if known is None:
+            self.types.pop(role, None)
         else:
-            self.shapes[role] = shape
-        best = self.shapes.get(management.ROLE_PUBLISHES) or self.shapes.get(management.ROLE_SUBSCRIBES, TopicType())
+            self.types[role] = known
+        best = self.types.get(management.ROLE_PUBLISHES) or self.types.get(management.ROLE_SUBSCRIBES, TopicType())
         self.size = best.size
         self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
 
 
 class EndpointInfo(msgspec.Struct, frozen=True):
-    """A publisher or subscriber of a node, as its r2p module tells; `module` is empty until its HELLO was heard."""
+    """A publisher or subscriber of a node, as announced by its r2p module.
+
+    `module` is empty until the HELLO of this `instance` was received.
+    """
 
     module: str
     instance: int
@@ -64,7 +72,7 @@ class EndpointInfo(msgspec.Struct, frozen=True):
     publisher_class: int
 
     def latches(self, topic: str) -> bool:
-        """Whether it publishes the topic, and latches it."""
+        """Whether it publishes this topic, and latches it."""
         latches = self.publisher_class & management.CLASS_LATCHES
         return self.topic == topic and self.role == management.ROLE_PUBLISHES and latches > 0
 
@@ -73,7 +81,7 @@ EndpointKey = tuple[int, str, str, int]
 
 
 class _Starts(msgspec.Struct):
-    """The recent starts of one module name, to tell two modules from one that restarts."""
+    """The recent starts under one module name, to tell two modules from one that restarts."""
 
     previous: int
     at: int
@@ -81,18 +89,18 @@ class _Starts(msgspec.Struct):
 
 
 class Directory:
-    """The tables of one link. Each endpoint has a timer, ("endpoint", its key): it is believed for that long."""
+    """The tables of one link. Each endpoint has a timer, ("endpoint", its key), after which it is forgotten."""
 
     def __init__(self, timers: KeyedTimers, counts: Counter[str]) -> None:
         self.modules: dict[str, ModuleInfo] = {}
         self.topics: dict[str, TopicInfo] = {}
         self.endpoints: dict[EndpointKey, EndpointInfo] = {}
         self.generation = 0
-        """Another number means that modules or endpoints have changed."""
+        """A number that changes when modules or endpoints change."""
+        self.direct_instances: dict[str, int] = {}
+        """The instances of the r2p modules on the link itself, not behind a gateway."""
         self._timers = timers
         self._counts = counts
-        self.ends: dict[str, int] = {}
-        """The instances of the r2p modules on the link itself, not behind a gateway."""
         self._direct: dict[PeerAddress, dict[str, ModuleInfo]] = {}
         self._leases: dict[PeerAddress, Counter[int]] = {}
         self._names: dict[int, str] = {}
@@ -101,27 +109,26 @@ class Directory:
 
     @property
     def knows_r2p(self) -> bool:
-        """Whether any r2p module is known on the link."""
         return bool(self._names)
 
     @property
     def r2p_modules(self) -> int:
-        """How many r2p modules are known on the link."""
+        """The number of r2p modules known on the link."""
         return len(self._names)
 
     def name_of(self, instance: int) -> str:
         return self._names.get(instance, "")
 
     def lease_of(self, source: PeerAddress) -> int | None:
-        """The longest lease of the r2p modules that speak from an address themselves; None: there are none."""
+        """The longest lease of the r2p modules directly at an address; None: there are none."""
         return max(self._leases.get(source, ()), default=None)
 
-    def speaks_alone(self, source: PeerAddress, instance: int) -> bool:
-        """Whether no other module than this one is known to speak from an address itself."""
+    def is_alone(self, source: PeerAddress, instance: int) -> bool:
+        """Whether no other module than this one is known directly at an address."""
         return all(info.instance == instance for info in self._direct.get(source, {}).values())
 
     def alive(self, now: int, message: management.Alive, source: PeerAddress) -> tuple[ModuleInfo | None, ModuleInfo]:
-        """A module's state: what was known before, and what is known now."""
+        """Read a module's state; returns what was known before (it is not entered yet), and what is known now."""
         before = self.modules.get(message.module)
         if before is None:
             info = ModuleInfo(message.module, message.flags, now, source=source)
@@ -130,7 +137,7 @@ class Directory:
         return before, info
 
     def hello(self, now: int, message: management.Hello, source: PeerAddress) -> tuple[ModuleInfo | None, ModuleInfo]:
-        """An r2p module: what was known before, and what is known now."""
+        """Read an r2p module's HELLO; returns what was known before (it is not entered yet), and what is known now."""
         before = self.modules.get(message.module)
         return before, ModuleInfo(
             name=message.module,
@@ -143,12 +150,12 @@ class Directory:
             source=source,
         )
 
-    def keep(self, info: ModuleInfo) -> ModuleInfo | None:
-        """Enter a module; who had to be forgotten for it comes back."""
+    def enter(self, info: ModuleInfo) -> ModuleInfo | None:
+        """Enter a module; returns the one that was forgotten for it, if the table was full."""
         before = self.modules.get(info.name)
         if before is not None and before.instance is not None and before.instance != info.instance:
-            self._forget_instance(before.instance)
-        self.generation += before is None or _who(before) != _who(info)
+            self._forget_instance(before.instance)  # the endpoints of its last start are gone
+        self.generation += before is None or _identity(before) != _identity(info)
         forgotten = self._put(self.modules, info.name, info, "modules forgotten")
         self._forget_direct(before)
         self._forget_direct(forgotten)
@@ -156,15 +163,15 @@ class Directory:
         if info.instance is not None:
             self._names[info.instance] = info.name
         if info.instance is not None and not info.hops:
-            self.ends[info.name] = info.instance
+            self.direct_instances[info.name] = info.instance
         else:
-            self.ends.pop(info.name, None)
+            self.direct_instances.pop(info.name, None)
         if forgotten is not None:
             self._forget(forgotten)
         return forgotten
 
     def remove(self, info: ModuleInfo) -> None:
-        """A module is gone, and its endpoints with it."""
+        """Forget a module, and its endpoints with it."""
         known = self.modules.pop(info.name, None)
         if known is not None:
             self._forget_direct(known)
@@ -172,7 +179,10 @@ class Directory:
             self._forget(info)
 
     def count_swaps(self, now: int, before: ModuleInfo | None, instance: int) -> int:
-        """How often a name went back and forth between two instances within a lease; a restart does not go back."""
+        """How often a name has gone back and forth between two instances within a lease.
+
+        Two modules of one name do so with every HELLO; a module that restarts never goes back.
+        """
         if before is None or before.instance in {None, instance}:
             return 0
         known = self._starts.get(before.name)
@@ -181,38 +191,38 @@ class Directory:
         self._starts[before.name] = _Starts(before.instance or 0, now, swaps)
         return swaps
 
-    def was(self, name: str, instance: int) -> bool:
-        """Whether the module had this instance just before its present one."""
+    def was_before(self, name: str, instance: int) -> bool:
+        """Whether a module had this instance just before its present one."""
         known = self._starts.get(name)
         return known is not None and known.previous == instance
 
     def size_of(self, topic: str) -> int:
-        """Bytes of the topic's messages; 0: not heard yet."""
+        """Bytes of the topic's messages; 0: unknown."""
         info = self.topics.get(topic)
         return 0 if info is None else info.size
 
     def topic(self, name: str) -> TopicInfo:
-        """The entry of a topic that was just heard of."""
+        """The entry of a topic that a message has just named."""
         info = self.topics.get(name) or TopicInfo(name)
         self._put(self.topics, name, info, "topics forgotten")
         return info
 
-    def typed(self, now: int, topic: str, role: int, shape: TopicType) -> TopicInfo:
-        """The type of a topic. Of several that differ the first one stays, as long as it is repeated."""
+    def typed(self, now: int, topic: str, role: int, said: TopicType) -> TopicInfo:
+        """Enter the type that a peer says. Of several that differ the first one stays, as long as it is repeated."""
         info = self.topic(topic)
         for each, at in list(info.typed_at.items()):
             if now > at + LEASE:
                 del info.typed_at[each]
-                info.typed(each, None)
-        known = info.shapes.get(role, TopicType())
-        if shape != TopicType() and known.fits(shape):
-            if known.fingerprint in {management.ANY_TYPE, shape.fingerprint}:
+                info.set_type(each, None)
+        known = info.types.get(role, TopicType())
+        if said != TopicType() and known.fits(said):
+            if known.fingerprint in {management.ANY_TYPE, said.fingerprint}:
                 info.typed_at[role] = now
-            info.typed(role, known.joined(shape))
+            info.set_type(role, known.merged(said))
         return info
 
     def endpoint(self, now: int, message: management.Endpoint) -> None:
-        """A publisher or subscriber of a remote node is there, or gone."""
+        """Enter a publisher or subscriber of a remote node, or forget it if it is gone."""
         role = message.role & ~management.ROLE_GONE
         key = (message.instance, message.node, message.topic, role)
         if message.role & management.ROLE_GONE:
@@ -226,10 +236,10 @@ class Directory:
         if old is not None:
             self._drop_endpoint((old.instance, old.node, old.topic, old.role))
         known = self.modules.get(module)
-        if known is None:  # a stranger, who may never say hello
+        if known is None:  # the HELLO of its module may never come
             self._timers.set(("endpoint", key), now + LEASE)
         elif known.lease < FOR_EVER:
-            self._timers.set(("endpoint", key), now + SELDOM * known.lease)
+            self._timers.set(("endpoint", key), now + SLOW_ROUNDS * known.lease)
         else:
             self._timers.clear(("endpoint", key))
 
@@ -238,21 +248,21 @@ class Directory:
             self.generation += 1
             self._drop_endpoint(key)
 
+    def forget_endpoints(self) -> None:
+        for key in list(self.endpoints):
+            self.forget_endpoint(key)
+
     def _drop_endpoint(self, key: EndpointKey) -> None:
-        """It is not in the table any more."""
+        """Forget what belongs to an endpoint that has left the table."""
         self._timers.clear(("endpoint", key))
         keys = self._endpoints_of[key[0]]
         del keys[key]
         if not keys:
             del self._endpoints_of[key[0]]
 
-    def forget_endpoints(self) -> None:
-        for key in list(self.endpoints):
-            self.forget_endpoint(key)
-
     def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
-        """Enter a value as the latest heard one; what had to go for it comes back."""
-        table.pop(key, None)
+        """Enter a value as the latest one; returns the one that was forgotten for it. A dict keeps the order."""
+        table.pop(key, None)  # to enter it as the last one again
         forgotten = None
         if len(table) >= MOST:
             forgotten = table.pop(next(iter(table)))
@@ -283,7 +293,7 @@ class Directory:
 
     def _forget(self, info: ModuleInfo) -> None:
         self._starts.pop(info.name, None)
-        self.ends.pop(info.name, None)
+        self.direct_instances.pop(info.name, None)
         if info.instance is not None:
             self._forget_instance(info.instance)
 
@@ -293,5 +303,37 @@ class Directory:
             self.forget_endpoint(key)
 
 
-def _who(info: ModuleInfo) -> tuple[object, ...]:
+def _identity(info: ModuleInfo) -> tuple[object, ...]:
     return (info.instance, info.observer, info.source, info.flags, info.hops)
+
+
+class Aliases:
+    """The names of modules that are too long for a message: an alias travels, and NAME says what it stands for."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, str] = {}
+        self._parts: dict[str, dict[int, str]] = {}
+
+    def name_of(self, alias: str) -> str:
+        """The name; the alias itself where none is known, or where it is a name."""
+        return self._names.get(alias, alias)
+
+    def receive(self, message: management.Name) -> str | None:
+        """Read a part of a name; returns the name if it is complete now, and new."""
+        parts = self._parts.setdefault(message.alias, {})
+        parts[message.number] = message.piece
+        if not set(range(message.last + 1)) <= parts.keys():
+            _bound(self._parts, _UNFINISHED_MAX)
+            return None
+        del self._parts[message.alias]
+        name = "".join(parts[each] for each in range(message.last + 1))
+        if len(name) > MODULE_PATH_MAX or module_alias(name) != message.alias or self._names.get(message.alias) == name:
+            return None
+        self._names[message.alias] = name
+        _bound(self._names, MOST)
+        return name
+
+
+def _bound(table: dict[str, Any], most: int) -> None:
+    while len(table) > most:
+        del table[next(iter(table))]

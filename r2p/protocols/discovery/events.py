@@ -1,6 +1,8 @@
-"""What discovery tells the shell around it: to send, to attach, to let go, to report. All values are frozen.
+"""The events that discovery hands to the link that drives it, and the values in them.
 
-`source` is the transport address of a sender on a bus (its id8 on CAN), None on a line with one other end.
+A link acts on each event in order: it sends a message, attaches a topic to a remote subscriber or detaches it, or
+reports a change to the module. `source` is the transport address of a peer on a bus (its id8 on CAN), None on a line,
+which has one other end.
 """
 
 import enum
@@ -15,42 +17,55 @@ PeerAddress = Hashable
 
 
 class Command(enum.Enum):
-    """What one module can order another to do (PROTOCOL.md 4)."""
+    """What one module can command another to do (PROTOCOL.md 4)."""
 
     STOP = "stop"
     REBOOT = "reboot"
     BOOTLOAD = "bootload"
 
 
-COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, Command, strict=True))
-"""The command by the type of the message that orders it."""
+Order = management.Stop | management.Reboot | management.Bootload
+"""The message of a command."""
+
+MESSAGE_OF_COMMAND: dict[Command, type[Order]] = {
+    Command.STOP: management.Stop,
+    Command.REBOOT: management.Reboot,
+    Command.BOOTLOAD: management.Bootload,
+}
+COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, MESSAGE_OF_COMMAND, strict=True))
+"""The command by the type byte of its message, as a DENIED names it."""
+
+
+def command_of(message: Order) -> Command:
+    """The command that a message gives."""
+    return next(command for command, cls in MESSAGE_OF_COMMAND.items() if type(message) is cls)
 
 
 class TopicType(msgspec.Struct, frozen=True):
-    """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (all zero: unknown)."""
+    """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (`ANY_TYPE`: unknown)."""
 
     size: int = 0
     fingerprint: bytes = management.ANY_TYPE
 
     def fits(self, other: "TopicType") -> bool:
-        """Whether nothing that both know differs."""
+        """Whether the two don't contradict each other: what is unknown fits everything."""
         if self.size != other.size and self.size and other.size:
             return False
         typed = self.fingerprint != management.ANY_TYPE and other.fingerprint != management.ANY_TYPE
         return not typed or self.fingerprint == other.fingerprint
 
-    def joined(self, other: "TopicType") -> "TopicType":
-        """What one of two that fit knows."""
+    def merged(self, other: "TopicType") -> "TopicType":
+        """What is known from either of two types that fit."""
         typed = self.fingerprint != management.ANY_TYPE
         return TopicType(self.size or other.size, self.fingerprint if typed else other.fingerprint)
 
 
 class ModuleInfo(msgspec.Struct, frozen=True):
-    """A module as heard on the link.
+    """A module on the link.
 
     `flags` are those of its ALIVE, `last_heard` is in monotonic ns. Only an r2p module has an `instance` (the random
     number of its start), a `lease` (ns that it may be silent), and can be an `observer`, a tool that sends no ALIVE.
-    `hops` counts the gateways in between.
+    `hops` is the number of gateways in between.
     """
 
     name: str
@@ -68,15 +83,15 @@ class ModuleInfo(msgspec.Struct, frozen=True):
 
 
 class Send(msgspec.Struct, frozen=True):
-    """Put these 32 bytes on the topic `R2P`; `urgent` ones before everything else."""
+    """Send these 32 bytes on the topic `R2P`, `urgent` ones before everything else."""
 
     data: bytes
     urgent: bool = False
 
 
 class SubscriberJoined(msgspec.Struct, frozen=True):
-    """A remote subscriber is new, or came back after a restart. Attach the topic to this link if it is not
-    yet, and send the latched value; `queue` is the length that it asked for.
+    """A remote subscriber is new, or is back after a restart. Attach the topic to this link if it is not attached yet,
+    and send its latched value; `queue` is the length that the subscriber asked for.
     """
 
     topic: str
@@ -86,13 +101,24 @@ class SubscriberJoined(msgspec.Struct, frozen=True):
 
 
 class SubscribersGone(msgspec.Struct, frozen=True):
-    """Nobody on this link subscribes the topic any more: detach it."""
+    """The topic has no subscriber on this link any more: detach it."""
 
     topic: str
 
 
+class SubscriberLeft(msgspec.Struct, frozen=True):
+    """One remote subscriber gets no more messages; `SubscribersGone` follows the last one. Only where the link can tell
+    subscribers apart. `gone`: the subscriber has ended; else it still subscribes, and this module publishes no more, or
+    another type.
+    """
+
+    topic: str
+    source: PeerAddress
+    gone: bool = True
+
+
 class PublisherFound(msgspec.Struct, frozen=True):
-    """A remote publisher is new, or has new parameters: take its data. `size` is in bytes, 0 where it did not say."""
+    """A remote publisher is new, or has new parameters: accept its messages. `size` is in bytes, 0: unknown."""
 
     topic: str
     source: PeerAddress
@@ -101,20 +127,20 @@ class PublisherFound(msgspec.Struct, frozen=True):
 
 
 class PublisherGone(msgspec.Struct, frozen=True):
-    """That remote publisher is gone or has another type: take no more data from it."""
+    """A remote publisher is gone, or has a type that does not fit: accept no more messages from it."""
 
     topic: str
     source: PeerAddress
 
 
 class CommandReceived(msgspec.Struct, frozen=True):
-    """Somebody orders this very module."""
+    """A command for this module."""
 
     command: Command
 
 
 class Mismatched(msgspec.Struct, frozen=True):
-    """Same topic, another type: refused. `role` is theirs: ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
+    """A peer has another type for a topic, so nothing flows. `role` is the peer's, ROLE_..."""
 
     topic: str
     source: PeerAddress
@@ -124,7 +150,7 @@ class Mismatched(msgspec.Struct, frozen=True):
 
 
 class NameConflict(msgspec.Struct, frozen=True):
-    """Two modules carry one name; an instance is None for firmware, which has none."""
+    """Two modules have one name; the instance of a firmware module is None."""
 
     module: str
     instance_a: int | None
@@ -132,7 +158,7 @@ class NameConflict(msgspec.Struct, frozen=True):
 
 
 class CommandDenied(msgspec.Struct, frozen=True):
-    """A gateway does not let an order through; `reason` is DENIED_... of management."""
+    """A gateway does not let a command through; `reason` is DENIED_... of management."""
 
     gateway: str
     command: Command
@@ -141,8 +167,8 @@ class CommandDenied(msgspec.Struct, frozen=True):
 
 
 class ConnectionDenied(msgspec.Struct, frozen=True):
-    """The module at the other end serves as many clients as it may, and closes the connection; or, if this one is of a
-    `gateway`, lets nothing pass.
+    """The server at the other end does not accept this connection: it serves as many clients as it may, or this module
+    is a `gateway` and the server accepts none.
     """
 
     server: str
@@ -150,53 +176,43 @@ class ConnectionDenied(msgspec.Struct, frozen=True):
 
 
 class EchoDetected(msgspec.Struct, frozen=True):
-    """The line gives back what we send."""
+    """The line echoes what this module sends."""
 
 
 class ModuleChanged(msgspec.Struct, frozen=True):
-    """A module is new, or another than before in anything but the time it was heard."""
+    """A module is new, or anything but the time it was last heard has changed."""
 
     info: ModuleInfo
 
 
 class ModuleGone(msgspec.Struct, frozen=True):
-    """An r2p module said good-bye, or was `silent` for its lease; on zenoh, which tells no more, it is just gone."""
+    """An r2p module said good-bye, or was `silent` for its lease. On zenoh the two can't be told apart."""
 
     info: ModuleInfo
     silent: bool = False
 
 
 class Declare(msgspec.Struct, frozen=True):
-    """Keep this liveliness token, for as long as we live or until `Undeclare`."""
+    """Declare this liveliness token."""
 
     key: str
 
 
 class Undeclare(msgspec.Struct, frozen=True):
-    """Keep it no more."""
+    """Undeclare this liveliness token."""
 
     key: str
 
 
 class QueryTokens(msgspec.Struct, frozen=True):
-    """Ask the network for all tokens: call `Presence.appeared` with each of them, then `Presence.looked`."""
-
-
-class SubscriberLeft(msgspec.Struct, frozen=True):
-    """Nothing flows to one remote subscriber any more; `SubscribersGone` follows the last one. Only where links can
-    tell subscribers apart. `gone`: the subscriber itself is gone; else it still subscribes, and this
-    module publishes no more, or another type.
-    """
-
-    topic: str
-    source: PeerAddress
-    gone: bool = True
+    """Query the network for all tokens; `appeared` takes each of them, `looked` the end of the answers."""
 
 
 Event = (
     Send
     | SubscriberJoined
     | SubscribersGone
+    | SubscriberLeft
     | PublisherFound
     | PublisherGone
     | CommandReceived
@@ -210,26 +226,21 @@ Event = (
     | Declare
     | Undeclare
     | QueryTokens
-    | SubscriberLeft
 )
 
-
-# Where everything that happens is collected until the shell takes it: messages to send and news to act on.
-
-
-_REMEMBERED = 256
-"""Messages that are recognised when a line echoes them."""
+_ECHO_MEMORY = 256
+"""Messages that are recognised when a line echoes them: more than are on the way at a time."""
 
 
 class Outbox:
-    """The events of one call. While the link is not `up` nothing is sent."""
+    """Collects the events of one call. While the link is not `up` nothing is sent."""
 
     def __init__(self) -> None:
         self.up = False
         self._events: list[Event] = []
-        self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._sent: deque[bytes] = deque(maxlen=_ECHO_MEMORY)
 
-    def say(self, *messages: management.Management, urgent: bool = False) -> None:
+    def send(self, *messages: management.Management, urgent: bool = False) -> None:
         if self.up:
             for message in messages:
                 data = management.encode(message)
@@ -239,12 +250,12 @@ class Outbox:
     def emit(self, event: Event) -> None:
         self._events.append(event)
 
-    def take(self) -> list[Event]:
+    def drain(self) -> list[Event]:
         events, self._events = self._events, []
         return events
 
-    def forget(self, data: bytes) -> bool:
-        """Whether we sent this lately; each message is recognised once."""
+    def is_echo(self, data: bytes) -> bool:
+        """Whether these bytes were sent lately; each message is recognised once."""
         if data not in self._sent:
             return False
         self._sent.remove(data)

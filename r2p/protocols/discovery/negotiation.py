@@ -1,13 +1,14 @@
-"""Who may exchange what: both sides of ADVERTISE, SUBSCRIBE_REQUEST and SUBSCRIBE_RESPONSE (PROTOCOL.md 4).
+"""Which topics flow on one link: both sides of ADVERTISE, SUBSCRIBE_REQUEST and SUBSCRIBE_RESPONSE (PROTOCOL.md 4).
 
-Firmware is answered every time. Between r2p modules what only repeats itself brings no more than a response, for both
-sides repeat; and where many of them ask at once they share an answer (`SharedAnswers`). Only a change becomes an event.
-A type that does not fit is refused by both sides, because each sends its own with every repetition and as the answer
-to what it refuses. A TYPE is never answered, so two that disagree don't argue.
+Firmware is answered every time. Between r2p modules a repetition brings no more than a response, as both sides repeat;
+and where many of them ask at once, they share an answer (`SharedAnswers`). Only a change becomes an event.
+
+A type that does not fit is refused by both sides, because each sends its own with every repetition and as the answer to
+what it refuses. A TYPE is never answered, so two modules that disagree don't argue for ever.
 """
 
 from collections import Counter
-from typing import Any
+from typing import Generic, TypeVar
 
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
@@ -25,76 +26,82 @@ from r2p.protocols.discovery.events import (
     TopicType,
 )
 from r2p.protocols.discovery.peers import Peer, Peers
-from r2p.protocols.discovery.schedule import SharedAnswers
 from r2p.protocols.timers import KeyedTimers
+
+M = TypeVar("M")
 
 _SENT_BY_R2P = (UNANSWERED, ANSWERED)
 
 GRACE = 50_000_000
-"""Ns after a SUBSCRIBE_RESPONSE, or a reconnect, in which firmware drops data: the thread that takes the response has
-its lowest priority."""
+"""Ns after a SUBSCRIBE_RESPONSE, or a reconnect, in which firmware drops messages of the topic: the thread that handles
+the response has its lowest priority."""
+_SHARED_GAP = 20_000_000
+"""Ns between two answers about one topic, for each module on the link."""
+_AT_ONCE = 3
+"""Answers about one topic that need not wait."""
 
 
 class SubscriptionNegotiation:
-    """What flows on one link, by peer and topic."""
+    """The subscriptions of one link, by peer and topic."""
 
     def __init__(
-        self, own: Announcer, outbox: Outbox, directory: Directory, timers: KeyedTimers, counts: Counter[str]
+        self, own: Announcer, directory: Directory, timers: KeyedTimers, outbox: Outbox, counts: Counter[str]
     ) -> None:
         self._own = own
-        self._outbox = outbox
         self._directory = directory
         self._timers = timers
+        self._outbox = outbox
         self._counts = counts
         self._peers = Peers(counts)
-        self._answers: SharedAnswers[Any] = SharedAnswers(timers)
+        self._offers = SharedAnswers[management.Advertise](timers, ROLE_PUBLISHES)
+        self._requests = SharedAnswers[management.SubscribeRequest](timers, ROLE_SUBSCRIBES)
         self._attached: set[str] = set()
-        """The topics of which the link has been told that they have subscribers."""
+        """The topics for which `SubscriberJoined` was emitted, and no `SubscribersGone` since."""
 
-    # What peers say
+    # Messages
 
     def advertised(self, now: int, message: management.Advertise, source: PeerAddress) -> None:
-        """A publisher: ask for its data if somebody here wants it."""
+        """ADVERTISE, of a publisher: request its messages if this module subscribes the topic."""
         topic = message.topic
         self._directory.typed(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
         own = self._own.subscribers.get(topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if own is None or peer is None:
             return
+        # Firmware is asked at once and every time: it may have restarted, which it does not say.
         if peer.is_r2p(now) and (
-            _receives(peer, message)
-            or self._answers.waits(now, (ROLE_PUBLISHES, topic), source, message, self._directory.r2p_modules)
+            _receives(peer, message) or self._offers.defer(now, topic, source, message, self._directory.r2p_modules)
         ):
             return
-        self._request(now, topic, own, [(peer, message)])
+        self._send_request(now, topic, own, [(peer, message)])
 
     def requested(self, now: int, message: management.SubscribeRequest, source: PeerAddress) -> None:
-        """A subscriber: answer, and attach it if it is new. The size that it tells is not looked at."""
+        """SUBSCRIBE_REQUEST, of a subscriber: respond, and attach it if it is new. The size in it decides nothing."""
         topic = message.topic
         self._directory.typed(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
         own = self._own.publishers.get(topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if own is None or peer is None:
             return
-        r2p = peer.is_r2p(now) or message.params in _SENT_BY_R2P
-        modules = self._directory.r2p_modules
-        if not (r2p and self._answers.waits(now, (ROLE_SUBSCRIBES, topic), source, message, modules)):
-            self._respond(now, topic, own, [(peer, message)])
+        r2p = peer.is_r2p(now) or message.params in _SENT_BY_R2P  # its HELLO may be later than its request
+        if not (r2p and self._requests.defer(now, topic, source, message, self._directory.r2p_modules)):
+            self._send_response(now, topic, own, [(peer, message)])
 
     def responded(self, now: int, message: management.SubscribeResponse, source: PeerAddress) -> None:
-        """A publisher that will send: let its data in."""
+        """SUBSCRIBE_RESPONSE, of a publisher that will send: accept its messages."""
         topic = message.topic
         peer = self._peers.get_or_create(source) if topic in self._own.subscribers else None
-        if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, message)):
+        if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, message)):
             return
         self._directory.typed(now, topic, ROLE_PUBLISHES, TopicType(message.size))
-        if peer.opened.get(topic) != (message.params, message.size):
-            peer.opened[topic] = (message.params, message.size)
-            self._own.answered.add(topic)
+        # Every response to a repeated request comes here; only new params, as after a restart, are an event.
+        if peer.publishers.get(topic) != (message.params, message.size):
+            peer.publishers[topic] = (message.params, message.size)
+            self._own.with_publisher.add(topic)
             self._outbox.emit(PublisherFound(topic, source, message.params, message.size))
 
     def typed(self, now: int, message: management.TypeInfo, source: PeerAddress) -> None:
-        """A peer's type of a topic: compare it if the topic is ours too."""
+        """TYPE: compare a peer's type of a topic with this module's, if it has the topic."""
         self._directory.typed(now, message.topic, message.role, TopicType(message.size, message.fingerprint))
         own = self._counterpart(message.role).get(message.topic)
         peer = self._peers.get_or_create(source) if own is not None else None
@@ -103,10 +110,12 @@ class SubscriptionNegotiation:
             self._fits(peer, message.topic, message.role, theirs)
 
     def unsubscribed(self, now: int, message: management.Unsubscribe, source: PeerAddress) -> None:
-        """A subscriber is gone; where several modules share an address, only the lease tells who is left."""
+        """UNSUBSCRIBE: end a subscription. Where several modules share an address, only the lease can end it, as the
+        others may still subscribe.
+        """
         peer = self._peers.get(source)
         if peer is not None and peer.direct == {self._directory.name_of(message.instance)}:
-            self._end(peer, message.topic)
+            self._remove_subscriber(peer, message.topic)
         else:
             self._counts["unsubscribe left to the lease"] += 1
 
@@ -114,127 +123,135 @@ class SubscriptionNegotiation:
 
     def answer(self, now: int, role: int, topic: str) -> None:
         """Answer all r2p modules that have said since the last answer that they publish or subscribe the topic."""
-        asked = self._answers.take(now, (role, topic), self._directory.r2p_modules)
-        known = [(peer, message) for source, message in asked if (peer := self._peers.get(source)) is not None]
-        own = self._counterpart(role).get(topic)
-        if own is None or not known:
-            return
+        own, modules = self._counterpart(role).get(topic), self._directory.r2p_modules
         if role == ROLE_PUBLISHES:
-            self._request(now, topic, own, known)
+            offers = self._with_peers(self._offers.pop(now, topic, modules))
+            if own is not None and offers:
+                self._send_request(now, topic, own, offers)
         else:
-            self._respond(now, topic, own, known)
+            requests = self._with_peers(self._requests.pop(now, topic, modules))
+            if own is not None and requests:
+                self._send_response(now, topic, own, requests)
 
-    def _request(self, now: int, topic: str, own: LocalTopic, offers: list[tuple[Peer, management.Advertise]]) -> None:
-        """Ask publishers for their data; those whose data come in by now, at our next request."""
+    def _with_peers(self, asked: list[tuple[PeerAddress, M]]) -> list[tuple[Peer, M]]:
+        return [(peer, message) for source, message in asked if (peer := self._peers.get(source)) is not None]
+
+    def _send_request(
+        self, now: int, topic: str, own: LocalTopic, offers: list[tuple[Peer, management.Advertise]]
+    ) -> None:
+        """Request the messages of publishers, but for those of r2p that have responded meanwhile."""
         r2p = [peer.is_r2p(now) for peer, _ in offers]
         offers = [each for each, is_r2p in zip(offers, r2p, strict=True) if not (is_r2p and _receives(*each))]
-        if any(r2p) and offers:
-            self._outbox.say(own.type(topic, ROLE_SUBSCRIBES))
-        sizes = [offer.size for peer, offer in offers if self._fits(peer, topic, ROLE_PUBLISHES, _theirs(peer, offer))]
+        if any(r2p) and offers:  # before the request: publishers compare it with theirs when they respond
+            self._outbox.send(own.type_info(topic, ROLE_SUBSCRIBES))
+        sizes = [
+            offer.size for peer, offer in offers if self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, offer))
+        ]
         if sizes:
-            self._outbox.say(*self._own.requests(topic, own, sizes[-1]))
+            self._outbox.send(*self._own.requests(topic, own, sizes[-1]))
 
-    def _respond(
+    def _send_response(
         self, now: int, topic: str, own: LocalTopic, requests: list[tuple[Peer, management.SubscribeRequest]]
     ) -> None:
-        """Answer subscribers, and attach those that are new."""
+        """Respond to subscribers, and attach those that are new."""
         if any(_needs_type(now, peer, request) for peer, request in requests):
-            self._outbox.say(own.type(topic, ROLE_PUBLISHES))
+            self._outbox.send(own.type_info(topic, ROLE_PUBLISHES))
         requests = [each for each in requests if self._may_subscribe(each[0], topic)]
         if not requests:
             return
-        queue = max(requests[-1][1].queue, 1)
-        self._outbox.say(management.SubscribeResponse(topic, own.shape.size, queue, own.params))
+        queue = max(requests[-1][1].queue, 1)  # a request with 0, at which firmware halts, is answered with 1
+        self._outbox.send(management.SubscribeResponse(topic, own.type.size, queue, own.params))
         for peer, request in requests:
             unanswered = peer.is_r2p(now) and request.params == UNANSWERED
-            if self._peers.join(now, peer, topic, unanswered=unanswered):
-                self._own.wanted.add(topic)
-                self._join(now, peer, SubscriberJoined(topic, request.params, request.queue, peer.source))
+            if self._peers.add_subscriber(now, peer, topic, unanswered=unanswered):
+                self._own.with_subscriber.add(topic)
+                self._add_subscriber(now, peer, SubscriberJoined(topic, request.params, request.queue, peer.source))
             self._renew(now, peer, topic)
 
     def _may_subscribe(self, peer: Peer, topic: str) -> bool:
         theirs = peer.types.get((topic, ROLE_SUBSCRIBES))
         return theirs is None or self._fits(peer, topic, ROLE_SUBSCRIBES, theirs)
 
-    # What changed on our side
+    # Changes of this module
 
-    def retyped(self, topic: str, role: int) -> None:
-        """Our own type is new: compare it with those of the peers in this role."""
+    def type_changed(self, topic: str, role: int) -> None:
+        """Compare this module's new type of a topic with those of the peers in this role."""
         for peer in self._peers.all():
-            peer.refused.pop((topic, role), None)
+            peer.mismatched.pop((topic, role), None)  # so a mismatch with the new type is reported, too
             theirs = peer.types.get((topic, role))
             if theirs is not None:
                 self._fits(peer, topic, role, theirs)
 
     def withdrawn(self, topic: str) -> None:
-        """Our last publisher is gone."""
-        self._answers.forget((ROLE_SUBSCRIBES, topic))
+        """End all remote subscriptions of a topic that this module publishes no more."""
+        self._requests.forget(topic)
         for peer in self._peers.all():
-            self._end(peer, topic)
+            self._remove_subscriber(peer, topic)
             peer.forget_type(topic, ROLE_SUBSCRIBES)
 
-    def unwanted(self, topic: str) -> None:
-        """Our last subscriber is gone."""
-        self._answers.forget((ROLE_PUBLISHES, topic))
+    def subscription_ended(self, topic: str) -> None:
+        """Accept no more messages of a topic that this module subscribes no more."""
+        self._offers.forget(topic)
         for peer in self._peers.all():
-            self._shut(peer, topic)
+            self._remove_publisher(peer, topic)
             peer.forget_type(topic, ROLE_PUBLISHES)
 
-    # Who is there
+    # Changes of the peers
 
-    def met(self, now: int, info: ModuleInfo, *, is_new: bool) -> None:
-        """An r2p module is the very other end: from now on its address has leases."""
+    def module_found(self, now: int, info: ModuleInfo, *, is_new: bool) -> None:
+        """An r2p module is directly at an address: from now on, subscriptions from there are leases."""
         peer = self._peers.get_or_create(info.source)
         if peer is None:
             return
-        if not peer.is_r2p(now):  # nor was it firmware that asked before the link was down
-            for topic in [topic for topic, stale in peer.requests.items() if stale]:
-                self._end(peer, topic)
+        if not peer.is_r2p(now):  # nor was it firmware that had subscribed before the link was down
+            for topic in [topic for topic, restarted in peer.subscriptions.items() if restarted]:
+                self._remove_subscriber(peer, topic)
         if is_new and peer.r2p_until:  # the first HELLO of all may just be later than its module's requests
-            peer.mark_stale()
-        peer.meet(now, info)
+            peer.mark_restarted()
+        peer.add_module(now, info)
         for topic in list(peer.permanent):
             self._renew(now, peer, topic)
 
     def restarted(self, source: PeerAddress) -> None:
-        """A module there lost what it knew: its next requests are as good as new."""
+        """A module at an address has restarted, and forgot its subscriptions: its next requests are as good as new."""
         peer = self._peers.get(source)
         if peer is not None:
-            peer.mark_stale()
+            peer.mark_restarted()
 
-    def moved_away(self, now: int, info: ModuleInfo) -> None:
-        """A module is not at this address any more; with the last r2p module goes all that was asked and offered."""
+    def module_gone(self, now: int, info: ModuleInfo) -> None:
+        """A module has left its address. With the last r2p module there, all subscriptions and publishers end."""
         peer = self._peers.get(info.source)
         if peer is not None and info.name in peer.direct:
             peer.direct.discard(info.name)
             if not peer.direct:
-                self._depart(now, peer)
+                self._forget_peer(now, peer)
 
-    def left(self, now: int, source: PeerAddress) -> None:
-        """The good-bye of a module whose other HELLOs were all lost."""
+    def unknown_left(self, now: int, source: PeerAddress) -> None:
+        """A module said good-bye whose other HELLOs were all lost."""
         peer = self._peers.get(source)
         if peer is not None and not peer.direct:
-            self._depart(now, peer)
+            self._forget_peer(now, peer)
 
-    def interrupted(self) -> None:
-        """The link is down. Firmware does not notice a reconnect: its subscriptions stay, leases end."""
-        self._answers.clear()
+    def link_down(self) -> None:
+        """End all leases. Firmware does not notice that the link is down, so its subscriptions stay."""
+        self._offers.clear()
+        self._requests.clear()
         for peer in self._peers.all():
-            peer.r2p_until = 0
-            for topic in [topic for topic in peer.requests if topic not in peer.permanent]:
-                self._end(peer, topic)
-            peer.mark_stale()
+            peer.r2p_until = 0  # another module may answer after the reconnect
+            for topic in [topic for topic in peer.subscriptions if topic not in peer.permanent]:
+                self._remove_subscriber(peer, topic)
+            peer.mark_restarted()
             self._peers.prune(peer)
 
     def lease_over(self, source: PeerAddress, topic: str) -> None:
         peer = self._peers.get(source)
         if peer is not None:
-            self._end(peer, topic)
+            self._remove_subscriber(peer, topic)
 
     def grace_over(self, source: PeerAddress, topic: str) -> None:
-        """Firmware has taken our response by now: it may get data.
+        """Firmware has handled the response by now: attach it.
 
-        On a line we advertise once more: it may be the one of a gateway of firmware, which passes data on only after a
+        On a line advertise once more: the other end may be a gateway of firmware, which passes messages on only after a
         second round of request and response.
         """
         peer = self._peers.get(source)
@@ -244,46 +261,47 @@ class SubscriptionNegotiation:
             if source is None:
                 self._own.advertise_again(topic)
 
-    def memory_over(self, source: PeerAddress) -> None:
-        """What a peer sent before it left can't arrive any more."""
+    def linger_over(self, source: PeerAddress) -> None:
+        """Forget a peer: what it sent before it left has arrived by now."""
         peer = self._peers.get(source)
         if peer is not None:
             self._peers.prune(peer)
 
-    def _depart(self, now: int, peer: Peer) -> None:
-        self._answers.drop(peer.source)
-        for topic in list(peer.requests):
-            self._end(peer, topic)
-        for topic in list(peer.opened):
-            self._shut(peer, topic)
+    def _forget_peer(self, now: int, peer: Peer) -> None:
+        self._offers.remove(peer.source)
+        self._requests.remove(peer.source)
+        for topic in list(peer.subscriptions):
+            self._remove_subscriber(peer, topic)
+        for topic in list(peer.publishers):
+            self._remove_publisher(peer, topic)
         peer.types.clear()
-        peer.refused.clear()
+        peer.mismatched.clear()
         peer.r2p_until = now + LEASE
         self._timers.set(("peer", peer.source), peer.r2p_until)
 
     def _counterpart(self, role: int) -> dict[str, LocalTopic]:
-        """Our side of what a peer in this role tells."""
+        """This module's topics in the opposite role of a peer."""
         return {ROLE_PUBLISHES: self._own.subscribers, ROLE_SUBSCRIBES: self._own.publishers}.get(role, {})
 
     def _fits(self, peer: Peer, topic: str, role: int, theirs: TopicType) -> bool:
-        """Whether a peer's type fits ours; if not, it is told once and nothing flows."""
-        ours = self._counterpart(role)[topic].shape
-        fits = ours.fits(theirs)
+        """Whether a peer's type fits this module's. If not, nothing flows, and it is reported once."""
+        ours = self._counterpart(role)[topic].type
+        fits = ours.fits(theirs)  # what is unknown fits, so firmware, which has no fingerprints, is judged by size only
         self._directory.topic(topic).mismatch = not fits
         if fits:
-            peer.refused.pop((topic, role), None)
+            peer.mismatched.pop((topic, role), None)
             return True
-        if peer.refused.get((topic, role)) != theirs:
-            peer.refused[topic, role] = theirs
+        if peer.mismatched.get((topic, role)) != theirs:
+            peer.mismatched[topic, role] = theirs
             self._outbox.emit(Mismatched(topic, peer.source, role, ours, theirs))
         if role == ROLE_SUBSCRIBES:
-            self._end(peer, topic)
+            self._remove_subscriber(peer, topic)
         else:
-            self._shut(peer, topic)
+            self._remove_publisher(peer, topic)
         return False
 
-    def _join(self, now: int, peer: Peer, joined: SubscriberJoined) -> None:
-        """A subscriber is new. Firmware is given time to take the response before the data."""
+    def _add_subscriber(self, now: int, peer: Peer, joined: SubscriberJoined) -> None:
+        """Attach a new subscriber. Firmware gets time to handle the response before the first message."""
         if peer.is_r2p(now) or joined.params in _SENT_BY_R2P:
             self._attach(joined)
         else:
@@ -295,7 +313,7 @@ class SubscriptionNegotiation:
         self._outbox.emit(joined)
 
     def _renew(self, now: int, peer: Peer, topic: str) -> None:
-        """A subscription was made or repeated: a lease with r2p peers, for ever with firmware."""
+        """Extend a subscription that was made or repeated: by a lease for r2p peers, for ever for firmware."""
         key = ("lease", peer.source, topic)
         if not peer.is_r2p(now):
             peer.permanent.add(topic)
@@ -305,37 +323,90 @@ class SubscriptionNegotiation:
         if peer.lease is not None:
             self._timers.set(key, now + peer.lease)
 
-    def _end(self, peer: Peer, topic: str) -> None:
-        self._answers.drop(peer.source, (ROLE_SUBSCRIBES, topic))
+    def _remove_subscriber(self, peer: Peer, topic: str) -> None:
+        self._requests.remove(peer.source, topic)
         self._timers.clear(("lease", peer.source, topic))
         if peer.waiting.pop(topic, None) is not None:
             self._timers.clear(("grace", peer.source, topic))
-        if self._peers.end(peer, topic):
-            self._own.wanted.discard(topic)
+        if self._peers.remove_subscriber(peer, topic):
+            self._own.with_subscriber.discard(topic)
             if topic in self._attached:
                 self._attached.remove(topic)
                 self._outbox.emit(SubscribersGone(topic))
 
-    def _shut(self, peer: Peer, topic: str) -> None:
-        if peer.opened.pop(topic, None) is not None:
-            if not any(topic in each.opened for each in self._peers.all()):
-                self._own.answered.discard(topic)
+    def _remove_publisher(self, peer: Peer, topic: str) -> None:
+        if peer.publishers.pop(topic, None) is not None:
+            if not any(topic in each.publishers for each in self._peers.all()):
+                self._own.with_publisher.discard(topic)
             self._outbox.emit(PublisherGone(topic, peer.source))
 
 
 def _receives(peer: Peer, message: management.Advertise) -> bool:
-    """Whether what this publisher offers comes in already, and it knows of subscribers."""
-    return peer.opened.get(message.topic) == (message.params, message.size)
+    """Whether the messages of this publisher, with these params and size, are accepted already."""
+    return peer.publishers.get(message.topic) == (message.params, message.size)
 
 
 def _needs_type(now: int, peer: Peer, message: management.SubscribeRequest) -> bool:
-    """Whether an r2p subscriber may not know our type: repeats of its requests only keep its lease."""
+    """Whether an r2p subscriber may not know this module's type yet. Later requests only extend its lease."""
     if not peer.is_r2p(now):
         return False
-    return message.params == UNANSWERED or peer.requests.get(message.topic) is not False
+    return message.params == UNANSWERED or peer.subscriptions.get(message.topic) is not False
 
 
-def _theirs(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> TopicType:
-    """What a publisher's message says of its type, with the TYPE before it if that speaks of the same size."""
+def _implied_type(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> TopicType:
+    """The type that a publisher's message implies: that of the TYPE before it, if the sizes agree."""
     typed = peer.types.get((message.topic, ROLE_PUBLISHES))
     return typed if typed is not None and typed.size == message.size else TopicType(message.size)
+
+
+class SharedAnswers(Generic[M]):
+    """The answers to r2p modules in one role, by topic: which go at once, and which wait to serve several modules.
+
+    An answer is heard by all modules on the link, so it serves everyone who asked before it. About each topic the first
+    few answers go at once; then there is one for each `_SHARED_GAP` and module. Without that, when n modules start
+    together, each would answer each of the others, and each of these answers would be answered. The timers have keys
+    that begin with "answer".
+    """
+
+    def __init__(self, timers: KeyedTimers, role: int) -> None:
+        self._timers = timers
+        self._role = role
+        self._full_at: dict[str, int] = {}
+        self._deferred: dict[str, dict[PeerAddress, M]] = {}
+
+    def defer(self, now: int, topic: str, source: PeerAddress, message: M, modules: int) -> bool:
+        """Whether the answer to this message waits for its timer; `modules` are known on the link."""
+        deferred = self._deferred.get(topic)
+        if deferred is not None:
+            deferred[source] = message
+            return True
+        gap = _SHARED_GAP * modules
+        ready = self._full_at.get(topic, 0) - (_AT_ONCE - 1) * gap
+        if ready <= now:
+            self._count(now, topic, gap)
+            return False
+        self._deferred[topic] = {source: message}
+        self._timers.set(("answer", self._role, topic), ready)
+        return True
+
+    def pop(self, now: int, topic: str, modules: int) -> list[tuple[PeerAddress, M]]:
+        """The peers to answer now that the timer has run out, and what each of them said last."""
+        self._count(now, topic, _SHARED_GAP * modules)
+        return list(self._deferred.pop(topic, {}).items())
+
+    def remove(self, source: PeerAddress, topic: str | None = None) -> None:
+        """Don't answer a peer any more, about one topic or about all."""
+        for deferred in self._deferred.values() if topic is None else [self._deferred.get(topic, {})]:
+            deferred.pop(source, None)
+
+    def forget(self, topic: str) -> None:
+        self._full_at.pop(topic, None)
+        self._deferred.pop(topic, None)
+        self._timers.clear(("answer", self._role, topic))
+
+    def clear(self) -> None:
+        for topic in self._full_at.keys() | self._deferred.keys():
+            self.forget(topic)
+
+    def _count(self, now: int, topic: str, gap: int) -> None:
+        self._full_at[topic] = max(self._full_at.get(topic, 0), now) + gap

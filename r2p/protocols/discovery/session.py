@@ -1,8 +1,9 @@
-"""The management protocol of one link (PROTOCOL.md 4 and 9): who is there, and what may flow.
+"""Discovery by management messages, for one link (PROTOCOL.md 4 and 9): who is there, and what may flow.
 
-The protocol is stateless and lazy: everything is said again and again, every request is answered every time, and no
-single message matters. `Announcer` says what this module has, `SubscriptionNegotiation` answers what others want,
-`Directory` remembers what the peers said, `PeerLiveness` reports which peers come and go; `Discovery` drives them all.
+The protocol keeps no connections: everything is announced again and again, every request is answered every time, and no
+single message matters. `Announcer` says what this module has, `SubscriptionNegotiation` answers what peers offer and
+request, `PeerLiveness` reports which modules come and go, and `Directory` remembers what they said. `Discovery` gives
+each received message to the part that handles it, and calls the parts when their time has come.
 """
 
 from collections import Counter
@@ -14,77 +15,42 @@ from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBS
 from r2p.errors import DecodeError
 from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic, Relayed
+from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.demand import Demand, LeasedDemand
 from r2p.protocols.discovery.directory import Directory, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.discovery.events import (
     COMMAND_OF_TYPE,
+    MESSAGE_OF_COMMAND,
     Command,
     CommandDenied,
     CommandReceived,
     ConnectionDenied,
-    EchoDetected,
     Event,
-    Mismatched,
-    ModuleChanged,
-    ModuleGone,
     ModuleInfo,
-    NameConflict,
+    Order,
     Outbox,
     PeerAddress,
-    PublisherFound,
-    PublisherGone,
-    Send,
-    SubscriberJoined,
-    SubscribersGone,
     TopicType,
+    command_of,
 )
 from r2p.protocols.discovery.liveness import PeerLiveness
 from r2p.protocols.discovery.negotiation import SubscriptionNegotiation
-from r2p.protocols.discovery.schedule import Kind, Schedule
+from r2p.protocols.discovery.schedule import ItemKind, Schedule
 from r2p.protocols.timers import KeyedTimers
 
-__all__ = [
-    "Command",
-    "CommandReceived",
-    "Discovery",
-    "EchoDetected",
-    "EndpointInfo",
-    "Event",
-    "Mismatched",
-    "ModuleChanged",
-    "ModuleGone",
-    "ModuleInfo",
-    "NameConflict",
-    "PeerAddress",
-    "PublisherFound",
-    "PublisherGone",
-    "Send",
-    "SubscriberJoined",
-    "SubscribersGone",
-    "TopicInfo",
-    "TopicType",
-]
-
 _SECOND = 1_000_000_000
-_SLEPT = _SECOND
-"""Ns by which nobody is late who runs at all."""
+_SUSPENDED = _SECOND
+"""Ns by which `poll` is late only when this program did not run: its computer slept, or a debugger held it."""
 _HEARD_AGAIN = 2 * _SECOND
-"""Ns in which whoever lives says so."""
-_ORDERS: dict[Command, Callable[[str], management.Management]] = {
-    Command.STOP: management.Stop,
-    Command.REBOOT: management.Reboot,
-    Command.BOOTLOAD: management.Bootload,
-}
+"""Ns in which every live peer repeats itself."""
 
 
-class Discovery:
+class Discovery(DiscoveryProtocol):
     """The management protocol of one link.
 
-    `rate` is the most management messages a second that nobody asked for, `burst` how many of them may go at once,
+    `rate` is the most management messages a second that were not asked for, `burst` how many of them may go at once,
     `quiet` the time (s) without management traffic before something is repeated. An `observer` sends no ALIVE.
     `counts` is the counter to use, where its owner wants to see it grow.
-
-    Every method takes `now` (monotonic ns) and gives back what to do, in order; call `poll` at `next_deadline()`.
     """
 
     def __init__(
@@ -98,197 +64,164 @@ class Discovery:
         observer: bool = False,
         counts: Counter[str] | None = None,
     ) -> None:
-        self.counts: Counter[str] = Counter() if counts is None else counts
-        """Received messages that were dropped, by reason."""
-        self._module = module
-        self._instance = instance
+        self.counts = Counter() if counts is None else counts
         self._outbox = Outbox()
         self._schedule = Schedule(rate, burst, round(quiet * _SECOND))
         self._timers = KeyedTimers()
         self._directory = Directory(self._timers, self.counts)
-        self._announcer = Announcer(
-            module, instance, self._schedule, self._outbox, self._directory.size_of, observer=observer
+        self._announcer = Announcer(module, instance, self._schedule, self._outbox, self._directory, observer=observer)
+        self._negotiation = SubscriptionNegotiation(
+            self._announcer, self._directory, self._timers, self._outbox, self.counts
         )
-        self._exchange = SubscriptionNegotiation(
-            self._announcer, self._outbox, self._directory, self._timers, self.counts
-        )
-        self._neighbours = PeerLiveness(
-            module,
-            instance,
-            self._directory,
-            self._exchange,
-            self._announcer,
-            self._schedule,
-            self._timers,
-            self._outbox,
-            self.counts,
+        self._liveness = PeerLiveness(
+            self._announcer, self._negotiation, self._directory, self._timers, self._outbox, self.counts
         )
         self._demand: LeasedDemand | None = None
         self._handlers: dict[type, Callable[[int, Any, PeerAddress], None]] = {
-            management.Alive: self._neighbours.alive,
-            management.Stop: self._stop,
-            management.Reboot: self._reboot,
-            management.Bootload: self._bootload,
-            management.Advertise: self._exchange.advertised,
-            management.SubscribeRequest: self._exchange.requested,
-            management.SubscribeResponse: self._exchange.responded,
-            management.Hello: self._neighbours.hello,
-            management.TypeInfo: self._exchange.typed,
-            management.Unsubscribe: self._exchange.unsubscribed,
-            management.Endpoint: self._neighbours.endpoint,
-            management.Name: self._neighbours.named,
-            management.Conflict: self._neighbours.conflict,
+            management.Alive: self._liveness.alive,
+            management.Stop: self._commanded,
+            management.Reboot: self._commanded,
+            management.Bootload: self._commanded,
+            management.Advertise: self._negotiation.advertised,
+            management.SubscribeRequest: self._negotiation.requested,
+            management.SubscribeResponse: self._negotiation.responded,
+            management.Hello: self._liveness.hello,
+            management.TypeInfo: self._negotiation.typed,
+            management.Unsubscribe: self._negotiation.unsubscribed,
+            management.Endpoint: self._liveness.endpoint,
+            management.Name: self._liveness.name,
+            management.Conflict: self._liveness.conflict,
             management.Denied: self._denied,
         }
 
-    # What was learnt
+    # What is known of the link
 
     @property
     def flags(self) -> int:
-        """Our own flags, as in ALIVE."""
         return self._announcer.flags
 
     @property
     def modules(self) -> dict[str, ModuleInfo]:
-        """The modules heard on the link, by name; one of our own name is another module that has it too."""
         return self._directory.modules
 
     @property
     def topics(self) -> dict[str, TopicInfo]:
-        """The topics heard of on the link, by name."""
         return self._directory.topics
 
     @property
     def endpoints(self) -> dict[EndpointKey, EndpointInfo]:
-        """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
         return self._directory.endpoints
 
     @property
     def sole_peer(self) -> int | None:
-        """The instance of the one r2p module on the link itself; None if there is none, or more than one."""
-        ends = self._directory.ends
-        return next(iter(ends.values())) if len(ends) == 1 else None
+        direct = self._directory.direct_instances
+        return next(iter(direct.values())) if len(direct) == 1 else None
 
     @property
     def generation(self) -> int:
-        """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
         return self._directory.generation
 
-    # What the module has and wants
-
-    def set_flags(self, now: int, flags: int) -> list[Event]:
-        """The module's state changed: tell at once. `flags` are FLAG_... of ALIVE."""
-        if flags != self._announcer.flags:
-            self._announcer.flags = flags
-            self._announcer.once(Kind.PRESENCE)
-        return self._go_on(now)
-
-    def advertise(
-        self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
-    ) -> list[Event]:
-        """The module publishes this topic: messages of `size` bytes. `params` are the transport's."""
-        if self._announcer.publish(topic, LocalTopic(TopicType(size, fingerprint), params)):
-            self._exchange.retyped(topic, ROLE_SUBSCRIBES)
-            for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES) if self._demand is not None else ():
-                self._exchange.requested(now, management.SubscribeRequest(topic, size, 1), source)  # was heard before
-        return self._go_on(now)
-
-    def withdraw(self, now: int, topic: str) -> list[Event]:
-        """The module does not publish this topic any more: whoever joined has left."""
-        if self._announcer.withdraw(topic):
-            self._exchange.withdrawn(topic)
-        return self._go_on(now)
-
-    def subscribe(
-        self, now: int, topic: str, size: int = 0, queue: int = management.QUEUE, fingerprint: bytes = ANY_TYPE
-    ) -> list[Event]:
-        """The module subscribes this topic. Size 0 and no fingerprint: whatever its type is; it is then not asked for
-        before its size has been heard.
-
-        `queue`: messages that a publisher may have to keep for us, bounded by what firmware bears (`queue_length`).
-        """
-        own = LocalTopic(TopicType(size, fingerprint), queue=queue)
-        if self._announcer.subscribe(topic, own):
-            self._exchange.retyped(topic, ROLE_PUBLISHES)
-        return self._go_on(now)
-
-    def unsubscribe(self, now: int, topic: str) -> list[Event]:
-        """The module does not subscribe this topic any more: what was opened is shut."""
-        if self._announcer.unsubscribe(topic):
-            self._exchange.unwanted(topic)
-        return self._go_on(now)
-
-    def endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
-        """A node publishes or subscribes (ROLE_...) the topic, as CLASS_...; told to r2p modules only."""
-        self._announcer.endpoint(node, topic, role, publisher_class)
-        return self._go_on(now)
-
-    def endpoint_gone(self, now: int, node: str, topic: str, role: int) -> list[Event]:
-        """It does not any more."""
-        self._announcer.endpoint_gone(node, topic, role)
-        return self._go_on(now)
-
-    # What a person or the shell wants
-
-    def command(self, now: int, command: Command, module: str) -> list[Event]:
-        """Order a module to stop, reboot or enter its loader."""
-        self._outbox.say(_ORDERS[command](module_alias(module)), urgent=True)
-        return self._outbox.take()
-
-    def query(self, now: int) -> list[Event]:
-        """Ask everybody to repeat what they publish and subscribe."""
-        self._announcer.once(Kind.QUERY)
-        return self._go_on(now)
-
-    def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
-        """Tell the link that two modules, which don't hear each other, carry one name."""
-        self._announcer.once(Kind.CONFLICT, module_alias(module), instance_a, instance_b)
-        return self._go_on(now)
-
-    # For gateways
-
     def demand(self) -> Demand:
-        """What others offer and want; kept from the first call on."""
+        """What the other modules publish and subscribe. It is kept from the first call on."""
         if self._demand is None:
             self._demand = LeasedDemand(self._timers, self._directory)
         return self._demand
 
+    # What this module has
+
+    def set_flags(self, now: int, flags: int) -> list[Event]:
+        if flags != self._announcer.flags:
+            self._announcer.flags = flags
+            self._announcer.announce_once(ItemKind.PRESENCE)
+        return self._flush(now)
+
+    def advertise(
+        self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
+    ) -> list[Event]:
+        if self._announcer.publish(topic, LocalTopic(TopicType(size, fingerprint), params)):
+            self._negotiation.type_changed(topic, ROLE_SUBSCRIBES)
+            # Those who asked before there was a publisher need not ask again.
+            for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES) if self._demand is not None else ():
+                self._negotiation.requested(now, management.SubscribeRequest(topic, size, 1), source)
+        return self._flush(now)
+
+    def withdraw(self, now: int, topic: str) -> list[Event]:
+        if self._announcer.withdraw(topic):
+            self._negotiation.withdrawn(topic)
+        return self._flush(now)
+
+    def subscribe(
+        self, now: int, topic: str, size: int = 0, queue: int = management.QUEUE, fingerprint: bytes = ANY_TYPE
+    ) -> list[Event]:
+        """Subscribe a topic. Size 0 and no fingerprint take every type; nothing is requested before a size is known.
+
+        `queue`: messages that a publisher may have to keep, bounded by what firmware has memory for (`queue_length`).
+        """
+        own = LocalTopic(TopicType(size, fingerprint), queue=queue)
+        if self._announcer.subscribe(topic, own):
+            self._negotiation.type_changed(topic, ROLE_PUBLISHES)
+        return self._flush(now)
+
+    def unsubscribe(self, now: int, topic: str) -> list[Event]:
+        if self._announcer.unsubscribe(topic):
+            self._negotiation.subscription_ended(topic)
+        return self._flush(now)
+
+    def endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
+        self._announcer.endpoint(node, topic, role, publisher_class)
+        return self._flush(now)
+
+    def endpoint_gone(self, now: int, node: str, topic: str, role: int) -> list[Event]:
+        self._announcer.endpoint_gone(node, topic, role)
+        return self._flush(now)
+
+    # What users and gateways ask for
+
+    def command(self, now: int, command: Command, module: str) -> list[Event]:
+        self._outbox.send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
+        return self._outbox.drain()
+
+    def query(self, now: int) -> list[Event]:
+        self._announcer.announce_once(ItemKind.QUERY)
+        return self._flush(now)
+
+    def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
+        self._announcer.announce_once(ItemKind.CONFLICT, module_alias(module), instance_a, instance_b)
+        return self._flush(now)
+
     def relay(self, now: int, message: Relayed) -> list[Event]:
-        """Pass on what a module on another link has said."""
         self._announcer.relay(message)
-        return self._go_on(now)
+        return self._flush(now)
 
     # The link
 
-    def pace(self, rate: float, burst: int, quiet: float) -> None:
-        """Speak at another rate from now on: for links that learn only in use what the others bear."""
-        self._schedule.pace(rate, burst, round(quiet * _SECOND))
+    def set_pace(self, rate: float, burst: int, quiet: float) -> None:
+        """Change the pace: for links that learn only in use how much the others can take."""
+        self._schedule.set_pace(rate, burst, round(quiet * _SECOND))
 
     def link_up(self, now: int) -> list[Event]:
-        """The other end can be reached: introduce yourself, ask, and announce everything."""
+        """Introduce this module to the other end, query it, and announce everything."""
         self._outbox.up = True
         self._schedule.start(now)
-        return self._go_on(now)
+        return self._flush(now)
 
     def link_down(self, now: int) -> list[Event]:
-        """The other end is away. Leases end; firmware's subscriptions stay, it does not notice a reconnect."""
+        """End all leases. Firmware's subscriptions stay, as it does not notice a reconnect."""
         self._outbox.up = False
         self._schedule.stop()
-        self._neighbours.interrupted(now)
-        self._exchange.interrupted()
+        self._liveness.link_down(now)
+        self._negotiation.link_down()
         if self._demand is not None:
-            self._demand.interrupted()
-        return self._outbox.take()
+            self._demand.link_down()
+        return self._outbox.drain()
 
     def leave(self, now: int) -> list[Event]:
-        """Say good-bye; nothing is sent after it."""
-        self._outbox.say(self._announcer.introduction(management.HELLO_LEAVING))
+        self._outbox.send(self._announcer.hello(management.HELLO_LEAVING))
         self._outbox.up = False
         self._schedule.stop()
-        return self._outbox.take()
+        return self._outbox.drain()
 
     def next_deadline(self) -> int | None:
-        """When to call `poll` (monotonic ns); a time in the past means at once."""
         due = self._timers.next()
         if not self._outbox.up:
             return due
@@ -296,23 +229,22 @@ class Discovery:
         return turn if due is None else min(due, turn)
 
     def poll(self, now: int) -> list[Event]:
-        """What the time brings: leases run out, things are repeated.
+        """End the leases that have run out, and repeat what is due.
 
-        Called far too late, it lets none run out: this program was stopped, and has yet to read what others said.
+        Called far too late, it ends no lease: this program was suspended, and has yet to read what came in meanwhile.
         """
         due = self._timers.next()
-        if due is not None and now - due > _SLEPT:
+        if due is not None and now - due > _SUSPENDED:
             self._timers.put_off(now + _HEARD_AGAIN)
         for key in self._timers.pop(now):
             self._expired(now, key)
-        return self._go_on(now)
+        return self._flush(now)
 
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
-        """A message of the topic `R2P` came in from `source`. Never raises for bad bytes: they are counted."""
         if not self._outbox.up:
             self.counts["link down"] += 1
             return []
-        self._schedule.traffic(now)
+        self._schedule.traffic(now)  # whatever it is, it took time on a line that is to be quiet
         try:
             message = management.decode(data)
         except UnknownType:
@@ -321,51 +253,42 @@ class Discovery:
             self.counts["undecodable"] += 1
         else:
             handler = self._handlers.get(type(message))
-            if handler is not None and not self._neighbours.is_echo(now, data):
-                handler(now, message, source)
+            if handler is not None and not self._liveness.is_echo(now, data):
+                handler(now, message, source)  # before demand, which looks up the leases that a HELLO has set
                 if self._demand is not None:
-                    self._demand.heard(now, message, source)
-        return self._outbox.take()
+                    self._demand.receive(now, message, source)
+        return self._outbox.drain()
 
-    def _go_on(self, now: int) -> list[Event]:
-        self._announcer.go_on(now)
-        return self._outbox.take()
+    def _flush(self, now: int) -> list[Event]:
+        self._announcer.flush(now)
+        return self._outbox.drain()
 
     def _expired(self, now: int, key: Hashable) -> None:
         match key:
             case ("lease", source, str(topic)):
-                self._exchange.lease_over(source, topic)
+                self._negotiation.lease_over(source, topic)
             case ("answer", int(role), str(topic)):
-                self._exchange.answer(now, role, topic)
+                self._negotiation.answer(now, role, topic)
             case ("grace", source, str(topic)):
-                self._exchange.grace_over(source, topic)
+                self._negotiation.grace_over(source, topic)
             case ("module", str(name)):
-                self._neighbours.expired(now, name)
+                self._liveness.expired(now, name)
             case ("demand", str(topic), int(role), source) if self._demand is not None:
                 self._demand.expired(topic, role, source)
             case ("peer", source):
-                self._exchange.memory_over(source)
+                self._negotiation.linger_over(source)
             case ("endpoint", (int(instance), str(node), str(topic), int(role))):
                 self._directory.forget_endpoint((instance, node, topic, role))
 
-    # Orders
+    # Commands
 
     def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
         if message.reason in (management.DENIED_CLIENTS, management.DENIED_GATEWAYS):
             self._outbox.emit(ConnectionDenied(message.gateway, message.reason == management.DENIED_GATEWAYS))
         elif message.order in COMMAND_OF_TYPE:
-            denied = CommandDenied(message.gateway, COMMAND_OF_TYPE[message.order], message.module, message.reason)
-            self._outbox.emit(denied)
+            command = COMMAND_OF_TYPE[message.order]
+            self._outbox.emit(CommandDenied(message.gateway, command, message.module, message.reason))
 
-    def _stop(self, now: int, message: management.Stop, source: PeerAddress) -> None:
-        self._obey(Command.STOP, message.module)
-
-    def _reboot(self, now: int, message: management.Reboot, source: PeerAddress) -> None:
-        self._obey(Command.REBOOT, message.module)
-
-    def _bootload(self, now: int, message: management.Bootload, source: PeerAddress) -> None:
-        self._obey(Command.BOOTLOAD, message.module)
-
-    def _obey(self, command: Command, module: str) -> None:
-        if module == self._module:
-            self._outbox.emit(CommandReceived(command))
+    def _commanded(self, now: int, message: Order, source: PeerAddress) -> None:
+        if message.module == self._announcer.module:
+            self._outbox.emit(CommandReceived(command_of(message)))

@@ -151,7 +151,7 @@ class Matching:
         """The type of a topic is that of the first session that tells one."""
         sessions = self._telling.get((info.name, role), {}).values()
         shapes = (_shape(session.tokens[info.name, role]) for session in sessions)
-        info.typed(role, next((shape for shape in shapes if shape != TopicType()), None))
+        info.set_type(role, next((shape for shape in shapes if shape != TopicType()), None))
 
     def _mark(self, now: int, info: TopicInfo, role: int) -> None:
         if role == ROLE_PUBLISHES:

@@ -7,7 +7,6 @@ orders, CONFLICT, and what gateways have to say of firmware.
 """
 
 from collections import Counter
-from collections.abc import Callable
 
 import msgspec
 
@@ -16,12 +15,13 @@ from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 from r2p.names import module_alias
-from r2p.protocols.discovery import peers as aliases
 from r2p.protocols.discovery.announcer import Relayed
+from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.demand import Demand
-from r2p.protocols.discovery.directory import MOST, EndpointInfo, EndpointKey, TopicInfo
+from r2p.protocols.discovery.directory import MOST, Aliases, EndpointInfo, EndpointKey, TopicInfo
 from r2p.protocols.discovery.events import (
     COMMAND_OF_TYPE,
+    MESSAGE_OF_COMMAND,
     Command,
     CommandDenied,
     CommandReceived,
@@ -32,6 +32,7 @@ from r2p.protocols.discovery.events import (
     QueryTokens,
     Send,
     TopicType,
+    command_of,
 )
 from r2p.protocols.liveliness.matching import Matching
 from r2p.protocols.liveliness.modules import ModuleRegistry
@@ -45,14 +46,8 @@ _SECOND = 1_000_000_000
 _FRESHEN = _SECOND // 2
 """How often what lives is marked as heard (ns)."""
 
-_ORDERS: dict[Command, Callable[[str], management.Management]] = {
-    Command.STOP: management.Stop,
-    Command.REBOOT: management.Reboot,
-    Command.BOOTLOAD: management.Bootload,
-}
 
-
-class LivelinessDiscovery:
+class LivelinessDiscovery(DiscoveryProtocol):
     """Who is there, on a network with liveliness tokens.
 
     Every method takes `now` (monotonic ns) and gives back what to do, in order; call `poll` at `next_deadline()`.
@@ -62,8 +57,7 @@ class LivelinessDiscovery:
     def __init__(
         self, module: str, instance: int, *, observer: bool = False, counts: Counter[str] | None = None
     ) -> None:
-        self.counts: Counter[str] = Counter() if counts is None else counts
-        """What came in and was dropped, by reason."""
+        self.counts = Counter() if counts is None else counts
         self._module = module
         self._instance = instance
         self._up = False
@@ -73,7 +67,7 @@ class LivelinessDiscovery:
         self._census = ModuleRegistry(module, instance, self._events, self.counts)
         self._tokens: dict[str, liveliness.Token] = {}
         self._refused = Refused(TOKENS, instance)
-        self._aliases = aliases.Aliases()
+        self._aliases = Aliases()
         self._freshen_at: int | None = None
 
     @property
@@ -172,7 +166,7 @@ class LivelinessDiscovery:
                     token = msgspec.structs.replace(known, flags=flags & liveliness.FLAGS)
                     self._relay(("module", name), token, gone=False)
                 else:
-                    for each in aliases.told(name):
+                    for each in management.alias_messages(name):
                         self._say(each)
                     self._say(management.Alive(module_alias(name), flags))
             case management.Endpoint(role, instance, node, topic, publisher_class):
@@ -193,7 +187,7 @@ class LivelinessDiscovery:
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         """Order a module to stop, reboot or enter its loader."""
-        self._say(_ORDERS[command](module_alias(module)), urgent=True)
+        self._say(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
         return self._take()
 
     def query(self, now: int) -> list[Event]:
@@ -345,18 +339,14 @@ class LivelinessDiscovery:
 
     def _heard(self, now: int, message: management.Management, source: PeerAddress) -> None:
         match message:
-            case management.Stop(self._module):
-                self._events.append(CommandReceived(Command.STOP))
-            case management.Reboot(self._module):
-                self._events.append(CommandReceived(Command.REBOOT))
-            case management.Bootload(self._module):
-                self._events.append(CommandReceived(Command.BOOTLOAD))
+            case management.Stop(self._module) | management.Reboot(self._module) | management.Bootload(self._module):
+                self._events.append(CommandReceived(command_of(message)))
             case management.Conflict(self._module, a, b) if self._instance in (a, b):
                 self._events.append(NameConflict(self._module, a, b))
             case management.Denied(gateway, module, order, reason) if order in COMMAND_OF_TYPE:
                 self._events.append(CommandDenied(gateway, COMMAND_OF_TYPE[order], module, reason))
             case management.Name():
-                self._aliases.heard(message)
+                self._aliases.receive(message)
             case management.Alive(name, flags):
                 name = self._aliases.name_of(name)
                 self._census.firmware(ModuleInfo(name, flags, now, hops=1, source=source))

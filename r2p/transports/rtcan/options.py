@@ -136,8 +136,8 @@ def discovery_on(hub: Hub, link: str) -> Discovery:
 def pace(discovery: Discovery, profile: Profile, bit: int) -> float:
     """Now it is known what the bus bears; `bit` in ns. Returns the announcements a second."""
     if profile is Profile.FIRMWARE:
-        discovery.pace(_FIRMWARE_RATE, _LEAST, _QUIET)
+        discovery.set_pace(_FIRMWARE_RATE, _LEAST, _QUIET)
         return _FIRMWARE_RATE
     rate = _RATE * _BIT / bit
-    discovery.pace(rate, max(_LEAST, _BURST * _BIT // bit), 0.0)
+    discovery.set_pace(rate, max(_LEAST, _BURST * _BIT // bit), 0.0)
     return rate

@@ -8,7 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.session import Discovery, TopicType
+from r2p.protocols.discovery.events import (
+    TopicType,
+)
+from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import Line, S, Side, World
 
 TOPICS = ("leds", "cmd", "odometry")

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from r2p.codecs import management as m
+from r2p.protocols.discovery.events import (
+    Send,
+)
 from r2p.protocols.discovery.negotiation import GRACE
-from r2p.protocols.discovery.session import Discovery, Send
+from r2p.protocols.discovery.session import Discovery
 
 SECOND = 1_000_000_000
 

@@ -4,11 +4,9 @@ import pytest
 
 from r2p.codecs import management as m
 from r2p.protocols.discovery.directory import MOST
-from r2p.protocols.discovery.negotiation import GRACE
-from r2p.protocols.discovery.session import (
+from r2p.protocols.discovery.events import (
     Command,
     CommandReceived,
-    Discovery,
     EchoDetected,
     ModuleChanged,
     ModuleGone,
@@ -17,6 +15,8 @@ from r2p.protocols.discovery.session import (
     SubscriberJoined,
     SubscribersGone,
 )
+from r2p.protocols.discovery.negotiation import GRACE
+from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import (
     ME,
     MS,
@@ -27,9 +27,9 @@ from tests.protocols.discovery.wire import (
     SOON,
     TWO,
     S,
+    changes_in,
     hear,
     joined,
-    news,
     run,
     sent,
     started,
@@ -37,7 +37,7 @@ from tests.protocols.discovery.wire import (
 
 
 class TestModules:
-    def test_a_module_is_told_when_it_is_new_or_different(self) -> None:
+    def test_a_module_is_reported_when_it_is_new_or_different(self) -> None:
         discovery = started()
         assert hear(discovery, S, m.Alive("IMU1")) == [ModuleChanged(discovery.modules["IMU1"])]
         assert hear(discovery, 2 * S, m.Alive("IMU1")) == []
@@ -112,7 +112,7 @@ class TestModules:
     def test_orders_are_urgent(self, command: Command, message: type[m.Stop]) -> None:
         assert started().command(SOON, command, "IMU1") == [Send(m.encode(message("IMU1")), urgent=True)]
 
-    def test_endpoints_are_told_to_r2p_only(self) -> None:
+    def test_only_r2p_modules_get_endpoints(self) -> None:
         discovery = started()
         discovery.endpoint(S, "blink", "leds", m.ROLE_PUBLISHES, m.CLASS_SRT)
         assert not any(
@@ -164,7 +164,7 @@ class TestModules:
 
 
 class TestNames:
-    def test_a_namesake_is_told_every_five_seconds(self) -> None:
+    def test_a_namesake_is_reported_every_five_seconds(self) -> None:
         discovery = started()
         told = [
             now
@@ -202,7 +202,7 @@ class TestNames:
         hellos = [m.Hello("IMU1", instance) for instance in (1, 2, 1, 2, 2, 3, 4, 3, 4, 4)]
         assert not any(isinstance(event, NameConflict) for event in hear(discovery, S, *hellos))
 
-    def test_a_hub_that_hears_both_tells(self) -> None:
+    def test_a_hub_that_hears_both_reports_them(self) -> None:
         hub = started()
         message = m.Conflict("IMU1", 1, 2)
         assert sent(hub.conflict(SOON, "IMU1", 1, 2)) == [message]
@@ -223,10 +223,10 @@ class TestNames:
         assert discovery.modules == {}
         for now, event in run(discovery, 1, 60 * S):
             if isinstance(event, Send):
-                assert news(discovery.receive(now, event.data)) in ([], [EchoDetected()])
+                assert changes_in(discovery.receive(now, event.data)) in ([], [EchoDetected()])
         theirs = hear(discovery, 60 * S, m.SubscribeRequest("both", 5, 5), m.SubscribeRequest("both", 5, 5))
         theirs += discovery.poll(60 * S + GRACE)
-        assert news(theirs) == [SubscriberJoined("both", bytes(10), 5)], "the same words from a peer count"
+        assert changes_in(theirs) == [SubscriberJoined("both", bytes(10), 5)], "the same words from a peer count"
 
 
 def test_endpoints_that_are_forgotten_leave_no_timer() -> None:
@@ -241,18 +241,18 @@ def test_endpoints_that_are_forgotten_leave_no_timer() -> None:
     assert len(discovery._timers._due) <= MOST + 8
 
 
-def test_what_gateways_still_tell_of_a_last_start_is_no_namesake() -> None:
+def test_a_last_start_that_gateways_still_announce_is_not_a_namesake() -> None:
     """Neither of ours, nor of a module that is nearer."""
     discovery = started()
     hear(discovery, S, PC2)
     assert joined(discovery, S)
     last_starts = [m.Hello(name, 77, flags, 1) for name in ("PC1", "PC2") for flags in (0, m.HELLO_LEAVING)]
-    assert news(hear(discovery, 2 * S, *last_starts)) == []
+    assert changes_in(hear(discovery, 2 * S, *last_starts)) == []
     assert discovery.modules["PC2"].instance == PEER
     assert not joined(discovery, 3 * S)
 
 
-def test_whoever_was_stopped_itself_takes_nobody_for_gone() -> None:
+def test_a_suspended_program_takes_no_module_for_gone() -> None:
     """What the others said meanwhile is still to be read; only who says nothing from then on is gone."""
     a = Discovery("A", 1)
     a.link_up(0)

@@ -3,9 +3,7 @@
 import pytest
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.negotiation import GRACE
-from r2p.protocols.discovery.session import (
-    Discovery,
+from r2p.protocols.discovery.events import (
     Event,
     Mismatched,
     ModuleGone,
@@ -16,6 +14,8 @@ from r2p.protocols.discovery.session import (
     SubscribersGone,
     TopicType,
 )
+from r2p.protocols.discovery.negotiation import GRACE
+from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import (
     ME,
     MS,
@@ -27,9 +27,9 @@ from tests.protocols.discovery.wire import (
     SOON,
     TWO,
     S,
+    changes_in,
     hear,
     joined,
-    news,
     run,
     sent,
     started,
@@ -42,11 +42,11 @@ class TestHandshake:
         params = b"\xaa" * 10
         first = hear(discovery, S, m.SubscribeRequest("leds", 99, 8, params))
         assert sent(first) == [m.SubscribeResponse("leds", 5, 8)]
-        assert news(first) == []
-        assert news(discovery.poll(S + GRACE)) == [SubscriberJoined("leds", params, 8)]
+        assert changes_in(first) == []
+        assert changes_in(discovery.poll(S + GRACE)) == [SubscriberJoined("leds", params, 8)]
         again = hear(discovery, S, m.SubscribeRequest("leds", 5, 0 + 3))
         assert sent(again) == [m.SubscribeResponse("leds", 5, 3)]
-        assert news(again) == []
+        assert changes_in(again) == []
 
     def test_the_answer_goes_before_the_latched_value(self) -> None:
         assert isinstance(hear(started(), S, REQUEST)[0], Send)
@@ -81,7 +81,7 @@ class TestHandshake:
         assert hear(started(), S, message) == []
 
     @pytest.mark.parametrize("message", [m.Advertise("cmd", 8), m.SubscribeResponse("cmd", 8)])
-    def test_another_size_is_refused_and_told_once(self, message: m.Management) -> None:
+    def test_another_size_is_refused_and_reported_once(self, message: m.Management) -> None:
         discovery = started()
         ours, theirs = TopicType(12, TWO), TopicType(8)
         expected = Mismatched("cmd", None, m.ROLE_PUBLISHES, ours, theirs)
@@ -91,7 +91,7 @@ class TestHandshake:
         assert not discovery.topics["cmd"].mismatch
         assert hear(discovery, S, message) == [expected, PublisherGone("cmd", None)]
 
-    def test_a_size_that_nobody_knows_fits(self) -> None:
+    def test_an_unknown_size_fits(self) -> None:
         discovery = started()
         discovery.subscribe(S, "any")
         assert hear(discovery, S, m.SubscribeResponse("any", 7), m.SubscribeResponse("cmd", 0)) == [
@@ -104,14 +104,14 @@ class TestHandshake:
         assert joined(discovery, S, source=0x28)
         assert joined(discovery, S, source=0x29)
         assert not joined(discovery, S, source=0x28)
-        assert news(discovery.withdraw(S, "leds")) == [SubscribersGone("leds")]
+        assert changes_in(discovery.withdraw(S, "leds")) == [SubscribersGone("leds")]
 
     def test_withdrawn_and_back_starts_afresh(self) -> None:
         discovery = started()
         assert joined(discovery, S)
         hear(discovery, S, RESPONSE)
-        assert news(discovery.withdraw(S, "leds")) == [SubscribersGone("leds")]
-        assert news(discovery.unsubscribe(S, "cmd")) == [PublisherGone("cmd", None)]
+        assert changes_in(discovery.withdraw(S, "leds")) == [SubscribersGone("leds")]
+        assert changes_in(discovery.unsubscribe(S, "cmd")) == [PublisherGone("cmd", None)]
         assert hear(discovery, S, REQUEST, RESPONSE) == []
         discovery.advertise(S, "leds", 5)
         assert joined(discovery, S)
@@ -125,8 +125,8 @@ class TestGrace:
 
     def test_firmware_takes_the_response_before_the_data(self) -> None:
         discovery = started()
-        assert news(hear(discovery, S, REQUEST)) == []
-        assert news(hear(discovery, S + GRACE // 2, REQUEST)) == [], "a repeat"
+        assert changes_in(hear(discovery, S, REQUEST)) == []
+        assert changes_in(hear(discovery, S + GRACE // 2, REQUEST)) == [], "a repeat"
         assert self.joins(discovery, S) == [GRACE]
 
     def test_after_a_restart_again(self) -> None:
@@ -134,28 +134,28 @@ class TestGrace:
         hear(discovery, S, m.Alive("IMU1"))
         assert joined(discovery, S)
         hear(discovery, 2 * S, m.Alive("IMU1", m.FLAG_REBOOTED))
-        assert news(hear(discovery, 3 * S, REQUEST)) == []
+        assert changes_in(hear(discovery, 3 * S, REQUEST)) == []
         assert self.joins(discovery, 3 * S) == [GRACE]
 
     def test_r2p_takes_both_at_once(self) -> None:
         discovery = started()
         hear(discovery, S, PC2)
-        assert news(hear(discovery, S, REQUEST)) == [SubscriberJoined("leds", bytes(10), 8)]
+        assert changes_in(hear(discovery, S, REQUEST)) == [SubscriberJoined("leds", bytes(10), 8)]
 
     @pytest.mark.parametrize("params", [m.UNANSWERED, m.ANSWERED])
     def test_what_only_r2p_sends_tells_it_from_firmware(self, params: bytes) -> None:
         """Its HELLO may have been lost."""
-        assert news(hear(started(), S, m.SubscribeRequest("leds", 5, 8, params))) == [
+        assert changes_in(hear(started(), S, m.SubscribeRequest("leds", 5, 8, params))) == [
             SubscriberJoined("leds", params, 8)
         ]
 
     def test_who_leaves_before_its_data_never_joined(self) -> None:
         discovery = started()
         hear(discovery, S, REQUEST)
-        assert news(discovery.withdraw(S, "leds")) == []
+        assert changes_in(discovery.withdraw(S, "leds")) == []
         assert self.joins(discovery, S) == []
         discovery.advertise(2 * S, "leds", 5)
-        assert news(hear(discovery, 2 * S, REQUEST, source=2)) == []
+        assert changes_in(hear(discovery, 2 * S, REQUEST, source=2)) == []
         hear(discovery, 2 * S, PC2, REQUEST)
         leaving = hear(discovery, 2 * S, m.Hello("PC2", PEER, m.HELLO_LEAVING))
         assert not any(isinstance(event, SubscribersGone) for event in leaving), "firmware is still there"
@@ -203,7 +203,7 @@ class TestLeases:
         discovery = started()
         for now in range(S, 30 * S, 4 * S):
             hear(discovery, now, PC2, REQUEST)
-            assert not news(event for _, event in run(discovery, now, now + 4 * S))
+            assert not changes_in(event for _, event in run(discovery, now, now + 4 * S))
 
     def test_a_hello_turns_what_came_before_it_into_leases(self) -> None:
         discovery = started()
@@ -228,7 +228,7 @@ class TestLeases:
         assert joined(discovery, 5 * S)
         run(discovery, 5 * S, 7 * S)
         assert not joined(discovery, 7 * S)
-        assert not news(event for _, event in run(discovery, 7 * S, 60 * S))
+        assert not changes_in(event for _, event in run(discovery, 7 * S, 60 * S))
 
     def test_the_longest_lease_at_an_address_counts(self) -> None:
         discovery = started()
@@ -280,7 +280,7 @@ class TestLeases:
         assert hear(discovery, S, m.Unsubscribe("leds", PEER)) == []
         assert hear(discovery, S, m.Unsubscribe("nobodys", PEER)) == []
 
-    def test_nobody_unsubscribes_for_others(self) -> None:
+    def test_a_module_can_not_unsubscribe_for_others(self) -> None:
         discovery = started()
         assert joined(discovery, S)
         assert hear(discovery, S, m.Unsubscribe("leds", PEER)) == []
@@ -349,7 +349,7 @@ class TestLostAnswers:
         assert self.joins(discovery, S)
         assert not self.joins(discovery, 3 * S)
 
-    def test_our_own_request_tells_until_it_is_answered(self) -> None:
+    def test_a_request_says_whether_it_was_answered(self) -> None:
         discovery = started()
         plain = m.SubscribeRequest("cmd", 12, 5)
         assert sent(hear(discovery, S, m.Advertise("cmd", 12))) == [plain], "firmware is told nothing"
@@ -395,7 +395,7 @@ class TestRepeats:
         assert sent(hear(discovery, S, m.Advertise("cmd", 12))) == [m.SubscribeRequest("cmd", 12, 5)]
         assert sent(hear(discovery, S, REQUEST)) == [m.SubscribeResponse("leds", 5, 8)]
 
-    def test_an_advertisement_tells_whether_anybody_has_subscribed(self) -> None:
+    def test_an_advertisement_says_whether_it_has_subscribers(self) -> None:
         discovery = started()
         hear(discovery, S, PC2)
 
@@ -501,7 +501,7 @@ class TestTypes:
         assert hear(discovery, S, theirs) == [told]
         answer = hear(discovery, S, REQUEST, theirs, REQUEST)
         assert sent(answer) == [m.TypeInfo(m.ROLE_PUBLISHES, "leds", ONE, 5)] * 2
-        assert news(answer) == []
+        assert changes_in(answer) == []
 
     def test_a_publisher_of_another_type_is_refused(self) -> None:
         discovery = started()
@@ -511,7 +511,7 @@ class TestTypes:
         assert hear(discovery, S, theirs) == [told]
         answer = hear(discovery, S, m.Advertise("cmd", 12), RESPONSE)
         assert sent(answer) == [m.TypeInfo(m.ROLE_SUBSCRIBES, "cmd", TWO, 12)]
-        assert news(answer) == []
+        assert changes_in(answer) == []
 
     def test_a_late_type_undoes_what_was_done(self) -> None:
         discovery = started()
@@ -530,8 +530,11 @@ class TestTypes:
         discovery = started()
         right = m.TypeInfo(m.ROLE_SUBSCRIBES, "leds", ONE, 5)
         hear(discovery, S, PC2, right, REQUEST)
-        assert [type(event) for event in news(discovery.advertise(S, "leds", 5, TWO))] == [Mismatched, SubscribersGone]
-        assert news(discovery.advertise(S, "leds", 5, ONE)) == []
+        assert [type(event) for event in changes_in(discovery.advertise(S, "leds", 5, TWO))] == [
+            Mismatched,
+            SubscribersGone,
+        ]
+        assert changes_in(discovery.advertise(S, "leds", 5, ONE)) == []
         assert joined(discovery, S)
 
     @pytest.mark.parametrize("fingerprint", [m.ANY_TYPE, ONE])
@@ -539,16 +542,16 @@ class TestTypes:
         discovery = started()
         hear(discovery, S, PC2)
         size = 5 if fingerprint == ONE else 0
-        assert news(hear(discovery, S, m.TypeInfo(m.ROLE_SUBSCRIBES, "leds", fingerprint, size))) == []
+        assert changes_in(hear(discovery, S, m.TypeInfo(m.ROLE_SUBSCRIBES, "leds", fingerprint, size))) == []
         assert joined(discovery, S)
 
-    def test_a_changed_type_is_told_again(self) -> None:
+    def test_a_changed_type_is_announced_again(self) -> None:
         discovery = started()
         hear(discovery, S, PC2, m.TypeInfo(m.ROLE_SUBSCRIBES, "leds", TWO, 5))
         third = m.TypeInfo(m.ROLE_SUBSCRIBES, "leds", b"\x03" * 8, 9)
         assert [type(event) for event in hear(discovery, S, third, third)] == [Mismatched]
 
-    def test_unsubscribing_is_told_to_r2p_only(self) -> None:
+    def test_only_r2p_modules_get_unsubscribe(self) -> None:
         discovery = started()
         assert sent(discovery.unsubscribe(SOON, "cmd")) == []
         hear(discovery, SOON, PC2)

@@ -4,8 +4,15 @@ import pytest
 
 from r2p.codecs import management as m
 from r2p.codecs.debug import Reader
-from r2p.protocols.discovery.session import Command, CommandReceived, Discovery, Event, PublisherFound, SubscriberJoined
-from tests.protocols.discovery.wire import MS, news, sent
+from r2p.protocols.discovery.events import (
+    Command,
+    CommandReceived,
+    Event,
+    PublisherFound,
+    SubscriberJoined,
+)
+from r2p.protocols.discovery.session import Discovery
+from tests.protocols.discovery.wire import MS, changes_in, sent
 from tests.vectors import FROM_NODE, TO_NODE, Case, Entry, cases
 
 PROMPT_MS = 4
@@ -60,7 +67,7 @@ def test_as_the_module_it_answers_like_firmware(case: Case) -> None:
             elif entry.dir == TO_NODE:
                 events = node.receive(now, m.encode(message) if not _queueless(message) else _raw(entry))
                 assert gist(sent(events)) == recorded_answers(case, at), f"at {entry.t_ms} ms"
-                obeyed = [event for event in news(events) if isinstance(event, CommandReceived)]
+                obeyed = [event for event in changes_in(events) if isinstance(event, CommandReceived)]
                 if obeyed:
                     node.withdraw(now, "leds")
                     node.unsubscribe(now, "cmd")

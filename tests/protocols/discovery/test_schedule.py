@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.schedule import Item, Kind, Schedule, TokenBucket
+from r2p.protocols.discovery.schedule import Item, ItemKind, Schedule, TokenBucket
 from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import MS, S, run, sent
 
@@ -17,13 +17,13 @@ from tests.protocols.discovery.wire import MS, S, run, sent
     st.integers(2, 50),
     st.lists(st.tuples(st.integers(0, S), st.integers(1, 2)), max_size=60),
 )
-def test_a_bucket_never_lets_more_pass(rate: float, burst: int, wishes: list[tuple[int, int]]) -> None:
+def test_a_bucket_never_lets_more_pass(rate: float, burst: int, requests: list[tuple[int, int]]) -> None:
     bucket = TokenBucket(rate, burst)
     now, passed = 0, list[int]()
-    for wait, count in wishes:
+    for wait, count in requests:
         now += wait
         if bucket.ready_at(count) <= now:
-            bucket.take(now, count)
+            bucket.spend(now, count)
             passed += [now] * count
     for first, start in enumerate(passed):
         for last in range(first, len(passed)):
@@ -33,7 +33,7 @@ def test_a_bucket_never_lets_more_pass(rate: float, burst: int, wishes: list[tup
 class TestSchedule:
     def test_a_ring_of_what_is_left(self) -> None:
         schedule = Schedule(1000, 100, 0)
-        items = [Item(Kind.PUBLISHER, (f"t{n}",)) for n in range(4)]
+        items = [Item(ItemKind.PUBLISHER, (f"t{n}",)) for n in range(4)]
         for item in items:
             schedule.add(item)
         schedule.drop(items[1])
@@ -53,7 +53,7 @@ class TestSchedule:
         """They have been said for 10 s: seldom by now."""
         schedule = Schedule(1000, 100, 0)
         schedule.start(0)
-        items = [Item(Kind.ENDPOINT, ("n", f"t{n}", 1)) for n in range(count)]
+        items = [Item(ItemKind.ENDPOINT, ("n", f"t{n}", 1)) for n in range(count)]
         for each in items:
             schedule.add(each)
         self.said(schedule, 0, 10 * S)
@@ -71,7 +71,7 @@ class TestSchedule:
     def test_what_only_describes_is_repeated_once_soon_and_then_seldom(self) -> None:
         schedule = Schedule(1000, 100, 0)
         schedule.start(0)
-        endpoint, publisher = Item(Kind.ENDPOINT, ("n", "t", 1)), Item(Kind.PUBLISHER, ("t",))
+        endpoint, publisher = Item(ItemKind.ENDPOINT, ("n", "t", 1)), Item(ItemKind.PUBLISHER, ("t",))
         schedule.add(publisher)
         schedule.add(endpoint)
         said = self.said(schedule, 0, 40 * S)
@@ -87,15 +87,15 @@ class TestSchedule:
     def test_of_much_that_only_describes_each_has_its_turn_in_four_rounds(self) -> None:
         schedule = Schedule(1000, 100, 0)
         for n in range(40):
-            schedule.add(Item(Kind.ENDPOINT, ("n", f"t{n}", 1)))
+            schedule.add(Item(ItemKind.ENDPOINT, ("n", f"t{n}", 1)))
         for n in range(7):
-            schedule.add(Item(Kind.PUBLISHER, (f"t{n}",)))
+            schedule.add(Item(ItemKind.PUBLISHER, (f"t{n}",)))
         schedule.start(0)
         said = self.said(schedule, 0, 40 * S)
         late = [(now, item) for now, item in said if now > 10 * S]
         for item in {item for _, item in late}:
             times = [now for now, each in late if each == item]
-            rounds = 4 if item.kind is Kind.ENDPOINT else 1
+            rounds = 4 if item.kind is ItemKind.ENDPOINT else 1
             assert max(b - a for a, b in pairwise(times)) == pytest.approx(rounds * 1.5 * S, rel=0.1)
 
     def test_for_a_newcomer_what_only_describes_is_said_at_once_and_once_more_soon(self) -> None:
@@ -112,16 +112,16 @@ class TestSchedule:
         schedule, items = self.with_endpoints(3)
         schedule.drop(items[1])
         later = {item for _, item in self.said(schedule, 10 * S, 20 * S)}
-        assert later == {items[0], items[2], Item(Kind.PRESENCE, once=True)}
+        assert later == {items[0], items[2], Item(ItemKind.PRESENCE, once=True)}
         schedule.drop(items[0])
         schedule.drop(items[2])
-        assert {item for _, item in self.said(schedule, 20 * S, 30 * S)} == {Item(Kind.PRESENCE, once=True)}
+        assert {item for _, item in self.said(schedule, 20 * S, 30 * S)} == {Item(ItemKind.PRESENCE, once=True)}
 
     def test_what_is_said_once_is_forgotten_when_the_link_goes_down(self) -> None:
         schedule = Schedule(1, 2, 0)
         schedule.start(0)
-        schedule.add(Item(Kind.PUBLISHER, ("t",)))
-        schedule.add(Item(Kind.UNSUBSCRIBE, ("t",), once=True))
+        schedule.add(Item(ItemKind.PUBLISHER, ("t",)))
+        schedule.add(Item(ItemKind.UNSUBSCRIBE, ("t",), once=True))
         schedule.stop()
         schedule.start(0)
         kinds = []
@@ -129,8 +129,8 @@ class TestSchedule:
             while (item := schedule.pop(now)) is not None:
                 kinds.append(item.kind)
                 schedule.sent(now, 1)
-        assert kinds[:2] == [Kind.QUERY, Kind.PUBLISHER]
-        assert Kind.UNSUBSCRIBE not in kinds
+        assert kinds[:2] == [ItemKind.QUERY, ItemKind.PUBLISHER]
+        assert ItemKind.UNSUBSCRIBE not in kinds
 
     def test_what_comes_and_goes_while_the_link_is_down_leaves_nothing_behind(self) -> None:
         discovery = Discovery("PC1", 1)
@@ -153,7 +153,7 @@ class TestSchedule:
 
     def test_a_new_type_of_what_was_announced_goes_first(self) -> None:
         schedule = Schedule(1000, 100, 0)
-        items = [Item(Kind.PUBLISHER, (f"t{n}",)) for n in range(4)]
+        items = [Item(ItemKind.PUBLISHER, (f"t{n}",)) for n in range(4)]
         for item in items:
             schedule.add(item)
         while (schedule.pop(0)) is not None:
@@ -164,12 +164,12 @@ class TestSchedule:
 
     def test_presence_leaves_room_on_a_slow_line(self) -> None:
         schedule = Schedule(1, 2, 0)
-        schedule.add(Item(Kind.PUBLISHER, ("t",)))
+        schedule.add(Item(ItemKind.PUBLISHER, ("t",)))
         schedule.start(0)
         kinds = []
         for now in range(0, 60 * S, S):
             schedule.repeat(now)
             while (item := schedule.pop(now)) is not None:
                 kinds.append(item.kind)
-                schedule.sent(now, 2 if item.kind in {Kind.PRESENCE, Kind.QUERY} else 1)
-        assert kinds.count(Kind.PUBLISHER) > kinds.count(Kind.PRESENCE) > 5
+                schedule.sent(now, 2 if item.kind in {ItemKind.PRESENCE, ItemKind.QUERY} else 1)
+        assert kinds.count(ItemKind.PUBLISHER) > kinds.count(ItemKind.PRESENCE) > 5

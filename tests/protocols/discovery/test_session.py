@@ -6,7 +6,12 @@ import pytest
 
 from r2p.codecs import management as m
 from r2p.protocols.discovery import directory
-from r2p.protocols.discovery.session import Command, Discovery, Event, ModuleGone
+from r2p.protocols.discovery.events import (
+    Command,
+    Event,
+    ModuleGone,
+)
+from r2p.protocols.discovery.session import Discovery
 from tests.protocols.discovery.wire import ME, MS, PC2, PEER, REQUEST, SOON, S, hear, joined, run, sent, started
 
 
@@ -66,7 +71,7 @@ class TestStart:
         hear(discovery, SOON, m.Advertise("pose", 250))
         assert sent(discovery.subscribe(2 * SOON, "pose")) == [m.SubscribeRequest("pose", 250, 3)]
 
-    def test_to_r2p_modules_an_unknown_size_is_told_as_a_type(self) -> None:
+    def test_r2p_modules_get_an_unknown_size_as_a_type(self) -> None:
         discovery = started()
         hear(discovery, SOON, PC2)
         discovery.poll(SOON)

@@ -7,9 +7,7 @@ from collections.abc import Iterable
 import msgspec
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.negotiation import GRACE
-from r2p.protocols.discovery.session import (
-    Discovery,
+from r2p.protocols.discovery.events import (
     Event,
     Mismatched,
     ModuleGone,
@@ -19,6 +17,8 @@ from r2p.protocols.discovery.session import (
     SubscriberJoined,
     SubscribersGone,
 )
+from r2p.protocols.discovery.negotiation import GRACE
+from r2p.protocols.discovery.session import Discovery
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -29,18 +29,18 @@ def sent(events: Iterable[Event]) -> list[m.Management]:
     return [m.decode(event.data) for event in events if isinstance(event, Send)]
 
 
-def news(events: Iterable[Event]) -> list[Event]:
-    """The events that are no messages."""
+def changes_in(events: Iterable[Event]) -> list[Event]:
+    """The events that are not messages."""
     return [event for event in events if not isinstance(event, Send)]
 
 
 def hear(discovery: Discovery, now: int, *messages: m.Management, source: object = None) -> list[Event]:
-    """All that comes of these messages."""
+    """The events of receiving these messages."""
     return [event for message in messages for event in discovery.receive(now, m.encode(message), source)]
 
 
 def run(discovery: Discovery, start: int, end: int) -> list[tuple[int, Event]]:
-    """Poll it when it wants to, from `start` until before `end`."""
+    """Poll it at its deadlines, from `start` until before `end`."""
     events: list[tuple[int, Event]] = []
     now = start
     while (due := discovery.next_deadline()) is not None and due < end:
@@ -58,7 +58,7 @@ class Line(msgspec.Struct):
 
 
 class Side:
-    """A shell around one discovery: attaches and opens as it is told, and keeps account."""
+    """Drives one discovery: attaches and opens topics as its events say, and keeps account."""
 
     def __init__(self, discovery: Discovery) -> None:
         self.discovery = discovery
@@ -100,7 +100,7 @@ class World:
         self._sent = 0
 
     def do(self, side: Side, events: list[Event], *, solicited: bool = False) -> None:
-        """Carry out what one side's discovery said."""
+        """Carry out the events of one side's discovery."""
         for event in events:
             if isinstance(event, Send):
                 if not solicited:

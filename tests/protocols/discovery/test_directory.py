@@ -7,43 +7,42 @@ import pytest
 from r2p.codecs import management
 from r2p.errors import NameTooLong
 from r2p.names import module_alias, module_path
-from r2p.protocols.discovery import peers as aliases
-from r2p.protocols.discovery.peers import Aliases
+from r2p.protocols.discovery.directory import Aliases
 
 NAMES = ["robot1/MOTOR1", "a/b", "ABC_DEFGH", "sixteen_letters_/MOTOR_1"]
 
 
 def test_short_names_are_their_own_aliases() -> None:
     assert module_alias("MOTOR1") == "MOTOR1"
-    assert aliases.told("MOTOR1") == []
+    assert management.alias_messages("MOTOR1") == []
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_told_is_understood(name: str) -> None:
-    heard = Aliases()
+def test_a_name_travels_in_pieces(name: str) -> None:
+    aliases = Aliases()
     alias = module_alias(module_path(name))
     assert len(alias) <= 7
-    assert heard.name_of(alias) == alias
-    told = [management.decode(management.encode(each)) for each in aliases.told(name)]
-    news = [heard.heard(each) for each in reversed(told) if isinstance(each, management.Name)]
-    assert news[-1] == name
-    assert heard.name_of(alias) == name
+    assert aliases.name_of(alias) == alias
+    received = [management.decode(management.encode(each)) for each in management.alias_messages(name)]
+    complete = [aliases.receive(each) for each in reversed(received) if isinstance(each, management.Name)]
+    assert complete[-1] == name
+    assert aliases.name_of(alias) == name
 
 
 def test_an_alias_that_does_not_fit_is_not_believed() -> None:
-    heard = Aliases()
-    assert heard.heard(management.Name("MOTOR1", 0, "robot1/MOTOR1")) is None
-    assert heard.name_of("MOTOR1") == "MOTOR1"
+    aliases = Aliases()
+    assert aliases.receive(management.Name("MOTOR1", 0, "robot1/MOTOR1")) is None
+    assert aliases.name_of("MOTOR1") == "MOTOR1"
 
 
-def test_lies_are_bounded() -> None:
-    heard = Aliases()
+def test_made_up_aliases_are_bounded() -> None:
+    aliases = Aliases()
     for number in range(10_000):
         name = f"robot/{number}"
-        heard.heard(management.Name(module_alias(name), 0, name))
-        heard.heard(management.Name(f"x{number}", 0x0F, "part"))
-    assert len(heard._names) <= 4096
-    assert len(heard._parts) <= 256
+        aliases.receive(management.Name(module_alias(name), 0, name))
+        aliases.receive(management.Name(f"x{number}", 0x0F, "part"))
+    assert len(aliases._names) <= 4096
+    assert len(aliases._parts) <= 256
 
 
 def test_how_an_alias_is_made() -> None:
