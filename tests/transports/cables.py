@@ -295,7 +295,7 @@ class Pump:
 class Proxy:
     """Takes connections on a port of its own, and carries them to another one while it is not cut.
 
-    `target` tells that port, None: there is nobody. `buffer` in bytes is what the sockets may hold.
+    `target` returns that port; None: there is none. `buffer` in bytes is what the sockets may hold.
     """
 
     def __init__(self, target: Callable[[], int | None], *, buffer: int | None = None) -> None:
@@ -447,7 +447,7 @@ class Setup(msgspec.Struct, frozen=True):
     loop: Callable[[], asyncio.AbstractEventLoop]
 
     def run(self, test: Callable[[Cable], Coroutine[Any, Any, None]]) -> None:
-        """Run the test; an exception that nobody awaits fails it."""
+        """Run the test; an exception that is not awaited fails it."""
         lost: list[BaseException | str] = []
 
         async def main() -> None:

@@ -57,7 +57,7 @@ async def test_a_start_costs_messages_in_proportion_to_topics(monkeypatch: pytes
 
 
 async def test_a_newcomer_knows_all_nodes_soon() -> None:
-    """However many modules there are, and though another one has just been told."""
+    """However many modules there are, and though another one has just been answered."""
     async with contextlib.AsyncExitStack() as stack:
         for number in range(12):
             module = await stack.enter_async_context(r2p.Module(f"M{number}", via="memory:lab", watchdog=False))

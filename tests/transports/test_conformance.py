@@ -42,7 +42,7 @@ def other(module: r2p.Module, name: str) -> ModuleView | None:
 
 
 async def acquainted(a: r2p.Module, b: r2p.Module) -> None:
-    """Wait until each has heard the other's HELLO: what went before may be taken for firmware's."""
+    """Wait until each has heard the other's HELLO: what came before may look like firmware."""
     await until(lambda: other(a, b.name) and other(b, a.name))
 
 
@@ -309,7 +309,7 @@ async def test_a_reader_that_keeps_up_loses_nothing(cable: Cable) -> None:
 
 @conforms_lines
 async def test_a_peer_that_does_not_read(cable: Cable) -> None:
-    """It costs its publisher `stall` seconds once, and what it does not get is told; other subscribers lose nothing."""
+    """It costs its publisher `stall` seconds once, and what it does not get is reported; other subscribers lose nothing."""
     missed: list[r2p.Missed] = []
     text = Text(text="x" * 64)
     async with (

@@ -344,7 +344,7 @@ async def test_a_period_waits_for_a_line_until_the_next_one() -> None:
 
 
 async def test_what_a_line_that_is_down_does_not_get() -> None:
-    """Each sample of a real-time publisher is missed; the others were told that the link is down."""
+    """Each sample of a real-time publisher is missed; the link's end is signalled to the others."""
     missed: list[r2p.Missed] = []
     degraded: list[r2p.Missed] = []
     signals: dict[str, Any] = {"on_missed": missed.append, "on_degraded": degraded.append}
@@ -597,7 +597,7 @@ async def test_a_line_whose_reading_raises_does_not_stop_the_others(monkeypatch:
 async def test_a_line_that_is_refused_again_and_again_is_told_once(
     caplog: pytest.LogCaptureFixture, heard: bool
 ) -> None:
-    """It is up again when a module is heard there, or nobody has refused it for a while."""
+    """It is up again when a module is heard there, or it has not been refused for a while."""
     caplog.set_level(logging.INFO, "r2p")
     script = Script()
     module = r2p.Module("PC1", via=script)

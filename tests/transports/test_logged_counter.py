@@ -1,4 +1,4 @@
-"""What a link drops is told, once a second for each reason, and only to those who want to know."""
+"""What a link drops is logged, once a second for each reason, and only to those who want to know."""
 
 import asyncio
 import logging

@@ -103,7 +103,7 @@ async def test_a_peer_that_dies_in_the_middle_of_a_line_and_returns() -> None:
 
 
 async def test_a_dead_client_returns_to_a_server_that_died_in_a_line() -> None:
-    """The client's reader forgets the half line; the server is whoever listens next on that port."""
+    """The client's reader forgets the half line; the server is what listens next on that port."""
     listener = socket.create_server(("127.0.0.1", 0))
     listener.setblocking(False)
     loop = asyncio.get_running_loop()
