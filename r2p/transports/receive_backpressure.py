@@ -8,15 +8,13 @@ backpressure reaches from end to end.
 
 import asyncio
 import functools
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable
+from typing import Protocol
 
 from r2p.runtime.backpressure import INTERNAL_ERROR, PendingDelivery, Sink
 from r2p.runtime.sample import Sample
 from r2p.runtime.topic import RemoteSubscriber
 from r2p.transports.stats import LinkStats
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 FULL_QUEUE_TURNS = 4
 """Turns of the event loop that a link waits for a full queue before it goes on without it."""
@@ -42,19 +40,52 @@ class ReceivingLink(Protocol):
         """The message that had no room has been delivered, or given up: go on with those behind it."""
 
 
-class _PendingArrival(PendingDelivery):
-    """A message that came in, and waits in line with what this module publishes: first come, first served."""
+class BlockedMessage(PendingDelivery):
+    """A message from a link that waits for room, in line with what this module publishes: first come, first served.
 
-    __slots__ = ("over",)
+    `delivered` is called in a turn of the loop of its own when no sink lacks it any more, and `expired` when some still
+    do so after FULL_QUEUE_TURNS turns.
+    """
 
-    def __init__(self, sample: Sample, sinks: list[Sink]) -> None:
-        self.over: Callable[[], None] | None = None
-        """Called when it is delivered; until that is set, each turn looks whether it is."""
+    __slots__ = ("_delivered", "_expired", "_holds", "_loop", "_turns")
+
+    def __init__(
+        self,
+        sample: Sample,
+        sinks: list[Sink],
+        loop: asyncio.AbstractEventLoop,
+        delivered: Callable[[], object],
+        expired: Callable[["BlockedMessage"], object],
+    ) -> None:
+        self._loop = loop
+        self._delivered = delivered
+        self._expired = expired
+        self._holds = False
+        self._turns = FULL_QUEUE_TURNS
         super().__init__(sample, sinks)
+        loop.call_soon(self._look)
+
+    def hold(self) -> None:
+        """Wait on, without a limit."""
+        self._holds = True
+
+    def leave(self, sink: Sink) -> None:
+        """Wait no more for this sink."""
+        sink.wait_queue().remove(sink, self)
+        self.remaining.remove(sink)
 
     def completed(self, sink: Sink, refusal: str) -> None:
-        if not self.remaining and self.over is not None:
-            self.over()
+        if self._holds and not self.remaining:
+            self._loop.call_soon(self._delivered)  # after the work of the reader that made room
+
+    def _look(self) -> None:
+        self._turns -= 1
+        if not self.remaining:
+            self._delivered()
+        elif self._turns > 0:
+            self._loop.call_soon(self._look)
+        else:
+            self._expired(self)
 
 
 class ReceiveBackpressure:
@@ -65,60 +96,54 @@ class ReceiveBackpressure:
         self._loop = loop
         self._lossy: set[Sink] = set()
         """Sinks that were waited for in vain, and have not had plenty of room since."""
-        self._turns = 0
-        self._stalled: _PendingArrival | None = None
+        self._stalled: BlockedMessage | None = None
+        """The message for which the line stands still."""
         self._stall: asyncio.TimerHandle | None = None
         self._in_vain_at = -LONGEST_STALL
         self._closed = False
 
     def wait(self, sample: Sample, blocked: list[Sink]) -> bool:
         """Wait for room in these sinks: `room_found` of the link follows. Returns False if none is worth it."""
-        guard = self._link.stats.lost.guard
         for sink in self._lossy.intersection(blocked):
-            guard(sink.force, sample)
+            self._link.stats.lost.guard(sink.force, sample)
         waiting = [sink for sink in blocked if sink not in self._lossy]
-        if not waiting:
-            return False
-        self._turns = FULL_QUEUE_TURNS
-        self._loop.call_soon(self._look, _PendingArrival(sample, waiting))
-        return True
+        if waiting:
+            BlockedMessage(sample, waiting, self._loop, self._delivered, self._expired)
+        return bool(waiting)
 
     def close(self) -> None:
-        """Wait no more."""
+        """Let the line stand still no more."""
         self._closed = True
         if self._stalled is not None:
             self._stalled.withdraw()
             self._end_stall()
 
-    def _look(self, pending: _PendingArrival) -> None:
-        self._turns -= 1
-        if pending.remaining and self._turns > 0 and not self._closed:
-            self._loop.call_soon(self._look, pending)
-            return
+    def _delivered(self) -> None:
+        self._end_stall()
+        self._link.room_found()
+
+    def _expired(self, message: BlockedMessage) -> None:
+        # Only other links stall the line: a slow reader in this module loses messages, so that other topics go on.
         may_stall = self._link.flow_controlled and not self._closed
-        # Only other links stall the line: a slow reader in this module loses messages, and the topics of others go on.
-        links: list[Sink] = [sink for sink in pending.remaining if may_stall and isinstance(sink, RemoteSubscriber)]
-        for sink in pending.withdraw():
-            if sink not in links:
-                self._link.stats.lost.guard(sink.force, pending.sample)
-                self._lossy.add(sink)
-                sink.wait_queue().recoveries.append(functools.partial(self._lossy.discard, sink))
-        if links:
-            self._begin_stall(_PendingArrival(pending.sample, links))
+        rest = [sink for sink in message.remaining if not (may_stall and isinstance(sink, RemoteSubscriber))]
+        for sink in rest:
+            message.leave(sink)
+        for sink in rest:
+            self._link.stats.lost.guard(sink.force, message.sample)
+            self._lossy.add(sink)
+            sink.wait_queue().recoveries.append(functools.partial(self._lossy.discard, sink))
+        if message.remaining:
+            self._begin_stall(message)
         else:
             self._link.room_found()
 
     # Stall: the line stands still until the links that the message goes out by have room, or had none for too long
 
-    def _begin_stall(self, pending: _PendingArrival) -> None:
-        pending.over = self._stall_over
-        self._stalled = pending
+    def _begin_stall(self, message: BlockedMessage) -> None:
+        message.hold()
+        self._stalled = message
         longest = min(LONGEST_STALL, max(SHORTEST_STALL, self._loop.time() - self._in_vain_at))
-        self._stall = self._loop.call_later(longest, self._give_up, pending, f"no room for {longest:.2g} s")
-
-    def _stall_over(self) -> None:
-        self._end_stall()
-        self._loop.call_soon(self._link.room_found)  # after the work of the reader that made room
+        self._stall = self._loop.call_later(longest, self._give_up, message, f"no room for {longest:.2g} s")
 
     def _end_stall(self) -> None:
         self._stalled = None
@@ -126,12 +151,12 @@ class ReceiveBackpressure:
             self._stall.cancel()
             self._stall = None
 
-    def _give_up(self, pending: _PendingArrival, refusal: str) -> None:
+    def _give_up(self, message: BlockedMessage, refusal: str) -> None:
         guard = self._link.stats.lost.guard
-        for sink in list(pending.remaining):
+        for sink in list(message.remaining):
             guard(sink.refill)  # a last attempt
-        for sink in list(pending.remaining):
+        for sink in list(message.remaining):
             if not guard(sink.become_lossy, refusal):
-                sink.wait_queue().remove(sink, pending)
-                pending.complete(sink, INTERNAL_ERROR)  # else the line would stand still for ever
+                sink.wait_queue().remove(sink, message)
+                message.complete(sink, INTERNAL_ERROR)  # else the line would stand still for ever
             self._in_vain_at = self._loop.time()

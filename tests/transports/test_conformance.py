@@ -309,7 +309,7 @@ async def test_a_reader_that_keeps_up_loses_nothing(cable: Cable) -> None:
 
 @conforms_lines
 async def test_a_peer_that_does_not_read(cable: Cable) -> None:
-    """It costs its publisher `stall` seconds once, and what it does not get is reported; other subscribers lose nothing."""
+    """It costs its publisher `stall` seconds once, and what it lacks is reported; other subscribers lose nothing."""
     missed: list[r2p.Missed] = []
     text = Text(text="x" * 64)
     async with (
