@@ -209,19 +209,19 @@ class BufferedLink(Link):
                 return
             arrival = arrivals.popleft()
             try:
-                origin = received.get(arrival.topic)
-                if origin is None:
+                entry = received.get(arrival.topic)
+                if entry is None:
                     self.receive_other(arrival)
                     continue
-                size = origin.sizes.get(self.sender(arrival))
+                size = entry.sizes.get(self.sender(arrival))
                 if size is None:
                     self._receive_unexpected(arrival)
                 elif size and len(arrival.data) != size:
                     lost["wrong size"] += 1
                 else:
                     self.stats.received += 1
-                    origin.last = sample = self.sample(origin.topic.name, arrival)
-                    blocked = origin.topic.deliver(sample)
+                    entry.last = sample = self.sample(entry.topic.name, arrival)
+                    blocked = entry.topic.deliver(sample)
                     if blocked is not None and self._backpressure.wait(sample, blocked):
                         self._pause_reading()
                         return
