@@ -1,12 +1,12 @@
-"""A gateway: what joins the links of a module, so that they are one network.
+"""A gateway joins the links of a module, so that they are one network.
 
-A gateway has no topics of its own. On each link it publishes what others offer elsewhere, and subscribes what others
-want elsewhere; so subscriptions travel through it, also from gateway to gateway, and only what somebody wants is sent.
-It never decodes a message. Where it forwards at all is agreed with the other gateways (`r2p.protocols.bridge`).
+A gateway has no topics of its own. On each link it publishes what is published elsewhere, and subscribes what is
+subscribed elsewhere; so subscriptions travel through it, also from gateway to gateway, and only what is subscribed is
+sent. It never decodes a message. Where it forwards at all is agreed with the other gateways (`r2p.protocols.bridge`).
 
-    link  ->  BridgedTopic.deliver  ->  Way  ->  outlet of another link
-
-`Bridge` owns the ports and the tree, `Relays` keeps the topics up to date, `Presences` tells of modules and nodes.
+Read `forwarding` first (a message's way through), then `routing` (which routes there are) and `bridge` (ports, tree,
+management messages). `shaping` changes messages on their way, `directory_relay` passes on modules and nodes, `orders`
+STOP and the like; `options` says what may pass. `multihoming` is for modules with several links that are not gateways.
 """
 
 from r2p.bridge.bridge import Bridge

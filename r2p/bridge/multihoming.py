@@ -1,8 +1,8 @@
-"""A module that is no gateway, with several links: it uses each topic on one of those that gateways join.
+"""A module that is not a gateway, with several links: it uses each topic on one of those that gateways join.
 
-A link hears NOTHING of a topic that uses another link (`r2p.protocols.bridge.link_selection`), and others see the
-module's nodes there as gateways tell of them. A topic that a link can't carry, as its name or its messages are too
-long, takes the next link that can.
+Which links are used is up to `r2p.protocols.bridge.link_selection`. A link that is not used for a topic announces
+NOTHING of it; others see the module's nodes there as gateways pass them on. A topic that a link can't carry, as its
+name or its messages are too long, takes the next link that can.
 """
 
 from collections.abc import Callable
@@ -15,68 +15,42 @@ from r2p.protocols.bridge.link_selection import LinkSelection
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.announcement import NOTHING, Announcement
-from r2p.transports.link import Link
+from r2p.transports.link import GatewayHooks, Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
-_KINDS = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
+_TYPES = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
 _ALL: frozenset[int] = frozenset()
-
-
-class StandbyPort:
-    """One link: where hellos of gateways come in, and where it is decided what the link is told."""
-
-    def __init__(self, standby: "MultihomedModule", link: Link, number: int) -> None:
-        self.link = link
-        self.number = number
-        self.generation = -1
-        """Of what was known of the modules there when it was looked at last."""
-        self._standby = standby
-
-    def handle_management(self, data: bytes) -> bool:
-        return self._standby.handle_management(self, data)
-
-    def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
-        return own if self._standby.uses(topic, self) else NOTHING
-
-    @property
-    def may_announce(self) -> bool:
-        return not self._standby.homes.is_twin(self.number)
-
-    @property
-    def has_other_gateways(self) -> bool:
-        return self._standby.homes.may_announce
-
-    def source_name(self, source: Source) -> str:
-        return source.module
-
-    def discovery_changed(self) -> None:
-        self._standby.discovery_changed(self)
+"""Topics that all links can carry: those that no link has to do without."""
 
 
 class MultihomedModule:
-    """The links of one module. `told(link, kind, text, trouble)` is called with news for the user."""
+    """The links of one module. `notify(link, kind, text, trouble)` is called with what the user should know."""
 
-    def __init__(self, space: TopicSpace, instance: int, told: Callable[[Link, str, str, bool], None]) -> None:
-        self.homes = LinkSelection(instance)
+    def __init__(self, space: TopicSpace, instance: int, notify: Callable[[Link, str, str, bool], None]) -> None:
+        self.selection = LinkSelection(instance)
         self._space = space
         self._instance = instance
-        self._told = told
-        self._ports: dict[str, StandbyPort] = {}  # by the name of the link
-        self._by_number: dict[int, StandbyPort] = {}
+        self._notify = notify
+        self._ports: dict[str, _MultihomedPort] = {}
+        """By the name of the link."""
+        self._by_number: dict[int, _MultihomedPort] = {}
         self._attached = 0
         self._changes = 0
-        self._used = {_ALL: self.homes.used(0, _ALL)}  # by the links that can't carry a topic
+        self._used = {_ALL: self.selection.used(0, _ALL)}
+        """The links that are used, by those that can't carry a topic."""
         self._without: dict[str, frozenset[int]] = {}
+        """The links that can't carry a topic, by its name, as they were when it was announced last."""
         self._unable: dict[tuple[int, int], frozenset[int]] = {}
-        self._guarding = False
+        """The links that can't carry a topic, by the length of its name and the size of its messages."""
+        self._filtering = False
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
     # Links
 
     def attach(self, link: Link) -> None:
-        """The module has a link, up or not yet; those that come first are preferred."""
+        """The module has one more link, up or not yet; those that come first are preferred."""
         self._attached += 1
-        port = StandbyPort(self, link, self._attached)
+        port = _MultihomedPort(self, link, self._attached)
         self._ports[link.name] = self._by_number[port.number] = port
         for key, unable in self._unable.items():
             if _cannot_carry(link, *key):
@@ -84,96 +58,99 @@ class MultihomedModule:
         link.gateway_hooks = port
 
     def detach(self, link: Link) -> None:
-        """It does not have it any more."""
+        """The module does not have the link any more."""
         port = self._ports.pop(link.name)
         del self._by_number[port.number]
         for key, unable in self._unable.items():
             if port.number in unable:
                 self._unable[key] = unable - {port.number}
-        self.homes.shut(self._now(), port.number)
-        self.homes.forget(port.number)
+        self.selection.close(self._now(), port.number)
+        self.selection.forget(port.number)
         self._act()
 
     def link_changed(self, link: Link) -> None:
-        """It went up or down."""
+        """The link went up or down."""
         port = self._ports.get(link.name)
         if port is None:
             return
         if link.up:
-            self.homes.open(self._now(), port.number, lone=link.point_to_point)
+            self.selection.open(self._now(), port.number, lone=link.point_to_point)
         else:
-            self.homes.shut(self._now(), port.number)
+            self.selection.close(self._now(), port.number)
             link.stands_by = ""
         self._act()
         if link.up and port.number not in self._used[_ALL]:
-            self._retell([link])
+            self._announce(list(self._space.topics.values()), [link])
 
     def close(self) -> None:
+        """The module ends."""
         self._alarm.close()
 
     # What comes in
 
-    def handle_management(self, port: StandbyPort, data: bytes) -> bool:
-        """A management message; True if discovery need not see it."""
-        if management.type_of(data) not in _KINDS:
+    def handle_management(self, port: "_MultihomedPort", data: bytes) -> bool:
+        """Handle a management message; True if discovery need not see it."""
+        if management.type_of(data) not in _TYPES:
             return False
         try:
             message = management.decode(data)
         except (DecodeError, UnknownType):
             return False
-        ours = self._heard(self._now(), port, message, data)
-        if ours:
+        is_for_us = self._select(self._now(), port.number, message, data)
+        if is_for_us:
             self._act()
-        return ours
+        return is_for_us
 
-    def _heard(self, now: int, port: StandbyPort, message: management.Management, data: bytes) -> bool:
+    def _select(self, now: int, number: int, message: management.Management, data: bytes) -> bool:
+        """Enter what a message shows about the links; False: nothing."""
         match message:
             case management.Bridge():
-                self.homes.bridge(now, port.number, message)
+                self.selection.receive_bridge(now, number, message)
             case management.Leaf(self._instance):
-                self.homes.leaf(now, port.number, message)
+                self.selection.receive_leaf(now, number, message)
             case management.Hello(_, self._instance, hops=0) | management.Alive(self._space.module):
-                return self.homes.heard_ourselves(now, port.number)
+                return self.selection.receive_own(now, number)
             case management.Alive() if (probe := probes.decode(data)) is not None and probe[0] == self._instance:
-                self.homes.probed(now, port.number, probe[1])
+                self.selection.receive_probe(now, number, probe[1])
             case management.Leaf() | management.Mesh():
                 pass
             case _:
                 return False
         return True
 
-    def discovery_changed(self, port: StandbyPort) -> None:
-        """Discovery may have learnt who is at the other end, or how long messages are of which we did not know it."""
+    def discovery_changed(self, port: "_MultihomedPort") -> None:
+        """Discovery may have found which module is at the other end, or how long messages of a topic are."""
         if port.link.point_to_point and port.link.discovery.generation != port.generation:
             port.generation = port.link.discovery.generation
-            self.homes.ended(self._now(), port.number, port.link.discovery.sole_peer)
+            self.selection.set_remote(self._now(), port.number, port.link.discovery.sole_peer)
             self._act()
-        if len(self._used[_ALL]) == len(self.homes.by_number):
+        if len(self._used[_ALL]) == len(self.selection.by_number):
             return
-        for topic in list(self._space.topics.values()):
-            if (
-                topic.layout is None
-                and not topic.unused
-                and self._without.get(topic.name, _ALL) != self._unable_for(topic)
-            ):
-                self._retell_topic(topic)
+        resized = [
+            topic
+            for topic in self._space.topics.values()
+            if topic.layout is None
+            and not topic.unused
+            and self._without.get(topic.name, _ALL) != self._unable_for(topic)
+        ]
+        self._announce(resized, [each.link for each in self._by_number.values() if each.link.up])
 
     # Topics
 
-    def uses(self, topic: Topic, port: StandbyPort) -> bool:
+    def uses(self, topic: Topic, port: "_MultihomedPort") -> bool:
         """Whether the topic takes this link; one that is down keeps what it had, until it is up again."""
-        if port.number not in self.homes.by_number:
+        if port.number not in self.selection.by_number:
             return True
         without = self._unable_for(topic)
         if topic.unused:
             self._without.pop(topic.name, None)
         else:
             self._without[topic.name] = without
-        topic.drop_filter = self._guard_of(topic) if self._guarding else None
-        return port.number in without or port.number in self.homes.used(self._now(), without)
+        topic.drop_filter = self._drop_filter(topic) if self._filtering else None
+        return port.number in without or port.number in self.selection.used(self._now(), without)
 
     def _unable_for(self, topic: Topic) -> frozenset[int]:
-        """The links that can't carry it."""
+        """The links that can't carry the topic."""
         size = topic.layout.size if topic.layout is not None else 0
         if not size:
             infos = (port.link.discovery.topics.get(topic.name) for port in self._by_number.values())
@@ -184,18 +161,18 @@ class MultihomedModule:
             self._unable[key] = frozenset(number for number, port in ports if _cannot_carry(port.link, *key))
         return self._unable[key]
 
-    def _guard_of(self, topic: Topic) -> Callable[[str], bool]:
+    def _drop_filter(self, topic: Topic) -> Callable[[str], bool]:
         """Asked before each message while gateways consent to the use of several links for a while only: a module that
         was stopped must not go on with them. Says whether the message came in by a link that is not used any more.
         """
 
-        def guard(link: str) -> bool:
-            if self._now() >= self.homes.until:
+        def drops(link: str) -> bool:
+            if self._now() >= self.selection.consent_until:
                 self._poll()
             port = self._ports.get(link)
             return port is not None and not self.uses(topic, port)
 
-        return guard
+        return drops
 
     # What follows
 
@@ -204,76 +181,103 @@ class MultihomedModule:
 
     def _poll(self) -> None:
         try:
-            self.homes.poll(self._now())
+            self.selection.poll(self._now())
             self._act()
         except Exception as error:  # noqa: BLE001 - counted and logged
             count_internal_error((port.link.stats.lost for port in self._ports.values()), error)
             self._alarm.set(self._now() + RETRY_AFTER_ERROR)
 
     def _act(self) -> None:
-        for number, message in self.homes.take():
+        for number, message in self.selection.pop_messages():
             link = self._by_number[number].link
             if link.up and message is not None:
                 link.write_management(management.encode(message), urgent=True)
             elif link.up and link.passes_probes:
                 link.write_management(probes.encode(self._instance, number))
-        guarding = self.homes.guards
-        if self.homes.changes != self._changes or guarding != self._guarding:
-            self._changes = self.homes.changes
-            self._guarding = guarding
+        filtering = self.selection.needs_consent
+        if self.selection.changes != self._changes or filtering != self._filtering:
+            self._changes = self.selection.changes
+            self._filtering = filtering
             self._choose()
         for number in self._by_number.keys() - self._used[_ALL]:
-            self._tell_user(number, self._by_number[number].link)
-        self._alarm.set(self.homes.next_deadline())
+            self._report_unused(number, self._by_number[number].link)
+        self._alarm.set(self.selection.next_deadline())
 
     def _choose(self) -> None:
         """Other links are used than before."""
         before = self._used
         withouts = {_ALL, *self._without.values()}
-        self._used = {without: self.homes.used(self._now(), without) for without in withouts}
+        self._used = {without: self.selection.used(self._now(), without) for without in withouts}
         changed = set().union(*(used ^ before.get(without, _ALL) for without, used in self._used.items()))
         ports = [port for number in sorted(changed) if (port := self._by_number.get(number)) and port.link.up]
         for port in ports:
             if port.number in self._used[_ALL]:
-                self._tell_used(port.link)
+                self._report_used(port.link)
             elif port.number in before[_ALL]:
-                port.link.stats.lost["standing by"] += port.link.discard()
+                port.link.stats.lost["standing by"] += port.link.discard()  # what waits there would arrive twice
         for topic in self._space.topics.values():
-            topic.drop_filter = self._guard_of(topic) if self._guarding else None
-        self._retell([port.link for port in ports])
+            topic.drop_filter = self._drop_filter(topic) if self._filtering else None
+        self._announce(list(self._space.topics.values()), [port.link for port in ports])
 
-    def _retell(self, links: list[Link]) -> None:
-        for topic in list(self._space.topics.values()):
+    def _announce(self, topics: list[Topic], links: list[Link]) -> None:
+        """Have these links announce what these topics are to be there now."""
+        for topic in topics:
             for link in links:
                 link.stats.lost.guard(link.topic_changed, topic)
 
-    def _retell_topic(self, topic: Topic) -> None:
-        for port in list(self._by_number.values()):
-            if port.link.up:
-                port.link.stats.lost.guard(port.link.topic_changed, topic)
-
-    def _tell_used(self, link: Link) -> None:
+    def _report_used(self, link: Link) -> None:
         if link.stands_by:
             link.stands_by = ""
-            self._told(link, "used", "is used again", False)
+            self._notify(link, "used", "is used again", False)
 
-    def _tell_user(self, number: int, link: Link) -> None:
-        """Of a link that is not used."""
-        other = self.homes.stands_by_for(number) if link.up and not link.stands_by else None
+    def _report_unused(self, number: int, link: Link) -> None:
+        other = self.selection.stands_by_for(number) if link.up and not link.stands_by else None
         if other is not None:
             link.stands_by = self._reason(number, self._by_number[other])
-            self._told(link, "stands by", link.stands_by, False)
+            self._notify(link, "stands by", link.stands_by, False)
 
-    def _reason(self, number: int, other: StandbyPort) -> str:
-        if self.homes.is_twin(number):
+    def _reason(self, number: int, other: "_MultihomedPort") -> str:
+        candidate = self.selection.by_number[number]
+        if self.selection.is_twin(number):
             return f"stands by: it leads to the same network as {other.link.name}"
-        if self.homes.by_number[number].end is not None:
+        if candidate.remote is not None:
             return f"stands by: it leads to the same module as {other.link.name}"
-        link = self._by_number[number].link
-        gateways = {gateway for gateway, _ in self.homes.by_number[number].gateways}
-        names = [info.name for info in link.discovery.modules.values() if info.instance in gateways]
+        gateways = {gateway for gateway, _ in candidate.gateways}
+        modules = self._by_number[number].link.discovery.modules.values()
+        names = [info.name for info in modules if info.instance in gateways]
         joins = f"gateway {names[0]} joins" if len(names) == 1 else "gateways join"
         return f"stands by: {joins} its network to that of {other.link.name}"
+
+
+class _MultihomedPort(GatewayHooks):
+    """What the module has to say about one of its links."""
+
+    def __init__(self, owner: MultihomedModule, link: Link, number: int) -> None:
+        self.link = link
+        self.number = number
+        self.generation = -1
+        """That of discovery when it was looked at last."""
+        self._owner = owner
+
+    def handle_management(self, data: bytes) -> bool:
+        return self._owner.handle_management(self, data)
+
+    def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
+        return own if self._owner.uses(topic, self) else NOTHING
+
+    @property
+    def may_announce(self) -> bool:
+        return not self._owner.selection.is_twin(self.number)
+
+    @property
+    def has_other_gateways(self) -> bool:
+        return self._owner.selection.may_announce
+
+    def source_name(self, source: Source) -> str:
+        return source.module
+
+    def discovery_changed(self) -> None:
+        self._owner.discovery_changed(self)
 
 
 def _cannot_carry(link: Link, name_length: int, size: int) -> bool:

@@ -1,18 +1,24 @@
-"""Which topics a gateway relays, and what it tells each link of them: looked at anew whenever demand changes.
+"""Which topics a gateway forwards, and what it announces of them on each link: worked out whenever demand changes.
 
-On a link we publish what is offered, and subscribe what is wanted, on another one to or from which it may go. All of
-that only on links that are in the tree; so demand travels along the tree, and can't feed itself.
+On a link we publish what is published on another one from which it may come, and subscribe what is subscribed on
+another one to which it may go. All of that only on links that are in the tree; so demand travels along the tree, and
+can't feed itself.
+
+A change of demand costs as much as there are links, not pairs of links: only new routes are looked at, the policy is
+asked for pairs of kinds of links, and types are looked up once for all links.
 """
 
+import functools
 import itertools
 import re
 from collections.abc import Iterable, Iterator
 
 import msgspec
 
-from r2p.bridge.forwarding import BridgedTopic, Relay, RelayedPeriodic, Route, Shaper
+from r2p.bridge.forwarding import BridgedTopic, RelayedTopic, Route
 from r2p.bridge.options import Policy
-from r2p.bridge.port import BridgePort
+from r2p.bridge.port import BridgePort, PortsByKind, by_kind
+from r2p.bridge.shaping import RelayedPeriodic, Shaper
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.log_lines import LineLimit, get_logger
 from r2p.names import LOADER_PREFIX
@@ -25,25 +31,28 @@ logger = get_logger("r2p.bridge")
 
 _NAME = re.compile(r"[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)?")
 LONG_NAMES = 64
-"""Names too long for a link that are remembered, so that each is told once; beyond that one a second is told."""
+"""Names too long for a link that are remembered, so that each is logged once; beyond that one a second is logged."""
 
 _LINES = 1  # of the log in a second about names that are too long, when there are many of them
-_BUSES = frozenset({"rtcan", "sim"})
+
+_Pair = tuple[BridgePort, BridgePort]
+_Types = tuple[TopicType, TopicType]
 
 
 class RoutingTable:
-    """The relayed topics by their name on the robot."""
+    """The topics that the gateway forwards, by their canonical names."""
 
     def __init__(self, ports: dict[str, BridgePort], space: TopicSpace, policy: Policy) -> None:
-        self.by_name: dict[str, Relay] = {}
+        self.by_name: dict[str, RelayedTopic] = {}
         self._ports = ports
         self._space = space
         self._policy = policy
-        self._dirty: dict[str, None] = {}
-        self._idle: set[str] = set()
-        """Topics that are offered or wanted, and may go nowhere as long as no other link comes."""
+        self._to_review: dict[str, None] = {}
         self._reviewing = False
-        self._shapes: dict[tuple[str, str], tuple[TopicType, TopicType]] = {}
+        self._idle: set[str] = set()
+        """Topics that are published or subscribed, and may go nowhere as long as no other link comes."""
+        self._announced: dict[tuple[str, str], _Types] = {}
+        """The types that are announced, by topic and link."""
         self._known: dict[tuple[str, int], list[tuple[BridgePort, TopicType]]] | None = None
         """What `_known_types` found, while all links are asked about the same topics one after the other."""
         self._too_long: dict[str, None] = {}
@@ -51,49 +60,49 @@ class RoutingTable:
 
     # What has changed
 
-    def changed(self, names: Iterable[str], port: BridgePort) -> None:
+    def demand_changed(self, names: Iterable[str], port: BridgePort) -> None:
         """The demand for these topics has changed on a link."""
-        self._mark(topic for name in names if (topic := self._meant(name, port)) is not None)
+        self._review_all(topic for name in names if (topic := self._to_canonical(name, port)) is not None)
 
     def port_changed(self, port: BridgePort) -> None:
-        """The link is new, or gone, or has another place in the tree: what it offers and wants is looked at anew, and
-        what others do is told to this link only.
+        """The link is new, or gone, or has another place in the tree: review what is published and subscribed there,
+        and announce there what other links publish and subscribe.
         """
-        heard = {topic for name in port.demand.topics() if (topic := self._meant(name, port))}
-        self._mark(heard | self._idle)
-        there = port.in_tree and self._ports.get(port.name) is port
-        for topic, relay in list(self.by_name.items()):
-            if topic in heard or self.by_name.get(topic) is not relay:
+        there = {topic for name in port.demand.topics() if (topic := self._to_canonical(name, port))}
+        self._review_all(there | self._idle)
+        is_member = port.in_tree and self._ports.get(port.name) is port
+        for topic, relayed in list(self.by_name.items()):
+            if topic in there or self.by_name.get(topic) is not relayed:
                 continue
-            if there and self._carries(topic, port):
-                self._enter(relay, topic, port)
+            if is_member and self._carries(topic, port):
+                self._enter(relayed, topic, port)
             else:
-                relay.forget(port.name)
-            self._tell_port(topic, port)
+                relayed.remove(port.name)
+            self._announce_on(topic, port)
 
-    def retyped(self) -> None:
-        """See whether other types, or sizes, are told than before."""
+    def check_types(self) -> None:
+        """See whether other types, or sizes, are known than those that are announced."""
         self._known = {}
         try:
-            changed = {topic for (topic, link), shape in self._shapes.items() if self._is_retyped(topic, link, shape)}
+            changed = {topic for (topic, link), types in self._announced.items() if self._differs(topic, link, types)}
         finally:
             self._known = None
-        self._mark(changed)
+        self._review_all(changed)
 
-    def _is_retyped(self, topic: str, link: str, shape: tuple[TopicType, TopicType]) -> bool:
+    def _differs(self, topic: str, link: str, types: _Types) -> bool:
         port = self._ports.get(link)
-        return port is not None and topic in self.by_name and self._types(topic, port) != shape
+        return port is not None and topic in self.by_name and self._types(topic, port) != types
 
-    def _mark(self, topics: Iterable[str]) -> None:
-        """Look at these anew, at once: what comes in next may need a new way."""
-        self._dirty.update(dict.fromkeys(sorted(topics)))
+    def _review_all(self, topics: Iterable[str]) -> None:
+        """Look at these anew, at once: what comes in next may need a new route."""
+        self._to_review.update(dict.fromkeys(sorted(topics)))
         if self._reviewing:
             return
         self._reviewing = True
         try:
-            while self._dirty:
-                topic = next(iter(self._dirty))
-                del self._dirty[topic]
+            while self._to_review:
+                topic = next(iter(self._to_review))
+                del self._to_review[topic]
                 try:
                     self._review(topic)
                 except Exception as error:  # noqa: BLE001 - counted and logged; the next topic follows
@@ -103,159 +112,193 @@ class RoutingTable:
 
     def _review(self, topic: str) -> None:
         ports = [port for port in self._ports.values() if port.in_tree and self._carries(topic, port)]
-        offering = [port for port in ports if self._offers(topic, port)]
-        wanting = [port for port in ports if self._wants(topic, port)]
-        if self._is_used(topic, ports, offering, wanting):
+        published_on = [port for port in ports if self._is_published(topic, port)]
+        subscribed_on = [port for port in ports if self._is_subscribed(topic, port)]
+        if self._is_used(topic, ports, published_on, subscribed_on):
             self._idle.discard(topic)
-            self._relay(topic, ports, offering, wanting)
+            self._relay(topic, ports, published_on, subscribed_on)
             return
         self._end(topic)
-        if (offering or wanting) and not self._policy.allows_nowhere(topic):
+        if (published_on or subscribed_on) and not self._policy.allows_nowhere(topic):
             self._idle.add(topic)
         else:
             self._idle.discard(topic)
 
+    # What is allowed
+
     def _is_used(
-        self, topic: str, ports: list[BridgePort], offering: list[BridgePort], wanting: list[BridgePort]
+        self, topic: str, ports: list[BridgePort], published_on: list[BridgePort], subscribed_on: list[BridgePort]
     ) -> bool:
         """Whether messages flow anywhere, or would if there were any."""
         if self._policy.allows_nowhere(topic):
             return False
-        return any(self._allows(topic, *each) for each in _pairs(offering, ports)) or any(
-            self._allows(topic, *each) for each in _pairs(ports, wanting)
+        everywhere = by_kind(ports)
+        return self._is_allowed(topic, by_kind(published_on), everywhere) or self._is_allowed(
+            topic, everywhere, by_kind(subscribed_on)
         )
 
-    def _allows(self, topic: str, source: BridgePort, target: BridgePort) -> bool:
-        return self._policy.allows(topic, source.name, target.name)
+    def _is_allowed(self, topic: str, sources: PortsByKind, targets: PortsByKind) -> bool:
+        """Whether the topic may go from one of these links to another one of those."""
+        return next(self._allowed_pairs(topic, sources, targets), None) is not None
 
-    # Relays
+    def _allowed_pairs(self, topic: str, sources: PortsByKind, targets: PortsByKind) -> Iterator[_Pair]:
+        for these in sources:
+            for those in targets:
+                if self._policy.allows(topic, these[0].name, those[0].name):
+                    yield from ((one, other) for one in these for other in those if one is not other)
+
+    # Topics that are forwarded
 
     def _relay(
-        self, topic: str, ports: list[BridgePort], offering: list[BridgePort], wanting: list[BridgePort]
+        self, topic: str, ports: list[BridgePort], published_on: list[BridgePort], subscribed_on: list[BridgePort]
     ) -> None:
-        relay = self.by_name.get(topic)
-        if relay is None:
-            relay = self.by_name[topic] = Relay()
-        relay.offering, relay.wanting = offering, wanting
+        relayed = self.by_name.get(topic)
+        if relayed is None:
+            relayed = self.by_name[topic] = RelayedTopic()
+        relayed.set_demand(published_on, subscribed_on)
         for port in ports:
-            self._enter(relay, topic, port)
+            self._enter(relayed, topic, port)
         if topic.startswith(LOADER_PREFIX):
-            offering = wanting = ports  # it flows without being offered or wanted
-        relay.keep({port.name for port in ports})
-        self._find_ways(relay, topic, offering, wanting)
-        self._tell(topic)
+            published_on = subscribed_on = ports  # messages of the loader flow without being announced
+        relayed.keep({port.name for port in ports})
+        self._add_routes(relayed, topic, published_on, subscribed_on)
+        self._announce(topic)
 
-    def _find_ways(self, relay: Relay, topic: str, offering: list[BridgePort], wanting: list[BridgePort]) -> None:
-        """Add the ways from and to what is new here: looking at all pairs each time would cost links squared."""
-        sources, targets = {port.name for port in offering}, {port.name for port in wanting}
-        new = [port for port in offering if port.name not in relay.sources]
-        old = [port for port in offering if port.name in relay.sources]
-        added = [port for port in wanting if port.name not in relay.targets]
-        for source, target in itertools.chain(_pairs(new, wanting), _pairs(old, added)):
-            if relay.way(source.name, target.name) is None and self._allows(topic, source, target):
-                here = self._topic(topic, target)
-                relay.add(source.name, Route(target, here, self._shaper(topic, source.name, target)))
-        relay.sources, relay.targets = sources, targets
+    def _add_routes(
+        self, relayed: RelayedTopic, topic: str, published_on: list[BridgePort], subscribed_on: list[BridgePort]
+    ) -> None:
+        """Add the routes from and to what is new here: looking at all pairs each time would cost links squared."""
+        new = [port for port in published_on if port.name not in relayed.sources]
+        old = [port for port in published_on if port.name in relayed.sources]
+        added = [port for port in subscribed_on if port.name not in relayed.targets]
+        pairs = itertools.chain(
+            self._allowed_pairs(topic, by_kind(new), by_kind(subscribed_on)),
+            self._allowed_pairs(topic, by_kind(old), by_kind(added)),
+        )
+        for source, target in pairs:
+            if relayed.route(source.name, target.name) is None:
+                shaper = self._shaper(topic, source, target)
+                relayed.add(source.name, Route(target, self._topic(topic, target), shaper))
+        relayed.sources = {port.name for port in published_on}
+        relayed.targets = {port.name for port in subscribed_on}
         if new or added:
-            relay.changed()
+            relayed.changed()
 
-    def _enter(self, relay: Relay, topic: str, port: BridgePort) -> None:
+    def _shaper(self, topic: str, source: BridgePort, target: BridgePort) -> Shaper | None:
+        has_slots = target.link.has_slots
+        reserve = (
+            functools.partial(self._reserve, topic, target) if has_slots and self._policy.reserves(topic) else None
+        )
+        rate, klass = self._policy.rate_limit(topic), self._policy.class_of(topic, source.name)
+        return Shaper.of(rate=rate, klass=klass, soften=has_slots, reserve=reserve)
+
+    def _reserve(self, topic: str, target: BridgePort, size: int, period: float) -> RelayedPeriodic:
+        """Ask a bus for slots for messages of `size` bytes each `period` seconds."""
+        here = self._topic(topic, target)
+        if here.reserved is None or here.reserved.size != size:
+            here.reserved = RelayedPeriodic(size, period)
+        target.link.topic_changed(here)
+        return here.reserved
+
+    def _enter(self, relayed: RelayedTopic, topic: str, port: BridgePort) -> None:
         here = self._topic(topic, port)
-        if here.relay is not relay:
-            here.relay = relay
-            here.open = {}
-        relay.topics[here.name] = here
+        if here.relayed is not relayed:
+            here.relayed = relayed
+            here.active_routes = {}
+        relayed.topics[here.name] = here
 
     def _end(self, topic: str) -> None:
-        relay = self.by_name.pop(topic, None)
-        if relay is None:
+        relayed = self.by_name.pop(topic, None)
+        if relayed is None:
             return
-        for here in relay.topics.values():
-            here.relay = here.reserved = None
-            here.open = {}
-        self._tell(topic, relay.topics)
-        for here in relay.topics.values():
+        for here in relayed.topics.values():
+            here.relayed = here.reserved = None
+            here.active_routes = {}
+        self._announce(topic, relayed.topics)
+        for here in relayed.topics.values():
             if here.unused and not here.in_use:
                 self._space.topics.pop(here.name, None)
 
-    def _tell(self, topic: str, topics: dict[str, BridgedTopic] | None = None) -> None:
+    # What is announced
+
+    def _announce(self, topic: str, ended: dict[str, BridgedTopic] | None = None) -> None:
+        """Announce a topic on all links; `ended`: what it was called while it was forwarded."""
         self._known = {}
         try:
             for port in list(self._ports.values()):
-                self._tell_port(topic, port, topics)
+                self._announce_on(topic, port, ended)
         finally:
             self._known = None
 
-    def _tell_port(self, topic: str, port: BridgePort, topics: dict[str, BridgedTopic] | None = None) -> None:
-        """Tell one link of a topic; `topics`: those of a relay that has ended."""
-        here = (topics or self._space.topics).get(self._policy.to_link_name(topic, port.name))
-        if topics is not None:
-            self._shapes.pop((topic, port.name), None)
+    def _announce_on(self, topic: str, port: BridgePort, ended: dict[str, BridgedTopic] | None = None) -> None:
+        here = (ended or self._space.topics).get(self._policy.to_link_name(topic, port.name))
+        if ended is not None:
+            self._announced.pop((topic, port.name), None)
         elif here is not None:
-            self._shapes[topic, port.name] = self._types(topic, port)
+            self._announced[topic, port.name] = self._types(topic, port)
         if here is not None:
             port.link.stats.lost.guard(port.link.topic_changed, here)
 
     def desired_state(self, port: BridgePort, topic: Topic, own: Announcement) -> Announcement:
-        """What a link is to be told of a topic that this module itself has as `own`."""
+        """What a link is to announce of a topic of which this module itself has `own`."""
         if not port.in_tree:
             return NOTHING
         name = self._policy.to_canonical(topic.name, port.name)
-        relay = None if name is None else self.by_name.get(name)
-        if name is None or relay is None:
+        relayed = None if name is None else self.by_name.get(name)
+        if name is None or relayed is None:
             return own
-        publishes = any(self._allows(name, each, port) for each in relay.offering if each is not port)
-        subscribes = any(self._allows(name, port, each) for each in relay.wanting if each is not port)
+        publishes = self._is_allowed(name, relayed.published_on_kinds, [[port]])
+        subscribes = self._is_allowed(name, [[port]], relayed.subscribed_on_kinds)
         if not publishes and not subscribes:
             return own
-        shape, asked = (own.asked, own.asked) if topic.layout is not None else self._types(name, port)
+        published, asked = (own.asked, own.asked) if topic.layout is not None else self._types(name, port)
         return msgspec.structs.replace(
             own,
             publishes=own.publishes or publishes,
             subscribes=own.subscribes or subscribes,
-            size=shape.size,
-            fingerprint=shape.fingerprint,
+            size=published.size,
+            fingerprint=published.fingerprint,
             asked=asked,
         )
 
-    def _types(self, topic: str, port: BridgePort) -> tuple[TopicType, TopicType]:
-        """The types in which a link is told that we publish and subscribe: what publishers say of it, if there are any.
+    def _types(self, topic: str, port: BridgePort) -> _Types:
+        """The types with which a link is to publish and to subscribe: what publishers announce, if there are any.
 
-        Those that it has itself are asked for what they have, so that one of another type elsewhere does not end it.
+        Those on the link itself are asked for what they have, so that another type elsewhere does not end the topic.
         """
-        relay = self.by_name[topic]
-        here = self._told(topic, [port], ROLE_PUBLISHES)
-        published = self._told_elsewhere(topic, port, relay.offering, ROLE_PUBLISHES)
-        asked = self._told_elsewhere(topic, port, relay.wanting, ROLE_SUBSCRIBES)
+        relayed = self.by_name[topic]
+        here = self._type_on(topic, [port], ROLE_PUBLISHES)
+        published = self._type_elsewhere(topic, port, relayed.published_on, ROLE_PUBLISHES)
+        asked = self._type_elsewhere(topic, port, relayed.subscribed_on, ROLE_SUBSCRIBES)
         return published or asked or TopicType(), here or asked or published or TopicType()
 
-    def _told_elsewhere(self, topic: str, port: BridgePort, ports: list[BridgePort], role: int) -> TopicType | None:
-        """The type that the first other one of these links tells; where there are none, the first that is known."""
+    def _type_elsewhere(self, topic: str, port: BridgePort, ports: list[BridgePort], role: int) -> TopicType | None:
+        """The type on the first other one of these links; where there are none, the first that is known."""
         if ports:
-            return self._told(topic, (each for each in ports if each is not port), role)
-        return next((shape for each, shape in self._known_types(topic, role) if each is not port), None)
+            return self._type_on(topic, (each for each in ports if each is not port), role)
+        return next((known for each, known in self._known_types(topic, role) if each is not port), None)
 
     def _known_types(self, topic: str, role: int) -> list[tuple[BridgePort, TopicType]]:
         """The first two links that know a type: so each link finds one besides its own, and none looks at all."""
         known = None if self._known is None else self._known.get((topic, role))
         if known is None:
-            told = ((port, self._told(topic, [port], role)) for port in self._ports.values() if port.in_tree)
-            known = list(itertools.islice(((port, shape) for port, shape in told if shape is not None), 2))
+            types = ((port, self._type_on(topic, [port], role)) for port in self._ports.values() if port.in_tree)
+            known = list(itertools.islice(((port, each) for port, each in types if each is not None), 2))
             if self._known is not None:
                 self._known[topic, role] = known
         return known
 
-    def _told(self, topic: str, ports: Iterable[BridgePort], role: int) -> TopicType | None:
-        """The type that the first link tells."""
+    def _type_on(self, topic: str, ports: Iterable[BridgePort], role: int) -> TopicType | None:
+        """The type that is announced on the first of these links where one is."""
         infos = (each.link.discovery.topics.get(self._policy.to_link_name(topic, each.name)) for each in ports)
         return next((info.types[role] for info in infos if info is not None and role in info.types), None)
 
     # One topic on one link
 
-    def _offers(self, topic: str, port: BridgePort) -> bool:
+    def _is_published(self, topic: str, port: BridgePort) -> bool:
         return port.demand.is_published(self._policy.to_link_name(topic, port.name))
 
-    def _wants(self, topic: str, port: BridgePort) -> bool:
+    def _is_subscribed(self, topic: str, port: BridgePort) -> bool:
         return port.demand.is_subscribed(self._policy.to_link_name(topic, port.name))
 
     def _topic(self, topic: str, port: BridgePort) -> BridgedTopic:
@@ -263,8 +306,8 @@ class RoutingTable:
         assert isinstance(here, BridgedTopic)  # this module makes no others
         return here
 
-    def _meant(self, name: str, port: BridgePort) -> str | None:
-        """The topic of the robot; None for what is not its own, and for what only a hostile wire can say."""
+    def _to_canonical(self, name: str, port: BridgePort) -> str | None:
+        """The canonical name; None for another robot's topics, and for names that only a hostile peer can send."""
         topic = self._policy.to_canonical(name, port.name)
         return topic if topic and _NAME.fullmatch(topic) else None
 
@@ -276,10 +319,10 @@ class RoutingTable:
         if len(name) <= port.link.max_name:
             return True
         if name not in self._too_long:
-            self._tell_too_long(name, port)
+            self._log_too_long(name, port)
         return False
 
-    def _tell_too_long(self, name: str, port: BridgePort) -> None:
+    def _log_too_long(self, name: str, port: BridgePort) -> None:
         many = len(self._too_long) >= LONG_NAMES
         more = self._limit.suffix("", self._space.clock.monotonic()) if many else ""
         if more is not None:
@@ -288,27 +331,3 @@ class RoutingTable:
         if many:
             del self._too_long[next(iter(self._too_long))]
         self._too_long[name] = None
-
-    def _shaper(self, topic: str, source: str, target: BridgePort) -> Shaper | None:
-        policy = self._policy
-        is_bus = target.name.partition(":")[0] in _BUSES
-        shaper = Shaper.of(
-            rate=policy.rate_limit(topic),
-            klass=policy.class_of(topic, source),
-            soften=is_bus,
-            learnt=(lambda size, period: reserve(size, period)) if is_bus and policy.reserves(topic) else None,
-        )
-
-        def reserve(size: int, period: float) -> None:
-            here = self._topic(topic, target)
-            if here.reserved is None or here.reserved.size != size:
-                here.reserved = RelayedPeriodic(here.name, size, period)
-            if shaper is not None:
-                shaper.reserved = here.reserved
-            target.link.topic_changed(here)
-
-        return shaper
-
-
-def _pairs(sources: list[BridgePort], targets: list[BridgePort]) -> Iterator[tuple[BridgePort, BridgePort]]:
-    return ((source, target) for source in sources for target in targets if source is not target)

@@ -1,7 +1,7 @@
-"""Probes: what a gateway says to find out whether it comes back by another link, through gateways of firmware.
+"""Probes: what a gateway sends to find out whether it comes back by another link, through gateways of firmware.
 
-Those pass on every ALIVE, and nothing that they don't know. So a probe is the ALIVE of a module that there can't be:
-its name begins with `_`, as those of tools, which send no ALIVE; six digits to the base 62 tell the gateway and port.
+Those pass on every ALIVE, and nothing that they do not know. So a probe is the ALIVE of a module that can't exist: its
+name begins with `_`, as those of tools, which send no ALIVE. Six digits to the base 62 hold the gateway and its port.
 """
 
 import string
@@ -9,13 +9,14 @@ import string
 from r2p.codecs import management
 
 _DIGITS = string.digits + string.ascii_letters
-_PORTS = 13  # as many as there is room for
 _LENGTH = 6
+PORT_MODULUS = 13
+"""A probe carries the number of its port modulo this: 62^6 / 2^32 values are left beside the gateway's 32 bits."""
 
 
 def encode(gateway: int, port: int) -> bytes:
-    """The probe of a port; its number is only known modulo 13."""
-    number = gateway * _PORTS + port % _PORTS
+    """The probe of a port."""
+    number = gateway * PORT_MODULUS + port % PORT_MODULUS
     name = ""
     for _ in range(_LENGTH):
         number, digit = divmod(number, len(_DIGITS))
@@ -25,11 +26,11 @@ def encode(gateway: int, port: int) -> bytes:
 
 def decode(data: bytes) -> tuple[int, int] | None:
     """Gateway and port of a probe; None for any other ALIVE."""
-    name = data[:7].decode("latin-1")
+    name = data[: _LENGTH + 1].decode("latin-1")
     if name[0] != "_" or not all(each in _DIGITS for each in name[1:]):
         return None
     number = 0
     for each in name[1:]:
         number = number * len(_DIGITS) + _DIGITS.index(each)
-    gateway, port = divmod(number, _PORTS)
+    gateway, port = divmod(number, PORT_MODULUS)
     return (gateway, port) if gateway <= 0xFFFFFFFF else None

@@ -319,7 +319,7 @@ class LinkManager:
         for other in self.links:
             called: str | None = name
             if self.bridge is not None and other is not link:
-                called = self.bridge.names.same(name, link.name, other.name)
+                called = self.bridge.names.translate(name, link.name, other.name)
             if called is not None and (info := other.discovery.modules.get(called)) is not None:
                 yield other, info
 

@@ -6,22 +6,22 @@ woken directly, the others one for each turn of the event loop, so that an impor
 handler steps of unimportant ones.
 """
 
+import abc
 import asyncio
 import heapq
 import itertools
 import logging
 import types
 from collections import deque
-from collections.abc import Callable, Generator, Hashable, Sequence
+from collections.abc import Callable, Generator, Hashable
 from typing import Any, Protocol
 from weakref import WeakValueDictionary
-
-import msgspec
 
 from r2p.clock import Clock
 from r2p.errors import MessageError, TypeMismatch
 from r2p.messages import Layout
 from r2p.runtime.backpressure import NO_ROOM, Sink, WaitQueue
+from r2p.runtime.duplicates import LastReceived
 from r2p.runtime.sample import PublisherClass, Sample
 
 YIELD_EVERY = 16
@@ -243,18 +243,48 @@ class PublisherHandle(Protocol):
         """A link sent a message after its deadline."""
 
 
+class SlotPublisher(abc.ABC):
+    """Fills the slots of a bus: a periodic publisher of this module, or of another link."""
+
+    period: float
+    """Seconds."""
+    lead: float
+    """Seconds before its slot in which a message is made."""
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """Bytes of one message."""
+
+    @abc.abstractmethod
+    def use_slot_clock(self, slot_link: object, period: float) -> bool:
+        """A link whose slots are the clock calls `tick` from now on, each `period` seconds; again: another period.
+
+        False if another link does already, or the publisher is closed.
+        """
+
+    @abc.abstractmethod
+    def use_own_clock(self, slot_link: object) -> None:
+        """That link does not any more."""
+
+    @abc.abstractmethod
+    def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
+        """The message for the slot due at `scheduled` (monotonic ns), `late` by ns, after so many `skipped` ones."""
+
+    @abc.abstractmethod
+    def link_degraded(self, link: str, reason: str) -> None:
+        """The link has no slots any more."""
+
+    @abc.abstractmethod
+    def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
+        """The link gave up a message that it had accepted; `late` is in seconds."""
+
+
 class LatchedSource(Protocol):
     """A link that publishes a topic here, and remembers its last message."""
 
-    def offer_latched(self, topic: "Topic", sink: SubscriberQueue) -> None:
-        """Send the last message to a new subscriber, if the publisher latches it."""
-
-
-class LastReceived(msgspec.Struct, eq=False, weakref=True):
-    """The last message of a remote publisher, by whatever way it came: sequence number and stamp."""
-
-    sequence: int = 0
-    stamp: int = 0
+    def latched_value(self, topic: "Topic") -> Sample | None:
+        """The last message, if the publisher latches it."""
 
 
 class Topic:
@@ -314,11 +344,13 @@ class Topic:
                 elif not waiter.done():
                     waiter.set_result(None)
         if self.remote_subscribers and not sample.source.link:
-            blocked = self._send(sample, blocked, slot_link)
+            blocked = self._send(self.remote_subscribers, sample, blocked, slot_link)
         return blocked
 
-    def _send(self, sample: Sample, blocked: list[Sink] | None, slot_link: object) -> list[Sink] | None:
-        for outlet in self.remote_subscribers:
+    def _send(
+        self, subscribers: list[RemoteSubscriber], sample: Sample, blocked: list[Sink] | None, slot_link: object
+    ) -> list[Sink] | None:
+        for outlet in subscribers:
             lines = outlet.waiting
             queues = (lines.events or lines.deliveries) and lines.queue_of(sample)
             if outlet.link is slot_link or (not queues and outlet.offer(sample)):
@@ -334,8 +366,8 @@ class Topic:
         if isinstance(sink, SubscriberQueue):
             self.queues.append(sink)
             self.queues.sort(key=lambda queue: -queue.priority)
-            for memory in self.latched_sources:
-                memory.offer_latched(self, sink)
+            for value in self.latched_values():
+                sink.offer_latched(value)
         elif sink not in self.remote_subscribers:
             self.remote_subscribers.append(sink)
         for publisher in self.publishers:
@@ -368,9 +400,13 @@ class Topic:
         return not (self.publishers or self.queues)
 
     @property
-    def slot_publishers(self) -> Sequence[object]:
-        """Those for whose messages a link may ask, if they are periodic: a bus with slots of its own."""
-        return self.publishers
+    def slot_publishers(self) -> list[SlotPublisher]:
+        """The publishers that may fill the slots of a bus."""
+        return [each for each in self.publishers if isinstance(each, SlotPublisher)]
+
+    def latched_values(self) -> list[Sample]:
+        """The last messages of remote publishers that latch them."""
+        return [value for source in self.latched_sources if (value := source.latched_value(self)) is not None]
 
     @property
     def wanted(self) -> bool:

@@ -19,7 +19,7 @@ from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.events import SubscriberJoined
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import SubscriberQueue, Topic
+from r2p.runtime.topic import Topic
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, LinkSubscriber
 from r2p.transports.receive_backpressure import ReceiveBackpressure
 
@@ -173,11 +173,10 @@ class BufferedLink(Link):
             received.topic.remote_publishers -= len(received.sizes)
             received.topic.latched_sources.remove(self)
 
-    def offer_latched(self, topic: Topic, sink: SubscriberQueue) -> None:
-        """Send the last message to a new subscriber, if the publisher latches it."""
+    def latched_value(self, topic: Topic) -> Sample | None:
+        """The last message, if its publisher latches it."""
         last = self._received[topic.name.encode()].last
-        if last is not None and self.latched(topic.name):
-            sink.offer_latched(last)
+        return last if last is not None and self.latched(topic.name) else None
 
     # In: messages
 

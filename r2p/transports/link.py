@@ -136,6 +136,8 @@ class Link(abc.ABC):
     """Whether there may be gateways of firmware on it."""
     point_to_point: ClassVar[bool] = False
     """Whether it has only one other end."""
+    has_slots: ClassVar[bool] = False
+    """Whether it sends periodic messages in slots of their own, which a publisher has to ask for."""
 
     def __init__(
         self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: DiscoveryProtocol | None = None

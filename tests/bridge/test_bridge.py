@@ -223,7 +223,7 @@ async def test_two_types_are_refused_across_the_gateway() -> None:
 
 
 async def test_another_type_elsewhere_does_not_end_what_flows() -> None:
-    """Whoever publishes or subscribes it wrongly is refused where he is, and leaves nothing behind."""
+    """A publisher or subscriber of another type is refused on its own link, and leaves nothing behind."""
     async with gateway(), node("A", "a") as a, node("B", "b") as b:
         publisher, subscriber = a.advertise("leds", Led), b.subscribe("leds", Led, queue=100)
         await publisher.wait_subscriber()
@@ -324,8 +324,8 @@ async def test_an_order_without_a_prefix_does_not_ask_for_all_modules(monkeypatc
     async with gateway(networks="abcd") as gw:
         assert gw._hub is not None
         assert gw._hub.bridge is not None
-        asked = Mock(return_value={})
-        monkeypatch.setattr(gw._hub.bridge.names, "_names", asked)
+        asked = Mock(return_value=[])
+        monkeypatch.setattr(gw._hub.bridge.directory, "own_modules", asked)
         a, b = Tap("a"), Tap("b")
         a.say(management.Stop("IMU1"))
         await asyncio.sleep(0.1)
@@ -360,7 +360,7 @@ async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.Monkey
 async def test_who_gives_an_order_that_does_not_pass_is_told(
     options: BridgeOptions, command: Command, missing: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Through another gateway, too; and nobody else is."""
+    """Through another gateway, too; and no other module is."""
     monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
     async with (
         gateway(options),

@@ -208,14 +208,14 @@ async def test_nothing_is_lost_where_a_gateway_stood_still_and_is_alone() -> Non
 
 
 def stand_still(gateway: r2p.Module, seconds: float) -> None:
-    """As if its event loop had not run for so long, in which nobody else said anything."""
+    """As if its event loop had not run for so long, in which no other module sent anything."""
     bridge = gateway._hub.bridge if gateway._hub is not None else None
     assert bridge is not None
     tree = bridge.tree
-    tree._looked_at -= round(seconds * 1e9)
+    tree._updated_at -= round(seconds * 1e9)
     for port in tree.ports.values():
-        port.said_at -= round(seconds * 1e9)
-        port.until -= round(seconds * 1e9)
+        port.sent_at -= round(seconds * 1e9)
+        port.forwards_until -= round(seconds * 1e9)
 
 
 async def test_what_a_gateway_kept_is_dropped_where_another_one_forwards() -> None:
@@ -244,7 +244,7 @@ async def test_a_line_without_a_gateway_goes_on_at_once() -> None:
         one.hear(manage(management.SubscribeResponse("leds", 5, 5)))
         bridge = gw._hub.bridge if gw._hub is not None else None
         assert bridge is not None
-        bridge.tree._looked_at -= 5_000_000_000
+        bridge.tree._updated_at -= 5_000_000_000
         one.hear(line("leds", Led(led=3).encode()))
         await asyncio.sleep(0.3)
         one.hear(line("leds", Led(led=4).encode()))

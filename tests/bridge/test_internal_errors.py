@@ -13,7 +13,7 @@ from r2p.bridge import MultihomedModule
 from r2p.bridge.forwarding import HeldMessages
 from r2p.codecs.management import Bridge, Endpoint, Hello
 from r2p.msg import Led
-from r2p.protocols.bridge.base import SayToClients
+from r2p.protocols.bridge.ports import SendToClients
 from r2p.runtime.sample import Sample, Source
 from tests.bridge.test_bridge import Tap, drain, gateway, node
 from tests.faults import once
@@ -67,12 +67,12 @@ async def test_what_the_tree_sends(monkeypatch: pytest.MonkeyPatch) -> None:
         assert (errors(module), bool(sent)) == ([1, 0], True)
 
 
-@pytest.mark.parametrize("part", ["relays", "presences"])
+@pytest.mark.parametrize("part", ["routing", "directory"])
 async def test_what_follows_from_a_new_place_in_the_tree(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Topics and modules pass, though it raised where a link got its place; and the gateway is heard on."""
     async with r2p.Module("GW", via=["memory:a", "memory:b"], bridge=True) as module:
         target = getattr(bridge_of(module), part)
-        method = {"relays": "port_changed", "presences": "changed"}[part]
+        method = {"routing": "port_changed", "directory": "changed"}[part]
         monkeypatch.setattr(target, method, once(getattr(target, method)))
         await asyncio.sleep(SETTLED)
         assert sum(errors(module)) == 1
@@ -84,9 +84,9 @@ async def test_what_follows_from_a_new_place_in_the_tree(part: str, monkeypatch:
 async def test_what_is_said_to_clients(monkeypatch: pytest.MonkeyPatch) -> None:
     async with gateway() as module:
         bridge = bridge_of(module)
-        say = once(bridge._say_to_clients)
-        monkeypatch.setattr(bridge, "_say_to_clients", say)
-        monkeypatch.setattr(bridge.tree, "take", lambda: [SayToClients(Bridge(7, 0, 1, 0, 7, bytes(12)))])
+        send = once(bridge._send_to_clients)
+        monkeypatch.setattr(bridge, "_send_to_clients", send)
+        monkeypatch.setattr(bridge.tree, "pop_actions", lambda: [SendToClients(Bridge(7, 0, 1, 0, 7, bytes(12)))])
         bridge._act()
         monkeypatch.undo()
         assert errors(module) == [1, 1]
@@ -110,8 +110,8 @@ async def test_what_is_told_of_modules(kind: type[object], monkeypatch: pytest.M
 
 async def test_the_review_of_one_topic(monkeypatch: pytest.MonkeyPatch) -> None:
     async with gateway() as module, node("A", "a") as alice, node("B", "b") as bob:
-        relays = bridge_of(module).relays
-        monkeypatch.setattr(relays, "_review", once(relays._review))
+        routing = bridge_of(module).routing
+        monkeypatch.setattr(routing, "_review", once(routing._review))
         publishers = [alice.advertise(name, Led) for name in ("one", "two", "three")]
         subscribers = [bob.subscribe(name, Led) for name in ("one", "two", "three")]
         await asyncio.sleep(SETTLED)
@@ -124,19 +124,19 @@ async def test_the_review_of_one_topic(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_the_alarm_of_a_module_with_several_links(monkeypatch: pytest.MonkeyPatch) -> None:
     async with gateway(), r2p.Module("PC", via=["memory:a", "memory:b"]) as module:
-        standby = module._hub and module._hub._joints
-        assert isinstance(standby, MultihomedModule)
-        monkeypatch.setattr(standby.homes, "poll", once(standby.homes.poll))
+        multihomed = module._hub and module._hub._joints
+        assert isinstance(multihomed, MultihomedModule)
+        monkeypatch.setattr(multihomed.selection, "poll", once(multihomed.selection.poll))
         await asyncio.sleep(SETTLED)
         assert errors(module) == [1, 1]
         assert sum(bool(link.stands_by) for link in module.links) == 1
 
 
-@pytest.mark.parametrize("step", ["_collect", "_meet", "_tell"])
+@pytest.mark.parametrize("step", ["_collect", "_meet", "_announce"])
 async def test_what_is_read_of_modules(step: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async with gateway() as module:
-        presences = bridge_of(module).presences
-        monkeypatch.setattr(presences, step, once(getattr(presences, step)))
+        directory = bridge_of(module).directory
+        monkeypatch.setattr(directory, step, once(getattr(directory, step)))
         async with node("A", "a"), r2p.Module("B", via="memory:b") as b:
             await asyncio.sleep(SETTLED)
             assert sum(errors(module)) in (1, 2)
@@ -150,6 +150,6 @@ async def test_what_is_kept_while_a_gateway_listens_anew() -> None:
         taken.append(10 // number)
 
     for number in (1, 0, 2):
-        assert held.keep(Sample(b"", Source(), 0), functools.partial(go_on, number))
+        assert held.hold(Sample(b"", Source(), 0), functools.partial(go_on, number))
     held.release(lambda error: failed.append(type(error).__name__))
     assert (taken, failed) == ([10, 5], ["ZeroDivisionError"])

@@ -89,7 +89,7 @@ async def test_everybody_gets_it_once_and_so_does_the_module(
         assert len(ours.queue) == len(others)
 
 
-async def test_the_user_is_told_which_link_stands_by_and_why(caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_log_says_which_link_stands_by_and_why(caplog: pytest.LogCaptureFixture) -> None:
     async with r2p.Module("M", via=["memory:a", "memory:b"]) as module:
         events = module.events()
         first, second = module.links
@@ -106,7 +106,7 @@ async def test_the_user_is_told_which_link_stands_by_and_why(caplog: pytest.LogC
     assert "gives back what we say" not in caplog.text
 
 
-async def test_two_links_to_one_network_are_told(caplog: pytest.LogCaptureFixture) -> None:
+async def test_two_links_to_one_network_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     async with r2p.Module("M", via=["memory:a", "memory:a"]) as module:
         for _ in range(20):
             await asyncio.sleep(1)
@@ -243,11 +243,11 @@ async def test_a_bus_that_comes_first_keeps_its_slots() -> None:
 
 
 class Clients(Transport):
-    """So many lines, one after the other, each to another module; each change of a topic that one is told counts."""
+    """So many lines, one after the other, each to another module; each change of a topic that one announces counts."""
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self.told: Counter[str] = Counter()
+        self.announced: Counter[str] = Counter()
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         links = [Counting(self, hub, f"client{n}") for n in range(self.count)]
@@ -271,7 +271,7 @@ class Counting(LineLink):
         self.clients = clients
 
     def topic_changed(self, topic: Topic) -> None:
-        self.clients.told[topic.name] += 1
+        self.clients.announced[topic.name] += 1
         super().topic_changed(topic)
 
 
@@ -297,4 +297,4 @@ async def test_a_client_more_costs_as_much_as_the_first_one() -> None:
         sender.advertise("leds", Led)
         await asyncio.sleep(2)
         assert sum("C" in name for link in module.links for name in link.discovery.modules) == 100
-        assert clients.told["leds"] <= 2 * 100 + 2
+        assert clients.announced["leds"] <= 2 * 100 + 2

@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import logging
 from contextlib import AsyncExitStack, asynccontextmanager
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
 
 import r2p
 from r2p.bridge import BridgeOptions
-from r2p.bridge.directory_relay import ModuleNames
 from r2p.bridge.options import Policy
+from r2p.bridge.orders import ModuleNames
 from r2p.codecs import management
 from r2p.msg import Led
 from r2p.names import module_alias
@@ -132,10 +133,11 @@ async def test_what_an_alias_stands_for_may_come_after_it() -> None:
 
 
 def test_an_alias_of_two_modules_is_nobodys(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("r2p.bridge.directory_relay.module_alias", lambda name: "robxxxx")
-    names = ModuleNames(Policy(BridgeOptions(prefix="robot1/")), lambda: {"A": "", "B": ""}, lambda _: "")
-    assert names.meant("robxxxx", "zenoh:") is None
-    assert names.meant("robxxxx", "zenoh:") is None
+    monkeypatch.setattr("r2p.bridge.orders.module_alias", lambda name: "robxxxx")
+    directory = SimpleNamespace(own_modules=lambda: ["A", "B"])
+    names = ModuleNames(Policy(BridgeOptions(prefix="robot1/")), directory)  # type: ignore[arg-type]
+    assert names.to_canonical("robxxxx", "zenoh:") is None
+    assert names.to_canonical("robxxxx", "zenoh:") is None
     assert [record.message for record in caplog.records] == [
         "robot1/A and robot1/B have the same alias robxxxx: orders reach neither; rename one"
     ]

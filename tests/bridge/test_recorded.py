@@ -73,7 +73,7 @@ class Bus:
             self.messages.append((found.message, self._parts.pop(found.message)))
 
     def management(self) -> list[management.Management]:
-        return [decoded for _, data in self.messages if (decoded := told(data)) is not None]
+        return [message for _, data in self.messages if (message := decoded(data)) is not None]
 
     def data(self, size: int) -> list[bytes]:
         return [data for message, data in self.messages if message != rtcan.FIRMWARE_MANAGEMENT and len(data) == size]
@@ -100,7 +100,7 @@ async def replayed(case: Case) -> AsyncIterator[tuple[Script, Bus]]:
         yield script, bus
 
 
-def told(data: bytes) -> management.Management | None:
+def decoded(data: bytes) -> management.Management | None:
     try:
         return management.decode(data) if len(data) == management.SIZE else None
     except r2p.DecodeError:
@@ -122,7 +122,7 @@ def lines(entries: list[Entry], topic: str) -> list[bytes]:
 
 
 def on_bus(case: Case, direction: str) -> Bus:
-    """What somebody else put on the bus."""
+    """What others put on the bus."""
     bus = Bus()
     for entry in case.transcript:
         if entry.dir == direction and entry.can_id is not None:
@@ -132,7 +132,7 @@ def on_bus(case: Case, direction: str) -> Bus:
 
 def on_line(case: Case, direction: str) -> list[management.Management]:
     entries = [entry for entry in case.transcript if entry.dir == direction]
-    return [each for data in lines(entries, "R2P") if (each := told(data)) is not None]
+    return [each for data in lines(entries, "R2P") if (each := decoded(data)) is not None]
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)

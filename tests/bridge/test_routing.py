@@ -27,7 +27,7 @@ pytestmark = pytest.mark.virtual_time
 
 
 async def test_a_message_too_long_for_the_next_link_is_counted_and_the_others_pass() -> None:
-    """Its topic may be of a type that nobody has told."""
+    """Its topic may be of a type that is not known."""
     script = Script()
     async with r2p.Module("GW", via=[script, "memory:b"], bridge=True):
         await asyncio.sleep(CONVERGED)
@@ -61,15 +61,15 @@ async def test_names_too_long_for_a_link_are_told_once_and_floods_of_them_once_a
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with gateway() as module:
-        relays = module._hub.bridge.relays  # type: ignore[union-attr]
-        port = relays._ports["memory:a"]
+        routing = module._hub.bridge.routing  # type: ignore[union-attr]
+        port = routing._ports["memory:a"]
         for number in range(2 * LONG_NAMES):
             for _ in range(2):
-                assert not relays._carries(f"{'a' * 16}/{number}", port)
+                assert not routing._carries(f"{'a' * 16}/{number}", port)
         warnings = [each for each in caplog.records if each.levelno == logging.WARNING]
-        assert len(warnings) - 1 == len(relays._too_long) == LONG_NAMES
+        assert len(warnings) - 1 == len(routing._too_long) == LONG_NAMES
         await asyncio.sleep(1.0)
-        assert not relays._carries(f"{'a' * 16}/more", port)
+        assert not routing._carries(f"{'a' * 16}/more", port)
         assert len(caplog.records) == len(warnings) + 1
         assert caplog.messages[-1].endswith(f" ({LONG_NAMES - 1} more since the last such line)")
 

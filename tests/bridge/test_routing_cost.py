@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import r2p
-from r2p.bridge.forwarding import Relay
+from r2p.bridge.forwarding import RelayedTopic
 from r2p.codecs import management
 from r2p.msg import Led
 from r2p.testing.network import node_in
@@ -30,10 +30,11 @@ RESPONSE = manage(management.SubscribeResponse("leds", 5, 5))
 
 
 @asynccontextmanager
-async def clients(count: int) -> AsyncIterator[list[Client]]:
+async def clients(count: int, deny: tuple[str, ...] = ()) -> AsyncIterator[list[Client]]:
     """Those of a gateway."""
     clients = [Client() for _ in range(count)]
-    async with r2p.Module("GW", via=["memory:a", *clients], bridge=True, watchdog=False):
+    options = r2p.BridgeOptions(deny=deny)
+    async with r2p.Module("GW", via=["memory:a", *clients], bridge=options, watchdog=False):
         await asyncio.sleep(CONVERGED)
         yield clients
 
@@ -61,9 +62,9 @@ def calls(client: Client, message: bytes) -> int:
     return count
 
 
-async def cost(count: int, *, wanted: bool, offered: bool) -> int:
+async def cost(count: int, deny: tuple[str, ...] = (), *, wanted: bool, offered: bool) -> int:
     """Calls for the last of these clients, all of which have said the same."""
-    async with clients(count) as all_of_them:
+    async with clients(count, deny) as all_of_them:
         messages = [SUBSCRIBE] * wanted + [ADVERTISE] * offered
         await said([(each, message) for each in all_of_them[:-1] for message in messages])
         await asyncio.sleep(1.0)
@@ -77,18 +78,26 @@ async def test_a_change_of_demand_costs_as_much_as_there_are_links(wanted: bool,
     assert await cost(40, wanted=wanted, offered=offered) < 5 * few
 
 
+@pytest.mark.parametrize(("wanted", "offered"), [(True, True), (False, True), (True, False)])
+async def test_rules_between_clients_cost_no_more(wanted: bool, offered: bool) -> None:
+    """The policy is asked for kinds of links: those that the same patterns match."""
+    deny = ("*@script*>script*",)
+    few = await cost(10, deny, wanted=wanted, offered=offered)
+    assert await cost(40, deny, wanted=wanted, offered=offered) < 5 * few
+
+
 async def test_ways_are_worked_out_once_for_each_change_however_many_links_join(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """By the first message that takes them."""
     routed: list[object] = []
-    route: Any = Relay.route
+    route: Any = RelayedTopic.active_from
 
     def counted(*args: object) -> object:
         routed.append(args)
         return route(*args)
 
-    monkeypatch.setattr(Relay, "route", counted)
+    monkeypatch.setattr(RelayedTopic, "active_from", counted)
     async with clients(30) as all_of_them:
         await said([(each, SUBSCRIBE) for each in all_of_them])
         for number, each in enumerate(all_of_them[:5]):

@@ -132,7 +132,7 @@ class World:
         await self._stack.enter_async_context(gateway.module)
 
     async def crash(self, gateway: Gateway) -> None:
-        """It is gone without a word: what it still says nobody hears."""
+        """It is gone without a word: what it still sends is lost."""
         assert gateway.module is not None
         for link in gateway.module.links:
             assert isinstance(link, MemoryLink)
@@ -195,7 +195,7 @@ class World:
     # What should be
 
     def twice(self, lately: Iterable[int] = ()) -> list[tuple[int, str, str]]:
-        """Messages that somebody got more than once: number, from, to.
+        """Messages that a module got more than once: number, from, to.
 
         Modules on several networks each hear each other by all that both are on, while no gateway joins these; so what
         such a pair says counts only `lately`, while nothing has changed.

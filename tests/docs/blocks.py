@@ -70,10 +70,7 @@ class Block(msgspec.Struct, frozen=True):
 
 def pages() -> list[Path]:
     """All pages for users."""
-    return [
-        *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")),
-        *sorted((ROOT / "docs").rglob("*.md")),
-    ]
+    return [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 @cache

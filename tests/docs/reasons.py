@@ -137,9 +137,7 @@ def _keys(file: _File) -> Iterator[ast.expr]:
     for node in file.nodes:
         match node:
             case ast.AugAssign(target=ast.Subscript(value=counter, slice=key), op=ast.Add()):
-                is_text = isinstance(key, ast.Constant) and isinstance(key.value, str)
-                is_own = ast.unparse(counter) == "self" and isinstance(key, ast.Name)  # in a class of counters
-                if _is_counter(counter) or is_text or is_own:
+                if _is_counter(counter) or (isinstance(key, ast.Constant) and isinstance(key.value, str)):
                     yield key
             case ast.Assign(targets=[ast.Subscript(value=counter, slice=key)], value=ast.BinOp()) if _is_counter(
                 counter

@@ -12,8 +12,8 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics, PortStatistics, WayStatistics
-from r2p.bridge.forwarding import Shaper
 from r2p.bridge.options import ClassOf, Policy, is_link, rule
+from r2p.bridge.shaping import Shaper
 from r2p.msg import GatewayStatus, Led
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.testing.network import node_in
@@ -171,7 +171,7 @@ def test_mistakes_are_told() -> None:
     for prefix in ("robot1", "rob ot/", "a/b/", "a_name_that_is_too_long/"):
         with pytest.raises(Usage, match=r"--prefix: .* robot1/"):
             gateway._prefix(prefix)
-        with pytest.raises(r2p.Error, match="is no prefix"):
+        with pytest.raises(r2p.Error, match="is not a valid prefix"):
             Policy(BridgeOptions(prefix=prefix))
     with pytest.raises(Usage, match="--rate-limit leds: write it as TOPIC=HZ"):
         list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))

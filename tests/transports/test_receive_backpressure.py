@@ -50,7 +50,7 @@ class Passing(Topic):
     """A topic of a gateway: what comes in goes out by the other link."""
 
     def deliver(self, sample: Sample, own: object = None, slot_link: object = None) -> Any:
-        return self._send(sample, None, slot_link)
+        return self._send(self.remote_subscribers, sample, None, slot_link)
 
 
 class End(BufferedLink):

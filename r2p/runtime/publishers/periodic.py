@@ -8,13 +8,13 @@ from r2p.runtime.backpressure import GIVEN_UP, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Periodic
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import EndpointOwner, SubscriberQueue, Topic, TopicSpace
+from r2p.runtime.topic import EndpointOwner, SlotPublisher, SubscriberQueue, Topic, TopicSpace
 
 _SECOND = 1_000_000_000
 _LATE_SHARE = 2  # a period is late when it is off by more than half of it
 
 
-class PeriodicPublisher(BasePublisher[M]):
+class PeriodicPublisher(BasePublisher[M], SlotPublisher):
     """A time-triggered publisher: it has no publish(), its class's `fill` is asked at every period."""
 
     publisher_class = PublisherClass.PERIODIC

@@ -55,6 +55,7 @@ class RtcanLink(BufferedLink):
     """A module's place on an RTCAN bus. `utc_error` (ns): how well the module knows UTC; None: not at all."""
 
     max_payload: ClassVar[int] = rtcan.PAYLOAD_MAX
+    has_slots: ClassVar[bool] = True
 
     def __init__(
         self, name: str, hub: Hub, port: CanPort, settings: EngineSettings, utc_error: int | None = None

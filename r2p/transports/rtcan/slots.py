@@ -7,7 +7,7 @@ own ticker sends, as for every other link, and the link makes soft real-time mes
 
 import asyncio
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 
@@ -17,8 +17,7 @@ from r2p.protocols.rtcan.calendar import Calendar, Refusal
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Degraded, Done, Due, Fate, Granted, Refused
-from r2p.runtime.publishers import PeriodicPublisher
-from r2p.runtime.topic import Topic
+from r2p.runtime.topic import SlotPublisher, Topic
 from r2p.transports.stats import LinkStats
 
 _SECOND = 1_000_000_000
@@ -33,7 +32,7 @@ class SlottedTopic(msgspec.Struct, eq=False):
     """
 
     topic: Topic
-    publisher: PeriodicPublisher[Any]
+    publisher: SlotPublisher
     high: int
     period: int = 0
     phase: int = 0
@@ -105,7 +104,7 @@ class SlottedTopics:
 
     def follow(self, topic: Topic, high: int | None) -> None:
         """The publishers of a topic changed, or its high byte: of those that are periodic the first gets slots."""
-        publisher = next((each for each in topic.slot_publishers if isinstance(each, PeriodicPublisher)), None)
+        publisher = next(iter(topic.slot_publishers), None)
         known = self.by_topic.get(topic.name)
         if known is not None and (known.publisher, known.high) != (publisher, high):
             self._drop(known)
@@ -134,7 +133,7 @@ class SlottedTopics:
 
     def undecided(self, topic: Topic) -> bool:
         """Whether it may still come to slots for a topic that wants some."""
-        if not any(isinstance(each, PeriodicPublisher) for each in topic.publishers):
+        if not any(isinstance(each, SlotPublisher) for each in topic.publishers):
             return False
         slotted = self.by_topic.get(topic.name)
         return slotted is None or not (slotted.driven or slotted.elsewhere)

@@ -22,8 +22,9 @@ from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.flow_control import ReceiveWindow
 from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import PendingDelivery, Sink
+from r2p.runtime.duplicates import LastReceived
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.runtime.topic import LastReceived, SubscriberQueue, Topic
+from r2p.runtime.topic import Topic
 from r2p.transports.link import MESSAGES_PER_TURN
 from r2p.transports.receive_backpressure import FULL_QUEUE_TURNS
 from r2p.transports.stats import LinkStats
@@ -271,11 +272,10 @@ class RxStream:
             flow.next = serial + 1
         elif not self._is_new(lane, serial):
             return False
-        if sequence <= heard.sequence and sequence and stamp <= heard.stamp:
+        if not heard.accept(sequence, stamp):
             self._came_again(lane, serial, sequence)
             return False
-        lane.sequence = heard.sequence = sequence
-        heard.stamp = stamp
+        lane.sequence = sequence
         stats = self._streams.stats
         stats.received += 1
         stats.bytes_received += size
@@ -602,11 +602,10 @@ class RxStreams:
             stream.topic.remote_publishers -= len(stream.senders)
             stream.topic.latched_sources.remove(self)
 
-    def offer_latched(self, topic: Topic, sink: SubscriberQueue) -> None:
-        """Send the last message to a new subscriber, if the publisher latches it."""
+    def latched_value(self, topic: Topic) -> Sample | None:
+        """The last message, if its publisher latches it."""
         last = self._streams[topic.name].last
-        if last is not None and self._latched(topic.name):
-            sink.offer_latched(last)
+        return last if last is not None and self._latched(topic.name) else None
 
     def close(self) -> None:
         for name in list(self._streams):

@@ -8,8 +8,8 @@ import random
 import pytest
 
 from r2p.codecs.management import Bridge, Leaf
-from r2p.protocols.bridge.base import ACK
 from r2p.protocols.bridge.link_selection import LinkSelection
+from r2p.protocols.bridge.ports import ACK
 from tests.protocols.bridge.test_tree import SECOND, STABLE, _connected, _talk, _trouble, reached, start, states, world
 from tests.protocols.bridge.wires import MS, Module, World
 
@@ -93,7 +93,7 @@ def test_a_gateway_that_joins_two_meshes_waits_for_the_modules_on_both() -> None
 def merging(*, deaf: str, mute: str = "") -> tuple[World, Module]:
     """Two meshes, and a module on both; then C and D become one network, and its root is news at A, not at B.
 
-    It begins when the gateways have just heard each other; before that nobody can know that there is one network.
+    It begins when the gateways have just heard each other; before that it can't be known that there is one network.
     """
     made, _ = world()
     one = start(made, "AC", 200)
@@ -123,7 +123,7 @@ def talk_of(both: Module, milliseconds: int) -> None:
 def test_a_gateway_waits_for_a_module_that_does_not_know_the_new_mesh() -> None:
     made, both = merging(deaf="A")
     talk_of(both, 450)
-    assert both.used == "AB"  # its lease is not over: whoever forwarded now would double
+    assert both.used == "AB"  # its lease is not over: a gateway that forwarded now would double
     both.deaf = set()
     talk_of(both, 2_000)
     assert both.used == "A"
@@ -181,7 +181,7 @@ def test_the_second_link_takes_over() -> None:
     made, (one,) = world("AB")
     both = module(made, "AB")
     made.run(STABLE)
-    both.homes.shut(made.now, 0)
+    both.selection.close(made.now, 0)
     both.go_on()
     assert both.used == ""  # what came by the first one may still come by the second
     made.run(310 * MS)
@@ -200,9 +200,9 @@ def test_what_one_link_can_t_carry_goes_by_the_next_one() -> None:
     made, _ = world("ABC")
     both = module(made, "ABC")
     made.run(STABLE)
-    assert both.homes.used(made.now, frozenset({0})) == {1}
-    assert both.homes.used(made.now, frozenset({0, 1})) == {2}
-    assert both.homes.used(made.now, frozenset()) == {0}
+    assert both.selection.used(made.now, frozenset({0})) == {1}
+    assert both.selection.used(made.now, frozenset({0, 1})) == {2}
+    assert both.selection.used(made.now, frozenset()) == {0}
 
 
 def test_two_links_to_one_network_are_known_by_our_own_voice() -> None:
@@ -210,10 +210,10 @@ def test_two_links_to_one_network_are_known_by_our_own_voice() -> None:
     both = module(made, "AA")
     made.run(STABLE)
     assert both.used == "A"
-    assert both.homes.is_twin(1)
+    assert both.selection.is_twin(1)
     for _ in range(10):
         made.run(SECOND)
-        both.homes.heard_ourselves(made.now, 0)  # HELLO, again and again
+        both.selection.receive_own(made.now, 0)  # HELLO, again and again
         both.go_on()
     assert both.used == "A"
     made.run(8 * SECOND)
@@ -224,23 +224,26 @@ def test_a_gateway_of_firmware_gives_our_name_and_our_probe_back() -> None:
     made, _ = world()
     both = module(made, "AB")
     made.run(STABLE)
-    assert both.homes.heard_ourselves(made.now, 1)
-    both.homes.poll(made.now)
-    assert [(number, message) for number, message in both.homes.take() if message is None] == [(0, None), (1, None)]
-    both.homes.probed(made.now, 1, 0)
+    assert both.selection.receive_own(made.now, 1)
+    both.selection.poll(made.now)
+    assert [(number, message) for number, message in both.selection.pop_messages() if message is None] == [
+        (0, None),
+        (1, None),
+    ]
+    both.selection.receive_probe(made.now, 1, 0)
     assert both.used == "A"
-    assert not both.homes.is_twin(1)
-    assert both.homes.stands_by_for(1) == 0
+    assert not both.selection.is_twin(1)
+    assert both.selection.stands_by_for(1) == 0
 
 
 def test_somebody_else_of_our_name_is_no_loop() -> None:
     made, _ = world()
     both = module(made, "AB")
     made.run(STABLE)
-    assert both.homes.heard_ourselves(made.now, 1)
+    assert both.selection.receive_own(made.now, 1)
     both.go_on()
     made.run(1_001 * MS)
-    assert not both.homes.heard_ourselves(made.now, 1)
+    assert not both.selection.receive_own(made.now, 1)
     assert both.used == "AB"
 
 
@@ -248,12 +251,12 @@ def test_a_line_that_echoes() -> None:
     made, _ = world()
     both = module(made, "AB")
     made.run(STABLE)
-    assert both.homes.heard_ourselves(made.now, 1)
-    both.homes.poll(made.now)
-    for number, message in both.homes.take():
+    assert both.selection.receive_own(made.now, 1)
+    both.selection.poll(made.now)
+    for number, message in both.selection.pop_messages():
         if number == 1 and message is not None:
-            both.homes.leaf(made.now, 1, message)
-    assert not both.homes.heard_ourselves(made.now, 1)
+            both.selection.receive_leaf(made.now, 1, message)
+    assert not both.selection.receive_own(made.now, 1)
     assert both.used == "AB"
 
 
@@ -325,24 +328,24 @@ class Thorough(LinkSelection):
         return False
 
 
-def step(homes: LinkSelection, now: int, count: int, numbers: random.Random) -> None:
+def step(selection: LinkSelection, now: int, count: int, numbers: random.Random) -> None:
     """Something happens to one of eight links."""
     number = numbers.randrange(8)
     operation = numbers.randrange(20)
-    if operation < 6 and number not in homes.by_number:
-        homes.open(now, number, lone=numbers.random() < 0.8)
+    if operation < 6 and number not in selection.by_number:
+        selection.open(now, number, lone=numbers.random() < 0.8)
     elif operation < 8:
-        homes.shut(now, number)
+        selection.close(now, number)
     elif operation < 14:
-        homes.ended(now, number, numbers.choice([None, 5, 6, 7, 8]))
+        selection.set_remote(now, number, numbers.choice([None, 5, 6, 7, 8]))
     elif operation < 16:
-        homes.bridge(now, number, Bridge(9, 1, count, 0, 9, ACK.pack(1, count)))
+        selection.receive_bridge(now, number, Bridge(9, 1, count, 0, 9, ACK.pack(1, count)))
     elif operation == 16:
-        homes.leaf(now, number, Leaf(1, (number + 1) % 8, count, b""))
+        selection.receive_leaf(now, number, Leaf(1, (number + 1) % 8, count, b""))
     elif operation == 17:
-        homes.probed(now, number, number + 1)
+        selection.receive_probe(now, number, number + 1)
     else:
-        homes.poll(now)
+        selection.poll(now)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -355,10 +358,10 @@ def test_links_that_stand_alone_are_used_as_if_all_were_looked_at_anew(seed: int
     for count in range(400):
         now += delays.choice([0, 10 * MS, 400 * MS, 3 * SECOND])
         seen = []
-        for homes, drawn in zip(both, numbers, strict=True):
-            if (due := homes.next_deadline()) is not None and due <= now:
-                homes.poll(now)
-            step(homes, now, count, drawn)
-            used = [homes.used(now, without) for without in (frozenset[int](), frozenset({2, 5}))]
-            seen.append((used, homes.guards, [number for number in range(8) if homes.is_twin(number)]))
+        for selection, drawn in zip(both, numbers, strict=True):
+            if (due := selection.next_deadline()) is not None and due <= now:
+                selection.poll(now)
+            step(selection, now, count, drawn)
+            used = [selection.used(now, without) for without in (frozenset[int](), frozenset({2, 5}))]
+            seen.append((used, selection.needs_consent, [number for number in range(8) if selection.is_twin(number)]))
         assert seen[0] == seen[1]

@@ -8,18 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs import management
-from r2p.protocols.bridge.mesh import MOST_HEARD, Assembly, Hearing, edges_from, parts, tree
+from r2p.protocols.bridge.mesh import MOST_HEARD, Adjacency, MeshAssembler, edges_from, mesh_messages, spanning_tree
 
 attachments = st.lists(st.lists(st.integers(0, 5), min_size=2, max_size=4), min_size=1, max_size=6)
 """For each gateway the networks of its ports."""
 
 
-def hearings(gateways: list[list[int]]) -> dict[int, frozenset[Hearing]]:
+def hearings(gateways: list[list[int]]) -> dict[int, frozenset[Adjacency]]:
     """What gateways 1, 2, ... hear if nothing is lost."""
     places = [
         (gateway, port, network) for gateway, ports in enumerate(gateways, 1) for port, network in enumerate(ports)
     ]
-    heard: dict[int, set[Hearing]] = {gateway: set() for gateway, _, _ in places}
+    heard: dict[int, set[Adjacency]] = {gateway: set() for gateway, _, _ in places}
     for gateway, port, network in places:
         for other, its_port, where in places:
             if where == network and (other, its_port) != (gateway, port):
@@ -31,7 +31,7 @@ def hearings(gateways: list[list[int]]) -> dict[int, frozenset[Hearing]]:
 def test_the_tree_reaches_every_network_by_one_way(gateways: list[list[int]]) -> None:
     heard = hearings(gateways)
     edges = edges_from(1, heard)
-    chosen = tree(edges)
+    chosen = spanning_tree(edges)
     members = {place[0] for edge in edges for place in edge}
     networks = {gateways[gateway - 1][port] for gateway, port in {place for edge in edges for place in edge}}
     used = {gateways[gateway - 1][port] for gateway, port in chosen}
@@ -54,9 +54,9 @@ def test_what_only_one_side_hears_does_not_count() -> None:
 
 
 @given(st.sets(st.tuples(st.integers(0, 255), st.integers(1, 2**32 - 1), st.integers(0, 255)), max_size=MOST_HEARD))
-def test_a_mesh_message_in_parts(heard: set[Hearing]) -> None:
-    messages = parts(7, 3, heard)
-    assembly = Assembly()
+def test_a_mesh_message_in_parts(heard: set[Adjacency]) -> None:
+    messages = mesh_messages(7, 3, heard)
+    assembly = MeshAssembler()
     whole = [assembly.add(_on_the_wire(each)) for each in reversed(messages)]
     assert whole[:-1] == [None] * (len(messages) - 1)
     assert whole[-1] == frozenset(heard)
@@ -69,16 +69,16 @@ def _on_the_wire(message: management.Mesh) -> management.Mesh:
 
 
 def test_parts_that_never_become_whole_are_forgotten() -> None:
-    assembly = Assembly()
+    assembly = MeshAssembler()
     for serial in range(1000):
-        assembly.add(parts(7, serial, {(port, 9, 0) for port in range(5)})[0])
+        assembly.add(mesh_messages(7, serial, {(port, 9, 0) for port in range(5)})[0])
     assert len(assembly._pieces) <= 64
 
 
 def test_no_network_has_two_ways_from_the_root() -> None:
     """A ring of three, and two side by side."""
     for gateways in ([[0, 1], [1, 2], [2, 0]], [[0, 1], [0, 1]]):
-        chosen = tree(edges_from(1, hearings(gateways)))
+        chosen = spanning_tree(edges_from(1, hearings(gateways)))
         parents = Counter(gateways[gateway - 1][port] for gateway, port in chosen)
         by_gateway = defaultdict(set)
         for gateway, port in chosen:

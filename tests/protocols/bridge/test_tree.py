@@ -8,9 +8,9 @@ import random
 import pytest
 
 from r2p.codecs.management import Bridge, Mesh, encode
-from r2p.protocols.bridge.base import STRANGE_PROBES, PortState
-from r2p.protocols.bridge.mesh import CHANGES, MOST_HEARD, MOST_RECORDS, MeshMap, parts
-from r2p.protocols.bridge.tree import Tree
+from r2p.protocols.bridge.mesh import CHANGES, MOST_HEARD, MOST_RECORDS, MeshMap, mesh_messages
+from r2p.protocols.bridge.ports import STRANGE_PROBES, PortState
+from r2p.protocols.bridge.tree import SpanningTree
 from tests.protocols.bridge.wires import MS, Gateway, World
 
 SECOND = 1_000 * MS
@@ -40,14 +40,14 @@ def reached(made: World, message: int) -> dict[str, int]:
 
 
 def test_forged_probes_are_not_kept_without_end() -> None:
-    tree = Tree(5)
+    tree = SpanningTree(5)
     tree.open(0, 0)
     port = tree.ports[0]
     for gateway in range(1000, 1000 + STRANGE_PROBES + 3):
-        tree.probed(SECOND, 0, gateway, 1)
+        tree.receive_probe(SECOND, 0, gateway, 1)
     assert (len(port.probes), port.lost) == (STRANGE_PROBES, {"too many probes": 3})
-    tree.probed(SECOND, 0, 5, 1)  # our own, and what is known already
-    tree.probed(2 * SECOND, 0, 1000, 1)
+    tree.receive_probe(SECOND, 0, 5, 1)  # our own, and what is known already
+    tree.receive_probe(2 * SECOND, 0, 1000, 1)
     assert (len(port.probes), port.probes[1000, 1]) == (STRANGE_PROBES + 1, (SECOND, 2 * SECOND))
     assert port.lost.total() == 3
 
@@ -192,16 +192,16 @@ def _connected(network: str, gateways: list[Gateway]) -> set[str]:
 
 def test_tables_are_bounded() -> None:
     """Whatever is said, and without work that grows with it."""
-    tree = Tree(1)
+    tree = SpanningTree(1)
     tree.open(0, 0)
     tree.poll(0)
     for number in range(2, 5_000):
-        tree.mesh(SECOND, 0, Mesh(number, 1, 0, bytes(18)))
-        tree.bridge(SECOND, 0, Bridge(number, 1, 1, 0, number, bytes(12)))
+        tree.receive_mesh(SECOND, 0, Mesh(number, 1, 0, bytes(18)))
+        tree.receive_bridge(SECOND, 0, Bridge(number, 1, 1, 0, number, bytes(12)))
     (port,) = tree.ports.values()
     assert len(port.neighbours) == MOST_HEARD
     assert port.lost["too many gateways"] == 4_998 - MOST_HEARD
-    assert len(tree._atlas._records) <= MOST_RECORDS
+    assert len(tree._mesh._records) <= MOST_RECORDS
 
 
 def test_neighbours_that_come_and_go_are_damped() -> None:
@@ -213,20 +213,20 @@ def test_neighbours_that_come_and_go_are_damped() -> None:
         for gateway in (one, two):
             gateway.hear(0, encode(Bridge(1_000 + number, 1, 1, 0, 1_000 + number, bytes(12))))
         made.run(200 * MS)
-        silent += one.tree.ports[0].until <= made.now
+        silent += one.tree.ports[0].forwards_until <= made.now
     assert silent < 120
     made.run(15 * SECOND)
     assert (states(one), states(two)) == (["forwarding"] * 2, ["forwarding", "blocked"])
 
 
 def test_a_gateway_that_tells_another_mesh_each_time_is_damped() -> None:
-    atlas = MeshMap(100)
-    atlas.hear(frozenset({(1, 101, 0)}))
+    known = MeshMap(100)
+    known.set_heard(frozenset({(1, 101, 0)}))
     learnt = 0
     for serial in range(600):
-        (message,) = parts(101, serial, [(0, 100, 1), (1, 500 + serial, 1)])
-        learnt += atlas.learn(serial * 100 * MS, message)
-    assert atlas.members == {100, 101}
+        (message,) = mesh_messages(101, serial, [(0, 100, 1), (1, 500 + serial, 1)])
+        learnt += known.receive(serial * 100 * MS, message)
+    assert known.members == {100, 101}
     assert CHANGES <= learnt <= CHANGES + 60 // 5 + 1
 
 

@@ -14,9 +14,9 @@ from collections import Counter, defaultdict
 from typing import TYPE_CHECKING, Any
 
 from r2p.codecs import management
-from r2p.protocols.bridge.base import Say
 from r2p.protocols.bridge.link_selection import LinkSelection
-from r2p.protocols.bridge.tree import Tree
+from r2p.protocols.bridge.ports import SendToPort
+from r2p.protocols.bridge.tree import SpanningTree
 
 if TYPE_CHECKING:
     import random
@@ -28,7 +28,7 @@ MS = 1_000_000
 class Station:
     """One start of a gateway or a module; `ports` are the networks that it is on, by number."""
 
-    def __init__(self, world: World, protocol: Tree | LinkSelection, ports: dict[int, str]) -> None:
+    def __init__(self, world: World, protocol: SpanningTree | LinkSelection, ports: dict[int, str]) -> None:
         self.world = world
         self.protocol = protocol
         self.ports = ports
@@ -82,7 +82,7 @@ class Gateway(Station):
     """A gateway."""
 
     def __init__(self, world: World, identity: int, ports: dict[int, str]) -> None:
-        self.tree = Tree(identity)
+        self.tree = SpanningTree(identity)
         super().__init__(world, self.tree, ports)
 
     def open(self, number: int) -> None:
@@ -91,23 +91,23 @@ class Gateway(Station):
     def hear(self, number: int, data: bytes) -> None:
         message = management.decode(data)
         if isinstance(message, management.Bridge):
-            self.tree.bridge(self.world.now, number, message)
+            self.tree.receive_bridge(self.world.now, number, message)
         elif isinstance(message, management.Mesh):
-            self.tree.mesh(self.world.now, number, message)
+            self.tree.receive_mesh(self.world.now, number, message)
         else:
             assert isinstance(message, management.Leaf)
-            self.tree.leaf(self.world.now, number, message)
+            self.tree.receive_leaf(self.world.now, number, message)
         self.go_on()
 
     def said(self) -> list[tuple[int, management.Management]]:
-        return [(action.port, action.message) for action in self.tree.take() if isinstance(action, Say)]
+        return [(action.port, action.message) for action in self.tree.pop_actions() if isinstance(action, SendToPort)]
 
     def carry(self, number: int, message: int) -> None:
         now = self.world.now
-        if number not in self.tree.ports or now >= self.tree.ports[number].until:
+        if number not in self.tree.ports or now >= self.tree.ports[number].forwards_until:
             return
         for other, port in self.tree.ports.items():
-            if other != number and now < port.until:
+            if other != number and now < port.forwards_until:
                 self.world.send(self.ports[other], message, sender=(self, other))
 
 
@@ -118,31 +118,31 @@ class Module(Station):
     """
 
     def __init__(self, world: World, identity: int, ports: dict[int, str]) -> None:
-        self.homes = LinkSelection(identity)
+        self.selection = LinkSelection(identity)
         self.identity = identity
         self.deaf: set[int] = set()
         self.mute: set[int] = set()
-        self.homes.used(world.now, frozenset())
+        self.selection.used(world.now, frozenset())
         self.got: Counter[int] = Counter()
-        super().__init__(world, self.homes, ports)
+        super().__init__(world, self.selection, ports)
 
     @property
     def used(self) -> str:
         """The networks that it uses."""
-        numbers = self.homes.used(self.world.now, frozenset())
+        numbers = self.selection.used(self.world.now, frozenset())
         return "".join(network for number, network in self.ports.items() if number in numbers)
 
     def open(self, number: int) -> None:
-        self.homes.open(self.world.now, number, lone=False)
+        self.selection.open(self.world.now, number, lone=False)
 
     def hear(self, number: int, data: bytes) -> None:
         message = management.decode(data)
         if number in self.deaf:
             return
         if isinstance(message, management.Bridge):
-            self.homes.bridge(self.world.now, number, message)
+            self.selection.receive_bridge(self.world.now, number, message)
         elif isinstance(message, management.Leaf) and message.module == self.identity:
-            self.homes.leaf(self.world.now, number, message)
+            self.selection.receive_leaf(self.world.now, number, message)
         self.go_on()
 
     def carry(self, number: int, message: int) -> None:
@@ -159,13 +159,13 @@ class Module(Station):
         return message
 
     def said(self) -> list[tuple[int, management.Management]]:
-        said = self.homes.take()
+        said = self.selection.pop_messages()
         return [(number, message) for number, message in said if message is not None and number not in self.mute]
 
     def _may_use(self, number: int) -> bool:
-        if self.world.now >= self.homes.until:
-            self.homes.poll(self.world.now)
-        return number in self.homes.used(self.world.now, frozenset())
+        if self.world.now >= self.selection.consent_until:
+            self.selection.poll(self.world.now)
+        return number in self.selection.used(self.world.now, frozenset())
 
 
 class World:
