@@ -24,7 +24,7 @@ from r2p.clock import Ticker
 from r2p.names import module_name_from
 from r2p.tools.output import Output
 from r2p.tools.session import Format, Quiet, Usage, Verbose, execute, settings
-from r2p.transports.can.netlink import ARPHRD_CAN, Interface, interfaces, socketcan
+from r2p.transports.can.netlink import ARPHRD_CAN, Interface, has_socketcan, list_interfaces
 
 EXTRAS = {"can": "python-can", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
 """The extras of r2p, and the package that each brings."""
@@ -162,7 +162,7 @@ def can(root: Path = _ROOT, told: dict[str, Interface] | None = None) -> Iterato
     for each in names:
         yield _can_interface(told.get(each.name) or _seen(each))
     if not names:
-        sockets = socketcan()
+        sockets = has_socketcan()
         nor = "" if sockets else ", nor CAN sockets in the kernel"
         first = "" if sockets else "sudo modprobe can_raw\n"
         do = f"{first}plug an adapter in; ip link\nor a virtual one: sudo ip link add dev vcan0 up type vcan"
@@ -171,7 +171,7 @@ def can(root: Path = _ROOT, told: dict[str, Interface] | None = None) -> Iterato
 
 def _told() -> dict[str, Interface]:
     try:
-        return {each.name: each for each in interfaces()}
+        return {each.name: each for each in list_interfaces()}
     except (OSError, AttributeError):  # AttributeError: not Linux
         return {}
 
@@ -182,13 +182,13 @@ def _seen(folder: Path) -> Interface:
 
 
 def _can_interface(there: Interface) -> Check:
-    if there.trouble:
-        found, _, do = there.trouble.partition(": ")
+    if there.problem:
+        found, _, do = there.problem.partition(": ")
         return Check("CAN", False, found, do)
     found = ", ".join([f"{there.name} is up", *_can_details(there)])
     if there.kind != "can" or there.one_shot:
         return Check("CAN", True, f"{found}: --via rtcan:{there.name}")
-    again = f"sudo ip link set {there.name} down\n{there.command()}"
+    again = f"sudo ip link set {there.name} down\n{there.command_up()}"
     return Check("CAN", True, f"{found}; in one-shot mode, if its driver has it, laxity is fresh at each try", again)
 
 

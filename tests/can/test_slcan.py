@@ -14,7 +14,7 @@ from can.interfaces import slcan
 
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
-from r2p.transports.can import netlink as interface
+from r2p.transports.can import netlink
 from r2p.transports.can.pythoncan import PythonCanPort
 from tests.can.rig import ip, port_on, until, using
 
@@ -41,10 +41,10 @@ async def program(*command: str) -> AsyncIterator[None]:
 async def adapter(device: str) -> AsyncIterator[str]:
     """A CAN interface that is up, of a serial device."""
     async with program("slcand", "-F", "-o", "-s8", device, "slcan0"):
-        await until(lambda: interface.look("slcan0"))
+        await until(lambda: netlink.find_interface("slcan0"))
         ip("set", "slcan0", "up")
         yield "slcan0"
-    await until(lambda: interface.look("slcan0") is None)
+    await until(lambda: netlink.find_interface("slcan0") is None)
 
 
 async def test_both_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,11 +72,11 @@ async def test_both_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 async def test_what_the_kernel_tells_of_it() -> None:
     main, device = os.openpty()
     async with adapter(os.ttyname(device)) as name:
-        there = interface.look(name)
+        there = netlink.find_interface(name)
         assert there is not None
-        assert (there.kind, there.up, there.state, there.trouble) == ("can", True, "error-active", "")
+        assert (there.kind, there.up, there.state, there.problem) == ("can", True, "error-active", "")
         ip("set", name, "down")
-        there = interface.look(name)
+        there = netlink.find_interface(name)
         assert there is not None
         assert there.state == "stopped"
     os.close(main)

@@ -14,8 +14,7 @@ import pytest
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
-from r2p.transports.can import netlink as interface
-from r2p.transports.can import socketcan
+from r2p.transports.can import netlink, socketcan
 from r2p.transports.can.socketcan import SocketCanPort
 from tests.can.rig import Candump, User, add, cangen, cansend, ip, new_name, now, port_on
 
@@ -307,25 +306,25 @@ async def test_bus_off(vcan: str) -> None:
         assert user.faults == ["bus-off"]
 
 
-async def test_what_the_kernel_tells_of_interfaces(vcan: str) -> None:
-    assert interface.look(vcan) == interface.Interface(vcan, "vcan", up=True)
+async def test_what_the_kernel_reports_of_interfaces(vcan: str) -> None:
+    assert netlink.find_interface(vcan) == netlink.Interface(vcan, "vcan", up=True)
     ip("set", vcan, "down")
-    there = interface.look(vcan)
+    there = netlink.find_interface(vcan)
     assert there is not None
-    assert there.trouble == f"{vcan} is down: sudo ip link set {vcan} up"
-    assert interface.look("lo") is None
+    assert there.problem == f"{vcan} is down: sudo ip link set {vcan} up"
+    assert netlink.find_interface("lo") is None
 
 
 async def test_changes_of_interfaces_are_noticed() -> None:
     name = new_name()
-    async with interface.InterfaceWatch() as watch:
+    async with netlink.InterfaceWatch() as watch:
         add(name)
         await watch.wait(3600.0)
         ip("delete", name)
         await watch.wait(3600.0)
 
 
-# What a driver tells of frames that did not get through. vcan confirms all, so the socket is made deaf to that
+# What a driver reports of frames that were not sent. vcan confirms all of them, so the socket filters that out
 
 
 @contextlib.asynccontextmanager
@@ -333,7 +332,7 @@ async def deaf_port(
     name: str, *, one_shot: bool, monkeypatch: pytest.MonkeyPatch
 ) -> AsyncIterator[tuple[SocketCanPort, User]]:
     modes = frozenset({"one-shot"} if one_shot else ())
-    monkeypatch.setattr(interface, "look", lambda _: interface.Interface(name, "can", up=True, modes=modes))
+    monkeypatch.setattr(netlink, "find_interface", lambda _: netlink.Interface(name, "can", up=True, modes=modes))
     async with port_on(name) as (port, user):
         assert port.one_shot is one_shot
         port.set_filters([])
@@ -347,7 +346,7 @@ async def test_one_try_that_failed(
     kind: int, data: str, outcome: Outcome, vcan: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The next frame is handed over only then: nobody else can be meant."""
-    monkeypatch.setattr(socketcan, "PATIENCE_ONE_SHOT", 3600_000 * MS)
+    monkeypatch.setattr(socketcan, "CONFIRM_TIMEOUT_ONE_SHOT_NS", 3600_000 * MS)
     async with Candump(vcan) as candump, deaf_port(vcan, one_shot=True, monkeypatch=monkeypatch) as (port, user):
         port.transmit(order(SRT))
         port.transmit(order(NRT, mailbox=Mailbox.NRT))
@@ -360,7 +359,7 @@ async def test_one_try_that_failed(
 
 
 async def test_errors_of_a_controller_that_goes_on_trying(vcan: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(socketcan, "PATIENCE", 20 * MS)
+    monkeypatch.setattr(socketcan, "CONFIRM_TIMEOUT_NS", 20 * MS)
     async with deaf_port(vcan, one_shot=False, monkeypatch=monkeypatch) as (port, user):
         port.transmit(order())
         error_frame(vcan, 0x2)
@@ -371,7 +370,7 @@ async def test_errors_of_a_controller_that_goes_on_trying(vcan: str, monkeypatch
 
 
 async def test_a_confirmation_that_comes_too_late_is_counted(vcan: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(socketcan, "PATIENCE", 0)
+    monkeypatch.setattr(socketcan, "CONFIRM_TIMEOUT_NS", 0)
     async with port_on(vcan) as (port, user):
         port.transmit(order())
         assert port._bus is not None

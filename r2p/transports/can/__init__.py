@@ -1,1 +1,11 @@
-"""CAN controllers: ports to SocketCAN and to the interfaces of python-can."""
+"""CAN controllers, each behind the same port. Nothing here knows RTCAN's cycle, laxities or topics.
+
+In the order in which to read it:
+
+    port          what RTCAN needs of a controller, and what ports to real interfaces share
+    tx_mailboxes  mailboxes in software, for drivers that queue frames
+    socketcan     Linux's CAN interfaces: rawsocket (batches of frames), errorframes, netlink (state of the interface)
+    pythoncan     the adapters that python-can knows
+
+The simulated controller is in `r2p.sim`.
+"""

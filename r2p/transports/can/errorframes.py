@@ -1,6 +1,6 @@
 """Error frames of SocketCAN: what a driver reports of the bus and of the controller (linux/can/error.h).
 
-Not every driver reports everything: many tell of arbitration lost never, or only with `berr-reporting on`.
+Not every driver reports everything: many never report that arbitration was lost, or only with `berr-reporting on`.
 """
 
 import msgspec
@@ -39,14 +39,14 @@ _PROTOCOLS = {
     0x20: "overload",
     0x40: "active error",
 }
-_TRANSMITTING = 0x80  # of the protocol errors: it was a frame of ours
+_TRANSMITTING = 0x80  # bit of the protocol errors: this node was sending the frame
 
 
-class Report(msgspec.Struct, frozen=True):
-    """What an error frame says: its kinds, and whether a frame that was being transmitted lost, or was destroyed."""
+class ErrorReport(msgspec.Struct, frozen=True):
+    """The kinds of errors that a frame reports, and whether a frame of this node lost arbitration or was destroyed."""
 
     kinds: tuple[str, ...]
-    lost: bool = False
+    arbitration_lost: bool = False
     destroyed: bool = False
 
     @property
@@ -54,18 +54,18 @@ class Report(msgspec.Struct, frozen=True):
         return BUS_OFF in self.kinds
 
 
-def decode(identifier: int, data: bytes) -> Report:
-    """An error frame's identifier, without its flags, and its 8 bytes."""
+def decode(identifier: int, data: bytes) -> ErrorReport:
+    """Decode an error frame: its identifier, without the flags, and its 8 bytes."""
     kinds = _names(identifier, _CLASSES)
     if identifier & _CONTROLLER:
         kinds += _names(data[1], _CONTROLLERS) or ["controller"]
     if identifier & _PROTOCOL:
         kinds += _names(data[2], _PROTOCOLS) or ["protocol error"]
-    mine = bool(identifier & _PROTOCOL and data[2] & _TRANSMITTING)
-    return Report(
+    own = bool(identifier & _PROTOCOL and data[2] & _TRANSMITTING)
+    return ErrorReport(
         tuple(kinds) or (f"error {identifier:#x}",),
-        lost=bool(identifier & _LOST_ARBITRATION),
-        destroyed=mine or NO_ACKNOWLEDGE in kinds or TRANSMIT_TIMEOUT in kinds,
+        arbitration_lost=bool(identifier & _LOST_ARBITRATION),
+        destroyed=own or NO_ACKNOWLEDGE in kinds or TRANSMIT_TIMEOUT in kinds,
     )
 
 

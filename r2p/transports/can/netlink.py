@@ -1,4 +1,4 @@
-"""What the kernel tells about CAN interfaces, and when that changes: rtnetlink, read-only. r2p configures nothing."""
+"""The state of CAN interfaces, and when it changes, as the kernel reports it by rtnetlink. Read-only."""
 
 import asyncio
 import contextlib
@@ -13,7 +13,7 @@ UP = "up"
 DOWN = "down"
 BUS_OFF = "bus-off"
 STATES = ("error-active", "error-warning", "error-passive", BUS_OFF, "stopped", "sleeping")
-"""What a controller may be in, by the kernel's number."""
+"""States of a controller, by the kernel's number."""
 
 ARPHRD_CAN = 280  # linux/if_arp.h
 CTRLMODES = {
@@ -28,7 +28,7 @@ CTRLMODES = {
 
 _GETLINK, _NEWLINK, _ERROR, _DUMP_DONE = 18, 16, 2, 3  # message types
 _REQUEST_ALL = 0x301  # flags NLM_F_REQUEST and NLM_F_DUMP
-_LINK_GROUP = 1  # RTMGRP_LINK: who listens there is told of every change
+_LINK_GROUP = 1  # RTMGRP_LINK: multicast group that gets every change of an interface
 _IFNAME, _LINKINFO = 3, 18  # attributes of a link
 _KIND, _DATA = 1, 2  # ... of its LINKINFO
 _BITTIMING, _STATE, _CTRLMODE, _RESTART_MS, _BERR_COUNTER = 1, 4, 5, 6, 8  # ... of the DATA of a CAN interface
@@ -37,11 +37,11 @@ _HEADER = struct.Struct("=IHHII")  # length, type, flags, sequence, sender
 _LINK = struct.Struct("=BxHiII")  # family, type, index, flags, change
 _ATTRIBUTE = struct.Struct("=HH")  # length, type
 _NESTED = 0x3FFF  # the upper two bits of an attribute's type are flags
-_CHUNK = 1 << 16
+_READ_MAX = 1 << 16  # bytes
 
 
 class Interface(msgspec.Struct, frozen=True):
-    """A CAN interface. What a driver does not tell is None or empty; a virtual one tells nothing."""
+    """A CAN interface. What its driver does not report is None or empty; a virtual one reports nothing."""
 
     name: str
     kind: str  # "can", "vcan", "vxcan", "slcan" ...
@@ -50,7 +50,7 @@ class Interface(msgspec.Struct, frozen=True):
     bitrate: int | None = None  # bit/s
     sample_point: float | None = None
     modes: frozenset[str] = frozenset()  # of CTRLMODES
-    restart_ms: int | None = None  # after bus-off; 0: not by itself
+    restart_ms: int | None = None  # after bus-off; 0: it does not restart by itself
     errors: tuple[int, int] | None = None  # the controller's counters of transmit and receive errors
 
     @property
@@ -58,37 +58,37 @@ class Interface(msgspec.Struct, frozen=True):
         return "one-shot" in self.modes
 
     @property
-    def trouble(self) -> str:
-        """Why it can't be used, and what to do; empty if it can."""
+    def problem(self) -> str:
+        """Why the interface can't be used, and what to do. Empty if it can."""
         if not self.up:
-            return f"{self.name} is down: {self.command()}"
+            return f"{self.name} is down: {self.command_up()}"
         if self.state == BUS_OFF and self.restart_ms:
             return f"{self.name} is in bus-off, and restarts every {self.restart_ms} ms"
         if self.state == BUS_OFF:
             return f"{self.name} is in bus-off: sudo ip link set {self.name} type can restart"
         return ""
 
-    def command(self, bitrate: int = 1_000_000) -> str:
-        """What brings it up."""
+    def command_up(self, bitrate: int = 1_000_000) -> str:
+        """The shell command that brings the interface up."""
         up = f"sudo ip link set {self.name} up"
         if self.kind in ("", "can"):
             return f"{up} type can bitrate {self.bitrate or bitrate} one-shot on restart-ms 100"
         return up
 
 
-def look(name: str) -> Interface | None:
-    """What the kernel knows of an interface now. None: it has none of that name, or it is not for CAN."""
-    return next((each for each in interfaces() if each.name == name), None)
+def find_interface(name: str) -> Interface | None:
+    """The CAN interface of this name. None: there is none, or it is not for CAN."""
+    return next((each for each in list_interfaces() if each.name == name), None)
 
 
-def interfaces() -> list[Interface]:
-    """All CAN interfaces. Raises OSError where the kernel has no rtnetlink."""
+def list_interfaces() -> list[Interface]:
+    """List all CAN interfaces. Raises OSError where the kernel has no rtnetlink."""
     found: list[Interface] = []
     request = _HEADER.pack(_HEADER.size + _LINK.size, _GETLINK, _REQUEST_ALL, 1, 0) + _LINK.pack(0, 0, 0, 0, 0)
     with _rtnetlink() as netlink:
         netlink.send(request)
         while True:
-            for kind, body in messages(netlink.recv(_CHUNK)):
+            for kind, body in messages(netlink.recv(_READ_MAX)):
                 if kind == _DUMP_DONE:
                     return found
                 if kind == _ERROR:
@@ -103,7 +103,7 @@ def _rtnetlink() -> socket.socket:
 
 
 def messages(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Types and contents of netlink messages."""
+    """Split what a netlink socket received into the types and contents of its messages."""
     while len(data) >= _HEADER.size:
         length, kind, *_ = _HEADER.unpack_from(data)
         if length < _HEADER.size:
@@ -113,26 +113,26 @@ def messages(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def parse(body: bytes) -> Interface | None:
-    """The interface that a link message is about; None if it is not for CAN."""
+    """Parse the interface that a link message describes. None if it is not for CAN."""
     _, kind, _, flags, _ = _LINK.unpack_from(body)
     if kind != ARPHRD_CAN:
         return None
     link = _attributes(body[_LINK.size :])
     info = _attributes(link.get(_LINKINFO, b""))
     can = _attributes(info.get(_DATA, b""))
-    bitrate, sample_point = _words(can.get(_BITTIMING), 2)
-    _, modes = _words(can.get(_CTRLMODE), 2)
+    bitrate, sample_point = _u32s(can.get(_BITTIMING), 2)
+    _, modes = _u32s(can.get(_CTRLMODE), 2)
     errors = can.get(_BERR_COUNTER, b"")
-    (state,) = _words(can.get(_STATE), 1)
+    (state,) = _u32s(can.get(_STATE), 1)
     return Interface(
         name=_text(link.get(_IFNAME, b"")),
         kind=_text(info.get(_KIND, b"")),
         up=bool(flags & _IFF_UP),
         state=STATES[state] if state is not None and state < len(STATES) else "",
-        bitrate=bitrate if bitrate and bitrate != 0xFFFF_FFFF else None,  # slcan may not know
+        bitrate=bitrate if bitrate and bitrate != 0xFFFF_FFFF else None,  # slcan's marks an unknown one so
         sample_point=sample_point / 1000 if bitrate and sample_point else None,
         modes=frozenset(name for bit, name in CTRLMODES.items() if (modes or 0) & bit),
-        restart_ms=_words(can.get(_RESTART_MS), 1)[0],
+        restart_ms=_u32s(can.get(_RESTART_MS), 1)[0],
         errors=struct.unpack("=HH", errors) if len(errors) == 4 else None,
     )
 
@@ -152,8 +152,8 @@ def _aligned(length: int) -> int:
     return length + 3 & ~3
 
 
-def _words(data: bytes | None, count: int) -> tuple[int | None, ...]:
-    """The first 32-bit numbers of an attribute."""
+def _u32s(data: bytes | None, count: int) -> tuple[int | None, ...]:
+    """The first `count` 32-bit numbers of an attribute; each is None if the attribute is missing or too short."""
     if data is None or len(data) < 4 * count:
         return (None,) * count
     return struct.unpack_from(f"={count}I", data)
@@ -164,14 +164,14 @@ def _text(data: bytes) -> str:
 
 
 class InterfaceWatch:
-    """Waits for changes of any network interface, as an async context manager inside which they are noticed."""
+    """Notices changes of any network interface while its `async with` block runs."""
 
     def __init__(self) -> None:
         self._changed = asyncio.Event()
         self._netlink: socket.socket | None = None
 
     async def __aenter__(self) -> Self:
-        with contextlib.suppress(OSError):  # without it, only the time-out of `wait` remains
+        with contextlib.suppress(OSError):  # without netlink, `wait` always takes its whole time-out
             self._netlink = socket.socket(
                 socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.NETLINK_ROUTE
             )
@@ -184,21 +184,21 @@ class InterfaceWatch:
             asyncio.get_running_loop().remove_reader(self._netlink)
             self._netlink.close()
 
-    async def wait(self, longest: float) -> None:
-        """Until something changes that has not been waited for, but `longest` seconds at most."""
+    async def wait(self, timeout: float) -> None:
+        """Wait until something has changed since the last call, at most `timeout` seconds."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(longest):
+            async with asyncio.timeout(timeout):
                 await self._changed.wait()
         self._changed.clear()
 
     def _readable(self, netlink: socket.socket) -> None:
-        with contextlib.suppress(OSError):  # nothing more; or there was so much that some was lost: a change it was
+        with contextlib.suppress(OSError):  # nothing left to read, or an overflow, which is a change as well
             while True:
-                netlink.recv(_CHUNK)
+                netlink.recv(_READ_MAX)
         self._changed.set()
 
 
-def socketcan() -> bool:
+def has_socketcan() -> bool:
     """Whether this kernel has CAN sockets."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()

@@ -1,7 +1,7 @@
-"""A CAN_RAW socket that is read 64 frames a system call.
+"""A CAN_RAW socket that reads up to 64 frames with one system call.
 
-Python's socket module lacks `recvmmsg`: one call brings a batch of frames, each with its flags (own or not) and its
-stamp. Its `recvmsg`, which brings the same for one frame, asks the kernel for the interface's name each time besides.
+That call is `recvmmsg`: it returns a batch of frames, each with its flags (own or not) and its stamp. Python's socket
+module lacks it; the module's `recvmsg` returns one frame only, and asks the kernel for the interface's name each time.
 """
 
 import ctypes
@@ -16,26 +16,27 @@ from typing import Any
 from r2p.codecs.rtcan import Frame
 
 BATCH = 64
-"""Frames that one call brings at most."""
+"""Frames that one call returns at most."""
 
 OWN = 0x800
-"""Flag MSG_CONFIRM: this socket sent the frame, and the controller says that it is through."""
+"""Flag MSG_CONFIRM: this socket sent the frame, and the controller reports that it was on the bus."""
 
 ERROR = socket.CAN_ERR_FLAG
 DATA = socket.CAN_EFF_FLAG
-"""Of the flags in an identifier, all that RTCAN's frames have: it is a long one."""
+"""The only flag in the identifiers of RTCAN's frames: they have 29 bits."""
 FLAGS = ERROR | DATA | socket.CAN_RTR_FLAG
+"""All flags in an identifier."""
 
-Arrived = tuple[int, bytes, int, int]
-"""Identifier with FLAGS, up to 8 bytes, flags, and stamp (ns of the monotonic clock)."""
+ReceivedFrame = tuple[int, bytes, int, int]
+"""Identifier with FLAGS, up to 8 bytes, flags of the message such as OWN, and stamp (ns of the monotonic clock)."""
 
 _SECOND = 1_000_000_000
-_OLDEST = 10 * _SECOND  # ns; a stamp that seems older is from before the computer's clock was set
+_OLDEST = 10 * _SECOND  # ns; a stamp that seems older was made before the computer's clock was set
 _RECEIVE_BUFFER = 1 << 19  # bytes: some hundred frames, tens of ms of a saturated bus
-_KIND = DATA | socket.CAN_RTR_FLAG  # what filters look at besides; with ERROR they would be for error frames
-_FILTERS_MAX = 512  # CAN_RAW_FILTER_MAX; none at all would mean: nothing
+_KIND = DATA | socket.CAN_RTR_FLAG  # flags that filters look at, too; with ERROR they would be for error frames
+_FILTERS_MAX = 512  # CAN_RAW_FILTER_MAX
 _CAN_RAW_ERR_FILTER, _SO_RXQ_OVFL, _SO_TIMESTAMPNS = 2, 40, 64  # the last one has 64-bit seconds on all machines
-_NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
+_QUEUE_FULL = (errno.ENOBUFS, errno.EAGAIN)
 
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame
 _FILTER = struct.Struct("=II")
@@ -71,17 +72,17 @@ class _MMsgHdr(ctypes.Structure):
 
 
 class RawSocket:
-    """A socket on one interface. Raises OSError where Python's does."""
+    """A CAN_RAW socket on one interface. Raises OSError where Python's sockets do."""
 
     def __init__(self, name: str) -> None:
-        """Opened, but deaf until `set_filters`."""
+        """Open it. It receives nothing until `set_filters`."""
         self.dropped = 0
-        """Frames that the kernel threw away because this socket's queue was full."""
+        """Frames that the kernel dropped because this socket's queue was full."""
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
         try:
             self._configure()
             self._socket.bind((name,))
-        except BaseException:  # nobody has it yet who could close it
+        except BaseException:  # the caller has no socket yet that it could close
             self._socket.close()
             raise
         self._batch = _Batch(self._socket.fileno())
@@ -94,48 +95,47 @@ class RawSocket:
         self._socket.close()
 
     def set_filters(self, filters: Iterable[tuple[int, int]] | None) -> None:
-        """Take data frames with `id & mask == identifier` of one of these (identifier, mask), 29 bits each; None: all
-        frames, those with 11 bits and remote ones too.
+        """Receive data frames with `id & mask == identifier` of one of these (identifier, mask), 29 bits each.
+
+        None: receive all frames, including those with 11 bits and remote ones.
         """
-        every = [_FILTER.pack(0, 0)]
-        packed = (
-            every
-            if filters is None
-            else [_FILTER.pack(identifier | DATA, mask | _KIND) for identifier, mask in filters]
-        )
-        if len(packed) > _FILTERS_MAX:
+        if filters is None:
+            packed = [_FILTER.pack(0, 0)]
+        else:
+            packed = [_FILTER.pack(identifier | DATA, mask | _KIND) for identifier, mask in filters]
+        if len(packed) > _FILTERS_MAX:  # the kernel refuses so many: receive all data frames with 29 bits
             packed = [_FILTER.pack(DATA, _KIND)]
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(packed))
 
     def send(self, frame: Frame, priority: int) -> bool:
-        """Hand a frame to the kernel's queue of the interface; False: there is no room."""
+        """Hand a frame to the kernel's queue of the interface. False if the queue is full."""
         if priority != self._priority:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, priority)
             self._priority = priority
         try:
             self._socket.send(_FRAME.pack(frame.id | DATA, len(frame.data), frame.data))
         except OSError as error:
-            if error.errno in _NO_ROOM:
+            if error.errno in _QUEUE_FULL:
                 return False
             raise
         return True
 
-    def receive(self) -> list[Arrived]:
-        """Up to 64 frames that are there; none if nothing is."""
-        arrived, self.dropped = self._batch.receive(self.dropped)
-        return arrived
+    def receive(self) -> list[ReceivedFrame]:
+        """Read the frames that are there, at most BATCH."""
+        frames, self.dropped = self._batch.receive(self.dropped)
+        return frames
 
     def _configure(self) -> None:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
-        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+        self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # receive nothing yet
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 1)
         self._socket.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, socket.CAN_ERR_MASK)
 
 
 class _Batch:
-    """Memory that `recvmmsg` writes to, and how it is read."""
+    """The memory that `recvmmsg` writes to, allocated once."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
@@ -151,21 +151,21 @@ class _Batch:
             message.header.control_length = _CONTROL.size
         self._frame_bytes = memoryview(self._frames)
         self._control_bytes = memoryview(self._controls)
-        self._fresh = bytes(self._messages)  # the kernel overwrites the lengths
-        words = memoryview(self._messages).cast("B").cast("I")
-        self._flags = words[_MsgHdr.flags.offset // 4 :: ctypes.sizeof(_MMsgHdr) // 4]
+        self._unused = bytes(self._messages)  # as before a call: the kernel overwrites the lengths
+        numbers = memoryview(self._messages).cast("B").cast("I")
+        self._flags = numbers[_MsgHdr.flags.offset // 4 :: ctypes.sizeof(_MMsgHdr) // 4]
 
-    def receive(self, dropped: int) -> tuple[list[Arrived], int]:
-        """What is there, and how many frames were dropped so far."""
+    def receive(self, dropped: int) -> tuple[list[ReceivedFrame], int]:
+        """Read a batch. Returns its frames, and how many were dropped since the socket was opened."""
         count = self._recvmmsg(self._fd, self._messages, BATCH, socket.MSG_DONTWAIT, None)
         if count < 0:
             code = ctypes.get_errno()
             if code == errno.EAGAIN:
                 return [], dropped
             raise OSError(code, os.strerror(code))
-        now = time.monotonic_ns()
+        now = time.monotonic_ns()  # the kernel stamps in UTC, r2p in monotonic time
         offset = time.time_ns() - now
-        arrived: list[Arrived] = []
+        received: list[ReceivedFrame] = []
         frames = _FRAME.iter_unpack(self._frame_bytes[: count * _FRAME.size])
         controls = _CONTROL.iter_unpack(self._control_bytes[: count * _CONTROL.size])
         flags = self._flags[:count].tolist()
@@ -174,8 +174,9 @@ class _Batch:
             stamp = control[3] * _SECOND + control[4] - offset
             if not oldest < stamp < now:
                 stamp = now
-            arrived.append((identifier, data if length == 8 else data[:length], flag, stamp))
+            received.append((identifier, data if length == 8 else data[:length], flag, stamp))
+        # The kernel attaches the count of drops once there was one; the last frame has the newest count.
         if self._messages[count - 1].header.control_length > _STAMP_ONLY:
             dropped = control[8]
-        ctypes.memmove(self._messages, self._fresh, count * ctypes.sizeof(_MMsgHdr))
-        return arrived, dropped
+        ctypes.memmove(self._messages, self._unused, count * ctypes.sizeof(_MMsgHdr))
+        return received, dropped

@@ -1,4 +1,4 @@
-"""What the kernel says of CAN interfaces; the messages are built here, as linux/if_link.h and can/netlink.h say."""
+"""What the kernel reports of CAN interfaces; the messages are built here, as linux/if_link.h and can/netlink.h say."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def test_a_controller() -> None:
     )
     assert parse(body) == interface
     assert interface.one_shot
-    assert interface.trouble == ""
+    assert interface.problem == ""
 
 
-def test_what_is_not_told() -> None:
+def test_what_is_not_reported() -> None:
     assert parse(link("vcan0", can(kind=b"vcan\0"))) == Interface("vcan0", "vcan", up=True)
     assert parse(link("odd0", up=False)) == Interface("odd0", "", up=False)
     assert parse(
@@ -85,7 +85,7 @@ def test_a_cut_message_is_no_disaster() -> None:
 
 
 @pytest.mark.parametrize(
-    ("interface", "trouble"),
+    ("interface", "problem"),
     [
         (Interface("can0", "can", up=False), "can0 is down: sudo ip link set can0 up type can bitrate 1000000"),
         (Interface("can0", "can", up=False, bitrate=250_000), "bitrate 250000"),
@@ -101,9 +101,9 @@ def test_a_cut_message_is_no_disaster() -> None:
         (Interface("can0", "can", up=True, state="error-passive"), ""),
     ],
 )
-def test_trouble(interface: Interface, trouble: str) -> None:
-    assert trouble in interface.trouble
-    assert bool(interface.trouble) == bool(trouble)
+def test_problem(interface: Interface, problem: str) -> None:
+    assert problem in interface.problem
+    assert bool(interface.problem) == bool(problem)
 
 
 def test_messages_one_after_the_other() -> None:

@@ -140,7 +140,7 @@ async def test_an_interface_that_shows_no_own_frames(
     channel: str, peer: can.BusABC, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A frame counts as sent when the driver has it."""
-    monkeypatch.setattr(pythoncan, "ON_REQUEST", frozenset[str]())
+    monkeypatch.setattr(pythoncan, "ECHO_ON_REQUEST", frozenset[str]())
     port = port_on(channel)
     async with using(port) as user:
         port.transmit(order())

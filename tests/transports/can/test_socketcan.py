@@ -19,7 +19,7 @@ async def test_a_frame_that_raises_does_not_stop_the_others_of_its_batch(monkeyp
     sock: Any = SimpleNamespace(receive=lambda: frames, dropped=0, close=lambda: None)
     monkeypatch.setattr(user, "received", once(user.received))
     bus = _SocketCanBus(sock, user, one_shot=False)
-    assert bus._readable() == 3
+    assert bus._read_batch() == 3
     assert ([frame.id for frame in user.frames], user.faults) == ([1, 2], ["internal error: injected"])
 
 
@@ -30,6 +30,6 @@ async def test_a_timer_that_raises_goes_off_again(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(bus._mailboxes, "poll", once(bus._mailboxes.poll))
     bus._poll()
     assert user.faults == ["internal error: injected"]
-    assert bus._alarm._armed is not None
+    assert bus._timer._armed is not None
     bus._poll()
     assert len(user.faults) == 1

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit
-from r2p.transports.can.tx_slots import AGAIN, TxSlots
+from r2p.transports.can.tx_mailboxes import RETRY_INTERVAL, TxMailboxes
 
 HRT, SRT, NRT = Mailbox
 LATENCY = 100
-PATIENCE = 1_000_000
+CONFIRM_TIMEOUT = 1_000_000
 
 
 class Bus:
     """A driver's queue, and what the mailboxes say."""
 
-    def __init__(self, *, singly: bool = False) -> None:
+    def __init__(self, *, one_at_a_time: bool = False) -> None:
         self.queue: list[int] = []
         self.room = True
         self.said: list[tuple[Mailbox, Outcome, int]] = []
-        self.boxes = TxSlots(self._send, self._confirm, latency=LATENCY, patience=PATIENCE, singly=singly)
+        self.boxes = TxMailboxes(
+            self._send, self._confirm, latency=LATENCY, confirm_timeout=CONFIRM_TIMEOUT, one_at_a_time=one_at_a_time
+        )
 
     def put(self, now: int, number: int, mailbox: Mailbox = SRT, first: int = 0, last: int = NEVER) -> None:
         self.boxes.put(now, Transmit(Frame(number, b"x"), mailbox, first, last))
@@ -38,7 +40,7 @@ class Bus:
 def test_from_the_mailbox_to_the_bus() -> None:
     bus = Bus()
     bus.put(1000, 7)
-    assert (bus.queue, bus.boxes.handed) == ([7], [SRT])
+    assert (bus.queue, bus.boxes.handed_over) == ([7], [SRT])
     assert bus.seen(7, 2000)
     assert (bus.said, bus.boxes.next_deadline()) == ([(SRT, Outcome.SENT, 1995)], None)
     assert not bus.seen(7, 2000)
@@ -90,26 +92,26 @@ def test_no_room_is_tried_again_until_it_is_too_late() -> None:
     bus = Bus()
     bus.room = False
     bus.put(0, 7)
-    bus.put(0, 8, NRT, last=2 * AGAIN)
-    assert bus.boxes.next_deadline() == AGAIN
-    bus.boxes.poll(AGAIN)
-    assert bus.boxes.next_deadline() == 2 * AGAIN - LATENCY + 1
-    bus.boxes.poll(2 * AGAIN - LATENCY + 1)
-    assert bus.said == [(NRT, Outcome.LATE, 2 * AGAIN - LATENCY + 1)]
+    bus.put(0, 8, NRT, last=2 * RETRY_INTERVAL)
+    assert bus.boxes.next_deadline() == RETRY_INTERVAL
+    bus.boxes.poll(RETRY_INTERVAL)
+    assert bus.boxes.next_deadline() == 2 * RETRY_INTERVAL - LATENCY + 1
+    bus.boxes.poll(2 * RETRY_INTERVAL - LATENCY + 1)
+    assert bus.said == [(NRT, Outcome.LATE, 2 * RETRY_INTERVAL - LATENCY + 1)]
     bus.room = True
-    bus.boxes.poll(2 * AGAIN)
+    bus.boxes.poll(2 * RETRY_INTERVAL)
     assert bus.queue == [7]
 
 
 def test_a_confirmation_that_stays_away_is_no_reason_to_send_again() -> None:
     bus = Bus()
     bus.put(1000, 7)
-    assert bus.boxes.next_deadline() == 1000 + PATIENCE
-    bus.boxes.poll(999 + PATIENCE)
+    assert bus.boxes.next_deadline() == 1000 + CONFIRM_TIMEOUT
+    bus.boxes.poll(999 + CONFIRM_TIMEOUT)
     assert bus.said == []
-    bus.boxes.poll(1000 + PATIENCE)
-    assert (bus.queue, bus.said) == ([7], [(SRT, Outcome.UNKNOWN, 1000 + PATIENCE)])
-    assert not bus.seen(7, 3 * PATIENCE)
+    bus.boxes.poll(1000 + CONFIRM_TIMEOUT)
+    assert (bus.queue, bus.said) == ([7], [(SRT, Outcome.UNKNOWN, 1000 + CONFIRM_TIMEOUT)])
+    assert not bus.seen(7, 3 * CONFIRM_TIMEOUT)
 
 
 def test_classes_do_not_wait_for_each_other() -> None:
@@ -119,8 +121,8 @@ def test_classes_do_not_wait_for_each_other() -> None:
     assert bus.queue == [NRT, SRT, HRT]
 
 
-def test_singly_the_most_urgent_goes_next() -> None:
-    bus = Bus(singly=True)
+def test_one_at_a_time_the_most_urgent_goes_next() -> None:
+    bus = Bus(one_at_a_time=True)
     bus.put(0, 2, NRT)
     bus.put(0, 1, SRT, last=1000)
     bus.put(0, 0, HRT)
@@ -154,7 +156,7 @@ def test_the_next_frame_may_be_put_while_one_is_confirmed() -> None:
         if number is not None:
             boxes.put(at, Transmit(Frame(number, b""), mailbox, 0, 500))
 
-    boxes = TxSlots(bus._send, confirm, latency=LATENCY, patience=PATIENCE)
+    boxes = TxMailboxes(bus._send, confirm, latency=LATENCY, confirm_timeout=CONFIRM_TIMEOUT)
     boxes.put(0, Transmit(Frame(1, b""), SRT, 0))
     assert boxes.seen(1, b"", 100, 100)
     assert boxes.seen(2, b"", 900, 900)  # 3 and 4 are too late when they come
