@@ -147,7 +147,7 @@ class Outcome(msgspec.Struct):
 
 
 class Node:
-    """One node: its engine in the shell that the transport has, too, and its messages."""
+    """One node: its engine, driven as by the transport, and its messages."""
 
     def __init__(self, name: str, shared: SimCan, scenario: Scenario) -> None:
         numbers = random.Random(f"{scenario.seed}/{name}")
@@ -166,34 +166,34 @@ class Node:
                 transmit_latency=_LATENCY,
             )
         )
-        self.shell = EngineDriver(self.engine, self.port, self)
+        self.driver = EngineDriver(self.engine, self.port, self)
         self._data = numbers.randbytes
         self._sizes: dict[int, int] = {}
 
     async def run(self) -> None:
         """Take part, until cancelled."""
-        await self.port.run(self.shell, lambda: None)
+        await self.port.run(self.driver, lambda: None)
 
     def reserve(self, high: int, size: int, period: int) -> None:
         """Ask for slots, every `period` slots, for a message of `size` bytes. Its data are random."""
         self._sizes[high] = size
-        self.shell.do(self.engine.reserve(self.shell.now(), high, size, period * TIMING.slot))
+        self.driver.carry_out(self.engine.reserve(self.driver.now(), high, size, period * TIMING.slot))
 
     def publish(self, kind: Sporadic, payload: bytes, *, drop: bool) -> None:
         """Send an event."""
-        now = self.shell.now()
-        self.shell.do(self.engine.publish(now, kind.high, payload, deadline=now + kind.deadline, drop=drop))
+        now = self.driver.now()
+        self.driver.carry_out(self.engine.publish(now, kind.high, payload, deadline=now + kind.deadline, drop=drop))
 
-    # What the shell tells
+    # What the driver calls
 
     def act(self, action: Action) -> None:
         if isinstance(action, Due):
             data = self._data(self._sizes[action.high])
-            self.shell.do(self.engine.fill(self.shell.now(), action.high, data))
+            self.driver.carry_out(self.engine.fill(self.driver.now(), action.high, data))
         elif isinstance(action, Granted):
             self.grants[action.high] = action
         elif isinstance(action, Ready):
-            self.shell.refilter()
+            self.driver.update_filters()
 
     def bus_up(self) -> None:
         pass
@@ -377,7 +377,7 @@ def _outcome(
 
 
 def _track(master: Node, node: Node, message: Cyclic, listener: Listener) -> Track:
-    clock, now = master.port.controller.clock, master.shell.now()
+    clock, now = master.port.controller.clock, master.driver.now()
     zero = now - (master.engine.network_time(now) or 0)
     starts = listener.periodic[rtcan.message_id(message.high, node.engine.id8 or 0)]
     at = [clock.local(start) - zero for start in starts]

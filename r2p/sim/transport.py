@@ -24,8 +24,7 @@ from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdr
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
 from r2p.transports.can.port import CanPort, CanPortListener, PortAlarm
 from r2p.transports.link import Hub, Transport
-from r2p.transports.rtcan.options import OPTIONS, RtcanOptions, checked
-from r2p.transports.rtcan.transport import run_link
+from r2p.transports.rtcan.transport import OPTIONS, RtcanOptions, apply_options, run_link
 from r2p.transports.url import Url, duration
 
 _BILLION = 1_000_000_000
@@ -273,7 +272,7 @@ def from_url(url: Url) -> SimTransport:
     latency = Latency(values.get("latency", 0), values.get("jitter", 0))
     node = {"transmit": latency, "receive": latency}
     node |= {field: values[key] for key, field in _FIELDS.items() if key in values}
-    options = checked(str(url), known, DEFAULTS)
+    options = apply_options(str(url), known, DEFAULTS)
     return SimTransport(url.address, options, node, noise=values.get("noise", 0.0), seed=values.get("seed"))
 
 

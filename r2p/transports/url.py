@@ -26,7 +26,7 @@ BUILT_IN = {
     "tcp": "r2p.transports.tcp:TcpTransport",
     "tcp-listen": "r2p.transports.tcp:TcpListenTransport",
     "serial": "r2p.transports.serial:SerialTransport",
-    "rtcan": "r2p.transports.rtcan:from_url",
+    "rtcan": "r2p.transports.rtcan.transport:from_url",
     "sim": "r2p.sim.transport:from_url",
     "zenoh": "r2p.transports.zenoh:from_url",
 }

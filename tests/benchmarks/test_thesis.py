@@ -167,7 +167,7 @@ def frames(wishes: list[Wish], seed: int) -> list[FrameRecord]:
             for number, high, wish in wishes:
                 node = nodes[number]
                 if wish is None:
-                    node.shell.do(node.engine.release(node.shell.now(), high))
+                    node.driver.carry_out(node.engine.release(node.driver.now(), high))
                 else:
                     node.reserve(high, *wish)
                 await asyncio.sleep(0.05)

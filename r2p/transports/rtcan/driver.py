@@ -1,10 +1,11 @@
-"""The shell around an RTCAN engine, the same for every port: feed it, act, re-arm one timer.
+"""The one loop that drives an RTCAN engine: feed it an event, act on what it returns, re-arm one timer.
 
-    port  --frames, confirmations-->  engine  --orders-->  port
-                                              --messages, news-->  owner
+    CanPort  --frames, confirmations, state-->  Engine  --Transmit, Withdraw-->   CanPort
+    timer    ------------poll---------------->          --messages, events--->    DriverOwner
+             <-----------next_deadline--------
 
 What an action brings about comes after the actions before it: a port may confirm from within `transmit`, and the owner
-may publish from within `act`.
+may publish from within `act`. Both end in `carry_out`, which then only queues.
 """
 
 import asyncio
@@ -20,16 +21,16 @@ from r2p.transports.stats import RETRY_AFTER_ERROR
 
 
 class DriverOwner(Protocol):
-    """Who gets what the engine has to tell: a link, or a benchmark."""
+    """What an engine's messages and events go to: a link, or a node of a benchmark."""
 
     def act(self, action: Action) -> None:
-        """A message or news: any action but `Transmit` and `Withdraw`."""
+        """Handle a message or an event: any action but `Transmit` and `Withdraw`."""
 
     def bus_up(self) -> None:
         """The engine has started: `Ready` will follow."""
 
     def bus_down(self, reason: str) -> None:
-        """The engine has stopped; what it discards is told next."""
+        """The engine has stopped. What it discards follows."""
 
     def bus_waits(self, reason: str) -> None:
         """The port can't be used yet."""
@@ -38,83 +39,63 @@ class DriverOwner(Protocol):
         """Something went wrong on the bus."""
 
     def internal_error(self, error: Exception) -> None:
-        """A frame or an action raised: counted, logged, and the next one follows."""
+        """A frame or an action raised: count and log it. The next one follows."""
 
 
 class EngineDriver:
-    """An engine at work on a port, whose `PortUser` it is. `do` carries out what a call of the engine gives back."""
+    """Drives `engine` on `port`, as the port's `CanPortListener`.
+
+    Its owner calls the engine as well, and passes what that returns to `carry_out`.
+    """
 
     def __init__(self, engine: Engine, port: CanPort, owner: DriverOwner) -> None:
         self.engine = engine
+        self.port = port
         self.now = port.now
         """The clock of the engine and of all its instants (ns)."""
-        self._port = port
-        self._orders: dict[type, Callable[[Any], object]] = {Transmit: port.transmit, Withdraw: port.withdraw}
+        self.internal_error = owner.internal_error
         self._owner = owner
-        self._alarm = port.alarm(self._poll)
+        self._port_actions: dict[type, Callable[[Any], object]] = {Transmit: port.transmit, Withdraw: port.withdraw}
+        self._timer = port.alarm(self._poll)
         self._actions: deque[Action] = deque()
         self._acting = False
+        self._pending: Callable[[], object] = lambda: engine.waiting
         self._drained: asyncio.Future[None] | None = None
-        self.internal_error = owner.internal_error
-        self._waiting: Callable[[], object] = lambda: engine.waiting
 
-    def do(self, actions: Sequence[Action]) -> None:
-        """Carry these out, and wait for the engine's next deadline."""
-        if actions:
-            self._actions.extend(actions)
-            if self._acting:
-                return
-            self._act()
-        self._alarm.set(self.engine.next_deadline())
-        if self._drained is not None and not self._waiting() and not self._drained.done():
-            self._drained.set_result(None)
-
-    def refilter(self) -> None:
-        """The engine needs other frames than before."""
-        self._port.set_filters(self.engine.filters())
-
-    async def drained(self, longest: float, waiting: Callable[[], object] | None = None) -> None:
-        """Wait until all messages are on the bus, at most `longest` seconds; or until there is nothing `waiting`."""
-        self._waiting = waiting or (lambda: self.engine.waiting)
-        if self._waiting():
-            self._drained = asyncio.get_running_loop().create_future()
-            await asyncio.wait([self._drained], timeout=longest)
-
-    def close(self) -> None:
-        """Let nothing happen any more."""
-        self.do(self.engine.stop(self.now()))
-        self._alarm.close()
-
-    # For the port (`PortUser`)
+    # Feed: events of the port (as its `CanPortListener`) and of the timer. `received`, `confirmed` and `_poll` run for
+    # every frame on the bus, so the three steps are written out in each of them.
 
     def received(self, frame: Frame, stamp: int) -> None:
         try:
-            self.do(self.engine.receive(self.now(), frame, stamp))
+            self.carry_out(self.engine.receive(self.now(), frame, stamp))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
             self._failed(error)
 
-    def other(self, frame: OtherFrame, stamp: int) -> None:
-        """Nothing that concerns RTCAN."""
-
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         try:
-            self.do(self.engine.confirm(self.now(), mailbox, outcome, at))
+            self.carry_out(self.engine.confirm(self.now(), mailbox, outcome, at))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next confirmation follows
+            self._failed(error)
+
+    def _poll(self) -> None:
+        try:
+            self.carry_out(self.engine.poll(self.now()))
+        except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
 
     def up(self) -> None:
         try:
-            self.refilter()
-            self.do(self.engine.start(self.now()))
+            self.update_filters()
+            self.carry_out(self.engine.start(self.now()))
             self._owner.bus_up()
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
 
     def down(self, reason: str) -> None:
         try:
-            actions = self.engine.stop(self.now())
-            self._owner.bus_down(reason)
-            self.do(actions)
+            discarded = self.engine.stop(self.now())
+            self._owner.bus_down(reason)  # first: publishers are to learn that the link is down before what they lose
+            self.carry_out(discarded)
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
 
@@ -124,29 +105,55 @@ class EngineDriver:
     def fault(self, kind: str) -> None:
         self._owner.bus_fault(kind)
 
-    # Inside
+    def other(self, frame: OtherFrame, stamp: int) -> None:
+        """Ignore it: it does not concern RTCAN."""
 
-    def _poll(self) -> None:
-        try:
-            self.do(self.engine.poll(self.now()))
-        except Exception as error:  # noqa: BLE001 - counted and logged
-            self._failed(error)
+    # Act, and re-arm the timer
 
-    def _failed(self, error: Exception) -> None:
-        """The engine raised: go on with it, but not at once where a deadline is over that it can't get past."""
-        self.internal_error(error)
-        deadline = self.engine.next_deadline()
-        self._alarm.set(None if deadline is None else max(deadline, self.now() + RETRY_AFTER_ERROR))
+    def carry_out(self, actions: Sequence[Action]) -> None:
+        """Act on what a call of the engine returned, then re-arm the timer for its next deadline."""
+        if actions:
+            self._actions.extend(actions)
+            if self._acting:
+                return  # the call further up the stack acts on these, too
+            self._act()
+        self._timer.set(self.engine.next_deadline())
+        if self._drained is not None and not self._pending() and not self._drained.done():
+            self._drained.set_result(None)
 
     def _act(self) -> None:
-        actions, orders, act = self._actions, self._orders, self._owner.act
+        actions, port_actions, act = self._actions, self._port_actions, self._owner.act
         self._acting = True
         try:
             while actions:
                 action = actions.popleft()
                 try:
-                    orders.get(type(action), act)(action)
+                    port_actions.get(type(action), act)(action)
                 except Exception as error:  # noqa: BLE001 - counted and logged; the next action follows
                     self.internal_error(error)
         finally:
             self._acting = False
+
+    def _failed(self, error: Exception) -> None:
+        """The engine raised: go on with it, but not at once where it can't get past a deadline that is over."""
+        self.internal_error(error)
+        deadline = self.engine.next_deadline()
+        self._timer.set(None if deadline is None else max(deadline, self.now() + RETRY_AFTER_ERROR))
+
+    # For the owner
+
+    def update_filters(self) -> None:
+        """Pass the engine's filters to the port: it needs other frames than before."""
+        self.port.set_filters(self.engine.filters())
+
+    async def drain(self, timeout: float, pending: Callable[[], object] | None = None) -> None:
+        """Wait until nothing is `pending` (by default: all that the engine has to send), at most `timeout` seconds."""
+        self._pending = pending or (lambda: self.engine.waiting)
+        if self._pending():
+            self._drained = asyncio.get_running_loop().create_future()
+            await asyncio.wait([self._drained], timeout=timeout)
+
+    def close(self) -> None:
+        """Stop the engine and the timer."""
+        self.carry_out(self.engine.stop(self.now()))
+        self._timer.close()

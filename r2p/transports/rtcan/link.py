@@ -1,15 +1,12 @@
 """The link of a module on an RTCAN bus: one engine on its port, and the discovery that runs over it.
 
-    NonRealTime  non real-time: publishers wait for room
-    Sporadic     soft real-time, least laxity first; what is late is dropped or sent, and signalled
-    Periodic     hard real-time in slots of its own (`periodics`), without them soft real-time until the next period
-
-Each class has room of its own, so bulk never refuses an event. Nothing is announced before the node has an id8. A
-publisher is known by its 16-bit message id, which its SUBSCRIBE_RESPONSE tells: there is one inlet for each.
+Each publisher class has room of its own (see `tx`), so bulk data never keeps an event out. Nothing is announced before
+the node has an id8, and everything is announced again when it gets another one. A remote publisher is known by its
+16-bit message id, which its SUBSCRIBE_RESPONSE announces (see `rx`).
 """
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, ClassVar
 
 from r2p.codecs import management, rtcan
@@ -17,6 +14,7 @@ from r2p.codecs.attachment import ClockOffset
 from r2p.codecs.management import NO_PARAMS
 from r2p.names import MANAGEMENT
 from r2p.protocols.discovery.events import Event, ModuleGone, PublisherFound, PublisherGone
+from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import (
     Action,
@@ -28,6 +26,7 @@ from r2p.protocols.rtcan.events import (
     IdConflict,
     ParameterMismatch,
     ParametersMatch,
+    Profile,
     Ready,
     Received,
     Refused,
@@ -39,20 +38,25 @@ from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, unique_name
-from r2p.transports.rtcan import rx as origins
 from r2p.transports.rtcan.driver import EngineDriver
-from r2p.transports.rtcan.options import discovery_on, pace
-from r2p.transports.rtcan.rx import MessageIdMap, ReceivedMessage, SampleBuilder
+from r2p.transports.rtcan.rx import FIRMWARE, MessageIdMap, ReceivedMessage, SampleBuilder, address_of, publisher_in
 from r2p.transports.rtcan.slots import SlottedTopic, SlottedTopics, inadmissible
 from r2p.transports.rtcan.status import LinkStatus, UtcEstimator
-from r2p.transports.rtcan.tx import Handed, Response, Transmitter, TxAccounting
+from r2p.transports.rtcan.tx import ResponseHandle, SampleHandle, Transmitter, TxAccounting
+from r2p.transports.stats import LoggedCounter
 
 _MANAGEMENT = MANAGEMENT.encode()
-_LOSSES = ("undecodable", "management dropped")  # of what the engine counts: messages lost that were nobody's
+_LOSSES = ("undecodable", "management dropped")  # what the engine counts as lost without a publisher of this module
+
+# How much discovery may send. After a start all modules have much to announce at once.
+_RATE = 100.0  # messages a second: a fifteenth of a bus of 1 Mbit/s, and the same share of slower ones
+_BURST, _BURST_MIN = 8, 4  # messages at once, on a bus of 1 Mbit/s and on the slowest ones
+_BIT = 1000  # ns at 1 Mbit/s
+_FIRMWARE_RATE, _FIRMWARE_QUIET = 12.0, 0.033  # a second, and s: all modules have one id, so none may send at once
 
 
 class RtcanLink(BufferedLink):
-    """A module's place on an RTCAN bus. `utc_error` (ns): how well the module knows UTC; None: not at all."""
+    """A module's link to an RTCAN bus. `utc_error` (ns): how well the module knows UTC; None: not at all."""
 
     max_payload: ClassVar[int] = rtcan.PAYLOAD_MAX
     has_slots: ClassVar[bool] = True
@@ -61,50 +65,52 @@ class RtcanLink(BufferedLink):
         self, name: str, hub: Hub, port: CanPort, settings: EngineSettings, utc_error: int | None = None
     ) -> None:
         name = unique_name(name, hub)
-        discovery = discovery_on(hub, name)
-        super().__init__(name, hub, discovery=discovery)
-        self._paced = discovery
+        counts = LoggedCounter(name, hub.space.clock)
+        self._session = Discovery(
+            hub.space.module, hub.instance, rate=_RATE, burst=_BURST, observer=hub.observer, counts=counts
+        )
+        super().__init__(name, hub, discovery=self._session)
         self.engine = Engine(settings)
         self.stats.faults = self.engine.counts
-        self.shell = EngineDriver(self.engine, port, self)
-        self.do: Callable[[Sequence[Action]], None] = self.shell.do
-        self._now = port.now
+        self.driver = EngineDriver(self.engine, port, self)
         self._utc_error = utc_error
-        self._translation = UtcEstimator(self.network_time, self._clock.now, lambda: self.engine.epoch)
-        self._high_bytes = TopicIdAllocator()
-        self._samples = SampleBuilder(name, self.engine, port, discovery, self._translation, self._clock)
-        self._inlets = MessageIdMap(self.engine, self, self._space, self.stats.lost)
-        self._periodics = SlottedTopics(self, self._clock, port.now, port.monotonic)
-        self._words = LinkStatus(self.engine, port, settings)
-        self._handover = TxAccounting(name, self.stats)
-        self._departures = Transmitter(self.engine, port, self._handover, self._periodics, self._clock)
+        self._utc = UtcEstimator(self.driver, self._clock)
+        self._topic_ids = TopicIdAllocator()
+        self._samples = SampleBuilder(self.driver, self._session, name, self._clock, self._utc)
+        self._message_ids = MessageIdMap(self.engine, self, self._space, self.stats.lost)
+        self._slotted = SlottedTopics(self, self.driver, self._clock, self._has_subscribers)
+        self._status = LinkStatus(self.driver, settings)
+        self._accounting = TxAccounting(name, self.stats)
+        self._transmitter = Transmitter(self.driver, self._accounting, self._slotted, self._clock)
         self._on_bus = False
 
-    # For the shell
+    # What the driver calls
 
     def act(self, action: Action) -> None:
-        if isinstance(action, Received):
-            topic = self._inlets.topics.get(action.message, _MANAGEMENT)
-            if topic is _MANAGEMENT and action.message in self._inlets.shutting:
+        if isinstance(action, Received):  # the most frequent one first
+            topic = self._message_ids.topics.get(action.message, _MANAGEMENT)
+            if topic is _MANAGEMENT and action.message in self._message_ids.lingering:
                 self.stats.lost["not subscribed"] += 1
                 return
             self.receive((ReceivedMessage(topic, action.payload, action.message, action),))
         elif isinstance(action, Done):
             self._done(action)
         elif isinstance(action, Due):
-            self._periodics.due(action)
+            self._slotted.fill(action)
         else:
-            self._learn(action)
-            self._periodics.look()
+            self._network_event(action)
+            self._slotted.wake_waiters()
 
     def bus_up(self) -> None:
         self._on_bus = True
 
     def bus_down(self, reason: str) -> None:
         self._on_bus = False
-        down = self.on_down if self.up else self.unreachable
-        down(reason)
-        self._periodics.look()
+        if self.up:
+            self.on_down(reason)
+        else:
+            self.unreachable(reason)
+        self._slotted.wake_waiters()
 
     def bus_waits(self, reason: str) -> None:
         self.unreachable(reason)
@@ -115,33 +121,39 @@ class RtcanLink(BufferedLink):
     def internal_error(self, error: Exception) -> None:
         self.stats.lost.internal_error(error)
 
-    def _learn(self, news: Action) -> None:
-        match news:
+    def _network_event(self, event: Action) -> None:
+        match event:
             case Ready():
-                self._ready(news)
+                self._limit_discovery(event.profile)
+                self.driver.update_filters()
+                self._announce()
             case ParametersMatch() if self.engine.ready:
-                self._notice(news)
+                self._notice(event)
                 self._announce()
             case Granted() | Refused() | Degraded():
-                self._periodics.learn(news)
+                self._slotted.slots_changed(event)
             case _ if not self._closed:
-                text = self._notice(news)
-                if isinstance(news, ParameterMismatch) or (isinstance(news, IdConflict) and news.yielded):
+                text = self._notice(event)
+                if isinstance(event, ParameterMismatch) or (isinstance(event, IdConflict) and event.yielded):
                     self.on_down(text)
-                self._tell_utc()
+                self._set_utc()
 
-    def _notice(self, news: Action) -> str:
-        kind, text, trouble = self._words.notice(news)
+    def _notice(self, event: Action) -> str:
+        kind, text, trouble = self._status.notice(event)
         self._hub.link_notice(self, kind, text, trouble=trouble)
         return text
 
-    def _ready(self, news: Ready) -> None:
-        """The node has an id8, perhaps another one than before: announce everything under it."""
-        self._high_bytes.pace(pace(self._paced, news.profile, self.engine.timing.bit))
-        self.shell.refilter()
-        self._announce()
+    def _limit_discovery(self, profile: Profile) -> None:
+        """Let discovery send what this bus bears, now that the profile is known."""
+        bit = self.engine.timing.bit
+        rate, burst, quiet = _RATE * _BIT / bit, max(_BURST_MIN, _BURST * _BIT // bit), 0.0
+        if profile is Profile.FIRMWARE:
+            rate, burst, quiet = _FIRMWARE_RATE, _BURST_MIN, _FIRMWARE_QUIET
+        self._session.set_pace(rate, burst, quiet)
+        self._topic_ids.pace(rate)
 
     def _announce(self) -> None:
+        """Announce everything, under what may be another id8 than before."""
         for topic in list(self._space.topics.values()):
             self.stats.lost.guard(self.topic_changed, topic)
         self.on_up()
@@ -150,179 +162,180 @@ class RtcanLink(BufferedLink):
 
     def sample(self, topic: str, arrival: ReceivedMessage) -> Sample:
         self.stats.bytes_received += len(arrival.data)
-        return self._samples.make(topic, arrival)
+        return self._samples.build(topic, arrival)
 
     def sender(self, arrival: ReceivedMessage) -> Hashable:
         return arrival.message
 
     def receive_other(self, arrival: Any) -> None:
+        """Handle management: nothing else comes in unless it is subscribed."""
         data, message = arrival.data, arrival.message
         source = rtcan.id8_of(message)
         if message == rtcan.FIRMWARE_MANAGEMENT:
-            source = origins.address(data, self.discovery.modules)
+            source = address_of(data, self.discovery.modules)
             data = management.unmark(data)
-        told = origins.publisher_in(data, source)
-        if told is not None:
-            firmware = source == origins.FIRMWARE and message == rtcan.FIRMWARE_MANAGEMENT
+        publisher = publisher_in(data, source)
+        if publisher is not None:
+            firmware = source == FIRMWARE and message == rtcan.FIRMWARE_MANAGEMENT
             now, id8 = self._clock.monotonic(), self.engine.id8 or 0
-            self._renumber(self._high_bytes.heard(now, *told, id8, firmware=firmware))
-        if self.up:  # before, we only listen
+            self._renumber(self._topic_ids.heard(now, *publisher, id8, firmware=firmware))
+        if self.up:  # before, only the message ids of others matter
             self.manage(data, source)
 
     def _renumber(self, names: Sequence[str]) -> None:
-        """These topics of ours have to take another high byte, or may find one now."""
+        """Announce topics of this module that have to take another high byte, or may find one now."""
         for name in names:
             topic = self._space.topics.get(name)
             if topic is not None:
                 self.topic_changed(topic)
 
+    def _act(self, event: Event) -> None:
+        match event:
+            case PublisherFound(topic, source, params, size):
+                self._message_ids.add(self._clock.monotonic(), topic, source, params, size)
+                self.driver.update_filters()
+            case PublisherGone(topic, source):
+                self._message_ids.remove(self._clock.monotonic(), topic, source)
+                self.driver.update_filters()
+            case _:
+                if isinstance(event, ModuleGone) and isinstance(event.info.source, int):
+                    self._topic_ids.gone(event.info.source)
+                super()._act(event)
+
     # Out
 
     @property
     def full(self) -> bool:
-        return self._handover.full
+        return self._accounting.full
 
     def takes(self, sample: Sample) -> bool:
-        return self._handover.takes(sample)
+        return self._accounting.has_room(sample)
 
     def write(self, topic: str, sample: Sample) -> None:
-        high = self._high_bytes.pick(topic)
-        if (
-            high is None or not 1 <= len(sample.data) <= self.max_payload
-        ):  # only from other links, with topics of any size
+        high = self._topic_ids.pick(topic)
+        # Only topics of other links, which a gateway forwards, may have no message id or messages of any size.
+        if high is None or not 1 <= len(sample.data) <= self.max_payload:
             self.stats.lost["impossible message"] += 1
             return
-        self.do(self._departures.send(self._subscribers.get(topic), topic, high, sample))
+        self.driver.carry_out(self._transmitter.send(self._subscribers.get(topic), topic, high, sample))
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        self.do(self._departures.manage(data, urgent=urgent))
+        self.driver.carry_out(self._transmitter.send_management(data, urgent=urgent))
 
     def _add_subscriber(self, name: str) -> None:
-        if not self._departures.follows_response(name):
+        if not self._transmitter.waits_for_response(name):
             super()._add_subscriber(name)
 
     def _remove_subscriber(self, name: str) -> None:
-        self._departures.forget(name)
+        self._transmitter.remove_topic(name)
         super()._remove_subscriber(name)
 
+    def _has_subscribers(self, topic: str) -> bool:
+        return self.up and topic in self._subscribers
+
     def _done(self, done: Done) -> None:
-        handed = done.handle
-        if isinstance(handed, SlottedTopic):
-            self._periodics.done(handed, done)
-        elif isinstance(handed, Handed):
-            self._handover.done(handed, done)
-            if self.wait_queue:
-                self.made_room()
-        elif isinstance(handed, Response):
-            for name in self._departures.answered(handed):
-                if self.up:
-                    super()._add_subscriber(name)
+        match done.handle:
+            case SlottedTopic() as slotted:
+                self._slotted.completed(slotted, done)
+            case SampleHandle() as handle:
+                self._accounting.remove(handle, done)
+                if self.wait_queue:
+                    self.made_room()
+            case ResponseHandle() as response:
+                for name in self._transmitter.response_sent(response):
+                    if self.up:
+                        super()._add_subscriber(name)
 
     # Topics
 
     def params(self, topic: str) -> bytes | None:
         if not self.engine.ready:
             return NO_PARAMS
-        high = self._high_bytes.pick(topic)
+        high = self._topic_ids.pick(topic)
         if high is None:
             return None
         return management.rtcan_params(rtcan.message_id(high, self.engine.id8 or 0))
 
     def topic_changed(self, topic: Topic) -> None:
-        refused = self._high_bytes.refused
+        refused = self._topic_ids.refused
         known = topic.name in refused
         refused.discard(topic.name)
         super().topic_changed(topic)
         if topic.name in refused and not known:
             text = f"topic {topic.name}: all message ids are taken; it is published as soon as one comes free"
             self._hub.link_notice(self, "no id", text, trouble=True)
-        told = self._announced.get(topic.name)
-        if told is None or not told.publishes:
-            self._high_bytes.drop(topic.name)
-            self._periodics.follow(topic, None)
+        announced = self._announced.get(topic.name)
+        if announced is None or not announced.publishes:
+            self._topic_ids.drop(topic.name)
+            self._slotted.update(topic, None)
         elif self.engine.ready:
-            self._periodics.follow(topic, None if self._words.no_slots else self._high_bytes.pick(topic.name))
+            self._slotted.update(topic, None if self._status.no_slots else self._topic_ids.pick(topic.name))
 
-    def carries(self, topic: str) -> bool:
-        return self.up and topic in self._subscribers
-
-    def _act(self, event: Event) -> None:
-        match event:
-            case PublisherFound(topic, source, params, size):
-                self._inlets.open(self._clock.monotonic(), topic, source, params, size)
-                self.shell.refilter()
-            case PublisherGone(topic, source):
-                self._inlets.shut(self._clock.monotonic(), topic, source)
-                self.shell.refilter()
-            case _:
-                if isinstance(event, ModuleGone) and isinstance(event.info.source, int):
-                    self._high_bytes.gone(event.info.source)
-                super()._act(event)
-
-    # What it is worth
+    # What the link guarantees
 
     @property
     def losses(self) -> Counter[str]:
-        ours = Counter({kind: count for kind in _LOSSES if (count := self.engine.counts[kind])})
-        return sum(self.engine.losses.values(), super().losses + ours)
+        own = Counter({kind: count for kind in _LOSSES if (count := self.engine.counts[kind])})
+        return sum(self.engine.losses.values(), super().losses + own)
 
     @property
     def slots(self) -> dict[str, SlottedTopic]:
         """The periodic topics of this module, and how well their slots are kept."""
-        return self._periodics.by_topic
+        return self._slotted.by_topic
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
-        return self._words.guarantee(publisher_class, self._periodics.by_topic.get(topic))
+        return self._status.guarantee(publisher_class, self._slotted.by_topic.get(topic))
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
-        return publisher_class == PublisherClass.PERIODIC and bool(self._words.no_slots)
+        return publisher_class == PublisherClass.PERIODIC and bool(self._status.no_slots)
 
     def inadmissible(self, size: int, period: float) -> str | None:
         return inadmissible(self.engine.timing, size, period)
 
     async def admission(self, topic: str) -> None:
         """Wait until a periodic topic sends in slots of its own, if it ever can."""
-        await self._periodics.until(lambda: not self._undecided(topic))
+        await self._slotted.wait_until(lambda: not self._undecided(topic))
 
     def _undecided(self, topic: str) -> bool:
         known = self._space.topics.get(topic)
-        if known is None or not self._on_bus or self._words.no_slots or self._closed:
+        if known is None or not self._on_bus or self._status.no_slots or self._closed:
             return False
-        return self._periodics.undecided(known)
+        return self._slotted.undecided(known)
 
     # Time
 
     def network_time(self) -> int | None:
-        return self.engine.network_time(self._now())
+        return self.engine.network_time(self.driver.now())
 
     def translation(self) -> ClockOffset | None:
-        return self._translation.clock(self._clock.monotonic())
+        return self._utc.offset(self._clock.monotonic())
 
     def utc(self) -> tuple[int, int] | None:
         """UTC by the RTCAN master, and how far off it may be (both ns). None: not known."""
-        return self.engine.utc(self._now())
+        return self.engine.utc(self.driver.now())
 
-    def _tell_utc(self) -> None:
+    def _set_utc(self) -> None:
+        """As the master, distribute this module's UTC."""
         if self._utc_error is not None and self.engine.role is Role.MASTER:
-            self.engine.set_utc(self._now(), self._clock.now(), self._utc_error)
+            self.engine.set_utc(self.driver.now(), self._clock.now(), self._utc_error)
 
     def _poll(self) -> None:
-        self._tell_utc()
+        self._set_utc()
         now = self._clock.monotonic()
-        self._renumber(self._high_bytes.freed(now))
-        if self._inlets.forget_shut(now):
-            self.shell.refilter()
+        self._renumber(self._topic_ids.freed(now))
+        if self._message_ids.end_lingering(now):
+            self.driver.update_filters()
         super()._poll()
 
     # Life
 
-    async def drained(self, longest: float) -> None:
-        """Wait until the samples that the engine has are on the bus, at most `max_payload` seconds."""
-        await self.shell.drained(longest, lambda: self._handover.waiting)
+    async def drain(self, timeout: float) -> None:
+        """Wait until the samples that the engine has are on the bus, at most `timeout` seconds."""
+        await self.driver.drain(timeout, lambda: self._accounting.waiting)
 
     def close(self) -> None:
-        """Give the slots back and say good-bye; that takes a while on the bus: `shell.drained`."""
+        """Release the slots and announce the end. The bus takes its time for that: see `driver.drain`."""
         if not self._closed:
-            self._periodics.close()
+            self._slotted.close()
             super().close()
-            self._periodics.look()
+            self._slotted.wake_waiters()

@@ -1,13 +1,13 @@
-"""Periodic publishers on an RTCAN link: their slots are their clock, and without slots their own one goes on.
+"""Periodic publishers on an RTCAN link: their slots are their clock, and without slots their own clock goes on.
 
-A slot is asked for as soon as a topic is advertised, whether somebody subscribes it or not: admission must not depend
-on who listens. It is used only while somebody does. Until the master grants it, and when it is lost, the publisher's
-own ticker sends, as for every other link, and the link makes soft real-time messages of that.
+A slot is requested as soon as a topic is advertised, subscribed or not: admission must not depend on subscribers. It is
+used only while there are some. Until the master grants it, and when it is lost, the publisher's own ticker sends, as
+for every other link, and the link makes soft real-time messages of that.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 
@@ -15,31 +15,32 @@ from r2p.clock import Clock
 from r2p.codecs import rtcan
 from r2p.protocols.rtcan.calendar import Calendar, Refusal
 from r2p.protocols.rtcan.cycle import Timing
-from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Action, Degraded, Done, Due, Fate, Granted, Refused
-from r2p.runtime.topic import SlotPublisher, Topic
-from r2p.transports.stats import LinkStats
+from r2p.protocols.rtcan.events import Degraded, Done, Due, Fate, Granted, Refused
+from r2p.runtime.publishers import PeriodicPublisher
+from r2p.runtime.topic import Topic
+from r2p.transports.link import Link
+from r2p.transports.rtcan.driver import EngineDriver
 
 _SECOND = 1_000_000_000
 
 
 class SlottedTopic(msgspec.Struct, eq=False):
-    """A periodic topic and its slots. `period` and `phase` in slots (0: none granted), `interval` in ns.
-    `driven`: they are the publisher's clock; `elsewhere`: those of another link are.
+    """A periodic topic and its slots. `period` and `phase` are in slots (0: none granted), `interval` in ns.
 
-    `sent` and `missed` count messages since the grant; `earliest` and `latest` say when they ended, in ns from the
-    start of their first slot on: how far apart these are is the jitter.
+    `is_clock`: these slots are the publisher's clock; `clock_elsewhere`: those of another link are. `sent` and `missed`
+    count messages since the grant; `earliest` and `latest` are when they ended, in ns from the start of their first
+    slot on: the difference is the jitter.
     """
 
     topic: Topic
-    publisher: SlotPublisher
+    publisher: PeriodicPublisher[Any]
     high: int
     period: int = 0
     phase: int = 0
     interval: int = 0
     refusal: str = ""
-    driven: bool = False
-    elsewhere: bool = False
+    is_clock: bool = False
+    clock_elsewhere: bool = False
     due: int = 0
     sent: int = 0
     missed: int = 0
@@ -47,13 +48,14 @@ class SlottedTopic(msgspec.Struct, eq=False):
     latest: int = 0
 
     def measure(self, ended: int) -> None:
+        """Count a message whose last frame ended at this instant."""
         after = ended - self.due
         self.earliest = min(self.earliest, after) if self.sent else after
         self.latest = max(self.latest, after) if self.sent else after
         self.sent += 1
 
-    def words(self, timing: Timing) -> str:
-        """What the slots are worth, for people."""
+    def describe(self) -> str:
+        """Describe the slots and how well they are kept, for users."""
         if not self.period:
             return f"refused: {self.refusal}" if self.refusal else "waiting for admission"
         text = f"a slot every {self.period} slots ({self.interval / 1e6:g} ms), phase {self.phase}"
@@ -66,101 +68,90 @@ class SlottedTopic(msgspec.Struct, eq=False):
 
 
 def inadmissible(timing: Timing, size: int, period: float) -> str | None:
-    """Why there can never be slots for messages of `size` bytes each `period` seconds; None: there may be."""
+    """Why there can never be slots for messages of `size` bytes each `period` seconds. None: there may be."""
     wanted = round(period * _SECOND) // timing.slot
     fragments = rtcan.fragment_count(size)
     answer = Calendar(timing.slots).admit(rtcan.FIRST_TOPIC << 8, wanted, fragments, round_down=True)
     return answer.text if isinstance(answer, Refusal) else None
 
 
-class SlottedLink(Protocol):
-    """What this needs of its link."""
-
-    name: str
-    up: bool
-    stats: LinkStats
-    engine: Engine
-
-    def do(self, actions: Sequence[Action]) -> None:
-        """Carry out what the engine wants."""
-
-    def carries(self, topic: str) -> bool:
-        """Whether somebody subscribes the topic, and is in reach."""
-
-
 class SlottedTopics:
-    """The periodic topics of one link. `now` is the engine's clock, `monotonic` translates it to that of the module."""
+    """The periodic topics of one link.
 
-    def __init__(
-        self, link: SlottedLink, clock: Clock, now: Callable[[], int], monotonic: Callable[[int], int]
-    ) -> None:
+    `clock` is the module's. `has_subscribers` says whether a topic has any on the bus that can be reached.
+    """
+
+    def __init__(self, link: Link, driver: EngineDriver, clock: Clock, has_subscribers: Callable[[str], bool]) -> None:
         self.by_topic: dict[str, SlottedTopic] = {}
         self._link = link
+        self._driver = driver
         self._clock = clock
-        self._now = now
-        self._monotonic = monotonic
+        self._has_subscribers = has_subscribers
         self._by_high: dict[int, SlottedTopic] = {}
         self._waiters: list[asyncio.Future[None]] = []
 
-    def follow(self, topic: Topic, high: int | None) -> None:
-        """The publishers of a topic changed, or its high byte: of those that are periodic the first gets slots."""
-        publisher = next(iter(topic.slot_publishers), None)
+    def update(self, topic: Topic, high: int | None) -> None:
+        """Request and release slots after a change of a topic's publishers, or of its high byte (None: it has none).
+
+        Of the publishers that are periodic the first gets slots.
+        """
+        publisher = next((each for each in topic.slotted if isinstance(each, PeriodicPublisher)), None)
         known = self.by_topic.get(topic.name)
         if known is not None and (known.publisher, known.high) != (publisher, high):
-            self._drop(known)
+            self._release(known)
             known = None
         if known is None and publisher is not None and high is not None:
             self._reserve(SlottedTopic(topic, publisher, high))
 
-    async def until(self, condition: Callable[[], bool]) -> None:
-        """Wait for something that news about slots bring about."""
+    async def wait_until(self, condition: Callable[[], bool]) -> None:
+        """Wait for a condition that events about slots bring about."""
         while not condition():
             waiter = asyncio.get_running_loop().create_future()
             self._waiters.append(waiter)
             await waiter
 
-    def look(self) -> None:
-        """There are news: who waits may look."""
+    def wake_waiters(self) -> None:
+        """Let `wait_until` evaluate its conditions again."""
         waiters, self._waiters = self._waiters, []
         for waiter in waiters:
             if not waiter.done():
                 waiter.set_result(None)
 
     def close(self) -> None:
-        """Give all slots back."""
+        """Release all slots."""
         for each in list(self.by_topic.values()):
-            self._drop(each)
+            self._release(each)
 
     def undecided(self, topic: Topic) -> bool:
-        """Whether it may still come to slots for a topic that wants some."""
-        if not any(isinstance(each, SlotPublisher) for each in topic.publishers):
+        """Whether a topic wants slots, and may still get some."""
+        if not any(isinstance(each, PeriodicPublisher) for each in topic.publishers):
             return False
         slotted = self.by_topic.get(topic.name)
-        return slotted is None or not (slotted.driven or slotted.elsewhere)
+        return slotted is None or not (slotted.is_clock or slotted.clock_elsewhere)
 
-    def learn(self, news: Granted | Refused | Degraded) -> None:
-        """A topic got slots, or not, or lost them."""
-        each = self._by_high.get(news.high)
+    def slots_changed(self, event: Granted | Refused | Degraded) -> None:
+        """Note that a topic got slots, was refused some, or lost them."""
+        each = self._by_high.get(event.high)
         if each is None:
             return
-        if isinstance(news, Granted):
-            each.period, each.phase, each.interval = news.period, news.phase, news.interval
+        if isinstance(event, Granted):
+            each.period, each.phase, each.interval = event.period, event.phase, event.interval
             each.refusal, each.due, each.sent, each.missed = "", 0, 0, 0
             return
-        self._end(each)
-        if isinstance(news, Refused):
-            each.refusal = news.reason
-        elif self._link.up:  # else the publisher is told that the link is down
-            each.publisher.link_degraded(self._link.name, f"slots lost: {news.reason}")
+        self._lose_slots(each)
+        if isinstance(event, Refused):
+            each.refusal = event.reason
+        elif self._link.up:  # else the link tells the publisher that it is down
+            each.publisher.degraded(self._link.name, f"slots lost: {event.reason}")
 
-    def due(self, due: Due) -> None:
-        """The engine wants data: for a slot, or because the time has come and there is no slot."""
+    def fill(self, due: Due) -> None:
+        """Give the engine the data of a slot, or none where a tick is due and there is no slot."""
         each = self._by_high.get(due.high)
-        payload = self._tick(each, due) if each is not None and due.slotted else None
-        self._link.do(self._link.engine.fill(self._now(), due.high, payload))
+        payload = self._payload(each, due) if each is not None and due.slotted else None
+        self._driver.carry_out(self._driver.engine.fill(self._driver.now(), due.high, payload))
 
-    def done(self, each: SlottedTopic, done: Done) -> None:
-        """What became of the data."""
+    def completed(self, each: SlottedTopic, done: Done) -> None:
+        """Count what became of the data of a slot."""
         if done.fate in (Fate.SENT, Fate.UNKNOWN):
             each.measure(done.at)
             return
@@ -171,20 +162,20 @@ class SlottedTopics:
             if self.by_topic.get(each.topic.name) is each:  # else its publisher is closed
                 each.publisher.link_missed(self._link.name, done.fate.value)
 
-    def _tick(self, each: SlottedTopic, due: Due) -> bytes | None:
-        """Let the publisher make the message of this slot."""
-        if not each.driven:
-            each.driven = each.publisher.use_slot_clock(self._link, each.interval / _SECOND)
-            each.elsewhere = not each.driven
-            self.look()
-            if each.elsewhere:
+    def _payload(self, each: SlottedTopic, due: Due) -> bytes | None:
+        """Have the publisher make the message of this slot."""
+        if not each.is_clock:
+            each.is_clock = each.publisher.use_slot_clock(self._link, each.interval / _SECOND)
+            each.clock_elsewhere = not each.is_clock
+            self.wake_waiters()
+            if each.clock_elsewhere:
                 return None  # here it is soft real-time
-        since = round((due.at - each.due) / each.interval) if each.due else 1
+        since = round((due.at - each.due) / each.interval) if each.due else 1  # periods since the last slot
         each.due = due.at
-        scheduled = self._monotonic(due.at)
+        scheduled = self._driver.port.monotonic(due.at)
         late = max(0, self._clock.monotonic() - scheduled)
         sample = each.publisher.tick(scheduled, late, max(0, since - 1))
-        if sample is None or not self._link.carries(each.topic.name):
+        if sample is None or not self._has_subscribers(each.topic.name):
             return None
         self._link.stats.sent += 1
         self._link.stats.bytes_sent += len(sample.data)
@@ -193,19 +184,17 @@ class SlottedTopics:
     def _reserve(self, each: SlottedTopic) -> None:
         self.by_topic[each.topic.name] = self._by_high[each.high] = each
         interval, lead = round(each.publisher.period * _SECOND), round(each.publisher.lead * _SECOND)
-        engine = self._link.engine
-        size = each.publisher.size
-        self._link.do(engine.reserve(self._now(), each.high, size, interval, lead=lead, handle=each))
+        engine, now = self._driver.engine, self._driver.now()
+        self._driver.carry_out(engine.reserve(now, each.high, each.publisher.size, interval, lead=lead, handle=each))
 
-    def _drop(self, each: SlottedTopic) -> None:
-        self._end(each)
+    def _release(self, each: SlottedTopic) -> None:
+        self._lose_slots(each)
         del self.by_topic[each.topic.name]
         del self._by_high[each.high]
-        self._link.do(self._link.engine.release(self._now(), each.high))
+        self._driver.carry_out(self._driver.engine.release(self._driver.now(), each.high))
 
-    def _end(self, each: SlottedTopic) -> None:
-        """Its slots are gone."""
+    def _lose_slots(self, each: SlottedTopic) -> None:
         each.period = 0
-        if each.driven:
-            each.driven = False
+        if each.is_clock:
+            each.is_clock = False
             each.publisher.use_own_clock(self._link)

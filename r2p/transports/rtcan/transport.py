@@ -1,15 +1,102 @@
-"""The transport on any CAN port: one link, for as long as the port is open."""
+"""What an `rtcan:` URL names: the options of a node, the port to its CAN controller, and the life of its link.
+
+The options are those of every RTCAN transport, the simulated one included: who the node is, and what all nodes of its
+network have to agree on.
+"""
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
+import msgspec
+
+from r2p.errors import TransportError
+from r2p.protocols.rtcan.cycle import Timing, timing
+from r2p.protocols.rtcan.events import EngineSettings, Profile
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.link import RtcanLink
-from r2p.transports.rtcan.options import RtcanOptions
+from r2p.transports.url import Url, duration
 
-_DRAINING = 0.5  # seconds for the last messages to get through: their subscribers take nothing after the good-bye
-_CLOSING = 0.5  # ... and for the good-bye
+# fmt: off
+INTERFACES = frozenset({
+    "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys",
+    "neovi", "nican", "nixnet", "pcan", "robotell", "seeedstudio", "serial", "slcan",
+    "socketcan", "socketcand", "systec", "udp_multicast", "usb2can", "vector", "virtual",
+})
+# fmt: on
+"""python-can's interfaces by name, listed so that python-can need not be loaded. An interface of SocketCAN that has one
+of these names is `rtcan:socketcan:NAME`.
+"""
+
+_SLOT_MIN_COARSE = 500_000  # ns of the shortest slot that a port holds which can't hit an instant exactly
+_CAPACITY = 1024  # messages in the engine's queue: more than a link passes to it
+_SECOND = 1_000_000_000
+_DRAIN_TIMEOUT = 0.5  # seconds for the last messages: subscribers accept none after the announced end of the link
+_LEAVE_TIMEOUT = 0.5  # seconds for the announcement of the end
+
+
+class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of an RTCAN node, as a URL has them. Times in s.
+
+    `id`: 1 to 255, None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
+    and `bitrate` must be the same in the whole network. `profile`: auto, rtcan or firmware-2014. `utc`: how far the
+    module's UTC may be off, if it is known: as the master it distributes UTC.
+    """
+
+    id: int | None = None
+    priority: int = 0
+    slots: int = 60
+    cycle: float = 0.010
+    bitrate: int = 1_000_000
+    profile: Profile = Profile.AUTO
+    utc: float | None = None
+
+    @property
+    def timing(self) -> Timing:
+        """The slots of the network's cycle. Raises ValueError where no frame fits a slot."""
+        return timing(self.slots, self._cycle, self.bitrate)
+
+    @property
+    def holds_slots_on_coarse_port(self) -> bool:
+        """Whether the slots are so long that a port which can't hit an instant exactly stays inside of them."""
+        return self.timing.slot >= _SLOT_MIN_COARSE
+
+    @property
+    def utc_error(self) -> int | None:
+        """`utc` in ns."""
+        return None if self.utc is None else round(self.utc * _SECOND)
+
+    @property
+    def _cycle(self) -> int:
+        return round(self.cycle * _SECOND)
+
+    def settings(self, number: int, port: CanPort) -> EngineSettings:
+        """The settings of an engine on this port. `number`: 64 random bits."""
+        return EngineSettings(
+            number=number,
+            id8=self.id,
+            priority=self.priority,
+            profile=self.profile,
+            slots=self.slots,
+            cycle=self._cycle,
+            bit_rate=self.bitrate,
+            receive_latency=port.receive_latency,
+            transmit_latency=port.transmit_latency,
+            coarse=port.coarse,
+            reserves=self.holds_slots_on_coarse_port or not port.coarse,
+            capacity=_CAPACITY,
+        )
+
+
+def apply_options(url: str, values: dict[str, Any], defaults: RtcanOptions) -> RtcanOptions:
+    """Apply the options of a URL to the defaults. Raises TransportError where no frame fits a slot."""
+    options = msgspec.structs.replace(defaults, **values)
+    try:
+        _ = options.timing
+    except ValueError as error:
+        raise TransportError(f"{url}: {error}") from error
+    return options
 
 
 class RtcanTransport(Transport):
@@ -25,24 +112,112 @@ class RtcanTransport(Transport):
 
 
 async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanPort, options: RtcanOptions) -> None:
-    """Run a link on a port until cancelled; the port is closed after the link's last messages and its good-bye."""
+    """Run a link on a port until cancelled. The port is closed after the link's last messages and its announced end."""
     settings = options.settings(hub.random.getrandbits(64), port)
     link = RtcanLink(name, hub, port, settings, options.utc_error)
     hub.attach(link)
-    running = asyncio.create_task(port.run(link.shell, opened), name=f"{name} port")
+    running = asyncio.create_task(port.run(link.driver, opened), name=f"{name} port")
     try:
         await asyncio.wait([running])
         await running
     finally:
         try:
             if not running.done():
-                await link.drained(_DRAINING)
+                await link.drain(_DRAIN_TIMEOUT)
             link.close()
             if not running.done():
-                await link.shell.drained(_CLOSING)
+                await link.driver.drain(_LEAVE_TIMEOUT)
         finally:
             link.close()
             running.cancel()
             await asyncio.wait([running])
-            link.shell.close()
+            link.driver.close()
             hub.detach(link)
+
+
+def from_url(url: Url) -> RtcanTransport:
+    """`rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`, with the options of `RtcanOptions`."""
+    make_port, options = _port_of(url)
+    return RtcanTransport(f"rtcan:{url.address}", make_port, options)
+
+
+def open_port(url: Url) -> tuple[CanPort, RtcanOptions]:
+    """The port of such a URL, not running yet, and the options: for a program that only listens to the bus."""
+    make_port, options = _port_of(url)
+    return make_port(), options
+
+
+def _port_of(url: Url) -> tuple[Callable[[], CanPort], RtcanOptions]:
+    options = apply_options(str(url), url.parsed(OPTIONS), RtcanOptions())
+    if options.priority and not options.holds_slots_on_coarse_port:
+        raise TransportError(
+            f"{url}: a PC can't be the master with slots of {options.timing.slot // 1000} us, its syncs would come too "
+            "late: leave it to a module (priority=0), or give the whole network longer ones, such as "
+            "slots=20,cycle=10ms"
+        )
+    interface, colon, channel = url.address.partition(":")
+    if interface in INTERFACES and not channel:
+        example = {"socketcan": "can0", "slcan": "/dev/ttyACM0"}.get(interface, "CHANNEL")
+        raise TransportError(f"{url} lacks the channel: rtcan:{interface}:{example}")
+    if not colon:
+        interface, channel = "socketcan", url.address
+    if not channel:
+        raise TransportError(f"{url} lacks the CAN interface: rtcan:can0, or rtcan:slcan:/dev/ttyACM0")
+    return _port_maker(interface, channel, options), options
+
+
+def _port_maker(interface: str, channel: str, options: RtcanOptions) -> Callable[[], CanPort]:
+    # Imported here: SocketCAN is Linux's, and python-can takes its time to load.
+    if interface == "socketcan":
+        from r2p.transports.can.socketcan import SocketCanPort
+
+        return lambda: SocketCanPort(channel)
+    from r2p.transports.can.pythoncan import PythonCanPort
+
+    return lambda: PythonCanPort(interface, channel, options.bitrate)
+
+
+# Converters of options: each raises ValueError with a text that says what to write instead
+
+
+def _int_between(least: int, most: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        value = _int_or_none(text)
+        if value is None or not least <= value <= most:
+            raise ValueError(f"give a number of {least} to {most}")
+        return value
+
+    return parse
+
+
+def _int_or_none(text: str) -> int | None:
+    try:
+        return int(text)
+    except ValueError:
+        return None
+
+
+def _bitrate(text: str) -> int:
+    value = _int_or_none(text)
+    if value is None or value <= 0 or _SECOND % value:
+        raise ValueError("a bit must take whole nanoseconds, as with 1000000, 500000, 250000 or 125000")
+    return value
+
+
+def _profile(text: str) -> Profile:
+    try:
+        return Profile(text)
+    except ValueError:
+        raise ValueError(f"it is one of {', '.join(each.value for each in Profile)}") from None
+
+
+OPTIONS: dict[str, Callable[[str], Any]] = {
+    "id": _int_between(1, 255),
+    "priority": _int_between(0, 255),
+    "slots": _int_between(2, 64),
+    "cycle": duration,
+    "bitrate": _bitrate,
+    "profile": _profile,
+    "utc": duration,
+}
+"""Converters for `Url.parsed`."""

@@ -15,7 +15,7 @@ from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can import pythoncan
 from r2p.transports.can.pythoncan import PythonCanPort
-from r2p.transports.rtcan import INTERFACES
+from r2p.transports.rtcan.transport import INTERFACES
 from r2p.transports.url import open_transport
 from tests.can.rig import GUARD, User, now, using
 from tests.faults import once

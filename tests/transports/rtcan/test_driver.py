@@ -26,8 +26,8 @@ from r2p.protocols.rtcan.events import (
 from r2p.runtime.sample import PublisherClass
 from r2p.transports.can.port import CanPort, PortAlarm
 from r2p.transports.rtcan.driver import EngineDriver
-from r2p.transports.rtcan.options import RtcanOptions
 from r2p.transports.rtcan.status import LinkStatus
+from r2p.transports.rtcan.transport import RtcanOptions
 from tests.faults import once
 
 pytestmark = pytest.mark.virtual_time
@@ -41,7 +41,7 @@ class Port(CanPort):
         self.sent: list[Frame] = []
         self.filters: list[tuple[int, int]] | None = []
         self.stuck = False
-        self.shell: EngineDriver
+        self.driver: EngineDriver
 
     async def run(self, user: object, opened: Callable[[], object]) -> None:
         raise NotImplementedError
@@ -49,10 +49,10 @@ class Port(CanPort):
     def transmit(self, order: Transmit) -> None:
         self.sent.append(order.frame)
         if not self.stuck:
-            self.shell.confirmed(order.mailbox, Outcome.SENT, self.now())
+            self.driver.confirmed(order.mailbox, Outcome.SENT, self.now())
 
     def withdraw(self, order: Withdraw) -> None:
-        self.shell.confirmed(order.mailbox, Outcome.LATE, self.now())
+        self.driver.confirmed(order.mailbox, Outcome.LATE, self.now())
 
     def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         self.filters = filters
@@ -95,19 +95,19 @@ class Owner:
 
 def make() -> tuple[EngineDriver, Port, Owner]:
     port, owner = Port(), Owner()
-    port.shell = shell = EngineDriver(Engine(EngineSettings(number=5, id8=9)), port, owner)
-    return shell, port, owner
+    port.driver = driver = EngineDriver(Engine(EngineSettings(number=5, id8=9)), port, owner)
+    return driver, port, owner
 
 
 async def test_it_polls_when_the_engine_wants() -> None:
-    shell, port, owner = make()
-    shell.up()
+    driver, port, owner = make()
+    driver.up()
     assert port.filters == [(0, 0)]
     await asyncio.sleep(2.0)
     assert owner.changes == ["up"]
     assert any(isinstance(each, Ready) for each in owner.actions)
     assert len(port.sent) >= 8  # two claims of four frames
-    shell.close()
+    driver.close()
     sent = len(port.sent)
     await asyncio.sleep(10.0)
     assert len(port.sent) == sent
@@ -115,10 +115,10 @@ async def test_it_polls_when_the_engine_wants() -> None:
 
 async def test_a_port_that_confirms_at_once_and_an_owner_that_publishes_at_once() -> None:
     """Each waits for its turn: a message of many frames goes out whole, and in order."""
-    shell, port, owner = make()
+    driver, port, owner = make()
     payload = bytes(range(100))
-    owner.on_ready = lambda: shell.do(shell.engine.publish(port.now(), 0x42, payload, handle="bulk"))
-    shell.up()
+    owner.on_ready = lambda: driver.carry_out(driver.engine.publish(port.now(), 0x42, payload, handle="bulk"))
+    driver.up()
     await asyncio.sleep(3.0)
     data = [frame for frame in port.sent if frame.id >> 15 & 0xFF == 0x42]
     assert b"".join(frame.data for frame in data) == payload
@@ -127,35 +127,35 @@ async def test_a_port_that_confirms_at_once_and_an_owner_that_publishes_at_once(
 
 
 async def test_drained_when_all_is_on_the_bus_or_it_takes_too_long() -> None:
-    shell, port, _ = make()
-    shell.up()
+    driver, port, _ = make()
+    driver.up()
     await asyncio.sleep(3.0)
-    await shell.drained(1.0)
+    await driver.drain(1.0)
     port.stuck = True
-    shell.do(shell.engine.manage(port.now(), management.encode(Alive("A"))))
+    driver.carry_out(driver.engine.manage(port.now(), management.encode(Alive("A"))))
     before = port.now()
-    await shell.drained(0.5)
+    await driver.drain(0.5)
     assert port.now() - before == 500_000_000
-    waiting = asyncio.create_task(shell.drained(0.5))
+    waiting = asyncio.create_task(driver.drain(0.5))
     await asyncio.sleep(0.1)
     port.stuck = False
-    shell.confirmed(Mailbox.SRT, Outcome.SENT, port.now())
+    driver.confirmed(Mailbox.SRT, Outcome.SENT, port.now())
     await waiting
     assert port.now() - before < 700_000_000
 
 
 async def test_what_is_discarded_is_told_after_the_bus_is_down() -> None:
-    shell, port, owner = make()
-    shell.up()
+    driver, port, owner = make()
+    driver.up()
     await asyncio.sleep(3.0)
     port.stuck = True
-    shell.do(shell.engine.publish(port.now(), 0x42, b"x", handle="x"))
+    driver.carry_out(driver.engine.publish(port.now(), 0x42, b"x", handle="x"))
     owner.actions.clear()
-    shell.down("cable cut")
+    driver.down("cable cut")
     assert owner.changes == ["up", "cable cut"]
     assert owner.fates() == [Fate.DISCARDED]
-    shell.waits("no cable")
-    shell.fault("stuff error")
+    driver.waits("no cable")
+    driver.fault("stuff error")
     assert owner.changes[2:] == ["waits: no cable", "fault: stuff error"]
 
 
@@ -169,51 +169,51 @@ async def test_a_port_that_is_not_exact_asks_for_slots_only_where_they_are_coars
     ):
         settings = options.settings(1, port)
         assert settings.reserves == reserves
-        words = LinkStatus(Engine(settings), port, settings)
-        assert bool(words.no_slots) is not reserves
+        status = LinkStatus(EngineDriver(Engine(settings), port, Owner()), settings)
+        assert bool(status.no_slots) is not reserves
     port.coarse = False
     assert RtcanOptions().settings(1, port).reserves
 
 
 async def test_what_a_class_means_depends_on_the_controller() -> None:
-    shell, port, _ = make()
-    words = LinkStatus(shell.engine, port, EngineSettings(number=5))
-    assert words.guarantee(PublisherClass.SPORADIC, None) == "nothing yet: not on the bus"
-    shell.up()
+    driver, port, _ = make()
+    status = LinkStatus(driver, EngineSettings(number=5))
+    assert status.guarantee(PublisherClass.SPORADIC, None) == "nothing yet: not on the bus"
+    driver.up()
     await asyncio.sleep(3.0)
-    assert "fixed when a frame is handed to the controller" in words.guarantee(PublisherClass.SPORADIC, None)
+    assert "fixed when a frame is handed to the controller" in status.guarantee(PublisherClass.SPORADIC, None)
     port.one_shot = True
-    assert "fresh at each try" in words.guarantee(PublisherClass.SPORADIC, None)
+    assert "fresh at each try" in status.guarantee(PublisherClass.SPORADIC, None)
 
 
 @pytest.mark.parametrize("call", ["poll", "receive", "_sender._post.confirm"])
 async def test_an_engine_that_raises_goes_on(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    shell, port, owner = make()
+    driver, port, owner = make()
     place, _, name = f"engine.{call}".rpartition(".")
-    part = operator.attrgetter(place)(shell)
+    part = operator.attrgetter(place)(driver)
     monkeypatch.setattr(part, name, once(getattr(part, name)))
-    shell.up()
-    shell.received(Frame(0, b""), 0)
+    driver.up()
+    driver.received(Frame(0, b""), 0)
     await asyncio.sleep(3.0)
     assert [each for each in owner.changes if each != "up"] == ["internal error: injected"]
     assert any(isinstance(each, Ready) for each in owner.actions)
-    shell.do(shell.engine.publish(port.now(), 0x42, b"x", handle="x"))
+    driver.carry_out(driver.engine.publish(port.now(), 0x42, b"x", handle="x"))
     await asyncio.sleep(1.0)
     assert owner.fates() == [Fate.SENT]
 
 
 async def test_an_engine_that_always_raises_does_not_take_all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    shell, _, owner = make()
-    monkeypatch.setattr(shell.engine, "poll", lambda _now: 1 // 0)
-    shell.up()
+    driver, _, owner = make()
+    monkeypatch.setattr(driver.engine, "poll", lambda _now: 1 // 0)
+    driver.up()
     await asyncio.sleep(5.0)
     assert 10 < len(owner.changes) < 60
 
 
 async def test_an_action_that_raises_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    shell, _, owner = make()
+    driver, _, owner = make()
     monkeypatch.setattr(owner, "act", once(owner.act))
     actions = [Ready(9, Profile.RTCAN), Ready(10, Profile.RTCAN)]
-    shell.do(actions)
+    driver.carry_out(actions)
     assert owner.actions == actions[1:]
     assert owner.changes == ["internal error: injected"]

@@ -81,7 +81,7 @@ async def test_what_comes_after_the_good_bye_is_counted_for_a_while() -> None:
         frame = rtcan.Frame(rtcan.encode_identifier(rtcan.NRT, message), Led().encode())
         for seconds, lost in (0.0, 1), (0.5, 2), (5.0, 2), (5.0, 2):
             await asyncio.sleep(seconds)
-            link.shell.received(frame, link.shell.now())
+            link.driver.received(frame, link.driver.now())
             assert link.losses == {"not subscribed": lost}
             assert not subscriber.queue
         assert (message << 7, rtcan.MESSAGE_MASK) not in link.engine.filters()

@@ -15,7 +15,7 @@ from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
 from r2p.runtime.events import ModuleEvent
 from r2p.sim.can import ControllerState
-from r2p.transports.rtcan.options import RtcanOptions
+from r2p.transports.rtcan.transport import RtcanOptions
 from tests.transports.rtcan.networks import GUARD, Lab, lab, until
 
 pytestmark = pytest.mark.virtual_time
@@ -257,7 +257,7 @@ async def test_message_ids_that_a_broken_node_has_taken_come_free() -> None:
             advertise = Advertise(f"broken{high}", 8, 0, management.rtcan_params(rtcan.message_id(high, 1)))
             for left, data in rtcan.fragments(management.encode(advertise)):
                 frame = rtcan.Frame(rtcan.encode_identifier(50, 0x0101, left), data)
-                link.shell.received(frame, link.shell.now())
+                link.driver.received(frame, link.driver.now())
         assert publisher.subscribers == 0
         async with asyncio.timeout(25.0):
             await publisher.wait_subscriber()
@@ -318,5 +318,5 @@ async def test_a_fixed_id_that_is_taken_is_waited_for_and_that_is_told_once(capl
             assert made.link("B").engine.id8 == 5
     conflicts = [line for line in caplog.messages if "another node uses" in line]
     assert conflicts == [
-        "link sim: another node uses the id 5 of this one: it is the other's, this module waits till it is free"
+        "link sim: another node uses the id 5 of this one: the other node keeps it, this module waits until it is free"
     ]
