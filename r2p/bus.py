@@ -1,4 +1,4 @@
-"""Listening to an RTCAN bus: every frame in words, the true load, the use of the slots. Nothing is ever sent.
+"""A listener on an RTCAN bus: every frame described, the true load, the use of the slots. It never sends anything.
 
     from r2p.bus import BusMonitor
 
@@ -6,9 +6,9 @@
         async for seen in bus:
             print(seen.kind.value, seen.topic, seen.frame.data.hex())
 
-`Calendar` is the master's own: it plans reservations without a bus.
+`Calendar` is the one that the master uses: here it plans reservations without a bus.
 
-The port is the same that a module would use; behind it is a monitor instead of an engine.
+The port is the one that a module would use, with a `Monitor` behind it in place of an engine.
 """
 
 import asyncio
@@ -45,41 +45,43 @@ __all__ = [
 ]
 
 QUEUE = 8192
-"""Frames that wait for the iteration before the oldest are lost, counted."""
+"""Frames that wait for the iteration at most; then the oldest are dropped, and counted."""
 
 _SECOND = 1_000_000_000
-_LOOK = 10_000_000  # ns between two looks whether frames of a period that is over are still to be read
-_QUIET = 4  # looks without any, after which there are none
-_LATE = 500_000_000  # ns: more than a busy computer takes
-_STOPPED = 40_000_000  # ns that a look took longer: the process stood still, what came meanwhile is not read yet
+
+# After a period, frames of it may still have to be read. These decide when there are none left.
+_CHECK_INTERVAL = 10_000_000  # ns
+_QUIET_CHECKS = 4  # checks in a row without a new frame
+_STALLED = 40_000_000  # ns by which a check is late when the process stood still: what came meanwhile is not read yet
+_STALL_REPORTED = 500_000_000  # ns: longer than a busy computer delays a program
 
 
 class BusMonitor:
     """A silent listener on a CAN bus.
 
-    `via` is an rtcan: URL, or a port; the options `bitrate`, `slots` and `cycle` matter until the master has told its
-    own. `on_news` gets what happens to the interface, in words. Instants are ns of the port's clock.
+    `via` is an rtcan: URL, or a port. Its options `bitrate`, `slots` and `cycle` matter until the master has announced
+    its own. `on_status` is called with a text when the interface goes up or down. Instants are ns of the port's clock.
     """
 
-    def __init__(self, via: "str | CanPort", *, on_news: Callable[[str], object] | None = None) -> None:
+    def __init__(self, via: "str | CanPort", *, on_status: Callable[[str], object] | None = None) -> None:
         self.via = via if isinstance(via, str) else via.name
         self.since = 0
-        """When it was opened."""
+        """When the bus was opened."""
         self.lost = 0
-        """Frames that the iteration was too slow for."""
+        """Frames that were dropped as the iteration was too slow."""
         self._port = None if isinstance(via, str) else via
-        self._tell = on_news or (lambda _text: None)
+        self._report = on_status or (lambda _text: None)
         self._queue: deque[SeenFrame] = deque(maxlen=QUEUE)
-        self._wanted = False
-        self._trouble = ""
+        self._iterated = False
+        self._waits_for = ""
         self._arrived = asyncio.Event()
         self._synced = asyncio.Event()
         self._running: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         """Open the bus. Raises TransportError for a URL that can't work; an interface that is down is waited for."""
-        from r2p.transports.rtcan import open_port  # not at the top: only who listens to a bus needs it
-        from r2p.transports.rtcan.options import RtcanOptions
+        # Not at the top: `Calendar` is used without a bus, and the transport takes its time to load.
+        from r2p.transports.rtcan.transport import RtcanOptions, open_port
 
         if self._port is None:
             port, options = open_port(parse(self.via))
@@ -98,7 +100,7 @@ class BusMonitor:
         try:
             await asyncio.wait([waiting, self._running], return_when=asyncio.FIRST_COMPLETED)
             self._check()
-        except BaseException:  # cancelled, too: who does not come to the block does not leave it either
+        except BaseException:  # also when cancelled: `__aexit__` is not called then
             await self._close()
             raise
         finally:
@@ -108,7 +110,7 @@ class BusMonitor:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it, and wait for the end."""
+        """Close the bus, and wait until it is closed."""
         await self._close()
 
     async def _close(self) -> None:
@@ -117,7 +119,7 @@ class BusMonitor:
             await asyncio.wait([self._running])
 
     def _check(self) -> None:
-        """Raise what ended the port."""
+        """Raise the error that ended the port."""
         if self._running is not None and self._running.done() and not self._running.cancelled():
             self._running.result()
 
@@ -125,11 +127,11 @@ class BusMonitor:
         self._arrived.set()
         self._synced.set()
 
-    # What is known
+    # Results
 
     @property
     def timing(self) -> Timing:
-        """The slots of the cycle: as the master tells, else as the URL says."""
+        """The slots of the cycle: those that the master announces, else those of the URL."""
         return self._monitor.census.timing
 
     @property
@@ -139,11 +141,12 @@ class BusMonitor:
 
     @property
     def slot_cycles(self) -> int:
+        """The number of whole cycles that `slots` is about."""
         return self._monitor.cycles
 
     async def __aiter__(self) -> AsyncIterator[SeenFrame]:
-        """Every frame, from now on."""
-        self._wanted = True
+        """Iterate over every frame from now on."""
+        self._iterated = True
         while True:
             while self._queue:
                 yield self._queue.popleft()
@@ -152,9 +155,10 @@ class BusMonitor:
             await self._arrived.wait()
 
     async def loads(self, period: float) -> AsyncIterator[BusLoad]:
-        """What the bus carried, every `period` seconds; by the time at which it did, also when this program is late.
+        """Iterate over what the bus carried in each `period` (seconds).
 
-        Raises MessageError for what is not a number of seconds.
+        Periods are those of the frames' stamps, so the loads are right even when this program is late. Raises
+        MessageError for what is not a number of seconds.
         """
         seconds("the period of loads", period, least=SHORTEST)
         length = round(period * _SECOND)
@@ -167,42 +171,42 @@ class BusMonitor:
             yield self._monitor.next_load()
 
     async def _read_until(self, end: int) -> None:
-        """Wait until all frames are read that were on the bus until then."""
+        """Wait until all frames are read that were on the bus before `end`."""
         if (left := end - self._now()) > 0:
             await self._sleep(left)
         quiet = 0
-        while self._monitor.heard < end and quiet < _QUIET:
+        while self._monitor.heard < end and quiet < _QUIET_CHECKS:
             heard, before = self._monitor.heard, self._now()
-            late = await self._sleep(_LOOK)
-            quiet = quiet + 1 if self._monitor.heard == heard and before >= end and late < _STOPPED else 0
+            late = await self._sleep(_CHECK_INTERVAL)
+            quiet = quiet + 1 if self._monitor.heard == heard and before >= end and late < _STALLED else 0
 
     async def _sleep(self, duration: int) -> int:
-        """Sleep for so many ns, and return how many it took longer."""
+        """Sleep for so many ns. Returns by how many ns it woke up late."""
         due = self._now() + duration
         await asyncio.sleep(duration / _SECOND)
         late = self._now() - due
-        if late > _LATE:
-            self._tell(f"this program stood still for {late / _SECOND:.1f} s: frames that were not kept are missing")
+        if late > _STALL_REPORTED:
+            self._report(f"this program stood still for {late / _SECOND:.1f} s: frames that were not kept are missing")
         return late
 
-    async def cycles(self, count: int, patience: float) -> bool:
-        """Watch so many whole cycles. False: there was no sync for `patience` seconds.
+    async def cycles(self, count: int, timeout: float) -> bool:
+        """Watch so many whole cycles. False if there was no sync for `timeout` seconds.
 
         Raises MessageError for what is not a number of seconds.
         """
-        seconds("the patience of cycles", patience, least=0.0)
+        seconds("the timeout of cycles", timeout, least=0.0)
         self._monitor.reset(self._now())
         while self._monitor.cycles < count:
             self._synced.clear()
             try:
-                async with asyncio.timeout(patience):
+                async with asyncio.timeout(timeout):
                     await self._synced.wait()
             except TimeoutError:
                 return False
             self._check()
         return True
 
-    # For the port
+    # What the port calls (`CanPortListener`)
 
     def received(self, frame: Frame, stamp: int) -> None:
         """A frame was on the bus until `stamp`."""
@@ -215,33 +219,33 @@ class BusMonitor:
     def _saw(self, seen: SeenFrame) -> None:
         if seen.kind is FrameKind.SYNC:
             self._synced.set()
-        if self._wanted:
+        if self._iterated:
             self.lost += len(self._queue) == QUEUE
             self._queue.append(seen)
             self._arrived.set()
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        """Nothing is sent, so nothing is confirmed."""
+        """Do nothing: nothing is sent, so nothing is confirmed."""
 
     def up(self) -> None:
         """The bus can be used."""
-        self._trouble = ""
-        self._tell(f"{self.via} is up")
+        self._waits_for = ""
+        self._report(f"{self.via} is up")
 
     def down(self, reason: str) -> None:
-        """It can't any more."""
-        self._tell(f"{self.via} is down: {reason}")
+        """The bus can't be used any more."""
+        self._report(f"{self.via} is down: {reason}")
 
     def waits(self, reason: str) -> None:
-        """It can't yet: told once for each reason."""
-        if reason != self._trouble:
-            self._trouble = reason
-            self._tell(f"{self.via}: {reason}; trying again")
+        """The bus can't be used yet: report each reason once."""
+        if reason != self._waits_for:
+            self._waits_for = reason
+            self._report(f"{self.via}: {reason}; trying again")
 
     def fault(self, kind: str) -> None:
-        """An error frame."""
+        """There was an error frame."""
         self._monitor.fault(kind)
 
     def internal_error(self, error: Exception) -> None:
-        """A frame raised: it is logged, and the next one follows."""
+        """The handling of a frame raised: log it. The next frame follows."""
         self._errors.internal_error(error)

@@ -77,7 +77,7 @@ async def test_the_load_is_that_of_the_bus() -> None:
 
 async def test_the_slots_show_their_owner_and_who_died() -> None:
     async with robot() as (bus, listener):
-        assert await listener.cycles(20, patience=1.0)
+        assert await listener.cycles(20, timeout=1.0)
         owned = [slot for slot in listener.slots if "encoder" in slot.owners]
         assert [(slot.reserved, slot.missed) for slot in owned] == [(20, 0)]
         cells = bus_schedule.cells_of(listener)
@@ -88,7 +88,7 @@ async def test_the_slots_show_their_owner_and_who_died() -> None:
         ) == 1
         assert [row["used"] for row in bus_schedule.rows(listener) if row["owner"] == "encoder"] == [20]
         bus.power_off()
-        assert not await listener.cycles(20, patience=1.0)
+        assert not await listener.cycles(20, timeout=1.0)
 
 
 async def test_slow_iterations_lose_the_oldest_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +156,7 @@ async def test_a_bus_that_can_not_be_had_is_an_error() -> None:
 
 async def test_what_it_waits_for_is_told_once() -> None:
     told: list[str] = []
-    async with BusMonitor(SimPort(SimCan(), CanNode("listener")), on_news=told.append) as listener:
+    async with BusMonitor(SimPort(SimCan(), CanNode("listener")), on_status=told.append) as listener:
         for reason in ("no adapter", "no adapter", "no power"):
             listener.waits(reason)
         listener.up()
@@ -220,7 +220,7 @@ class LatePort(CanPort):
 @pytest.mark.parametrize("stopped_at", [0.3, 0.9999, 1.0, 1.0001])
 async def test_the_load_is_right_after_the_process_stood_still(stopped_at: float) -> None:
     port, told = LatePort(), list[str]()
-    async with BusMonitor(port, on_news=told.append) as bus:
+    async with BusMonitor(port, on_status=told.append) as bus:
         asyncio.get_running_loop().call_later(stopped_at, port.stand_still, 2_500_000_000)
         loads = bus.loads(1.0)
         frames = [sum(tally.frames for tally in (await anext(loads)).tallies.values()) for _ in range(6)]

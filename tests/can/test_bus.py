@@ -152,7 +152,7 @@ def test_nobody_is_there(vcan: str, capsys: pytest.CaptureFixture[str]) -> None:
 async def test_the_interface_goes_and_comes_while_somebody_looks(vcan: str) -> None:
     news: list[str] = []
     via = f"rtcan:{vcan}"
-    async with BusMonitor(via, on_news=news.append) as bus:
+    async with BusMonitor(via, on_status=news.append) as bus:
         frames = aiter(bus)
         for number in range(2):
             cansend(vcan, f"{SOFT << 7:08X}#{number:02X}")

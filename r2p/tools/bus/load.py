@@ -115,5 +115,5 @@ async def listen(via: list[str] | None) -> AsyncIterator[BusMonitor]:
     if len(urls) != 1:
         raise Usage(f"give one CAN bus, as in --via rtcan:can0 (not {' and '.join(urls or given) or 'none'})")
     check_urls(urls)
-    async with BusMonitor(urls[0], on_news=say) as bus:
+    async with BusMonitor(urls[0], on_status=say) as bus:
         yield bus

@@ -31,7 +31,7 @@ def schedule(
     async def main() -> None:
         output = Output(format)
         async with listen(via) as bus:
-            if not await bus.cycles(cycles, patience=_PATIENCE):
+            if not await bus.cycles(cycles, timeout=_PATIENCE):
                 raise TimedOut(
                     f"no sync frames for {_PATIENCE:g} s: no RTCAN master on this bus, so it has no slots "
                     "(firmware of 2014 works without them)"

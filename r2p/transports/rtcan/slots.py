@@ -95,7 +95,7 @@ class SlottedTopics:
 
         Of the publishers that are periodic the first gets slots.
         """
-        publisher = next((each for each in topic.slotted if isinstance(each, PeriodicPublisher)), None)
+        publisher = next((each for each in topic.slot_publishers if isinstance(each, PeriodicPublisher)), None)
         known = self.by_topic.get(topic.name)
         if known is not None and (known.publisher, known.high) != (publisher, high):
             self._release(known)
@@ -142,7 +142,7 @@ class SlottedTopics:
         if isinstance(event, Refused):
             each.refusal = event.reason
         elif self._link.up:  # else the link tells the publisher that it is down
-            each.publisher.degraded(self._link.name, f"slots lost: {event.reason}")
+            each.publisher.link_degraded(self._link.name, f"slots lost: {event.reason}")
 
     def fill(self, due: Due) -> None:
         """Give the engine the data of a slot, or none where a tick is due and there is no slot."""
