@@ -123,7 +123,7 @@ async def test_what_the_commands_print() -> None:
         assert bus_load.record(load)["load"] == pytest.approx(load.total, abs=1e-6)
 
 
-async def test_a_crowded_bus_is_told() -> None:
+async def test_a_crowded_bus_is_reported() -> None:
     async with robot() as (bus, listener):
 
         async def talk(node: r2p.Node) -> None:
@@ -145,7 +145,7 @@ async def test_a_crowded_bus_is_told() -> None:
         assert "starve" in str(bus_load.trouble(load))
 
 
-async def test_a_bus_that_can_not_be_had_is_an_error() -> None:
+async def test_a_bus_that_can_not_be_opened_is_an_error() -> None:
     with pytest.raises(r2p.TransportError, match="python-can"):
         async with BusMonitor("rtcan:nonsense:0"):
             pass
@@ -154,14 +154,14 @@ async def test_a_bus_that_can_not_be_had_is_an_error() -> None:
             pass
 
 
-async def test_what_it_waits_for_is_told_once() -> None:
-    told: list[str] = []
-    async with BusMonitor(SimPort(SimCan(), CanNode("listener")), on_status=told.append) as listener:
+async def test_what_it_waits_for_is_reported_once() -> None:
+    reported: list[str] = []
+    async with BusMonitor(SimPort(SimCan(), CanNode("listener")), on_status=reported.append) as listener:
         for reason in ("no adapter", "no adapter", "no power"):
             listener.waits(reason)
         listener.up()
         listener.waits("no power")
-    assert told == [
+    assert reported == [
         "listener is up",
         "listener: no adapter; trying again",
         "listener: no power; trying again",
@@ -170,7 +170,7 @@ async def test_what_it_waits_for_is_told_once() -> None:
     ]
 
 
-def test_a_topic_that_can_not_be_is_a_wrong_usage() -> None:
+def test_an_invalid_topic_is_a_usage_error() -> None:
     with pytest.raises(typer.BadParameter, match="letters, digits and underscores"):
         bus_dump.dump(topic=["no-name"], via=["rtcan:can0"])
 
@@ -183,7 +183,7 @@ async def test_the_commands_take_one_can_bus(via: list[str]) -> None:
 
 
 class LatePort(CanPort):
-    """A bus with one frame each `APART`, read by a process that can stand still: then its clock jumps."""
+    """A bus with one frame each `APART` ns, read by a process that can stand still: then its clock jumps."""
 
     APART = 5_000_000
 
@@ -197,13 +197,13 @@ class LatePort(CanPort):
     def stand_still(self, duration: int) -> None:
         self._stood += duration
 
-    async def run(self, user: CanPortListener, opened: Callable[[], object]) -> None:
+    async def run(self, listener: CanPortListener, opened: Callable[[], object]) -> None:
         opened()
         frame, stamp = Frame(20 << 23, bytes(8)), self.now() + self.APART // 2
         while True:
             for _ in range(8):  # as much as one turn of the loop reads
                 if stamp <= self.now():
-                    user.received(frame, stamp)
+                    listener.received(frame, stamp)
                     stamp += self.APART
             await asyncio.sleep(0.001)
 
@@ -219,17 +219,17 @@ class LatePort(CanPort):
 
 @pytest.mark.parametrize("stopped_at", [0.3, 0.9999, 1.0, 1.0001])
 async def test_the_load_is_right_after_the_process_stood_still(stopped_at: float) -> None:
-    port, told = LatePort(), list[str]()
-    async with BusMonitor(port, on_status=told.append) as bus:
+    port, reported = LatePort(), list[str]()
+    async with BusMonitor(port, on_status=reported.append) as bus:
         asyncio.get_running_loop().call_later(stopped_at, port.stand_still, 2_500_000_000)
         loads = bus.loads(1.0)
         frames = [sum(tally.frames for tally in (await anext(loads)).tallies.values()) for _ in range(6)]
         await loads.aclose()  # type: ignore[attr-defined]
     assert frames == [200] * 6
-    assert ["this program stood still for 2" in text for text in told] == [True]
+    assert ["this program stood still for 2" in text for text in reported] == [True]
 
 
-async def test_a_load_that_cannot_be_is_told() -> None:
+async def test_an_impossible_load_is_reported() -> None:
     tallies = {("", "", FrameKind.OTHER): TrafficCount(1, 2000)}
     load = BusLoad(1_000_000, 1000, tallies, {}, 0.0, 0.0, None)
     assert "200% is more than the bus can carry" in str(bus_load.trouble(load))

@@ -1,4 +1,4 @@
-"""Virtual CAN interfaces, programs beside r2p, and a user of a port that remembers what it was told."""
+"""Virtual CAN interfaces, programs beside r2p, and a listener that records what a port calls."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def cangen(name: str, count: int) -> None:
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """The kernel tells nobody who begins to listen: look until it is so."""
+    """Wait for a condition of which the kernel notifies no process."""
     async with asyncio.timeout(GUARD):
         while not condition():  # noqa: ASYNC110 - what is awaited is not in this process
             await asyncio.sleep(0.002)
@@ -100,8 +100,8 @@ async def run_program(*command: str) -> str:
     return output.decode()
 
 
-class User:
-    """Keeps what a port tells; `news` has one line for each change."""
+class RecordingListener:
+    """Records what a port calls; `states` has one line for each change of its state."""
 
     def __init__(self) -> None:
         self.frames: list[Frame] = []
@@ -110,7 +110,7 @@ class User:
         self.outcomes: list[tuple[Mailbox, Outcome]] = []
         self.instants: list[int] = []
         self.faults: list[str] = []
-        self.news: list[str] = []
+        self.states: list[str] = []
         self.on_confirm: Callable[[], object] = lambda: None
         self._changed = asyncio.Event()
 
@@ -130,13 +130,13 @@ class User:
         self._changed.set()
 
     def up(self) -> None:
-        self._tell("up")
+        self._note("up")
 
     def down(self, reason: str) -> None:
-        self._tell(f"down: {reason}")
+        self._note(f"down: {reason}")
 
     def waits(self, reason: str) -> None:
-        self._tell(f"waits: {reason}")
+        self._note(f"waits: {reason}")
 
     def fault(self, kind: str) -> None:
         self.faults.append(kind)
@@ -151,31 +151,31 @@ class User:
         return len(self.frames) >= count
 
     async def until(self, condition: Callable[[], object]) -> None:
-        """Until something it was told makes this true."""
+        """Wait until a call of the port makes this true."""
         async with asyncio.timeout(GUARD):
             while not condition():
                 self._changed.clear()
                 await self._changed.wait()
 
     def wake(self) -> None:
-        """Let `until` look again."""
+        """Let `until` evaluate its condition again."""
         self._changed.set()
 
-    def _tell(self, line: str) -> None:
-        if self.news[-1:] != [line]:
-            self.news.append(line)
+    def _note(self, line: str) -> None:
+        if self.states[-1:] != [line]:
+            self.states.append(line)
         self._changed.set()
 
 
 @contextlib.asynccontextmanager
-async def using(port: CanPort) -> AsyncIterator[User]:
-    """A user of a port that runs, and is up."""
-    user = User()
-    running = asyncio.create_task(port.run(user, lambda: None), name="port")
-    running.add_done_callback(lambda _: user.wake())
+async def using(port: CanPort) -> AsyncIterator[RecordingListener]:
+    """The listener of a port that runs, and is up."""
+    listener = RecordingListener()
+    running = asyncio.create_task(port.run(listener, lambda: None), name="port")
+    running.add_done_callback(lambda _: listener.wake())
     try:
-        await user.until(lambda: running.done() or user.news)
-        yield user
+        await listener.until(lambda: running.done() or listener.states)
+        yield listener
     finally:
         running.cancel()
         await asyncio.wait([running])
@@ -184,11 +184,11 @@ async def using(port: CanPort) -> AsyncIterator[User]:
 
 
 @contextlib.asynccontextmanager
-async def port_on(name: str) -> AsyncIterator[tuple[SocketCanPort, User]]:
-    """A port on an interface, and its user."""
+async def port_on(name: str) -> AsyncIterator[tuple[SocketCanPort, RecordingListener]]:
+    """A port on an interface, and its listener."""
     port = SocketCanPort(name)
-    async with using(port) as user:
-        yield port, user
+    async with using(port) as listener:
+        yield port, listener
 
 
 def now() -> int:

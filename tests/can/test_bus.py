@@ -38,7 +38,7 @@ def said(message: management.Management, source: int) -> Iterator[Frame]:
 
 
 def recording(name: str) -> Iterator[str]:
-    """Lines for canplayer. Slot 1 is the encoder's, who misses it in every second cycle; slot 3 is nobody's."""
+    """Lines for canplayer. Slot 1 is the encoder's, which misses it in every second cycle; slot 3 is free."""
     params = ENCODER.to_bytes(2, "little").ljust(10, b"\0")
     for cycle in range(CYCLES):
         frames = [(0.0, rtcan.encode_sync(cycle, 0b0011))]
@@ -83,8 +83,8 @@ def test_the_frames_with_their_names_and_slots(played: str, capsys: pytest.Captu
     seen = records(capsys)
     assert sorted(each["kind"] for each in seen) == ["hrt", "hrt", "sync", "sync", "sync", "sync"]
     hrt = [each for each in seen if each["kind"] == "hrt"][-1]
-    told = {name: hrt[name] for name in ("id", "topic", "module", "laxity", "left", "fragments", "slot", "data")}
-    assert told == {
+    fields = {name: hrt[name] for name in ("id", "topic", "module", "laxity", "left", "fragments", "slot", "data")}
+    assert fields == {
         "id": f"0x{ENCODER << 7:08X}",
         "topic": "encoder",
         "module": "MOTOR",
@@ -143,28 +143,28 @@ def test_the_slots_as_text_and_as_a_drawing(
     assert len(notes) == SLOTS
 
 
-def test_nobody_is_there(vcan: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_silent_bus(vcan: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert command("dump", "--timeout", "50ms", "--via", f"rtcan:{vcan}") == 3
     assert "nothing on the bus for 0.05 s" in capsys.readouterr().err
 
 
 @pytest.mark.anyio
-async def test_the_interface_goes_and_comes_while_somebody_looks(vcan: str) -> None:
-    news: list[str] = []
+async def test_the_interface_goes_and_comes_while_a_monitor_runs(vcan: str) -> None:
+    states: list[str] = []
     via = f"rtcan:{vcan}"
-    async with BusMonitor(via, on_status=news.append) as bus:
+    async with BusMonitor(via, on_status=states.append) as bus:
         frames = aiter(bus)
         for number in range(2):
             cansend(vcan, f"{SOFT << 7:08X}#{number:02X}")
             async with asyncio.timeout(GUARD):
                 assert (await anext(frames)).frame.data == bytes((number,))
             ip("set", vcan, "down")
-            await until(lambda: len(news) % 3 == 0)
+            await until(lambda: len(states) % 3 == 0)
             ip("set", vcan, "up")
-            await until(lambda: news[-1] == f"{via} is up")
+            await until(lambda: states[-1] == f"{via} is up")
     waits = f"{via}: {vcan} is down: sudo ip link set {vcan} up; trying again"
     again = [f"{via} is down: the interface is down", waits]
-    assert news == [f"{via} is up", *again, f"{via} is up", *again, f"{via} is up"]
+    assert states == [f"{via} is up", *again, f"{via} is up", *again, f"{via} is up"]
 
 
 def test_no_such_interface(capsys: pytest.CaptureFixture[str]) -> None:

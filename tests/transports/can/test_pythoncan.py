@@ -17,7 +17,7 @@ from r2p.transports.can import pythoncan
 from r2p.transports.can.pythoncan import PythonCanPort
 from r2p.transports.rtcan.transport import INTERFACES
 from r2p.transports.url import open_transport
-from tests.can.rig import GUARD, User, now, using
+from tests.can.rig import GUARD, RecordingListener, now, using
 from tests.faults import once
 
 if TYPE_CHECKING:
@@ -55,82 +55,82 @@ def order(identifier: int = SRT, data: bytes = b"", *, wait: int = 0, last: int 
 
 async def test_frames_go_out_and_are_confirmed(channel: str, peer: can.BusABC) -> None:
     port = port_on(channel)
-    async with using(port) as user:
+    async with using(port) as listener:
         sent = []
         for size in range(9):
             before = now()
             sent.append(order(SRT | size, bytes(range(size))))
             port.transmit(sent[-1])
-            await user.until(lambda: len(user.outcomes) == len(sent))
-            assert before - MS <= user.instants[-1] <= now()  # python-can's stamps are floats of UTC
-        assert user.outcomes == [(Mailbox.SRT, Outcome.SENT)] * 9
+            await listener.until(lambda: len(listener.outcomes) == len(sent))
+            assert before - MS <= listener.instants[-1] <= now()  # python-can's stamps are floats of UTC
+        assert listener.outcomes == [(Mailbox.SRT, Outcome.SENT)] * 9
         for size in range(9):
             message = peer.recv(GUARD)
             assert message is not None
             assert (message.arbitration_id, bytes(message.data)) == (SRT | size, bytes(range(size)))
             assert message.is_extended_id
-    assert (user.frames, user.news) == ([], ["up"])
+    assert (listener.frames, listener.states) == ([], ["up"])
 
 
 async def test_frames_come_in(channel: str, peer: can.BusABC) -> None:
-    async with using(port_on(channel)) as user:
+    async with using(port_on(channel)) as listener:
         before = now()
         for size in range(9):
             peer.send(can.Message(arbitration_id=SRT | size, data=bytes(range(size))))
-        await user.until(lambda: user.has(9))
-        assert user.frames == [Frame(SRT | size, bytes(range(size))) for size in range(9)]
-        assert all(before - MS <= stamp <= now() for stamp in user.stamps)
+        await listener.until(lambda: listener.has(9))
+        assert listener.frames == [Frame(SRT | size, bytes(range(size))) for size in range(9)]
+        assert all(before - MS <= stamp <= now() for stamp in listener.stamps)
 
 
 async def test_other_kinds_of_frames(channel: str, peer: can.BusABC) -> None:
     port = port_on(channel)
     port.set_filters(None)
-    async with using(port) as user:
+    async with using(port) as listener:
         peer.send(can.Message(arbitration_id=1, is_extended_id=False, data=b"ab"))
         peer.send(can.Message(arbitration_id=2, is_remote_frame=True, dlc=4))
         peer.send(can.Message(arbitration_id=3, is_error_frame=True))
         peer.send(can.Message(arbitration_id=4, is_fd=True))
         peer.send(can.Message(arbitration_id=5))
-        await user.until(lambda: user.frames)
-        assert (user.frames, user.faults) == ([Frame(5, b"")], ["bus error"])
-        assert user.others == [OtherFrame(1, b"ab"), OtherFrame(2, b"", True, 4)]
+        await listener.until(lambda: listener.frames)
+        assert (listener.frames, listener.faults) == ([Frame(5, b"")], ["bus error"])
+        assert listener.others == [OtherFrame(1, b"ab"), OtherFrame(2, b"", True, 4)]
 
 
 async def test_only_what_is_needed(channel: str, peer: can.BusABC) -> None:
     port = port_on(channel)
     port.set_filters([(SRT, 0x1FFFFFFF)])
-    async with using(port) as user:
+    async with using(port) as listener:
         port.transmit(order())  # once it is confirmed, so is the filter before it
-        await user.until(lambda: user.outcomes)
+        await listener.until(lambda: listener.outcomes)
         for identifier in (SRT | 1, SRT, SRT | 2, SRT):
             peer.send(can.Message(arbitration_id=identifier))
-        await user.until(lambda: user.has(2))
-        assert user.frames == [Frame(SRT, b"")] * 2
+        await listener.until(lambda: listener.has(2))
+        assert listener.frames == [Frame(SRT, b"")] * 2
 
 
 async def test_a_stamp_by_another_clock_is_not_used(channel: str, peer: can.BusABC) -> None:
     """Adapters count from when they were plugged in."""
     other = can.Bus(interface="virtual", channel=channel, preserve_timestamps=True)
-    async with using(port_on(channel)) as user:
+    async with using(port_on(channel)) as listener:
         before = now()
         other.send(can.Message(arbitration_id=1, timestamp=12.5))
-        await user.until(lambda: user.frames)
-        assert before <= user.stamps[0] <= now()
+        await listener.until(lambda: listener.frames)
+        assert before <= listener.stamps[0] <= now()
     other.shutdown()
 
 
 async def test_waiting_frames(channel: str, peer: can.BusABC) -> None:
     port = port_on(channel)
-    async with using(port) as user:
+    async with using(port) as listener:
         port.transmit(order(last=-1))
-        await user.until(lambda: user.outcomes)
+        await listener.until(lambda: listener.outcomes)
         port.transmit(order(wait=3600_000 * MS))
         port.withdraw(Withdraw(Mailbox.SRT))
-        assert user.outcomes == [(Mailbox.SRT, Outcome.LATE)] * 2
+        assert listener.outcomes == [(Mailbox.SRT, Outcome.LATE)] * 2
         sent = order(wait=20 * MS)
         port.transmit(sent)
-        await user.until(lambda: len(user.outcomes) == 3)
-        assert user.outcomes[-1] == (Mailbox.SRT, Outcome.SENT)
+        await listener.until(lambda: len(listener.outcomes) == 3)
+        assert listener.outcomes[-1] == (Mailbox.SRT, Outcome.SENT)
     port.transmit(order())
     port.withdraw(Withdraw(Mailbox.SRT))
     port.set_filters([])
@@ -142,10 +142,10 @@ async def test_an_interface_that_shows_no_own_frames(
     """A frame counts as sent when the driver has it."""
     monkeypatch.setattr(pythoncan, "ECHO_ON_REQUEST", frozenset[str]())
     port = port_on(channel)
-    async with using(port) as user:
+    async with using(port) as listener:
         port.transmit(order())
-        await user.until(lambda: user.outcomes)
-        assert user.outcomes == [(Mailbox.SRT, Outcome.SENT)]
+        await listener.until(lambda: listener.outcomes)
+        assert listener.outcomes == [(Mailbox.SRT, Outcome.SENT)]
         assert peer.recv(GUARD) is not None
 
 
@@ -153,7 +153,7 @@ async def test_an_interface_that_shows_no_own_frames(
 
 
 class Broken:
-    """Stands for `can.Bus`: behaves as it is told, one time after the other."""
+    """Stands for `can.Bus`: each call has the next of these behaviours."""
 
     def __init__(self, *behaviours: Exception | tuple[str, Exception]) -> None:
         self._behaviours = iter(behaviours)
@@ -173,19 +173,19 @@ class Broken:
 _VirtualBus = can.interface._get_class_for_interface("virtual")
 
 
-async def test_the_cause_is_told_too(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_cause_is_reported_too(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     error = can.CanInitializationError("could not configure socket")
     error.__cause__ = OSError(22, "Invalid argument")
     monkeypatch.setattr(can, "Bus", Broken(error))
-    async with using(port_on(channel)) as user:
-        assert user.news == ["waits: could not configure socket ([Errno 22] Invalid argument)"]
+    async with using(port_on(channel)) as listener:
+        assert listener.states == ["waits: could not configure socket ([Errno 22] Invalid argument)"]
 
 
 async def test_it_waits_until_it_can_be_opened(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(can, "Bus", Broken(can.CanInitializationError("no adapter"), OSError(19, "No such device")))
-    async with using(port_on(channel)) as user:
-        await user.until(lambda: user.news[-1] == "up")
-        assert user.news == [
+    async with using(port_on(channel)) as listener:
+        await listener.until(lambda: listener.states[-1] == "up")
+        assert listener.states == [
             "waits: no adapter",
             "waits: [Errno 19] No such device",
             "up",
@@ -197,12 +197,12 @@ async def test_it_is_opened_again_when_it_failed(method: str, channel: str, monk
     broken = Broken((method, can.CanOperationError("unplugged")))
     monkeypatch.setattr(can, "Bus", broken)
     port = port_on(channel)
-    async with using(port) as user:
+    async with using(port) as listener:
         port.transmit(order())
-        await user.until(lambda: len(user.news) == 3)
-        assert user.news == ["up", "down: unplugged", "up"]
+        await listener.until(lambda: len(listener.states) == 3)
+        assert listener.states == ["up", "down: unplugged", "up"]
         port.transmit(order(SRT | 1))
-        await user.until(lambda: user.outcomes)
+        await listener.until(lambda: listener.outcomes)
     assert [bus._open for bus in broken.made] == [False, False]
 
 
@@ -210,10 +210,10 @@ async def test_a_frame_that_was_not_sent_in_time(channel: str, monkeypatch: pyte
     """Perhaps it was."""
     monkeypatch.setattr(can, "Bus", Broken(("send", can.CanTimeoutError("full"))))
     port = port_on(channel)
-    async with using(port) as user:
+    async with using(port) as listener:
         port.transmit(order())
-        await user.until(lambda: user.outcomes)
-        assert (user.outcomes, user.news) == ([(Mailbox.SRT, Outcome.UNKNOWN)], ["up"])
+        await listener.until(lambda: listener.outcomes)
+        assert (listener.outcomes, listener.states) == ([(Mailbox.SRT, Outcome.UNKNOWN)], ["up"])
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ async def test_a_frame_that_was_not_sent_in_time(channel: str, monkeypatch: pyte
 async def test_what_waiting_does_not_mend(error: Exception, channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(can, "Bus", Broken(error))
     with pytest.raises(TransportError, match=f"rtcan:virtual:{channel}: no ") as caught:
-        await port_on(channel).run(User(), lambda: None)
+        await port_on(channel).run(RecordingListener(), lambda: None)
     assert caught.value.__cause__ is error
 
 
@@ -234,7 +234,7 @@ def test_an_unknown_interface() -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "says"),
+    ("url", "message"),
     [
         ("rtcan:slcan", "lacks the channel: rtcan:slcan:/dev/ttyACM0"),
         ("rtcan:socketcan", "rtcan:socketcan:can0"),
@@ -244,8 +244,8 @@ def test_an_unknown_interface() -> None:
         ("rtcan:can0,bitrate=fast", "whole nanoseconds"),
     ],
 )
-def test_urls_that_can_not_be(url: str, says: str) -> None:
-    with pytest.raises(TransportError, match=says):
+def test_invalid_urls(url: str, message: str) -> None:
+    with pytest.raises(TransportError, match=message):
         open_transport(url)
 
 
@@ -269,9 +269,12 @@ async def test_a_frame_that_raises_does_not_stop_the_others(
     channel: str, peer: can.BusABC, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = port_on(channel)
-    async with using(port) as user:
-        monkeypatch.setattr(user, "received", once(user.received))
+    async with using(port) as listener:
+        monkeypatch.setattr(listener, "received", once(listener.received))
         for number in range(3):
             peer.send(can.Message(arbitration_id=SRT | number, is_extended_id=True))
-        await user.until(lambda: user.has(2))
-        assert ([frame.id for frame in user.frames], user.faults) == ([SRT | 1, SRT | 2], ["internal error: injected"])
+        await listener.until(lambda: listener.has(2))
+        assert ([frame.id for frame in listener.frames], listener.faults) == (
+            [SRT | 1, SRT | 2],
+            ["internal error: injected"],
+        )

@@ -7,29 +7,29 @@ import pytest
 
 from r2p.transports.can import rawsocket
 from r2p.transports.can.socketcan import _SocketCanBus
-from tests.can.rig import User
+from tests.can.rig import RecordingListener
 from tests.faults import once
 
 pytestmark = pytest.mark.virtual_time
 
 
 async def test_a_frame_that_raises_does_not_stop_the_others_of_its_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    user = User()
+    listener = RecordingListener()
     frames = [(rawsocket.DATA | number, b"", 0, 0) for number in range(3)]
     sock: Any = SimpleNamespace(receive=lambda: frames, dropped=0, close=lambda: None)
-    monkeypatch.setattr(user, "received", once(user.received))
-    bus = _SocketCanBus(sock, user, one_shot=False)
+    monkeypatch.setattr(listener, "received", once(listener.received))
+    bus = _SocketCanBus(sock, listener, one_shot=False)
     assert bus._read_batch() == 3
-    assert ([frame.id for frame in user.frames], user.faults) == ([1, 2], ["internal error: injected"])
+    assert ([frame.id for frame in listener.frames], listener.faults) == ([1, 2], ["internal error: injected"])
 
 
 async def test_a_timer_that_raises_goes_off_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    user = User()
+    listener = RecordingListener()
     sock: Any = SimpleNamespace(receive=list, dropped=0, close=lambda: None)
-    bus = _SocketCanBus(sock, user, one_shot=False)
+    bus = _SocketCanBus(sock, listener, one_shot=False)
     monkeypatch.setattr(bus._mailboxes, "poll", once(bus._mailboxes.poll))
     bus._poll()
-    assert user.faults == ["internal error: injected"]
+    assert listener.faults == ["internal error: injected"]
     assert bus._timer._armed is not None
     bus._poll()
-    assert len(user.faults) == 1
+    assert len(listener.faults) == 1

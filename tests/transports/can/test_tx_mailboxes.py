@@ -71,7 +71,7 @@ def test_too_late() -> None:
     bus = Bus()
     bus.put(1000, 7, last=1099)
     bus.put(1000, 8, HRT, last=1100)
-    assert (bus.queue, bus.said) == ([8], [])  # who hears it at once would try again at once, for ever
+    assert (bus.queue, bus.said) == ([8], [])  # confirmed at once, the engine would try again at once, without end
     due = bus.boxes.next_deadline()
     assert due is not None
     assert due <= 1000

@@ -1,4 +1,4 @@
-"""A module of 2014 on a simulated bus, which says what was recorded, and hears as the recorded one did."""
+"""A module of 2014 on a simulated bus, which sends what was recorded, and receives as the recorded one did."""
 
 import asyncio
 from collections import deque
@@ -48,12 +48,12 @@ def _frame(entry: Entry) -> Frame:
 class Firmware:
     """IMU1: publishes `leds`, subscribes `cmd` (12 bytes). `repeats`: it goes through ALIVE, ADVERTISE and its request.
 
-    Of `cmd` it takes what comes with the high byte that it was told, and tells sources by the low one.
+    Of `cmd` it receives what has the high byte in its SUBSCRIBE_RESPONSE, and tells sources apart by the low byte.
     """
 
     def __init__(self, bus: SimCan, *, repeats: bool = True) -> None:
         self.repeats = repeats
-        self.heard: list[management.Management] = []
+        self.received: list[management.Management] = []
         self.commands: list[tuple[int, bytes]] = []
         """Message ids and payloads of `cmd`."""
         self._controller = bus.bus.attach(CanNode("firmware", one_shot=False))
@@ -81,7 +81,7 @@ class Firmware:
         self._next()
 
     async def _iterate(self) -> None:
-        """At start it speaks in any case."""
+        """Even with `repeats` off, each message is sent once."""
         steps = [recorded("ALIVE"), recorded("ADVERTISE", "leds"), recorded("SUBSCRIBE_REQUEST", "cmd")]
         self.send(steps[0])
         await asyncio.sleep(0.5)
@@ -106,13 +106,13 @@ class Firmware:
     def _receive(self, frame: Frame, _stamp: int) -> None:
         found = rtcan.decode_identifier(frame.id)
         if found.message == rtcan.FIRMWARE_MANAGEMENT:
-            self._hear(frame.data if found.left == 3 else self._management + frame.data, found.left)
+            self._receive_management(frame.data if found.left == 3 else self._management + frame.data, found.left)
         elif rtcan.high_byte(found.message) == self._high:
             self._parts[found.message] = self._parts.get(found.message, b"") + frame.data
             if not found.left:
                 self.commands.append((found.message, self._parts.pop(found.message)))
 
-    def _hear(self, data: bytes, left: int) -> None:
+    def _receive_management(self, data: bytes, left: int) -> None:
         self._management = data
         if left:
             return
@@ -120,7 +120,7 @@ class Firmware:
             message = management.decode(data)
         except DecodeError:
             return
-        self.heard.append(message)
+        self.received.append(message)
         match message:
             case management.SubscribeRequest("leds", queue=queue):
                 assert queue > 0  # it would halt

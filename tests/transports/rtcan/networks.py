@@ -21,7 +21,7 @@ CYCLE = 60 * SLOT
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Wait for what no event tells."""
+    """Wait for a condition for which there is no event."""
     async with asyncio.timeout(GUARD):
         while not condition():  # noqa: ASYNC110 - there is no event
             await asyncio.sleep(0.001)

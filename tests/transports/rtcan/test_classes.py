@@ -256,7 +256,7 @@ async def test_delivered_means_seen_on_the_bus() -> None:
         assert not subscriber.queue
 
 
-async def test_two_publishers_of_one_topic_are_two_inlets() -> None:
+async def test_two_publishers_of_one_topic_have_two_message_ids() -> None:
     async with lab("A", "B", "C") as (made, (alice, bob, carol)):
         subscriber = carol.subscribe("number", Float32)
         publishers = [node.advertise("number", Float32) for node in (alice, bob)]
@@ -272,7 +272,7 @@ async def test_two_publishers_of_one_topic_are_two_inlets() -> None:
         assert len({message >> 8 for message in messages}) == 1
 
 
-async def test_nobody_gets_what_it_does_not_subscribe() -> None:
+async def test_no_module_gets_what_it_does_not_subscribe() -> None:
     """The filters pass the ids of subscribed topics, and no others."""
     async with lab("A", "B", "C") as (made, (alice, bob, carol)):
         publisher = alice.advertise("leds", Led)
@@ -301,6 +301,6 @@ async def test_network_time_is_the_same_everywhere() -> None:
         assert ours is not None
         assert theirs is not None
         assert abs(ours - theirs) < CYCLE * 1e-4 + 2  # the drift of a cycle
-        told = made.link("B").utc()
-        assert told is not None
-        assert abs(told[0] - bob.now()) < 100_000 * 5.0 + 2_000_000
+        utc = made.link("B").utc()
+        assert utc is not None
+        assert abs(utc[0] - bob.now()) < 100_000 * 5.0 + 2_000_000

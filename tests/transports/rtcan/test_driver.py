@@ -43,7 +43,7 @@ class Port(CanPort):
         self.stuck = False
         self.driver: EngineDriver
 
-    async def run(self, user: object, opened: Callable[[], object]) -> None:
+    async def run(self, listener: object, opened: Callable[[], object]) -> None:
         raise NotImplementedError
 
     def transmit(self, order: Transmit) -> None:
@@ -62,7 +62,7 @@ class Port(CanPort):
 
 
 class Owner:
-    """Writes down what it is told, and publishes once when it is ready."""
+    """Records what the driver calls, and publishes once when the node is ready."""
 
     def __init__(self) -> None:
         self.actions: list[Action] = []
@@ -144,7 +144,7 @@ async def test_drained_when_all_is_on_the_bus_or_it_takes_too_long() -> None:
     assert port.now() - before < 700_000_000
 
 
-async def test_what_is_discarded_is_told_after_the_bus_is_down() -> None:
+async def test_what_is_discarded_follows_the_bus_being_down() -> None:
     driver, port, owner = make()
     driver.up()
     await asyncio.sleep(3.0)

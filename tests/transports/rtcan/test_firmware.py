@@ -27,7 +27,7 @@ async def test_its_topics_arrive_under_the_id_that_it_answers() -> None:
         assert sample.publisher_class is r2p.PublisherClass.SPORADIC
         mask = rtcan.MESSAGE_MASK
         assert [each for each in made.link("PC1").engine.filters() if each[1] == mask] == [(MESSAGE << 7, mask)]
-        assert any(isinstance(each, management.SubscribeRequest) for each in firmware.heard)
+        assert any(isinstance(each, management.SubscribeRequest) for each in firmware.received)
         assert not made.link("PC1").losses
 
 
@@ -48,7 +48,7 @@ async def test_it_gets_what_it_asks_for_the_latched_value_too() -> None:
 
 
 async def test_management_waits_for_silence() -> None:
-    """Each message begins 33 ms after the last frame of management of anybody."""
+    """Each message begins 33 ms after the last frame of management on the bus."""
     made = Lab()
     async with Firmware(made.can), made.module("PC1") as node:
         for number in range(10):
@@ -99,4 +99,4 @@ async def test_stop_of_a_firmware_module_is_what_it_expects() -> None:
         await asyncio.sleep(2.0)
         made.host("PC1").command(r2p.Command.STOP, "IMU1")
         await asyncio.sleep(0.2)
-        assert management.Stop("IMU1") in firmware.heard
+        assert management.Stop("IMU1") in firmware.received

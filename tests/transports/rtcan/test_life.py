@@ -52,13 +52,13 @@ async def test_nothing_is_announced_before_the_node_has_an_id() -> None:
             assert not link.up
             assert "not on the bus" in link.guarantee("leds", r2p.PublisherClass.NON_REAL_TIME)
             claims = made.sent(lambda found: rtcan.high_byte(found.message) == rtcan.MANAGEMENT)
-            assert len(claims) <= 4  # the CLAIM, which nobody acknowledges
+            assert len(claims) <= 4  # the CLAIM, which no node acknowledges
             await asyncio.sleep(0.01)
         assert link.up
 
 
 async def test_the_master_dies_and_another_one_takes_over() -> None:
-    """Slots are kept, and nobody sends outside of them; who had none for some cycles says so."""
+    """Slots are kept, and no module sends outside of them. A publisher that had none for some cycles is degraded."""
     async with lab("A", "B", "C") as (made, nodes):
         publishers = [node.advertise(node.module, PWM2, r2p.Periodic(0.005, PWM2)) for node in nodes]
         subscribers = {node.module: node.subscribe("x", PWM2) for node in nodes}
@@ -89,7 +89,7 @@ async def _listen(node: r2p.Node, topic: str) -> None:
         pass
 
 
-async def test_a_lost_slot_is_told_and_the_topic_goes_on() -> None:
+async def test_a_lost_slot_is_signalled_and_the_topic_goes_on() -> None:
     degraded: list[r2p.Missed] = []
     made = Lab()
     async with made.module("A", options={"priority": 0}) as alice:
@@ -152,7 +152,7 @@ async def test_a_latched_value_comes_again_when_its_reader_reboots() -> None:
         await until(lambda: values == [Led(led=7)] * 2)
 
 
-async def test_a_subscriber_that_says_nothing_any_more_loses_its_lease() -> None:
+async def test_a_subscriber_that_is_silent_loses_its_lease() -> None:
     async with lab("A", "B") as (made, (alice, bob)):
         publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
         await publisher.wait_subscriber()
@@ -196,8 +196,8 @@ async def test_two_nodes_of_one_id_the_one_that_came_later_yields() -> None:
         module = r2p.Module("B", via=made.can.transport(RtcanOptions(id=7, priority=1)), watchdog=False)
         events = module.events()
         async with module:
-            told = await notice(events, "id conflict")
-            assert "7" in told.text
+            conflict = await notice(events, "id conflict")
+            assert "7" in conflict.text
             assert not module.links[0].up
             assert made.link("A").up
             assert made.link("A").engine.id8 == 7
@@ -303,7 +303,7 @@ async def test_stop_is_urgent() -> None:
         assert made.host("A").stopped
 
 
-async def test_a_fixed_id_that_is_taken_is_waited_for_and_that_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_fixed_id_that_is_taken_is_waited_for_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "r2p")
     made = Lab()
     async with AsyncExitStack() as stack, made.module("C"):

@@ -22,7 +22,7 @@ TOPICS = 8
 async def test_one_election_and_not_a_period_is_missed(
     bitrate: int, slots: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """None of them knows who else will come. What all have to tell of their topics fills the bus for a while."""
+    """None of them knows which others will come. The announcements of all topics fill the bus for a while."""
     caplog.set_level(logging.INFO, "r2p")
     made = Lab(bitrate=bitrate)
     async with AsyncExitStack() as stack:
