@@ -71,7 +71,8 @@ def inadmissible(timing: Timing, size: int, period: float) -> str | None:
     """Why there can never be slots for messages of `size` bytes each `period` seconds. None: there may be."""
     wanted = round(period * _SECOND) // timing.slot
     fragments = rtcan.fragment_count(size)
-    answer = Calendar(timing.slots).admit(rtcan.FIRST_TOPIC << 8, wanted, fragments, round_down=True)
+    any_message = rtcan.message_id(rtcan.FIRST_TOPIC, 0)
+    answer = Calendar(timing.slots).admit(any_message, wanted, fragments, round_down=True)
     return answer.text if isinstance(answer, Refusal) else None
 
 

@@ -22,7 +22,7 @@ def recorded(kind: str, topic: str = "") -> list[Frame]:
     frames: list[Frame] = []
     for entry in _entries():
         frames.append(_frame(entry))
-        if not entry.decoded or frames[-1].id & 0x7F:
+        if not entry.decoded or rtcan.decode_identifier(frames[-1].id).left:
             continue
         if entry.decoded.get("type") == kind and topic in ("", entry.decoded["name"]):
             return frames
@@ -32,7 +32,8 @@ def recorded(kind: str, topic: str = "") -> list[Frame]:
 
 def recorded_data() -> list[Frame]:
     """The recorded messages of `leds`, one frame each."""
-    return [_frame(entry) for entry in _entries() if entry.can_id is not None and entry.can_id >> 7 & 0xFFFF == MESSAGE]
+    frames = [_frame(entry) for entry in _entries() if entry.can_id is not None]
+    return [frame for frame in frames if rtcan.decode_identifier(frame.id).message == MESSAGE]
 
 
 def _entries() -> list[Entry]:

@@ -65,6 +65,10 @@ class Lab:
             and accept(rtcan.decode_identifier(each.frame.id))
         ]
 
+    def identifiers(self, accept: Callable[[rtcan.Identifier], bool], module: str = "") -> list[rtcan.Identifier]:
+        """The identifiers of these frames."""
+        return [rtcan.decode_identifier(each.frame.id) for each in self.sent(accept, module)]
+
     def hrt(self, module: str) -> list[FrameRecord]:
         """Its frames in slots of its own, without syncs."""
         return self.sent(lambda found: found.laxity == rtcan.HRT and rtcan.high_byte(found.message) > 0, module)

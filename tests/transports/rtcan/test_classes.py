@@ -169,7 +169,7 @@ async def test_events_go_by_least_laxity() -> None:
         await late.publish(Led())
         await soon.publish(Led())
         await asyncio.sleep(0.005)
-        laxities = [found.frame.id >> 23 for found in made.sent(lambda found: 0 < found.laxity < 50)]
+        laxities = [found.laxity for found in made.identifiers(lambda found: 0 < found.laxity < 50)]
         assert laxities[0] <= 10
         assert 30 <= laxities[1] <= 40
         sample = subscribers[1].queue.popleft()
@@ -236,8 +236,8 @@ async def test_a_message_of_1024_bytes() -> None:
         await publisher.wait_subscriber()
         await publisher.publish(message)
         assert await subscriber.fetch(timeout=1.0) == message
-        frames = made.sent(lambda found: found.laxity == rtcan.NRT, "A")
-        assert [each.frame.id & 0x7F for each in frames] == list(range(127, -1, -1))
+        found = made.identifiers(lambda found: found.laxity == rtcan.NRT, "A")
+        assert [each.left for each in found] == list(range(127, -1, -1))
 
 
 async def test_delivered_means_seen_on_the_bus() -> None:
@@ -267,9 +267,9 @@ async def test_two_publishers_of_one_topic_have_two_message_ids() -> None:
         samples = subscriber.samples()
         seen = {(sample.source.module, sample.data) for sample in [await anext(samples), await anext(samples)]}
         assert {module for module, _ in seen} == {"A", "B"}
-        messages = {each.frame.id >> 7 & 0xFFFF for each in made.sent(lambda found: found.laxity == rtcan.NRT)}
+        messages = {each.message for each in made.identifiers(lambda found: found.laxity == rtcan.NRT)}
         assert len(messages) == 2
-        assert len({message >> 8 for message in messages}) == 1
+        assert len({rtcan.high_byte(message) for message in messages}) == 1
 
 
 async def test_no_module_gets_what_it_does_not_subscribe() -> None:
@@ -280,14 +280,14 @@ async def test_no_module_gets_what_it_does_not_subscribe() -> None:
         await publisher.wait_subscriber()
         await publisher.publish(Led())
         await subscriber.fetch(timeout=1.0)
-        message = made.sent(lambda found: found.laxity == rtcan.NRT)[0].frame.id >> 7 & 0xFFFF
+        message = made.identifiers(lambda found: found.laxity == rtcan.NRT)[0].message
         wanted = {each: made.link(each).engine.filters() for each in ("B", "C")}
-        mask = rtcan.MESSAGE_MASK
-        assert (message << 7, mask) in wanted["B"]
-        assert (message << 7, mask) not in wanted["C"]
+        needed = rtcan.encode_identifier(0, message), rtcan.MESSAGE_MASK
+        assert needed in wanted["B"]
+        assert needed not in wanted["C"]
         subscriber.close()
         await asyncio.sleep(0.1)
-        assert (message << 7, mask) not in made.link("B").engine.filters()
+        assert needed not in made.link("B").engine.filters()
         assert not publisher.subscribers
         assert not carol.subscribers
 

@@ -26,7 +26,9 @@ async def test_its_topics_arrive_under_the_id_that_it_answers() -> None:
         assert sample.source == r2p.Source("IMU1", "", "sim:")
         assert sample.publisher_class is r2p.PublisherClass.SPORADIC
         mask = rtcan.MESSAGE_MASK
-        assert [each for each in made.link("PC1").engine.filters() if each[1] == mask] == [(MESSAGE << 7, mask)]
+        assert [each for each in made.link("PC1").engine.filters() if each[1] == mask] == [
+            (rtcan.encode_identifier(0, MESSAGE), mask)
+        ]
         assert any(isinstance(each, management.SubscribeRequest) for each in firmware.received)
         assert not made.link("PC1").losses
 
@@ -40,7 +42,7 @@ async def test_it_gets_what_it_asks_for_the_latched_value_too() -> None:
         await publisher.publish(Velocity3(x=2.0))
         await asyncio.sleep(0.01)
         id8 = made.link("PC1").engine.id8
-        assert {message & 0xFF for message, _ in firmware.commands} == {id8}
+        assert {rtcan.id8_of(message) for message, _ in firmware.commands} == {id8}
         assert [Velocity3(x=1.0), Velocity3(x=2.0)] == [
             r2p.layout(Velocity3).decode(data) for _, data in firmware.commands
         ]
@@ -55,10 +57,11 @@ async def test_management_waits_for_silence() -> None:
             node.advertise(f"topic{number}", Led)
         await asyncio.sleep(5.0)
         frames = made.sent(lambda found: found.message == rtcan.FIRMWARE_MANAGEMENT)
-        ours = [at for at, each in enumerate(frames) if each.senders == ("PC1",) and each.frame.id & 0x7F == 3]
+        firsts = [at for at, each in enumerate(frames) if rtcan.decode_identifier(each.frame.id).left == 3]
+        ours = [at for at in firsts if frames[at].senders == ("PC1",)]
         assert len(ours) > 20
         assert all(frames[at].start - frames[at - 1].end >= 33_000_000 for at in ours)
-        assert not made.sent(lambda found: found.message >> 8 == rtcan.MANAGEMENT)
+        assert not made.sent(lambda found: rtcan.high_byte(found.message) == rtcan.MANAGEMENT)
 
 
 async def test_subscriptions_of_firmware_never_expire_and_those_of_r2p_do() -> None:

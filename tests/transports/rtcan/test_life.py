@@ -232,8 +232,8 @@ async def test_two_topics_never_share_a_high_byte() -> None:
         await other.publish(PWM2(pwm1=1))
         assert await ones.fetch(timeout=1.0) == Led(led=1)
         assert await others.fetch(timeout=1.0) == PWM2(pwm1=1)
-        data = made.sent(lambda found: found.laxity == rtcan.NRT)
-        assert len({each.frame.id >> 15 & 0xFF for each in data}) == 2
+        data = made.identifiers(lambda found: found.laxity == rtcan.NRT)
+        assert len({rtcan.high_byte(each.message) for each in data}) == 2
 
 
 def _colliding() -> tuple[str, str]:
@@ -280,9 +280,9 @@ async def test_publishers_of_a_topic_share_a_high_byte() -> None:
         for publisher, led in (alices, 1), (bobs, 2):
             await publisher.publish(Led(led=led))
             assert await subscriber.fetch(timeout=1.0) == Led(led=led)
-        data = made.sent(lambda found: found.laxity == rtcan.NRT)
-        assert len({each.frame.id >> 7 & 0xFFFF for each in data}) == 2
-        assert len({each.frame.id >> 15 & 0xFF for each in data}) == 1
+        data = made.identifiers(lambda found: found.laxity == rtcan.NRT)
+        assert len({each.message for each in data}) == 2
+        assert len({rtcan.high_byte(each.message) for each in data}) == 1
 
 
 async def test_stop_is_urgent() -> None:
