@@ -170,7 +170,7 @@ class _PythonCanBus(OpenInterface):
     def _handed_over(self, frame: Frame, mailbox: Mailbox, error: BaseException | None) -> None:
         """The driver has the frame, or raised."""
         now = self._clock.monotonic()
-        if isinstance(error, self._can.CanTimeoutError):
+        if isinstance(error, self._can.CanTimeoutError):  # the driver may send it all the same
             self._mailboxes.failed(mailbox, Outcome.UNKNOWN, now)
         elif error is not None:
             self._failed(error)

@@ -86,7 +86,7 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
         except OSError as error:
             listener.waits(f"{self.name}: {_reason(error)}")
             return False
-        self.one_shot = interface.one_shot
+        self.one_shot = interface.one_shot  # read each time: the interface may have been configured anew while down
         bus.set_filters(self._filters)
         self._bus = bus
         try:
@@ -200,7 +200,7 @@ class _SocketCanBus(OpenInterface):
 
     def _own_frame(self, identifier: int, data: bytes, stamp: int) -> None:
         if not self._mailboxes.seen(identifier, data, stamp, self._clock.monotonic()):
-            self._listener.fault("confirmed too late")
+            self._listener.fault("confirmed too late")  # it was given up as UNKNOWN, and is not sent again
 
     def _other_frame(self, identifier: int, data: bytes, stamp: int) -> None:
         extended, remote = bool(identifier & rawsocket.DATA), bool(identifier & socket.CAN_RTR_FLAG)

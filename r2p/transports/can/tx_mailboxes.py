@@ -104,7 +104,7 @@ class TxMailboxes:
 
     def poll(self, now: int) -> None:
         """Hand over what is due, the most urgent class first; give up what is too late."""
-        for mailbox in Mailbox:
+        for mailbox in Mailbox:  # in the order of urgency
             waiting = self._frames.get(mailbox)
             if waiting is None:
                 continue
@@ -128,7 +128,7 @@ class TxMailboxes:
     def _due(self, waiting: _WaitingFrame, *, blocked: bool) -> int:
         if waiting.handed_over:
             return waiting.due
-        too_late = waiting.latest + 1
+        too_late = waiting.latest + 1  # a frame that waits for its turn behind another one can only become too late
         return too_late if blocked else min(waiting.due, too_late)
 
     def _end(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:

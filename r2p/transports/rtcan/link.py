@@ -259,7 +259,7 @@ class RtcanLink(BufferedLink):
     def topic_changed(self, topic: Topic) -> None:
         refused = self._topic_ids.refused
         known = topic.name in refused
-        refused.discard(topic.name)
+        refused.discard(topic.name)  # `params`, which this calls, puts it back if there is still no high byte
         super().topic_changed(topic)
         if topic.name in refused and not known:
             text = f"topic {topic.name}: all message ids are taken; it is published as soon as one comes free"

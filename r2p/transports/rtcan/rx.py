@@ -141,12 +141,12 @@ class SampleBuilder:
         received = arrival.received
         started = self._port.monotonic(self._started(received))
         now = self._now()
-        if now >= self._offset_until:
+        if now >= self._offset_until:  # two clocks of one computer: not worth two system calls per message
             self._offset = self._clock.now() - self._clock.monotonic()
             self._offset_until = now + _OFFSET_VALID
         stamp = self._offset + started
         source = self._senders.source(topic, arrival.message)
-        laxity = received.laxity
+        laxity = received.laxity  # ms that were left; SRT_MAX stands for more, too, so it gives no deadline
         deadline = stamp + laxity * _MILLISECOND if rtcan.HRT < laxity < rtcan.SRT_MAX else 0
         sender = self._discovery.modules.get(source.module)
         return Sample(
@@ -218,13 +218,15 @@ class MessageIdMap:
         return bool(over)
 
     def _plausible(self, message: int, source: PeerAddress) -> bool:
+        # Without this check a module could claim the id of another one, and end what is received from that.
         if self._engine.profile is Profile.FIRMWARE:
             return message != rtcan.FIRMWARE_MANAGEMENT
         return rtcan.high_byte(message) >= rtcan.FIRST_TOPIC and rtcan.id8_of(message) == source
 
     def _assign(self, now: int, message: int, name: str, source: PeerAddress) -> None:
-        """Assign an id to this publisher alone. A publisher with an address of its own has one id at a time."""
+        """Assign an id to this publisher alone."""
         ids = self._ids[name, source]
+        # With an address of its own a publisher has one id at a time. Those that share an address have one each.
         stale = set() if source in (FIRMWARE, R2P) else ids - {message}
         if self.topics.get(message, name.encode()) != name.encode():
             stale.add(message)
@@ -236,7 +238,7 @@ class MessageIdMap:
     def _remove_id(self, now: int, message: int) -> None:
         name = self.topics.pop(message, b"").decode()
         topic = self._space.topics.get(name)
-        if topic is not None and topic.wanted:
+        if topic is not None and topic.wanted:  # stay subscribed, so that what is still on its way counts as lost
             self.lingering[message] = now + _LINGER
         else:
             self._engine.unsubscribe(message)

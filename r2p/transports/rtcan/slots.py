@@ -89,7 +89,7 @@ class SlottedTopics:
         self._clock = clock
         self._has_subscribers = has_subscribers
         self._by_high: dict[int, SlottedTopic] = {}
-        self._waiters: list[asyncio.Future[None]] = []
+        self._changed = asyncio.Event()
 
     def update(self, topic: Topic, high: int | None) -> None:
         """Request and release slots after a change of a topic's publishers, or of its high byte (None: it has none).
@@ -99,7 +99,7 @@ class SlottedTopics:
         publisher = next((each for each in topic.slot_publishers if isinstance(each, PeriodicPublisher)), None)
         known = self.by_topic.get(topic.name)
         if known is not None and (known.publisher, known.high) != (publisher, high):
-            self._release(known)
+            self._release(known)  # slots belong to a message id, and are as long as the publisher's messages
             known = None
         if known is None and publisher is not None and high is not None:
             self._reserve(SlottedTopic(topic, publisher, high))
@@ -107,16 +107,12 @@ class SlottedTopics:
     async def wait_until(self, condition: Callable[[], bool]) -> None:
         """Wait for a condition that events about slots bring about."""
         while not condition():
-            waiter = asyncio.get_running_loop().create_future()
-            self._waiters.append(waiter)
-            await waiter
+            self._changed.clear()  # tasks that wait already were woken by `set`
+            await self._changed.wait()
 
     def wake_waiters(self) -> None:
         """Let `wait_until` evaluate its conditions again."""
-        waiters, self._waiters = self._waiters, []
-        for waiter in waiters:
-            if not waiter.done():
-                waiter.set_result(None)
+        self._changed.set()
 
     def close(self) -> None:
         """Release all slots."""
@@ -165,12 +161,12 @@ class SlottedTopics:
 
     def _payload(self, each: SlottedTopic, due: Due) -> bytes | None:
         """Have the publisher make the message of this slot."""
-        if not each.is_clock:
+        if not each.is_clock:  # its first slot: until here its own clock went on
             each.is_clock = each.publisher.use_slot_clock(self._link, each.interval / _SECOND)
             each.clock_elsewhere = not each.is_clock
             self.wake_waiters()
             if each.clock_elsewhere:
-                return None  # here it is soft real-time
+                return None  # the other link's clock makes the messages, which go from here as soft real-time ones
         since = round((due.at - each.due) / each.interval) if each.due else 1  # periods since the last slot
         each.due = due.at
         scheduled = self._driver.port.monotonic(due.at)

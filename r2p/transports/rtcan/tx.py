@@ -140,7 +140,7 @@ class Transmitter:
 
     def send_management(self, data: bytes, *, urgent: bool) -> Sequence[Action]:
         """Send a management message, marked as r2p's where all modules have one id."""
-        handle = None
+        handle = None  # only of a response its end is of interest
         if management.type_of(data) == ManagementType.SUBSCRIBE_RESPONSE and self._engine.ready:
             handle = self._response = ResponseHandle()
         if self._engine.profile is Profile.FIRMWARE:
@@ -171,6 +171,7 @@ class Transmitter:
 
     def _time_left(self, topic: str, sample: Sample, publisher: PublisherHandle | None) -> int:
         """Ns until the deadline. A latched value that is sent once more gets a new one."""
+        # A sample from another computer has `expires`, its deadline by the clock here.
         left = (sample.expires or sample.deadline) - self._clock.now() if sample.deadline else 0
         if left > 0 or (sample.deadline and not (publisher is not None and publisher.latch)):
             return left
