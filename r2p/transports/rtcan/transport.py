@@ -118,17 +118,17 @@ async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanP
     hub.attach(link)
     running = asyncio.create_task(port.run(link.driver, opened), name=f"{name} port")
     try:
-        await asyncio.wait([running])
+        await asyncio.wait([running])  # unlike `await running`, this does not cancel the port when it is cancelled
         await running
     finally:
         try:
-            if not running.done():
+            if not running.done():  # else the port has failed, and sends nothing any more
                 await link.drain(_DRAIN_TIMEOUT)
             link.close()
             if not running.done():
                 await link.driver.drain(_LEAVE_TIMEOUT)
         finally:
-            link.close()
+            link.close()  # again, as a second cancellation may have ended the wait before the first one
             running.cancel()
             await asyncio.wait([running])
             link.driver.close()
