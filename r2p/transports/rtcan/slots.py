@@ -7,7 +7,6 @@ for every other link, and the link makes soft real-time messages of that.
 
 import asyncio
 from collections.abc import Callable
-from typing import Any
 
 import msgspec
 
@@ -16,8 +15,7 @@ from r2p.codecs import rtcan
 from r2p.protocols.rtcan.calendar import Calendar, Refusal
 from r2p.protocols.rtcan.cycle import Timing
 from r2p.protocols.rtcan.events import Degraded, Done, Due, Fate, Granted, Refused
-from r2p.runtime.publishers import PeriodicPublisher
-from r2p.runtime.topic import Topic
+from r2p.runtime.topic import SlotPublisher, Topic
 from r2p.transports.link import Link
 from r2p.transports.rtcan.driver import EngineDriver
 
@@ -33,7 +31,7 @@ class SlottedTopic(msgspec.Struct, eq=False):
     """
 
     topic: Topic
-    publisher: PeriodicPublisher[Any]
+    publisher: SlotPublisher
     high: int
     period: int = 0
     phase: int = 0
@@ -94,9 +92,9 @@ class SlottedTopics:
     def update(self, topic: Topic, high: int | None) -> None:
         """Request and release slots after a change of a topic's publishers, or of its high byte (None: it has none).
 
-        Of the publishers that are periodic the first gets slots.
+        Of the publishers that can use slots the first gets them.
         """
-        publisher = next((each for each in topic.slot_publishers if isinstance(each, PeriodicPublisher)), None)
+        publisher = next(iter(topic.slot_publishers), None)
         known = self.by_topic.get(topic.name)
         if known is not None and (known.publisher, known.high) != (publisher, high):
             self._release(known)  # slots belong to a message id, and are as long as the publisher's messages
@@ -121,7 +119,7 @@ class SlottedTopics:
 
     def undecided(self, topic: Topic) -> bool:
         """Whether a topic wants slots, and may still get some."""
-        if not any(isinstance(each, PeriodicPublisher) for each in topic.publishers):
+        if not any(isinstance(each, SlotPublisher) for each in topic.publishers):
             return False
         slotted = self.by_topic.get(topic.name)
         return slotted is None or not (slotted.is_clock or slotted.clock_elsewhere)
