@@ -1,17 +1,17 @@
-"""The header of messages on zenoh: what the payload, which is one packed message or several, does not say.
+"""The header of messages on zenoh: what the payload, which is one packed message or several, does not contain.
 
-It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by what stays the same from message to
-message of one publisher, the origin; so a reader looks that up in a table, and decodes it once. What a publisher sends
+It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by the origin, which stays the same from
+message to message of one publisher; so a reader looks it up in a table, and decodes it once. What a publisher sends
 without a pause may travel together: the payload is then several messages of one size, one after the other, whose
-serials and sequences count on from those in the header.
+serials and sequences count on from those in the header. Credit and the sender of management messages are here, too.
 
 | bytes | what |
 | --- | --- |
 | 0 | version, 1 |
 | 1 | flags: bit 0 the stamp is not the publisher's, bit 1 there is a clock part |
-| 2 | hops: gateways that it has crossed |
+| 2 | hops: gateways that the message has crossed |
 | 3 | messages in the payload besides the first one: m |
-| 4..7 | serial: counts what the sender has sent on this topic in this class; a gap is what was lost on the way |
+| 4..7 | serial: counts what the sender has sent on this topic in this class; what is missing was lost on the way |
 | 8..15 | sequence: counts what the publisher has published, from 1; 0: not known |
 | 16..23 | stamp, UTC in ns |
 | 24..31 | deadline, UTC in ns; 0: none |
@@ -40,7 +40,9 @@ FLAG_RESTAMPED = 1
 FLAG_CLOCK = 2
 
 SERIAL_WRAP = 0xFFFFFFFF
-_SEQUENCE_MOST = 0xFFFFFFFFFFFFFFFF
+"""Mask for serials, which have 32 bits on the wire."""
+
+_SEQUENCE_MAX = 0xFFFFFFFFFFFFFFFF
 
 _FIXED = struct.Struct("<BBBBIQqq")
 _CLOCK = struct.Struct("<IqI")
@@ -49,16 +51,16 @@ _CREDIT = struct.Struct("<BBII")
 _LEAVING = 0x80
 _SENDER = struct.Struct("<BI")
 _unpack = _FIXED.unpack_from
-_pack_start = struct.Struct("<IIQqq").pack
+_pack_start = struct.Struct("<IIQqq").pack  # as _FIXED, with the first four bytes as one number
 
-PACKET_MOST = 256
+PACKET_MAX = 256
 """Messages in one payload."""
 
 _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
 _NAMES = re.compile(rf"((?:{MODULE_PATH})?)/([A-Za-z0-9_]{{0,8}})".encode())
 _MODULE = re.compile(MODULE_PATH)
 _CLASSES = (1, 2, 3)
-_REMEMBERED = 4096  # origins
+_REMEMBERED_MAX = 4096  # origins that a reader keeps
 
 
 class ClockOffset(msgspec.Struct, frozen=True, gc=False):
@@ -72,12 +74,12 @@ class ClockOffset(msgspec.Struct, frozen=True, gc=False):
     error: int
 
     def utc(self, time: int) -> int:
-        """UTC (ns) of an instant (ns) of that clock, such as one in a payload, known to +-`error`."""
+        """Translate an instant (ns) of that clock, such as one in a payload, to UTC (ns), known to +-`error`."""
         return time + self.offset
 
 
 class Origin(msgspec.Struct, frozen=True):
-    """Who published a message, and who put it on this network.
+    """The publisher of a message, and the module that put it on this network.
 
     `sender` is the r2p module that sent it: the publisher's, or a gateway; `instance` the number of the module that
     published it, 0 for firmware. Names are empty where they are not known. `fingerprint` all zero: type not known.
@@ -107,7 +109,7 @@ class Header(msgspec.Struct, frozen=True, gc=False):
 
 
 class Packer:
-    """Headers without a clock part, of one origin; `start` is what `start_of` says."""
+    """Packs headers without a clock part, of one origin: the fast way. `start` is the result of `start_of`."""
 
     __slots__ = ("_pack", "_tail", "origin")
 
@@ -117,11 +119,11 @@ class Packer:
         self._pack = struct.Struct(f"<IIQqq{len(self._tail)}s").pack
 
     def one(self, start: int, serial: int, sequence: int, stamp: int, deadline: int) -> bytes:
-        """The header of one message."""
+        """Pack the header of one message."""
         return self._pack(start, serial & SERIAL_WRAP, sequence, stamp, deadline, self._tail)
 
     def several(self, start: int, serial: int, sequence: int, deadline: int, stamps: list[int]) -> bytes:
-        """The header of so many messages, `PACKET_MOST` at most; serial and sequence are those of the first."""
+        """Pack the header of several messages, PACKET_MAX at most; serial and sequence are those of the first."""
         first, *others = stamps
         more = len(others)
         fixed = _pack_start(start | more << 24, serial & SERIAL_WRAP, sequence, first, deadline)
@@ -129,12 +131,12 @@ class Packer:
 
 
 def start_of(hops: int, *, stamped: bool) -> int:
-    """The first four bytes of a header of one message without a clock part."""
+    """Return the first four bytes of the header of one message without a clock part, as a number."""
     return VERSION | (0 if stamped else FLAG_RESTAMPED << 8) | min(hops, 255) << 16
 
 
 def encode(header: Header) -> bytes:
-    """The bytes of a header; serial and error are cut to their 32 bits, hops to 255."""
+    """Encode a header; serial and error are cut to their 32 bits, hops to 255."""
     flags = (0 if header.stamped else FLAG_RESTAMPED) | (0 if header.clock is None else FLAG_CLOCK)
     hops, more, serial = min(header.hops, 255), len(header.more), header.serial & SERIAL_WRAP
     fixed = _FIXED.pack(VERSION, flags, hops, more, serial, header.sequence, header.stamp, header.deadline)
@@ -142,7 +144,7 @@ def encode(header: Header) -> bytes:
 
 
 class HeaderReader(Generic[T]):
-    """Decodes headers; `remember` makes of each new origin what is kept of it, and handed out with its headers."""
+    """Decodes headers. `remember` is called with each new origin; its result is kept, and returned with its headers."""
 
     def __init__(self, remember: Callable[[Origin], T]) -> None:
         self._make = remember
@@ -150,8 +152,8 @@ class HeaderReader(Generic[T]):
         """By the bytes of the origin."""
 
     def read(self, data: bytes) -> tuple[T, int, int, tuple[int, ...], int, int, bool, ClockOffset | None]:
-        """What is known of the origin; serial and sequence of the first message, the stamps of all, then deadline,
-        hops, whether the stamps are the publisher's, and clock.
+        """Return the result of `remember` for the origin, serial and sequence of the first message, the stamps of all,
+        then deadline, hops, whether the stamps are the publisher's, and clock.
 
         Raises `UnknownType` for a version to ignore, else `DecodeError`.
         """
@@ -174,7 +176,7 @@ class HeaderReader(Generic[T]):
                 raise DecodeError("the header ends in its stamps")
             stamps += _stamps(more).unpack_from(data, at)
             at += 8 * more
-        if sequence + more > _SEQUENCE_MOST:
+        if sequence + more > _SEQUENCE_MAX:
             raise DecodeError("the sequence ends in this packet")
         tail = data[at:]
         known = self.known.get(tail)
@@ -184,22 +186,22 @@ class HeaderReader(Generic[T]):
 
     def _remember(self, tail: bytes) -> T:
         origin = _decode_origin(tail)
-        if len(self.known) >= _REMEMBERED:
+        if len(self.known) >= _REMEMBERED_MAX:
             self.known.clear()
         known = self.known[tail] = self._make(origin)
         return known
 
 
 def decode(data: bytes) -> Header:
-    """The header in these bytes. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    """Decode a header. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
     origin, serial, sequence, stamps, deadline, hops, stamped, clock = HeaderReader(_itself).read(data)
     return Header(origin, serial, sequence, stamps[0], deadline, hops, stamped, clock, stamps[1:])
 
 
 class Credit(msgspec.Struct, frozen=True, gc=False):
-    """A subscriber's session tells a publisher's how far it has come: serial `serial` of this topic and class.
+    """How far a subscriber's session has come: up to this serial of the publisher's session, in this topic and class.
 
-    `leaving`: it does not subscribe any more, so this is the last one.
+    `leaving`: it does not subscribe any more, so this is its final credit.
     """
 
     session: int
@@ -210,14 +212,14 @@ class Credit(msgspec.Struct, frozen=True, gc=False):
 
 
 def encode_credit(credit: Credit) -> bytes:
-    """`u8 version; u8 class; u32 session; u32 serial`, then the topic in ASCII; class + 128: the last one."""
+    """`u8 version; u8 class; u32 session; u32 serial`, then the topic in ASCII; class + 128: `leaving`."""
     publisher_class = credit.publisher_class | _LEAVING * credit.leaving
     fixed = _CREDIT.pack(VERSION, publisher_class, credit.session, credit.serial & SERIAL_WRAP)
     return fixed + credit.topic.encode()
 
 
 def decode_credit(data: bytes) -> Credit:
-    """Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    """Decode a credit. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
     if data[:1] != bytes((VERSION,)):
         raise UnknownType(f"version {data[:1]!r} of a credit")
     if _TOPIC.fullmatch(data, _CREDIT.size) is None:
@@ -228,12 +230,12 @@ def decode_credit(data: bytes) -> Credit:
 
 
 def encode_sender(session: int) -> bytes:
-    """Who sends a management message: `u8 version; u32 session`."""
+    """Encode the sender of a management message: `u8 version; u32 session`."""
     return _SENDER.pack(VERSION, session)
 
 
 def decode_sender(data: bytes) -> int:
-    """The session. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    """Return the session. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
     if data[:1] not in (b"", bytes((VERSION,))):
         raise UnknownType(f"version {data[:1]!r} of a sender")
     if len(data) != _SENDER.size:
@@ -243,7 +245,7 @@ def decode_sender(data: bytes) -> int:
 
 
 def name_for(module: str) -> str:
-    """What a header calls a module: by its alias where the name is too long, or in two namespaces; else by no name."""
+    """Return a module's name in headers: its alias if it is too long or in two namespaces; empty if neither fits."""
     for name in (module, module_alias(module)):
         if len(name) <= MODULE_PATH_MAX and _MODULE.fullmatch(name):
             return name

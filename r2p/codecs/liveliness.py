@@ -6,11 +6,11 @@
 The first part is the version. `SESSION` is the instance of the r2p module that declares the token, in hex; `INSTANCE`
 is that of the module concerned, another one where `HOPS` (gateways in between) is not 0, and `-` for firmware. `-`
 stands also for a node or a fingerprint that is not known; `%` for the slash of a topic or a module in a namespace.
-`SIZE` is that of a message, so 1024 at most. Tokens of another version mean nothing to us.
+`SIZE` is that of a message, so 1024 at most. Tokens of another version are ignored.
 
-In front of each token stands `live/*`, or `live`, behind the name of the network. zenoh gives each key that it passes
-on a number at every session that hears of it, up to its first wildcard, and keeps that for as long as the session
-lives: so a key without one would stay in the memory of every router, for each module that has ever been there.
+In front of each token stands `live/*`, or `live`, behind the name of the network. Every session numbers the keys that
+zenoh passes on to it, up to their first wildcard, and keeps these numbers for as long as it lives: so a key without a
+wildcard would stay in the memory of every router, for each module that has ever been there.
 """
 
 import re
@@ -26,7 +26,7 @@ from r2p.names import MODULE_PATH, MODULE_PATH_MAX
 VERSION = "1"
 
 PLACE = "live"
-"""What tokens are watched under."""
+"""The part of the key under which tokens are watched."""
 
 _WILD = "*/"
 
@@ -41,7 +41,7 @@ _TOPIC = re.compile(
 )
 _OBSERVER = 0x80
 FLAGS = 0x7F
-"""The flags of ALIVE for which there is a place."""
+"""The flags of ALIVE that a token can hold."""
 
 _ROLES = {"pub": ROLE_PUBLISHES, "sub": ROLE_SUBSCRIBES}
 _ROLE_NAMES = {role: name for name, role in _ROLES.items()}
@@ -81,7 +81,7 @@ Token = ModuleToken | TopicToken
 
 
 def encode(token: Token) -> str:
-    """The key of a token."""
+    """Encode a token as its key, without `live/*`."""
     instance = _NONE if token.instance is None else f"{token.instance:x}"
     if isinstance(token, ModuleToken):
         flags = token.flags | (_OBSERVER if token.observer else 0)
@@ -96,7 +96,7 @@ def encode(token: Token) -> str:
 
 
 def decode(key: str) -> Token:
-    """The token of a key. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
+    """Decode a key. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
     version, _, rest = key.partition("/")
     if version != VERSION:
         raise UnknownType(f"version {version[:8]} of a token")
@@ -125,11 +125,11 @@ def decode(key: str) -> Token:
             int(window),
             int(hops),
         )
-    raise DecodeError(f"{key[:80]!r} is no token")
+    raise DecodeError(f"{key[:80]!r} is not a token")
 
 
 def is_carried(token: Token) -> bool:
-    """Whether the key says what the token says. Names that came in by another link may hold what means something else
+    """Whether the token survives encoding and decoding. Names from another link may contain what means something else
     in a key, or in a key expression of zenoh, such as `/` and `*`.
     """
     try:
@@ -139,17 +139,17 @@ def is_carried(token: Token) -> bool:
 
 
 def place(token: str) -> str:
-    """The key under which a token is declared."""
+    """Return the key under which a token is declared."""
     return f"{PLACE}/{_WILD}{token}"
 
 
 def token_at(place: str) -> str:
-    """The token of a key under PLACE."""
+    """Return the token of a key under PLACE."""
     return place.removeprefix(_WILD)
 
 
 def is_module(key: str) -> bool:
-    """Whether a key is the token of a module that is more than a tool."""
+    """Whether a key is the token of a module, not of a tool."""
     try:
         token = decode(key)
     except DecodeError:

@@ -1,23 +1,23 @@
-"""How much of the time that a publisher gives its messages is left when they arrive, whatever its clock shows.
+"""How much time until its deadline a message has left when it arrives, whatever the publisher's clock shows.
 
 The clocks of two computers are not compared: they may differ by seconds. A message's delay, the instant of its arrival
-less its stamp, is the difference of the clocks and the time on the way. The least delay of a publisher's messages is
-that of those that nothing held up; so what is above it is how long a message was held up, by a stalled network, or by a
-gateway that was stopped. What every message takes alike can't be told from the difference of the clocks, and is not
+less its stamp, is the difference of the clocks plus the time on the way. The least delay of a publisher's messages is
+that of messages that nothing held up; so what is above it is how long a message was held up, by a stalled network or by
+a gateway that was stopped. What every message takes alike can't be told from the difference of the clocks, and is not
 counted.
 """
 
 _SECOND = 1_000_000_000
-_DRIFT = 2_000  # two clocks drift apart by less than a part in so many
-_BELIEVED = 5 * _SECOND  # ns for which all of a publisher's messages can be late: no link holds them up for longer
-_DOUBTED = 60 * _SECOND
+_DRIFT = 2_000  # two clocks drift apart by less than 1/2000
+_LATE_MAX = 5 * _SECOND  # ns for which all of a publisher's messages can be late: no link holds them up for longer
+_DOUBT = 60 * _SECOND  # ns in which a clock that was set back may run slowly until it is right
 
 
 class TimeLeft:
-    """What is known of one publisher's messages; all times in ns.
+    """The least delay of one publisher's messages; all times in ns.
 
-    Where all are late for longer than a link can hold them up, the publisher's clock was set back. Such a clock may run
-    slowly until it is right (r2p.clock), so for a minute it does not say what is late.
+    If all are late for longer than a link can hold them up, the publisher's clock was set back. Such a clock may run
+    slowly until it is right (r2p.clock), so for a minute no message of it counts as late.
     """
 
     __slots__ = ("_at", "_doubted_until", "_late_since", "_least")
@@ -29,8 +29,8 @@ class TimeLeft:
         self._doubted_until: int | None = None
 
     def left(self, now: int, stamp: int, deadline: int) -> int:
-        """What is left at `now` (monotonic, this computer) until `deadline`, at most all of the time after `stamp`
-        (both UTC, the publisher's clock); 0 or less: it is too late.
+        """Return what is left at `now` (monotonic, this computer) until `deadline`, at most all of the time after
+        `stamp` (both UTC, the publisher's clock); 0 or less: it is too late.
         """
         span, delay = deadline - stamp, now - stamp
         least = delay if self._least is None else min(delay, self._least + (now - self._at) // _DRIFT)
@@ -41,15 +41,15 @@ class TimeLeft:
             self._late_since = None
         elif self._late_since is None:
             self._late_since = now
-        elif now - self._late_since > _BELIEVED:
+        elif now - self._late_since > _LATE_MAX:
             least, held_up = delay, 0
-            self._doubted_until, self._late_since = now + _DOUBTED, None
+            self._doubted_until, self._late_since = now + _DOUBT, None
         self._least, self._at = least, now
         return span - held_up
 
 
 class TimesLeft:
-    """Those of many publishers, by any key; of MOST at a time."""
+    """The `TimeLeft` of many publishers, by any key; of at most MOST at a time."""
 
     MOST = 1024
 
@@ -57,10 +57,10 @@ class TimesLeft:
         self._known: dict[object, TimeLeft] = {}
 
     def of(self, publisher: object) -> TimeLeft:
-        """That of one publisher."""
+        """Return that of one publisher."""
         known = self._known.get(publisher)
         if known is None:
             if len(self._known) >= self.MOST:
-                self._known.clear()
+                self._known.clear()  # the least delay is found again within a few messages
             known = self._known[publisher] = TimeLeft()
         return known

@@ -30,13 +30,13 @@ HEADERS = st.builds(
         node=st.text(NAME, max_size=8),
     ),
     serial=U32,
-    sequence=st.integers(0, 2**64 - attachment.PACKET_MOST),
+    sequence=st.integers(0, 2**64 - attachment.PACKET_MAX),
     stamp=I64,
     deadline=I64,
     hops=st.integers(0, 255),
     stamped=st.booleans(),
     clock=st.none() | st.builds(ClockOffset, epoch=U32, offset=I64, error=U32),
-    more=st.just(()) | st.lists(I64, max_size=attachment.PACKET_MOST - 1).map(tuple),
+    more=st.just(()) | st.lists(I64, max_size=attachment.PACKET_MAX - 1).map(tuple),
 )
 
 

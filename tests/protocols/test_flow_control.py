@@ -10,84 +10,84 @@ A, B = 1, 2
 
 def test_nobody_is_waited_for_who_did_not_ask() -> None:
     flow = SendWindow()
-    flow.joined(A, 0)
+    flow.add(A, 0)
     assert flow.limit == NO_LIMIT
     flow.serial = 1000
-    assert flow.give_up() == []
+    assert flow.skip_full() == []
 
 
 def test_the_slowest_sets_the_pace() -> None:
     flow = SendWindow()
     flow.serial = 100
-    flow.joined(A, 10)
-    flow.joined(B, 20)
+    flow.add(A, 10)
+    flow.add(B, 20)
     assert flow.limit == 110
     flow.serial = 110
-    flow.credited(A, 105)
+    flow.acknowledge(A, 105)
     assert flow.limit == 115
-    flow.credited(A, 110)
+    flow.acknowledge(A, 110)
     assert flow.limit == 120
-    flow.parted(B)
+    flow.remove(B)
     assert flow.limit == 120
-    flow.parted(A)
+    flow.remove(A)
     assert flow.limit == NO_LIMIT
 
 
 def test_who_hangs_is_left_behind_and_comes_back() -> None:
     flow = SendWindow()
-    flow.joined(A, 10)
-    flow.joined(B, 10)
+    flow.add(A, 10)
+    flow.add(B, 10)
     flow.serial = 10
-    flow.credited(B, 8)
-    assert flow.give_up() == [A]
+    flow.acknowledge(B, 8)
+    assert flow.skip_full() == [A]
     assert flow.limit == 18
     flow.serial = 18
-    flow.credited(B, 18)
+    flow.acknowledge(B, 18)
     assert flow.limit == 28
-    flow.credited(A, 10)
+    flow.acknowledge(A, 10)
     assert flow.limit == 20
 
 
 def test_credits_that_mean_nothing() -> None:
     flow = SendWindow()
-    flow.joined(A, 10)
+    flow.add(A, 10)
     flow.serial = 5
-    flow.credited(B, 5)  # nobody
-    flow.credited(A, 6)  # was never sent
+    flow.acknowledge(B, 5)  # nobody
+    flow.acknowledge(A, 6)  # was never sent
     assert flow.limit == 10
-    flow.credited(A, 4)
-    flow.credited(A, 2)  # overtaken by the one before
+    flow.acknowledge(A, 4)
+    flow.acknowledge(A, 2)  # overtaken by the one before
     assert flow.limit == 14
 
 
 def test_serials_wrap() -> None:
     flow = SendWindow()
     flow.serial = 2**32 - 2
-    flow.joined(A, 10)
+    flow.add(A, 10)
     flow.serial = 2**32 + 5
-    flow.credited(A, 3)
+    flow.acknowledge(A, 3)
     assert flow.limit == 2**32 + 13
 
 
 def test_who_has_never_been_heard() -> None:
     flow = SendWindow()
     flow.serial = 3
-    flow.joined(A, 10)
+    flow.add(A, 10)
     assert flow.unacknowledged() == []
     flow.serial = 4
     assert flow.unacknowledged() == [A]
-    flow.credited(A, 4)
+    flow.acknowledge(A, 4)
     assert flow.unacknowledged() == []
 
 
 def test_gaps_repeats_and_latecomers() -> None:
     flow = ReceiveWindow(8)
-    assert [flow.gap(serial) for serial in (17, 18, 20, 20, 19, 21, 31)] == [0, 0, 1, -1, -1, 0, 9]
+    assert [flow.advance(serial) for serial in (17, 18, 20, 20, 19, 21, 31)] == [0, 0, 1, -1, -1, 0, 9]
 
 
 def test_gaps_where_serials_wrap() -> None:
     flow = ReceiveWindow(8)
-    assert [flow.gap(serial & 0xFFFFFFFF) for serial in (2**32 - 1, 2**32, 2**32 + 2)] == [0, 0, 1]
+    assert [flow.advance(serial & 0xFFFFFFFF) for serial in (2**32 - 1, 2**32, 2**32 + 2)] == [0, 0, 1]
 
 
 def test_the_first_is_answered_at_once_then_each_quarter_of_a_window() -> None:
@@ -96,7 +96,7 @@ def test_the_first_is_answered_at_once_then_each_quarter_of_a_window() -> None:
     for number in range(12):
         flow.until_credit -= 1
         if not flow.until_credit:
-            flow.credited()
+            flow.credit_sent()
             answered.append(number)
     assert answered == [0, 2, 4, 6, 8, 10]
 
@@ -104,7 +104,7 @@ def test_the_first_is_answered_at_once_then_each_quarter_of_a_window() -> None:
 def test_a_lossy_one_answers_rarely() -> None:
     flow = ReceiveWindow(0)
     flow.until_credit -= 1
-    flow.credited()
+    flow.credit_sent()
     assert flow.until_credit == SHARE
 
 
@@ -112,33 +112,33 @@ def test_what_one_that_is_gone_has_not_confirmed_is_unknown() -> None:
     flow = SendWindow()
     flow.serial = 100
     for session, window in ((A, 0), (B, 10)):
-        flow.joined(session, window)
+        flow.add(session, window)
     flow.serial = 108
-    flow.credited(B, 106)
-    assert (flow.parted(A), flow.parted(B), flow.parted(B)) == (8, 2, 0)
+    flow.acknowledge(B, 106)
+    assert (flow.remove(A), flow.remove(B), flow.remove(B)) == (8, 2, 0)
 
 
 def test_one_that_leaves_in_order_wants_no_more() -> None:
     flow = SendWindow()
-    flow.joined(A, 10)
+    flow.add(A, 10)
     flow.serial = 8
-    flow.credited(A, 5)
-    flow.leaves(A, leaving=True)
-    assert flow.parted(A) == 0
-    flow.joined(A, 10)  # it is back
+    flow.acknowledge(A, 5)
+    flow.set_leaving(A, leaving=True)
+    assert flow.remove(A) == 0
+    flow.add(A, 10)  # it is back
     flow.serial = 10
-    assert flow.parted(A) == 2
+    assert flow.remove(A) == 2
 
 
 def test_one_that_comes_back_before_it_is_gone_has_not_left() -> None:
     flow = SendWindow()
-    flow.joined(A, 10)
+    flow.add(A, 10)
     flow.serial = 8
-    flow.credited(A, 5)
-    flow.leaves(A, leaving=True)
-    flow.credited(A, 6)
-    flow.leaves(A, leaving=False)
-    assert flow.parted(A) == 2
+    flow.acknowledge(A, 5)
+    flow.set_leaving(A, leaving=True)
+    flow.acknowledge(A, 6)
+    flow.set_leaving(A, leaving=False)
+    assert flow.remove(A) == 2
 
 
 @given(st.integers(2, 64), st.lists(st.sampled_from(["send", "arrive", "lose"]), max_size=400))
@@ -146,7 +146,7 @@ def test_it_never_runs_ahead_nor_sticks(window: int, steps: list[str]) -> None:
     """Whatever is lost on the way: at most `window` are out, and all that arrived makes room again."""
     out, inward = SendWindow(), ReceiveWindow(window)
     out.serial = start = 2**32 - 50
-    out.joined(A, window)
+    out.add(A, window)
     on_the_way: list[int] = []
     taken = start
     for step in [*steps, *["send", "arrive"] * (2 * window)]:
@@ -157,12 +157,12 @@ def test_it_never_runs_ahead_nor_sticks(window: int, steps: list[str]) -> None:
             on_the_way.pop(0)
         elif step == "arrive" and on_the_way:
             serial = on_the_way.pop(0)
-            assert inward.gap(serial & 0xFFFFFFFF) >= 0
+            assert inward.advance(serial & 0xFFFFFFFF) >= 0
             taken = serial
             inward.until_credit -= 1
             if not inward.until_credit:
-                inward.credited()
-                out.credited(A, serial & 0xFFFFFFFF)
+                inward.credit_sent()
+                out.acknowledge(A, serial & 0xFFFFFFFF)
         assert len(on_the_way) <= window
         assert out.serial - taken <= 2 * window
 
@@ -171,7 +171,7 @@ def test_it_never_runs_ahead_nor_sticks(window: int, steps: list[str]) -> None:
 def test_another_window_leaves_nobody_waiting(before: int, after: int, sent: int, on_the_way: int) -> None:
     """A topic's first subscriber was a tool that would rather lose some, or the next one knows its type."""
     out, inward = SendWindow(), ReceiveWindow(before)
-    out.joined(A, before)
+    out.add(A, before)
     flying: list[int] = []
 
     def send() -> None:
@@ -183,15 +183,15 @@ def test_another_window_leaves_nobody_waiting(before: int, after: int, sent: int
         serial = flying.pop(0)
         inward.until_credit -= 1
         if not inward.until_credit:
-            inward.credited()
-            out.credited(A, serial)
+            inward.credit_sent()
+            out.acknowledge(A, serial)
 
     for _ in range(sent):
         send()
         while len(flying) > on_the_way:
             arrive()
-    inward.resized(after)
-    out.joined(A, after)
+    inward.resize(after)
+    out.add(A, after)
     for _ in range(300):
         while flying:
             arrive()

@@ -1,6 +1,6 @@
-"""Who may exchange what, among those who tell it by tokens: our side of each topic against that of every session.
+"""Which topics flow between this module and each other session, worked out from the tokens of both.
 
-Both sides see the other's tokens, so both know when two types don't fit, and tell their own user.
+Both sides see each other's tokens, so both know when two types don't fit, and tell their own user.
 """
 
 from collections import Counter
@@ -25,11 +25,11 @@ from r2p.protocols.liveliness.tokens import TokenSet, TopicRole, counterpart
 
 
 class _PeerSession(msgspec.Struct):
-    """What one r2p module on the network has declared of topics, what of it flows, and what was refused."""
+    """The topics of another module on the network: its tokens, what of them flows, and the types that don't fit."""
 
     tokens: dict[TopicRole, dict[str, TopicToken]] = msgspec.field(default_factory=dict)
     matched: dict[TopicRole, int] = msgspec.field(default_factory=dict)
-    refused: dict[TopicRole, TopicType] = msgspec.field(default_factory=dict)
+    mismatched: dict[TopicRole, TopicType] = msgspec.field(default_factory=dict)
 
 
 class Matching:
@@ -38,92 +38,92 @@ class Matching:
     def __init__(self, own: TokenSet, events: list[Event]) -> None:
         self.topics: dict[str, TopicInfo] = {}
         self.demand = Demand()
-        """What others offer and want, whether we have anything to do with it or not."""
+        """What other modules publish and subscribe, whether this one has anything to do with it or not."""
         self._own = own
         self._events = events
         self._sessions: dict[int, _PeerSession] = {}
-        self._takers: Counter[str] = Counter()
-        self._told: Counter[TopicRole] = Counter()
-        self._telling: dict[TopicRole, dict[int, _PeerSession]] = {}  # those that have tokens of it, by number
-        self._refused: Counter[str] = Counter()  # sessions whose type does not fit, by topic
+        self._subscribers: Counter[str] = Counter()  # sessions that this module sends to, by topic
+        self._token_counts: Counter[TopicRole] = Counter()
+        self._sessions_of: dict[TopicRole, dict[int, _PeerSession]] = {}  # by number
+        self._mismatches: Counter[str] = Counter()  # sessions and roles whose type does not fit, by topic
 
     def appeared(self, now: int, key: str, token: TopicToken) -> None:
-        """A publisher or subscriber of some session is there."""
+        """A publisher or subscriber is there."""
         session = self._sessions.setdefault(token.session, _PeerSession())
         topic_role = token.topic, token.role
         session.tokens.setdefault(topic_role, {})[key] = token
-        self._telling.setdefault(topic_role, {})[token.session] = session
-        self._told[topic_role] += 1
+        self._sessions_of.setdefault(topic_role, {})[token.session] = session
+        self._token_counts[topic_role] += 1
         self.demand.add(*topic_role, token.session)
         self._note(now, token)
-        self._review(token.session, session, topic_role)
+        self._match(token.session, session, topic_role)
 
     def disappeared(self, key: str, token: TopicToken) -> None:
-        """It is not there any more."""
+        """A publisher or subscriber is gone."""
         session = self._sessions[token.session]
         topic_role = token.topic, token.role
         tokens = session.tokens[topic_role]
         del tokens[key]
         if not tokens:
             del session.tokens[topic_role]
-            del self._telling[topic_role][token.session]
+            del self._sessions_of[topic_role][token.session]
             self.demand.remove(*topic_role, token.session)
-        self._review(token.session, session, topic_role)
+        self._match(token.session, session, topic_role)
         if not session.tokens:
             del self._sessions[token.session]
         self._retype(self.topics[token.topic], token.role)
-        self._told[topic_role] -= 1
-        if not self._told[topic_role]:
-            del self._told[topic_role]
-            del self._telling[topic_role]
+        self._token_counts[topic_role] -= 1
+        if not self._token_counts[topic_role]:
+            del self._token_counts[topic_role]
+            del self._sessions_of[topic_role]
             self._forget_role(*topic_role)
 
     def changed(self, topic: str, role: int) -> None:
-        """Our own side of the topic in this role has changed."""
+        """What this module does with the topic in this role has changed."""
         theirs = topic, counterpart(role)
-        for number, session in list(self._telling.get(theirs, {}).items()):
-            self._accept(session, theirs)
-            self._review(number, session, theirs)
+        for number, session in list(self._sessions_of.get(theirs, {}).items()):
+            self._clear_mismatch(session, theirs)
+            self._match(number, session, theirs)
 
-    def freshen(self, now: int) -> None:
-        """What is there is as good as just heard."""
-        for topic, role in self._told:
+    def mark_heard(self, now: int) -> None:
+        """Mark what has a token as heard now."""
+        for topic, role in self._token_counts:
             self._mark(now, self.topics[topic], role)
 
-    def _review(self, number: int, session: _PeerSession, key: TopicRole) -> None:
+    def _match(self, number: int, session: _PeerSession, key: TopicRole) -> None:
         topic, role = key
         tokens = session.tokens.get(key)
-        own = self._own.own(topic, counterpart(role))
+        own = self._own.get(topic, counterpart(role))
         if not tokens or own is None:
-            self._accept(session, key)
+            self._clear_mismatch(session, key)
             self._end(number, session, key)
         else:
-            theirs = _shape(tokens)
-            if own.shape.fits(theirs):
-                self._accept(session, key)
-                self._match(number, session, key, _detail(tokens, role))
+            theirs = _type_of(tokens)
+            if own.type.fits(theirs):
+                self._clear_mismatch(session, key)
+                self._start(number, session, key, _detail(tokens, role))
             else:
                 self._end(number, session, key)
-                if session.refused.get(key) != theirs:
-                    self._refused[topic] += key not in session.refused
-                    session.refused[key] = theirs
-                    self._events.append(Mismatched(topic, number, role, own.shape, theirs))
+                if session.mismatched.get(key) != theirs:
+                    self._mismatches[topic] += key not in session.mismatched
+                    session.mismatched[key] = theirs
+                    self._events.append(Mismatched(topic, number, role, own.type, theirs))
         if topic in self.topics:
-            self.topics[topic].mismatch = topic in self._refused
+            self.topics[topic].mismatch = topic in self._mismatches
 
-    def _accept(self, session: _PeerSession, key: TopicRole) -> None:
-        """The session's type of the topic is not refused any more."""
-        if session.refused.pop(key, None) is not None:
-            self._refused[key[0]] -= 1
-            if not self._refused[key[0]]:
-                del self._refused[key[0]]
+    def _clear_mismatch(self, session: _PeerSession, key: TopicRole) -> None:
+        """The session's type of the topic is not in the way any more."""
+        if session.mismatched.pop(key, None) is not None:
+            self._mismatches[key[0]] -= 1
+            if not self._mismatches[key[0]]:
+                del self._mismatches[key[0]]
 
-    def _match(self, number: int, session: _PeerSession, key: TopicRole, detail: int) -> None:
+    def _start(self, number: int, session: _PeerSession, key: TopicRole, detail: int) -> None:
         if session.matched.get(key) == detail:
             return
         topic, role = key
         if role == ROLE_SUBSCRIBES:
-            self._takers[topic] += key not in session.matched
+            self._subscribers[topic] += key not in session.matched
             self._events.append(SubscriberJoined(topic, NO_PARAMS, detail, number))
         else:
             self._events.append(PublisherFound(topic, number, NO_PARAMS, detail))
@@ -137,9 +137,9 @@ class Matching:
             self._events.append(PublisherGone(topic, number))
             return
         self._events.append(SubscriberLeft(topic, number, gone=key not in session.tokens))
-        self._takers[topic] -= 1
-        if not self._takers[topic]:
-            del self._takers[topic]
+        self._subscribers[topic] -= 1
+        if not self._subscribers[topic]:
+            del self._subscribers[topic]
             self._events.append(SubscribersGone(topic))
 
     def _note(self, now: int, token: TopicToken) -> None:
@@ -148,10 +148,10 @@ class Matching:
         self._retype(info, token.role)
 
     def _retype(self, info: TopicInfo, role: int) -> None:
-        """The type of a topic is that of the first session that tells one."""
-        sessions = self._telling.get((info.name, role), {}).values()
-        shapes = (_shape(session.tokens[info.name, role]) for session in sessions)
-        info.set_type(role, next((shape for shape in shapes if shape != TopicType()), None))
+        """A topic has the type of the first session that declares one."""
+        sessions = self._sessions_of.get((info.name, role), {}).values()
+        types = (_type_of(session.tokens[info.name, role]) for session in sessions)
+        info.set_type(role, next((each for each in types if each != TopicType()), None))
 
     def _mark(self, now: int, info: TopicInfo, role: int) -> None:
         if role == ROLE_PUBLISHES:
@@ -160,8 +160,8 @@ class Matching:
             info.requested_at = now
 
     def _forget_role(self, topic: str, role: int) -> None:
-        """Nobody has the topic in this role any more; where nobody does in the other one it is forgotten."""
-        if (topic, counterpart(role)) not in self._told:
+        """No token has the topic in this role any more; if none has it in the other role, it is forgotten."""
+        if (topic, counterpart(role)) not in self._token_counts:
             del self.topics[topic]
         elif role == ROLE_PUBLISHES:
             self.topics[topic].advertised_at = None
@@ -169,15 +169,15 @@ class Matching:
             self.topics[topic].requested_at = None
 
 
-def _shape(tokens: dict[str, TopicToken]) -> TopicType:
-    """The type that a session tells; the first one that does."""
+def _type_of(tokens: dict[str, TopicToken]) -> TopicType:
+    """Return the type that a session declares; of several tokens, the first that has one counts."""
     size = next((each.size for each in tokens.values() if each.size), 0)
     fingerprint = next((each.fingerprint for each in tokens.values() if each.fingerprint != ANY_TYPE), ANY_TYPE)
     return TopicType(size, fingerprint)
 
 
 def _detail(tokens: dict[str, TopicToken], role: int) -> int:
-    """What else matters: the size of a publisher's messages, the window of a subscriber."""
+    """Return the size of a publisher's messages, or the window of a subscriber."""
     if role == ROLE_PUBLISHES:
-        return _shape(tokens).size
+        return _type_of(tokens).size
     return max(each.window for each in tokens.values())

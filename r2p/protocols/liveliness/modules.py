@@ -1,4 +1,4 @@
-"""Who lives on a network with liveliness tokens: the modules and their nodes, worked out from the tokens there are."""
+"""The modules on a network with liveliness tokens, and their nodes, worked out from the tokens there are."""
 
 from collections import Counter
 
@@ -8,12 +8,15 @@ from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.protocols.discovery.directory import FOR_EVER, MOST, EndpointInfo, EndpointKey
 from r2p.protocols.discovery.events import Event, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
 
-_NAMESAKE = 1_500_000_000
-"""Ns for which two modules of one name must be there: the token of one that has hung may live for a second."""
+_CONFLICT_AFTER = 1_500_000_000
+"""Ns for which two modules of one name must be there: the token of one that hangs may live for a second."""
 
 
 class ModuleRegistry:
-    """The others on the network of module `module`, run `instance`. What has changed is added to `events`."""
+    """The other modules on the network of module `module`, run `instance`. What has changed is added to `events`.
+
+    It keeps MOST modules; of others only the name, so that they are shown as soon as another module is gone.
+    """
 
     def __init__(self, module: str, instance: int, events: list[Event], counts: Counter[str]) -> None:
         self.modules: dict[str, ModuleInfo] = {}
@@ -23,107 +26,108 @@ class ModuleRegistry:
         self._instance = instance
         self._events = events
         self._counts = counts
-        self._named: dict[str, dict[str, ModuleToken]] = {}
-        self._told: Counter[EndpointKey] = Counter()
+        self._tokens: dict[str, dict[str, ModuleToken]] = {}  # by name and key
+        self._endpoint_tokens: Counter[EndpointKey] = Counter()
         self._names: dict[int, str] = {}  # by instance
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
-        self._suspected: dict[str, int] = {}
-        self._hidden: dict[str, None] = {}  # names with tokens for which there is no room among the modules
+        self._conflict_at: dict[str, int] = {}  # names with several modules, and when that is reported
+        self._without_room: dict[str, None] = {}
+        """Names with tokens that are not among the modules."""
 
     # Tokens
 
     def module_appeared(self, now: int, key: str, token: ModuleToken) -> None:
-        self._named.setdefault(token.name, {})[key] = token
+        self._tokens.setdefault(token.name, {})[key] = token
         self._review(now, token.name)
 
     def module_disappeared(self, now: int, key: str, token: ModuleToken) -> None:
-        named = self._named[token.name]
+        named = self._tokens[token.name]
         del named[key]
         if not named:
-            del self._named[token.name]
+            del self._tokens[token.name]
         self._review(now, token.name)
 
     def endpoint_appeared(self, token: TopicToken) -> None:
         key = _endpoint_key(token)
         if key is None or token.instance == self._instance:
             return
-        self._told[key] += 1
+        self._endpoint_tokens[key] += 1
         self._endpoints_of.setdefault(key[0], {})[key] = None
         name = self._names.get(key[0], "")
         self.endpoints[key] = EndpointInfo(name, *key, token.publisher_class)
         self.generation += 1
 
     def endpoint_disappeared(self, token: TopicToken) -> None:
-        """Unless another token tells of it, as when its class has changed."""
+        """Remove it, unless another token declares it as well, as when its class has changed."""
         key = _endpoint_key(token)
-        if key is not None and key in self._told:
-            self._told[key] -= 1
-            if not self._told[key]:
-                del self._told[key], self.endpoints[key]
+        if key is not None and key in self._endpoint_tokens:
+            self._endpoint_tokens[key] -= 1
+            if not self._endpoint_tokens[key]:
+                del self._endpoint_tokens[key], self.endpoints[key]
                 self._forget_endpoint(key)
                 self.generation += 1
 
-    # What else is heard
+    # Without tokens
 
     def firmware(self, info: ModuleInfo) -> None:
-        """A gateway tells of a module that has no token of its own."""
-        if info.name != self._module and info.name not in self._named:
+        """A gateway announces a module that has no token of its own."""
+        if info.name != self._module and info.name not in self._tokens:
             self._keep(self.modules.get(info.name), info)
 
-    def freshen(self, now: int) -> None:
-        """What has a token lives."""
-        for name in self._named:
+    def mark_heard(self, now: int) -> None:
+        """Mark what has a token as heard now."""
+        for name in self._tokens:
             info = self.modules.get(name)
             if info is not None and info.r2p:
                 self.modules[name] = msgspec.structs.replace(info, last_heard=now)
 
     def clear(self) -> None:
-        """Forget those whom no token told of."""
+        """Forget the modules without a token."""
         for info in list(self.modules.values()):
             self._gone(info)
 
-    # Namesakes
+    # Deadlines
 
     def next_deadline(self) -> int | None:
         """When to call `poll` (monotonic ns); a time in the past means at once."""
-        if self._hidden and len(self.modules) < MOST:
+        if self._without_room and len(self.modules) < MOST:
             return 0
-        return min(self._suspected.values(), default=None)
+        return min(self._conflict_at.values(), default=None)
 
     def poll(self, now: int) -> None:
-        """Tell of modules that have room now, and of those that have carried one name for long enough."""
-        while self._hidden and len(self.modules) < MOST:
-            self._review(now, next(iter(self._hidden)))
-        for name in [name for name, due in self._suspected.items() if due <= now]:
-            del self._suspected[name]
-            instances = [each.instance for each in self._named.get(name, {}).values()]
+        """Show modules that have room now, and report two modules that have had the same name for long enough."""
+        while self._without_room and len(self.modules) < MOST:
+            self._review(now, next(iter(self._without_room)))
+        for name in [name for name, due in self._conflict_at.items() if due <= now]:
+            del self._conflict_at[name]
+            instances = [each.instance for each in self._tokens.get(name, {}).values()]
             if name == self._module:
                 instances.insert(0, self._instance)
             one, other, *_ = dict.fromkeys(instances)
             self._events.append(NameConflict(name, one, other))
 
     def _review(self, now: int, name: str) -> None:
-        """The tokens of a name have changed: the nearest and latest of them is the module."""
-        tokens = [each for each in self._named.get(name, {}).values() if each.instance != self._instance]
+        """The tokens of a name have changed: the nearest and latest of them becomes the module."""
+        tokens = [each for each in self._tokens.get(name, {}).values() if each.instance != self._instance]
         before = self.modules.get(name)
-        self._hidden.pop(name, None)
+        self._without_room.pop(name, None)
         if not tokens:
-            self._suspected.pop(name, None)
+            self._conflict_at.pop(name, None)
             if before is not None:
                 self._gone(before)
             return
         self._keep(before, _info(min(reversed(tokens), key=lambda each: each.hops), now))
         own = {self._instance} if name == self._module else set()
         if len({each.instance for each in tokens} | own) > 1:
-            self._suspected.setdefault(name, now + _NAMESAKE)
+            self._conflict_at.setdefault(name, now + _CONFLICT_AFTER)
         else:
-            self._suspected.pop(name, None)
+            self._conflict_at.pop(name, None)
 
     def _keep(self, before: ModuleInfo | None, info: ModuleInfo) -> None:
         if before is None and len(self.modules) >= MOST:
             self._counts["modules forgotten"] += 1
-            if info.name in self._named:  # no token tells of it again
-                self._hidden[info.name] = None
+            if info.name in self._tokens:  # firmware is announced again, a token is not
+                self._without_room[info.name] = None
             return
         self.modules[info.name] = info
         if before is not None and before.instance is not None and before.instance != info.instance:

@@ -1,9 +1,9 @@
-"""Discovery on a network that tells by itself who lives: zenoh's liveliness tokens (PROTOCOL.md 10).
+"""Discovery on a network that reports by itself what its modules have: zenoh's liveliness tokens (PROTOCOL.md 10).
 
-The same door as `Discovery`, and the same events; but nothing is repeated, asked for, or leased. What this module has
-becomes tokens (`Declare`, `Undeclare`); the tokens of the others come in with `appeared` and `disappeared`, also those
-that were there before. What has no place in a token travels as a management message on the network's control key: the
-orders, CONFLICT, and what gateways have to say of firmware.
+Links use it as they use `Discovery`, and get the same events; but nothing is repeated, asked for, or leased. What this
+module has becomes tokens (`Declare`, `Undeclare`); the tokens of other modules come in with `appeared` and
+`disappeared`, also those that were there before. What has no place in a token travels as a management message on the
+network's control key: commands, CONFLICT, and what gateways have to say of firmware.
 """
 
 from collections import Counter
@@ -36,22 +36,27 @@ from r2p.protocols.discovery.events import (
 )
 from r2p.protocols.liveliness.matching import Matching
 from r2p.protocols.liveliness.modules import ModuleRegistry
-from r2p.protocols.liveliness.refused import Refused
 from r2p.protocols.liveliness.tokens import DeclaredTopic, TokenSet
 
-TOKENS = 4 * MOST
-"""Tokens of others that are kept at most."""
+TOKENS_MAX = 4 * MOST
+"""Tokens of other modules that are kept."""
 
 _SECOND = 1_000_000_000
-_FRESHEN = _SECOND // 2
-"""How often what lives is marked as heard (ns)."""
+_MARK_EVERY = _SECOND // 2
+"""Ns after which what has a token is marked as heard once more."""
+
+_FIRST_PAUSE = 5 * _SECOND
+"""Ns from when there is room for refused tokens until they are queried; twice as long each time."""
+
+_LONGEST_PAUSE = 300 * _SECOND
+"""Ns that this pause may become, and ns without a query after which it is short again."""
 
 
 class LivelinessDiscovery(DiscoveryProtocol):
-    """Who is there, on a network with liveliness tokens.
+    """The discovery of one module on a network with liveliness tokens.
 
-    Every method takes `now` (monotonic ns) and gives back what to do, in order; call `poll` at `next_deadline()`.
-    `counts` is the counter to use, where its owner wants to see it grow.
+    Every method takes `now` (monotonic ns) and returns what to do, in order; call `poll` at `next_deadline()`.
+    `counts` is the counter to use, if its owner wants to see it grow.
     """
 
     def __init__(
@@ -64,11 +69,11 @@ class LivelinessDiscovery(DiscoveryProtocol):
         self._events: list[Event] = []
         self._own = TokenSet(module, instance, observer=observer)
         self._matching = Matching(self._own, self._events)
-        self._census = ModuleRegistry(module, instance, self._events, self.counts)
+        self._modules = ModuleRegistry(module, instance, self._events, self.counts)
         self._tokens: dict[str, liveliness.Token] = {}
-        self._refused = Refused(TOKENS, instance)
+        self._refused = RefusedTokens(TOKENS_MAX, instance)
         self._aliases = Aliases()
-        self._freshen_at: int | None = None
+        self._mark_at: int | None = None
 
     @property
     def flags(self) -> int:
@@ -78,22 +83,22 @@ class LivelinessDiscovery(DiscoveryProtocol):
     @property
     def modules(self) -> dict[str, ModuleInfo]:
         """The other modules by name; one of our own name is another module that has it too."""
-        return self._census.modules
+        return self._modules.modules
 
     @property
     def endpoints(self) -> dict[EndpointKey, EndpointInfo]:
         """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
-        return self._census.endpoints
+        return self._modules.endpoints
 
     @property
     def sole_peer(self) -> int | None:
-        """None: there may always be more than one module."""
+        """None: there may always be more than one module on the network."""
         return None
 
     @property
     def generation(self) -> int:
         """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
-        return self._census.generation
+        return self._modules.generation
 
     @property
     def topics(self) -> dict[str, TopicInfo]:
@@ -106,49 +111,49 @@ class LivelinessDiscovery(DiscoveryProtocol):
         """The module's state changed. `flags` are FLAG_... of ALIVE."""
         if flags != self._own.flags:
             self._own.set_flags(flags)
-        return self._take()
+        return self._pop_events()
 
     def advertise(
         self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
     ) -> list[Event]:
         """The module publishes this topic: messages of `size` bytes (0: not known)."""
-        return self._enter(topic, ROLE_PUBLISHES, DeclaredTopic(TopicType(size, fingerprint)))
+        return self._set_topic(topic, ROLE_PUBLISHES, DeclaredTopic(TopicType(size, fingerprint)))
 
     def withdraw(self, now: int, topic: str) -> list[Event]:
-        """The module does not publish this topic any more: whoever joined has left."""
-        return self._remove(topic, ROLE_PUBLISHES)
+        """The module does not publish this topic any more: its subscribers have left."""
+        return self._remove_topic(topic, ROLE_PUBLISHES)
 
     def subscribe(
         self, now: int, topic: str, size: int = 0, queue: int = 16, fingerprint: bytes = ANY_TYPE
     ) -> list[Event]:
-        """The module subscribes this topic. Size 0 and no fingerprint: whatever its type is.
+        """The module subscribes this topic. Size 0 and no fingerprint: of any type.
 
-        `queue`: how many messages may be on the way to it; 0: as many as come, it would rather lose some.
+        `queue`: how many messages may be on the way to it; 0: any number, it would rather lose some.
         """
-        return self._enter(topic, ROLE_SUBSCRIBES, DeclaredTopic(TopicType(size, fingerprint), queue))
+        return self._set_topic(topic, ROLE_SUBSCRIBES, DeclaredTopic(TopicType(size, fingerprint), queue))
 
     def unsubscribe(self, now: int, topic: str) -> list[Event]:
-        """The module does not subscribe this topic any more: what was opened is shut."""
-        return self._remove(topic, ROLE_SUBSCRIBES)
+        """The module does not subscribe this topic any more: its publishers are gone."""
+        return self._remove_topic(topic, ROLE_SUBSCRIBES)
 
     def endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
         """A node publishes or subscribes (ROLE_...) the topic, as CLASS_..."""
-        self._own.node(topic, role, node, publisher_class)
-        return self._take()
+        self._own.add_node(topic, role, node, publisher_class)
+        return self._pop_events()
 
     def endpoint_gone(self, now: int, node: str, topic: str, role: int) -> list[Event]:
         """It does not any more."""
-        self._own.node_gone(topic, role, node)
-        return self._take()
+        self._own.remove_node(topic, role, node)
+        return self._pop_events()
 
     # For gateways
 
     def demand(self) -> Demand:
-        """What others offer and want."""
+        """Return what other modules publish and subscribe."""
         return self._matching.demand
 
     def relay(self, now: int, message: Relayed) -> list[Event]:
-        """Pass on what a module on another link has said: r2p modules and their nodes as tokens with more hops, of
+        """Pass on what a module on another link has announced: r2p modules and their nodes as tokens with more hops, of
         firmware each sign of life, so that its age can be seen.
         """
         match message:
@@ -159,7 +164,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
                     token = msgspec.structs.replace(token, flags=before.flags)
                 gone = bool(flags & management.HELLO_LEAVING)
                 if not gone or (isinstance(before, ModuleToken) and before.instance == instance):
-                    self._relay(("module", name), token, gone=gone)  # its next start may have been told already
+                    self._relay(("module", name), token, gone=gone)  # its next start may have been announced already
             case management.Alive(name, flags):
                 known = self._own.relayed(("module", name))
                 if isinstance(known, ModuleToken):
@@ -167,80 +172,80 @@ class LivelinessDiscovery(DiscoveryProtocol):
                     self._relay(("module", name), token, gone=False)
                 else:
                     for each in management.alias_messages(name):
-                        self._say(each)
-                    self._say(management.Alive(module_alias(name), flags))
+                        self._send(each)
+                    self._send(management.Alive(module_alias(name), flags))
             case management.Endpoint(role, instance, node, topic, publisher_class):
                 key = (instance, node, topic, role & ~management.ROLE_GONE)
                 endpoint = TopicToken(self._instance, key[3], topic, instance, node, publisher_class, hops=1)
                 self._relay(key, endpoint, gone=bool(role & management.ROLE_GONE))
-        return self._take()
+        return self._pop_events()
 
     def _relay(self, key: tuple[str | int, ...], token: liveliness.Token, *, gone: bool) -> None:
         if gone:
-            self._own.relay(key, None)
+            self._own.set_relayed(key, None)
         elif liveliness.is_carried(token):
-            self._own.relay(key, token)
+            self._own.set_relayed(key, token)
         else:
             self.counts["name not carried"] += 1
 
-    # What a person or the shell wants
+    # What the user wants
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         """Order a module to stop, reboot or enter its loader."""
-        self._say(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
-        return self._take()
+        self._send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
+        return self._pop_events()
 
     def query(self, now: int) -> list[Event]:
-        """Nobody has to be asked: what r2p modules have is known."""
-        return self._take()
+        """Do nothing: what r2p modules have is known."""
+        return self._pop_events()
 
     def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
-        """Tell two modules, which don't see each other, that they carry one name."""
-        self._say(management.Conflict(module_alias(module), instance_a, instance_b))
-        return self._take()
+        """Tell two modules, which don't see each other, that they have the same name."""
+        self._send(management.Conflict(module_alias(module), instance_a, instance_b))
+        return self._pop_events()
 
     # The network
 
     def link_up(self, now: int) -> list[Event]:
-        """It can be reached: declare what there is."""
+        """The network can be reached: declare what there is."""
         self._up = True
-        self._events += self._own.changes()
+        self._events += self._own.pop_changes()
         self._review_refused(now)
-        return self._take()
+        return self._pop_events()
 
     def link_down(self, now: int) -> list[Event]:
-        """Nobody can be seen; who is still there appears again. So do we: after everything else of our session."""
+        """The network is away: forget all tokens, which will appear again. This module's own are declared anew then."""
         self._up = False
-        self._events += self._own.take_back()
+        self._events += self._own.withdraw_all()
         for key in list(self._tokens):
             self._remove_token(now, key)
         self._refused.clear()
-        self._census.clear()  # firmware that gateways told of
-        return self._take()
+        self._modules.clear()  # what is left is firmware, of which gateways tell by messages
+        return self._pop_events()
 
     def leave(self, now: int) -> list[Event]:
-        """Nothing is said after it: our tokens go with our session."""
+        """Say nothing any more: the tokens go with the session."""
         self._up = False
         self._refused.clear()
-        return self._take()
+        return self._pop_events()
 
     def next_deadline(self) -> int | None:
         """When to call `poll` (monotonic ns); a time in the past means at once."""
-        if self._up and self._own.pending:
+        if self._up and self._own.has_changes:
             return 0
-        due = (self._census.next_deadline(), self._refused.next_deadline(), self._freshen_at)
+        due = (self._modules.next_deadline(), self._refused.next_deadline(), self._mark_at)
         return min((each for each in due if each is not None), default=None)
 
     def poll(self, now: int) -> list[Event]:
-        """Declare what changed here; what lives is as good as just heard."""
+        """Declare what has changed here; mark as heard what has a token; query tokens that were refused."""
         if self._up:
-            self._events += self._own.changes()
-        if self._freshen_at is not None and self._freshen_at <= now:
-            self._freshen(now)
-        if self._refused.due(now, self._free):
+            self._events += self._own.pop_changes()
+        if self._mark_at is not None and self._mark_at <= now:
+            self._mark_heard(now)
+        if self._refused.is_due(now, self._free):
             self._events.append(QueryTokens())
-        self._census.poll(now)
-        return self._take()
+        self._modules.poll(now)
+        return self._pop_events()
 
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
         """A management message of the session `source`. Never raises for bad bytes: they are counted."""
@@ -251,35 +256,35 @@ class LivelinessDiscovery(DiscoveryProtocol):
         except DecodeError:
             self.counts["undecodable"] += 1
         else:
-            self._heard(now, message, source)
-        return self._take()
+            self._handle(now, message, source)
+        return self._pop_events()
 
     def appeared(self, now: int, key: str) -> list[Event]:
-        """A token is there."""
+        """A token is there; what is known already is ignored."""
         token = None if key in self._tokens else self._decoded(key)
         if token is None or token.session == self._instance:
-            return self._take()
-        if len(self._tokens) >= TOKENS:
+            return self._pop_events()
+        if len(self._tokens) >= TOKENS_MAX:
             return self.refused(now)
         self._tokens[key] = token
-        if self._freshen_at is None:
-            self._freshen_at = now + _FRESHEN
+        if self._mark_at is None:
+            self._mark_at = now + _MARK_EVERY
         if isinstance(token, ModuleToken):
-            self._census.module_appeared(now, key, token)
+            self._modules.module_appeared(now, key, token)
         else:
-            self._census.endpoint_appeared(token)
+            self._modules.endpoint_appeared(token)
             if not token.hops:  # behind a gateway: its own tokens say what it passes on
                 self._matching.appeared(now, key, token)
-        return self._take()
+        return self._pop_events()
 
     def disappeared(self, now: int, key: str) -> list[Event]:
         """A token is not there any more."""
         if key in self._tokens:
             self._remove_token(now, key)
         else:
-            self._refused.went()
+            self._refused.remove_one()
         self._review_refused(now)
-        return self._take()
+        return self._pop_events()
 
     def refused(self, now: int) -> list[Event]:
         """There was no room for a token."""
@@ -287,33 +292,33 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self.missed(now, 1)
 
     def missed(self, now: int, count: int) -> list[Event]:
-        """So many tokens may be there that were not told of; they are asked for when there is room for them."""
+        """This many tokens may be there that were not reported; they are queried when there is room for them."""
         self._refused.add(count)
         self._review_refused(now)
-        return self._take()
+        return self._pop_events()
 
-    def looked(self, now: int, *, complete: bool) -> list[Event]:
+    def query_ended(self, now: int, *, complete: bool) -> list[Event]:
         """All answers to `QueryTokens` have come, or, if not `complete`, some of them."""
-        self._refused.answered(complete=complete)
+        self._refused.query_ended(complete=complete)
         self._review_refused(now)
-        return self._take()
+        return self._pop_events()
 
     # Topics
 
-    def _enter(self, topic: str, role: int, own: DeclaredTopic) -> list[Event]:
-        if self._own.own(topic, role) != own:
-            self._own.enter(topic, role, own)
+    def _set_topic(self, topic: str, role: int, own: DeclaredTopic) -> list[Event]:
+        if self._own.get(topic, role) != own:
+            self._own.set_topic(topic, role, own)
             self._matching.changed(topic, role)
-        return self._take()
+        return self._pop_events()
 
-    def _remove(self, topic: str, role: int) -> list[Event]:
-        self._own.remove(topic, role)
+    def _remove_topic(self, topic: str, role: int) -> list[Event]:
+        self._own.remove_topic(topic, role)
         self._matching.changed(topic, role)
-        return self._take()
+        return self._pop_events()
 
     @property
     def _free(self) -> int:
-        return TOKENS - len(self._tokens)
+        return TOKENS_MAX - len(self._tokens)
 
     def _review_refused(self, now: int) -> None:
         if self._up:
@@ -322,22 +327,22 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def _remove_token(self, now: int, key: str) -> None:
         token = self._tokens.pop(key, None)
         if isinstance(token, ModuleToken):
-            self._census.module_disappeared(now, key, token)
+            self._modules.module_disappeared(now, key, token)
         elif token is not None:
-            self._census.endpoint_disappeared(token)
+            self._modules.endpoint_disappeared(token)
             if not token.hops:
                 self._matching.disappeared(key, token)
         if not self._tokens:
-            self._freshen_at = None
+            self._mark_at = None
 
-    def _freshen(self, now: int) -> None:
-        self._freshen_at = now + _FRESHEN
-        self._matching.freshen(now)
-        self._census.freshen(now)
+    def _mark_heard(self, now: int) -> None:
+        self._mark_at = now + _MARK_EVERY
+        self._matching.mark_heard(now)
+        self._modules.mark_heard(now)
 
     # Messages
 
-    def _heard(self, now: int, message: management.Management, source: PeerAddress) -> None:
+    def _handle(self, now: int, message: management.Management, source: PeerAddress) -> None:
         match message:
             case management.Stop(self._module) | management.Reboot(self._module) | management.Bootload(self._module):
                 self._events.append(CommandReceived(command_of(message)))
@@ -349,9 +354,9 @@ class LivelinessDiscovery(DiscoveryProtocol):
                 self._aliases.receive(message)
             case management.Alive(name, flags):
                 name = self._aliases.name_of(name)
-                self._census.firmware(ModuleInfo(name, flags, now, hops=1, source=source))
+                self._modules.firmware(ModuleInfo(name, flags, now, hops=1, source=source))
 
-    def _say(self, message: management.Management, *, urgent: bool = False) -> None:
+    def _send(self, message: management.Management, *, urgent: bool = False) -> None:
         if self._up:
             self._events.append(Send(management.encode(message), urgent))
 
@@ -364,7 +369,77 @@ class LivelinessDiscovery(DiscoveryProtocol):
             self.counts["undecodable"] += 1
         return None
 
-    def _take(self) -> list[Event]:
+    def _pop_events(self) -> list[Event]:
         events = self._events[:]
         self._events.clear()
         return events
+
+
+class RefusedTokens:
+    """How many tokens were refused as there were too many, and when to query them.
+
+    The network reports each token only once, so refused ones have to be queried when there is room. They are not kept,
+    only counted: memory stays bounded. Many answers are work for a router, so this waits until all of them have room,
+    or a quarter of the table is free, and longer and longer where that happens again and again. While the network has
+    more tokens than fit, some stay unknown.
+    """
+
+    def __init__(self, most: int, spread: int) -> None:
+        """`most` tokens are kept. `spread` is a number that few modules share: it keeps them from querying at once."""
+        self._enough = most // 4
+        self._spread = spread % 256
+        self._any = False
+        self._count = 0
+        """An estimate: a token that went may have been one of those that were refused."""
+        self._query_at: int | None = None
+        self._querying = False
+        self._pause = _FIRST_PAUSE
+        self._last_query: int | None = None
+
+    def add(self, count: int = 1) -> None:
+        """Count tokens that were refused."""
+        self._any = True
+        self._count += count
+
+    def remove_one(self) -> None:
+        """A token is gone that was not kept."""
+        self._count = max(0, self._count - 1)
+
+    def clear(self) -> None:
+        """All tokens are gone, and will be reported again."""
+        self._any = False
+        self._count = 0
+        self._query_at = None
+
+    def next_deadline(self) -> int | None:
+        """When to call `is_due` (monotonic ns)."""
+        return self._query_at
+
+    def review(self, now: int, free: int) -> None:
+        """Plan a query if there is room for `free` tokens."""
+        if self._querying or self._query_at is not None or not self._fit(free):
+            return
+        if self._last_query is not None and now - self._last_query >= _LONGEST_PAUSE:
+            self._pause = _FIRST_PAUSE
+        self._query_at = now + self._pause + self._pause * self._spread // 256
+
+    def is_due(self, now: int, free: int) -> bool:
+        """Whether to query the tokens now; `query_ended` has to follow."""
+        if self._query_at is None or now < self._query_at:
+            return False
+        self._query_at = None
+        if not self._fit(free):
+            return False
+        self._any, self._count, self._querying = False, 0, True
+        self._last_query, self._pause = now, min(2 * self._pause, _LONGEST_PAUSE)
+        return True
+
+    def query_ended(self, *, complete: bool) -> None:
+        """All answers are there; if not `complete`, others may be missing."""
+        self._querying = False
+        self._count //= 2  # one that came meanwhile may also be among the answers; rather too few than too many
+        self._any = self._any or not complete
+
+    def _fit(self, free: int) -> bool:
+        # As the count is an estimate, a quarter of the table is enough in any case.
+        return self._any and free >= min(max(self._count, 1), self._enough)

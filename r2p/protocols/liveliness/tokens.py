@@ -1,7 +1,7 @@
-"""What this module has, as liveliness tokens: which to declare, and which to take back.
+"""What this module has, as liveliness tokens: which to declare, and which to undeclare.
 
-Changes are collected, and become orders in one go: so a publisher that is announced first and gets the name of its node
-a moment later is one token, and a change declares the new token before it takes back the old one.
+Changes are collected, and become events all at once: so a publisher that is announced first and gets the name of its
+node a moment later is one token, and a change declares the new token before it undeclares the old one.
 """
 
 import msgspec
@@ -21,7 +21,7 @@ _RELAYED: TopicRole = ("", -1)
 class DeclaredTopic(msgspec.Struct, frozen=True):
     """A topic that this module publishes, or subscribes with a `window` (messages on the way; 0: it may lose some)."""
 
-    shape: TopicType
+    type: TopicType
     window: int = 0
 
 
@@ -40,41 +40,41 @@ class TokenSet:
         self._dirty: set[TopicRole] = {_MODULE}
 
     @property
-    def pending(self) -> bool:
-        """Whether something has changed since `changes` was called."""
+    def has_changes(self) -> bool:
+        """Whether something has changed since `pop_changes` was called."""
         return bool(self._dirty)
 
-    def own(self, topic: str, role: int) -> DeclaredTopic | None:
+    def get(self, topic: str, role: int) -> DeclaredTopic | None:
         return self._own.get((topic, role))
 
     def set_flags(self, flags: int) -> None:
         self.flags = flags
         self._dirty.add(_MODULE)
 
-    def enter(self, topic: str, role: int, own: DeclaredTopic) -> None:
+    def set_topic(self, topic: str, role: int, own: DeclaredTopic) -> None:
         """The module publishes or subscribes the topic."""
         self._own[topic, role] = own
         self._dirty.add((topic, role))
 
-    def remove(self, topic: str, role: int) -> None:
+    def remove_topic(self, topic: str, role: int) -> None:
         """It does not any more."""
         self._own.pop((topic, role), None)
         self._dirty.add((topic, role))
 
-    def node(self, topic: str, role: int, node: str, publisher_class: int) -> None:
-        """This node does it."""
+    def add_node(self, topic: str, role: int, node: str, publisher_class: int) -> None:
+        """A node of the module does it."""
         self._nodes.setdefault((topic, role), {})[node] = publisher_class
         self._dirty.add((topic, role))
 
-    def node_gone(self, topic: str, role: int, node: str) -> None:
+    def remove_node(self, topic: str, role: int, node: str) -> None:
         nodes = self._nodes.get((topic, role), {})
         nodes.pop(node, None)
         if not nodes:
             self._nodes.pop((topic, role), None)
         self._dirty.add((topic, role))
 
-    def relay(self, key: tuple[str | int, ...], token: liveliness.Token | None) -> None:
-        """Something behind this module, a gateway; None: it is not there any more."""
+    def set_relayed(self, key: tuple[str | int, ...], token: liveliness.Token | None) -> None:
+        """Declare something behind this module, which is a gateway; None: it is gone."""
         if token is None:
             self._relayed.pop(key, None)
         else:
@@ -84,26 +84,26 @@ class TokenSet:
     def relayed(self, key: tuple[str | int, ...]) -> liveliness.Token | None:
         return self._relayed.get(key)
 
-    def changes(self) -> list[Declare | Undeclare]:
-        """What is to be done since the last call."""
-        orders: list[Declare | Undeclare] = []
+    def pop_changes(self) -> list[Declare | Undeclare]:
+        """Return what to declare and undeclare since the last call."""
+        events: list[Declare | Undeclare] = []
         dirty, self._dirty = self._dirty, set()
         for key in dirty:
             declared, wanted = self._declared.get(key, set()), self._wanted(key)
-            orders += [Declare(token) for token in sorted(wanted - declared)]
-            orders += [Undeclare(token) for token in sorted(declared - wanted)]
+            events += [Declare(token) for token in sorted(wanted - declared)]
+            events += [Undeclare(token) for token in sorted(declared - wanted)]
             if wanted:
                 self._declared[key] = wanted
             else:
                 self._declared.pop(key, None)
-        return orders
+        return events
 
-    def take_back(self) -> list[Declare | Undeclare]:
-        """The network is away: take back everything, and have it declared anew when that is back."""
-        orders: list[Declare | Undeclare] = [Undeclare(key) for keys in self._declared.values() for key in keys]
+    def withdraw_all(self) -> list[Declare | Undeclare]:
+        """Undeclare everything, as the network is away; it is declared anew by the next `pop_changes`."""
+        events: list[Declare | Undeclare] = [Undeclare(key) for keys in self._declared.values() for key in keys]
         self._dirty |= self._declared.keys()
         self._declared.clear()
-        return orders
+        return events
 
     def _wanted(self, key: TopicRole) -> set[str]:
         if key == _MODULE:
@@ -119,7 +119,7 @@ class TokenSet:
 
     def _token(self, key: TopicRole, own: DeclaredTopic, node: str, publisher_class: int) -> str:
         topic, role = key
-        size, fingerprint = own.shape.size, own.shape.fingerprint
+        size, fingerprint = own.type.size, own.type.fingerprint
         return liveliness.encode(
             TopicToken(
                 self._instance, role, topic, self._instance, node, publisher_class, size, fingerprint, own.window
@@ -128,5 +128,5 @@ class TokenSet:
 
 
 def counterpart(role: int) -> int:
-    """Our side of what another one does."""
+    """Return the role at the other end of a topic."""
     return ROLE_SUBSCRIBES if role == ROLE_PUBLISHES else ROLE_PUBLISHES

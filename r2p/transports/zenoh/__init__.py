@@ -1,21 +1,22 @@
-"""zenoh as a transport: between PCs, over any network that zenoh reaches.
+"""zenoh as a transport: between computers, over any network that zenoh reaches.
 
-    options   what the URL says               config    ... as zenoh wants it
-    session   one zenoh session: everything that comes from zenoh's threads enters the event loop here
-    link      discovery and topics over it; tokens: who is there
-    outlet    what goes out of a topic, with senders, as far as there are credits; reach: whether it arrives
-    burst     ... in which packets, and when; lane: of one topic and class
-    streams   what comes in; stream: of one topic
-    trouble   why there is no connection, in words
+In the order to read it:
+
+    transport   opens a session for a module, and explains why it can't; config: what the URL and the user's file say
+    link        tokens, topics and management messages of one module on one network
+    credit      out: the subscribers in other modules, and the credit they grant; publish: in which packets, and when
+    subscribe   in: from zenoh's ring to the queues of a topic; backlog: messages that have no room
+    session     one zenoh session, and the way from its threads into the event loop; threads: which those are
+    diagnose    why there is no connection
 
 zenoh itself is imported when a session is opened, not before.
 """
 
 from r2p.transports.url import Url
-from r2p.transports.zenoh.config import options_of
+from r2p.transports.zenoh.config import parse_options
 from r2p.transports.zenoh.transport import ZenohTransport
 
 
 def from_url(url: Url) -> ZenohTransport:
-    """`zenoh:[ENDPOINT]`; options: see `_PARSERS` there. Raises TransportError."""
-    return ZenohTransport(options_of(url))
+    """`zenoh:[ENDPOINT]`; `config` has the options. Raises TransportError."""
+    return ZenohTransport(parse_options(url))

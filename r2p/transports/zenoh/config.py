@@ -1,33 +1,39 @@
-"""zenoh's configuration for a link: what r2p needs, then the user's file, then what the URL says."""
+"""What a `zenoh:` URL says, and zenoh's configuration for it.
+
+The configuration is what r2p needs, then what the user's file says, then what the URL says. So a file can change what
+r2p prefers, and the URL has the last word.
+"""
 
 import json
 import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
-import zenoh
 
 from r2p.errors import TransportError
 from r2p.transports.url import Url
 from r2p.transports.zenoh.diagnose import ConnectionSettings, Tls
 
-# What a `zenoh:` URL says.
-
+if TYPE_CHECKING:  # imported when it is used: a URL can be checked without zenoh, and loading it takes long
+    import zenoh
 
 MODES = ("peer", "client", "router")
 
-_MOST_NAMED = 8  # networks in one text
+_NAMED_MAX = 8
+"""Networks that one text names."""
+
 _NETWORK = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_AT_PORTS = ("tcp", "udp", "tls", "quic", "ws")
-_PROTOCOLS = (*_AT_PORTS, "unixsock-stream", "unixpipe", "serial", "vsock")
-_PORT = re.compile(r".+:([0-9]+)(#.*)?")  # behind # are options of the endpoint: its network interface
+_PORT_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")
+_PROTOCOLS = (*_PORT_PROTOCOLS, "unixsock-stream", "unixpipe", "serial", "vsock")
+_PORT = re.compile(r".+:([0-9]+)(#.*)?")  # behind # are options of the endpoint, such as its network interface
 _PORT_MAX = 65_535
 
 
 class ZenohOptions(msgspec.Struct, frozen=True):
-    """A URL, checked. What is None is left to the configuration file, or to zenoh; the network to `chosen`."""
+    """A checked URL. What is None is left to the configuration file, or to zenoh; the network to `choose_network`."""
 
     name: str
     network: str | None = None
@@ -40,12 +46,12 @@ class ZenohOptions(msgspec.Struct, frozen=True):
     config: Path | None = None
 
     def error(self, text: str) -> TransportError:
-        """What is wrong with it, in words."""
+        """Return an error that begins with the URL."""
         return TransportError(f"{self.name.removesuffix(':')}: {text}")
 
 
-def options_of(url: Url) -> ZenohOptions:
-    """Check a URL. Raises TransportError."""
+def parse_options(url: Url) -> ZenohOptions:
+    """Parse and check a URL. Raises TransportError."""
     given = url.parsed(_PARSERS)
     endpoint = url.address or None
     if endpoint is not None:
@@ -53,7 +59,7 @@ def options_of(url: Url) -> ZenohOptions:
             _endpoint_text(endpoint)
         except ValueError as error:
             raise TransportError(f"{url}: {error}") from None
-    mode = given.get("mode") or (_default_mode(endpoint, given.get("config")))
+    mode = given.get("mode") or _default_mode(endpoint, given.get("config"))
     if mode == "client" and given.get("listen"):
         raise TransportError(f"{url}: a client listens nowhere: leave out listen=, or use mode=peer or mode=router")
     config = given.get("config")
@@ -70,12 +76,12 @@ def options_of(url: Url) -> ZenohOptions:
 
 
 def default_network() -> str:
-    """The name of a network that has been given none: the host's, without its domain."""
+    """Return the name of the network where the URL names none: the host's, without its domain."""
     return re.sub(r"[^A-Za-z0-9_.-]", "", socket.gethostname().partition(".")[0]) or "robot"
 
 
-def chosen(found: set[str]) -> str:
-    """The network that a tool joins which was not told one: the host's, or else the only one that there is.
+def choose_network(found: set[str]) -> str:
+    """Return the network that a tool joins if its URL names none: the host's, or else the only one that there is.
 
     Raises ValueError where there are several others.
     """
@@ -84,18 +90,18 @@ def chosen(found: set[str]) -> str:
     if own in found or not others:
         return own
     if len(others) > 1:
-        raise ValueError(f"there are the networks {listed(others)}: say which, as ?network={others[0]}")
+        raise ValueError(f"there are the networks {list_networks(others)}: say which, as ?network={others[0]}")
     return others[0]
 
 
-def listed(networks: list[str]) -> str:
-    """Networks for a text: the first ones by name, where there are many."""
-    more = len(networks) - _MOST_NAMED
-    return ", ".join(networks[:_MOST_NAMED]) + f" and {more} more" * (more > 0)
+def list_networks(networks: list[str]) -> str:
+    """Return the names for a text: the first ones, where there are many."""
+    more = len(networks) - _NAMED_MAX
+    return ", ".join(networks[:_NAMED_MAX]) + f" and {more} more" * (more > 0)
 
 
 def is_network_name(text: str) -> bool:
-    """Whether a network can have this name; keys of others may hold anything in its place."""
+    """Whether a network can have this name; keys of other programs may hold anything in its place."""
     return _NETWORK.fullmatch(text) is not None
 
 
@@ -123,15 +129,15 @@ def _network_name(text: str) -> str:
 def _endpoint_text(text: str) -> str:
     protocol, _, address = text.partition("/")
     if not address:
-        raise ValueError(f"{text!r} is no zenoh endpoint: give it as tcp/ADDRESS:PORT or tls/ADDRESS:PORT")
+        raise ValueError(f"{text!r} is not a zenoh endpoint: give it as tcp/ADDRESS:PORT or tls/ADDRESS:PORT")
     if protocol not in _PROTOCOLS:
-        raise ValueError(f"{protocol!r} is no protocol of zenoh: use one of {', '.join(_PROTOCOLS)}")
-    if protocol in _AT_PORTS:
+        raise ValueError(f"{protocol!r} is not a protocol of zenoh: use one of {', '.join(_PROTOCOLS)}")
+    if protocol in _PORT_PROTOCOLS:
         found = _PORT.fullmatch(address)
         if found is None:
             raise ValueError(f"the port is missing: {protocol}/{address}:7447")
         if int(found[1]) > _PORT_MAX:
-            raise ValueError(f"{found[1]} is no port: the last one is {_PORT_MAX}")
+            raise ValueError(f"{found[1]} is not a valid port: the last one is {_PORT_MAX}")
     return text
 
 
@@ -145,75 +151,81 @@ _PARSERS: dict[str, Callable[[str], str]] = {
 }
 
 
-# config
+# Configuration
 
 
 LEASE_MS = 1000
-"""A peer that says nothing for so long is gone: one that hangs is noticed within two seconds."""
+"""Milliseconds without a sign of life after which a peer is gone: one that hangs is noticed within two seconds."""
 
-_OURS: dict[str, object] = {
-    "scouting/delay": 0,  # else opening takes half a second
+_NEEDED: dict[str, object] = {
+    "scouting/delay": 0,  # else opening a session takes half a second
     "transport/link/tx/lease": LEASE_MS,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "connect/exit_on_failure": {"router": False, "peer": False, "client": True},
     "transport/unicast/open_timeout": 3000,
     "transport/link/tx/queue/size/data": 16,  # batches of 64 kB: what flow control allows to be on the way fits
-    # Urgent messages are batches of their own: what comes while zenoh's threads do not get to run fits.
+    # Each urgent message is a batch of its own: this many fit while zenoh's threads do not get to run.
     "transport/link/tx/queue/size/interactive_high": 16,
     "transport/link/tx/queue/size/real_time": 16,
 }
 
-_USUAL = ["tcp/[::]:7447"]
+_DEFAULT_LISTEN = ["tcp/[::]:7447"]
 """Where the first peer on a computer listens, so that clients find it without a router."""
 
-_ANY_PORT: dict[str, object] = {  # the others; where there is no IPv6, not even that
+_ANY_PORT: dict[str, object] = {  # for the other peers on the computer; without IPv6 not even this one listens
     "listen/endpoints": ["tcp/[::]:0"],
     "listen/exit_on_failure": False,
 }
 
 _LOOPBACK = re.compile(r"(unix|serial|vsock)|[a-z]+/(localhost|127\.[0-9.]+|\[::1\]):")
-"""Endpoints that other computers do not reach by a network."""
+"""Endpoints that other computers do not reach over a network."""
 
-_LISTENS: dict[str, object] = {
-    # This session's own, which tells where it listens. Not for clients: zenoh keeps 37 kB for ever of each session that
-    # is closed with one.
+_NEEDED_TO_LISTEN: dict[str, object] = {
+    # The session's own admin space says where it listens. Not for clients: zenoh keeps 37 kB for ever of each session
+    # that is closed with one.
     "adminspace/enabled": True,
 }
 
 
-def config_of(options: ZenohOptions) -> zenoh.Config:
-    """Raises TransportError for a file that zenoh can't read, and for what it does not take."""
+def build_config(options: ZenohOptions) -> "zenoh.Config":
+    """Return zenoh's configuration. Raises TransportError for a file or an option that zenoh can't read."""
+    import zenoh
+
     config = _from_file(options)
     try:
-        for key, value in _stated(options).items():
+        for key, value in _from_url(options).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        raise options.error(f"zenoh does not take this: {_words(error)}") from error
+        raise options.error(f"zenoh does not take this: {plain_text(error)}") from error
     return config
 
 
-def take_any_port(config: zenoh.Config, options: ZenohOptions) -> bool:
-    """Listen at any port, as the usual one can't be had. False where a place was asked for, or it was tried already."""
-    if not _may_choose(options) or json.loads(config.get_json("listen/endpoints")) != _USUAL:
+def use_any_port(config: "zenoh.Config", options: ZenohOptions) -> bool:
+    """Listen at any port, as the default one is in use. False if the user chose one, or this was tried already."""
+    if not _may_choose(options) or json.loads(config.get_json("listen/endpoints")) != _DEFAULT_LISTEN:
         return False
     for key, value in _ANY_PORT.items():
         config.insert_json5(key, json.dumps(value))
     return True
 
 
-def open_to_all(config: zenoh.Config) -> list[str]:
-    """The endpoints where it takes connections of other computers without asking who they are."""
+def open_endpoints(config: "zenoh.Config") -> list[str]:
+    """Return the endpoints where other computers can connect without saying who they are."""
     if (
         json.loads(config.get_json("mode")) == "client"
         or json.loads(config.get_json("transport/auth/usrpwd"))["dictionary_file"]
     ):
         return []
     certified = ("tls/", "quic/") if json.loads(config.get_json("transport/link/tls"))["enable_mtls"] else ()
-    return [each for each in way_of(config).listens if not each.startswith(certified) and not _LOOPBACK.match(each)]
+    return [
+        each
+        for each in connection_settings(config).listens
+        if not each.startswith(certified) and not _LOOPBACK.match(each)
+    ]
 
 
-def way_of(config: zenoh.Config) -> ConnectionSettings:
-    """What it connects to, and with what; and where it listens."""
+def connection_settings(config: "zenoh.Config") -> ConnectionSettings:
+    """Return what the session connects to, and with what; and where it listens."""
     tls = json.loads(config.get_json("transport/link/tls"))
     user = json.loads(config.get_json("transport/auth/usrpwd"))
     names = Tls(
@@ -228,54 +240,56 @@ def way_of(config: zenoh.Config) -> ConnectionSettings:
     return ConnectionSettings(_texts(connects), names, user["user"], _texts(listens))
 
 
-def _from_file(options: ZenohOptions) -> zenoh.Config:
+def _from_file(options: ZenohOptions) -> "zenoh.Config":
+    import zenoh
+
     config = zenoh.Config()
-    ours = _OURS if options.mode == "client" else _OURS | _LISTENS
-    for key, value in ours.items():
+    needed = _NEEDED if options.mode == "client" else _NEEDED | _NEEDED_TO_LISTEN
+    for key, value in needed.items():
         config.insert_json5(key, json.dumps(value))
     if options.config is None:
         return config
     try:
-        theirs = zenoh.Config.from_file(options.config)
+        given = zenoh.Config.from_file(options.config)
     except (zenoh.ZError, OSError) as error:
-        reason = "there is no such file" if not options.config.exists() else _words(error)
+        reason = "there is no such file" if not options.config.exists() else plain_text(error)
         raise options.error(f"can't read {options.config}: {reason}") from error
     blank = zenoh.Config()
-    for key, value in ours.items():
-        if theirs.get_json(key) == blank.get_json(key):  # what the file says counts
-            theirs.insert_json5(key, json.dumps(value))
-    return theirs
+    for key, value in needed.items():
+        if given.get_json(key) == blank.get_json(key):  # not set in the file
+            given.insert_json5(key, json.dumps(value))
+    return given
 
 
-def _stated(options: ZenohOptions) -> dict[str, object]:
-    stated: dict[str, object] = {}
+def _from_url(options: ZenohOptions) -> dict[str, object]:
+    settings: dict[str, object] = {}
     if options.mode is not None:
-        stated["mode"] = options.mode
+        settings["mode"] = options.mode
     if options.connect is not None:
-        stated["connect/endpoints"] = [options.connect]
+        settings["connect/endpoints"] = [options.connect]
     if options.listen is not None:
-        stated["listen/endpoints"] = [options.listen]
+        settings["listen/endpoints"] = [options.listen]
     elif _may_choose(options):
-        stated["listen/endpoints"] = _USUAL
+        settings["listen/endpoints"] = _DEFAULT_LISTEN
     if options.scouting is not None:
-        stated["scouting/multicast/enabled"] = options.scouting
-    return stated
+        settings["scouting/multicast/enabled"] = options.scouting
+    return settings
 
 
 def _may_choose(options: ZenohOptions) -> bool:
-    """Whether it is left to us where to listen."""
+    """Whether this module chooses where to listen."""
     return options.listen is None and options.mode == "peer" and options.config is None
 
 
-def _words(error: Exception) -> str:
-    """zenoh's text without its own places, and with that in the file, if it tells it, in front."""
+def plain_text(error: Exception) -> str:
+    """Return zenoh's text without positions in its source, and behind the position in the file, if it has one."""
     text = re.sub(r" at /\S+?\.rs:\d+\.?", "", str(error)).strip()
     found = re.search(r'msg: "(.*)", location: Some\(Location \{ line: (\d+), column: (\d+)', text, re.DOTALL)
     return f"line {found[2]}, column {found[3]}: {found[1]}" if found else text
 
 
 def _texts(value: object) -> list[str]:
-    """The endpoints in a list, or in a list for each mode."""
+    """Return the endpoints in a list, or in a list for each mode."""
     if isinstance(value, dict):
         return [text for each in value.values() for text in _texts(each)]
     if not isinstance(value, list):

@@ -1,271 +1,535 @@
-"""What subscribers grant the publishers of this module, looked at when a publisher has come to the end of it.
+"""The subscribers in other modules: when they are sent to, what credit they grant, and what they got in the end.
 
-Under load the loop's thread seldom lets another one run, and credit that had to come through one would come when the
-publisher has stopped for it. So it stays in zenoh's ring until somebody has no room, or for REST seconds.
+    SubscriberJoined -> Reachability (do messages arrive there?) -> ZenohSubscriber -> TxStream
+    credit           -> CreditReader -> ZenohSubscriber, whose waiting publishers go on
+    SubscriberLeft   -> FinalCredits: is anything unknown that the subscriber was sent?
+
+A topic goes out no further than its subscribers have room (r2p.protocols.flow_control).
 """
 
-from collections.abc import Callable, Iterable
+import asyncio
+from collections import Counter
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from r2p.codecs import UnknownType
-from r2p.codecs.attachment import decode_credit
+from r2p.codecs.attachment import Credit, Origin, decode_credit, name_for
+from r2p.codecs.management import ANY_TYPE
 from r2p.errors import DecodeError
-from r2p.runtime.sample import PublisherClass
-from r2p.transports.stats import LinkStats
+from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
+from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.topic import Topic
+from r2p.transports.link import Hub, Link, LinkSubscriber
+from r2p.transports.zenoh.publish import BATCH_MAX, Batcher, PublisherCache, TxStream
+from r2p.transports.zenoh.session import SubscriptionReader, ZenohError, ZenohSession
 
 if TYPE_CHECKING:
-    import asyncio
-
     import zenoh
 
-    from r2p.transports.zenoh.link import ZenohLink
-    from r2p.transports.zenoh.publish import ZenohSubscriber
-    from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
-
-REST = 0.02
-"""Seconds for which nobody is woken by credit that nobody waits for."""
-
-_MOST = 1024
-"""Credits that come in that time at most."""
-
-_LONGEST = 256  # bytes
+_NRT = PublisherClass.NON_REAL_TIME
 
 
-class Credits:
-    """The credit of all topics of one link. `outlets` gives those that are there; `left(topic, session)` is called for
-    each last credit, whether or not there is an outlet.
+class ZenohSubscriber(LinkSubscriber):
+    """One topic on its way out, to all its subscribers on the network.
+
+    Subscribers without room are waited for as the class of the publisher says.
     """
 
-    def __init__(
-        self,
-        loop: "asyncio.AbstractEventLoop",
-        stats: LinkStats,
-        outlets: Callable[[], Iterable["ZenohSubscriber"]],
-        left: Callable[[str, int], object],
-    ) -> None:
-        self._loop = loop
-        self._stats = stats
-        self._outlets = outlets
-        self._left = left
-        self._tap: SubscriptionReader | None = None
-        self._expected = False
-        self._rest: asyncio.TimerHandle | None = None
+    __slots__ = ("_batcher", "_sender", "_streams", "resending", "silent_checks")
 
-    def connect(self, session: "ZenohSession", key: str) -> None:
-        """There is a session now."""
-        self._tap = session.subscribe(key, _MOST, self._arrived)
-        self._expected = True
+    def __init__(self, sender: "ZenohSender", topic: Topic) -> None:
+        super().__init__(sender.link, topic, WaitQueue())
+        self._sender = sender
+        self._batcher = sender.batcher
+        self._streams = {
+            each: TxStream(sender.publishers.window(topic.name, each), urgent=each is not _NRT)
+            for each in PublisherClass
+        }
+        self.resending = False
+        """Whether latched values are being sent to a new subscriber, even if others have no room."""
+        self.silent_checks: Counter[int] = Counter()
+        """How often each session was found to have acknowledged nothing."""
 
-    def look(self) -> None:
-        """Take what has come; those who waited for it go on when the work that is being done now is over."""
-        if self._tap is not None:
-            first = self._tap.take()
-            if first is not None:
-                self._take(first)
-                self._loop.call_soon(self._serve)
+    # As a sink
 
-    def expect(self) -> None:
-        """Somebody waits for credit: wake him when some comes."""
-        if self._tap is not None and not self._expected:
-            self._expected = True
-            self._tap.wait()
+    def offer(self, sample: Sample) -> bool:
+        stream = self._streams[sample.publisher_class]
+        window = stream.window
+        # One condition for the hot path: there is credit, from the same publisher as before, and the link is up.
+        if window.serial >= window.limit or sample.source is not stream.source or not self._link.up:
+            if not self._link.up:
+                return self._offer_down(sample)
+            if not self._has_credit(stream) and not self.resending:
+                return False
+            if sample.source is not stream.source:
+                self._prepare(stream, sample)
+        window.serial += 1
+        stream.waiting.append(sample)
+        if stream.urgent or len(stream.waiting) in (1, BATCH_MAX):
+            self._batcher.add(stream)
+        return True
+
+    def _offer_down(self, sample: Sample) -> bool:
+        if sample.publisher_class != _NRT:
+            return False
+        self.count_lost(LINK_DOWN)
+        return True
+
+    def _has_credit(self, stream: TxStream) -> bool:
+        """Whether the subscribers have room, as far as their credit says; it is read now, if need be."""
+        window = stream.window
+        if window.serial < window.limit:
+            return True
+        self._sender.credits.receive()
+        if window.serial < window.limit:
+            return True
+        self._sender.credits.wait()
+        return False
+
+    def force(self, sample: Sample) -> None:
+        if not self._link.up:
+            self.count_lost(LINK_DOWN)
+        elif not self.offer(sample):
+            self.count_lost("no credit")
+
+    def refill(self) -> None:
+        while not self._link.stats.lost.guard(self.waiting.serve):
+            pass  # the one that raised waits no more
+        self.waiting.recover()
+
+    def become_lossy(self, refusal: str) -> None:
+        """Go on without the subscribers that have no room; the others are waited for as before."""
+        self._streams[_NRT].window.skip_full()
+        self._sender.credits.wait()
+        self.waiting.reject(self, refusal)
+
+    # For the sender
+
+    def has_session(self, session: int) -> bool:
+        """Whether a session subscribes."""
+        return session in self._streams[_NRT].window.subscribers
+
+    def add_session(self, session: int, window: int) -> None:
+        """Add a session that subscribes, or give it another window."""
+        for publisher_class, stream in self._streams.items():
+            stream.window.add(session, window if publisher_class == _NRT else 0)
+        self.refill()
+
+    def remove_session(self, session: int) -> int:
+        """Remove a session; return how many messages it did not acknowledge, unless it left in order."""
+        self._sender.credits.receive()
+        unacknowledged = sum([stream.window.remove(session) for stream in self._streams.values()])
+        self.refill()
+        return unacknowledged
+
+    def acknowledge(self, credit: Credit) -> None:
+        """Note how far a session has come; a publisher that waits for that goes on with `refill`."""
+        self._streams[PublisherClass(credit.publisher_class)].window.acknowledge(credit.session, credit.serial)
+        self.set_leaving(credit.session, leaving=credit.leaving)
+
+    def set_leaving(self, session: int, *, leaving: bool) -> None:
+        """Note whether a session has ended its subscription, in all classes."""
+        for stream in self._streams.values():
+            stream.window.set_leaving(session, leaving=leaving)
+
+    def resend_latched(self) -> None:
+        """Send what is latched, whether or not there is room."""
+        self.resending = True
+        self.topic.resend_latched(self)
+        self.resending = False
+
+    @property
+    def awaits_credit(self) -> bool:
+        """Whether a publisher waits, or went on without a session that may grant credit again."""
+        return bool(self.waiting) or not all(
+            each.waited_for for each in self._streams[_NRT].window.subscribers.values()
+        )
+
+    def unacknowledged(self) -> set[int]:
+        """Return the sessions that were sent something, and have acknowledged nothing in any class."""
+        windows = [stream.window for stream in self._streams.values()]
+        answered = {number for window in windows for number, each in window.subscribers.items() if each.answered}
+        return {number for window in windows for number in window.unacknowledged()} - answered
+
+    def _prepare(self, stream: TxStream, sample: Sample) -> None:
+        """Switch to another publisher."""
+        self._batcher.send(stream)
+        put = self._sender.publishers.put(self.topic.name, sample.publisher_class)
+        stream.prepare(sample.source, self._sender.origin(self.topic, sample), put)
+
+
+class ZenohSender:
+    """All topics that go out by one link."""
+
+    def __init__(self, link: Link, hub: Hub, subscribers: dict[str, LinkSubscriber], *, batching: bool) -> None:
+        """`subscribers` are those of the link, by topic; `batching`: several messages may share a payload."""
+        self.link = link
+        self.loop = hub.space.loop
+        self.publishers = PublisherCache()
+        self.batcher = Batcher(self.loop, link.stats, ZenohError, batching=batching)
+        self.credits = CreditReader(self)
+        self.reachability = Reachability(self)
+        self.final_credits = FinalCredits(self.loop, self.credits.receive, self._count_unknown)
+        self._hub = hub
+        self._subscribers = subscribers
+        self._prefix = ""
+
+    def connect(self, session: ZenohSession, prefix: str) -> None:
+        """Use this session."""
+        self._prefix = prefix
+        self.publishers.connect(session, f"{prefix}/topic/")
+        self.credits.connect(session, f"{prefix}/credit/{self._hub.instance:x}")
 
     def close(self) -> None:
-        tap, self._tap = self._tap, None
-        if tap is not None:
-            tap.close()
-        if self._rest is not None:
-            self._rest.cancel()
+        self.reachability.close()
+        self.final_credits.close()
+        self.credits.close()
+        self.publishers.close()
+
+    def subscribers(self) -> Iterator[ZenohSubscriber]:
+        """Return the topics that are subscribed."""
+        return (each for each in self._subscribers.values() if isinstance(each, ZenohSubscriber))
+
+    def subscriber(self, topic: str) -> ZenohSubscriber | None:
+        subscriber = self._subscribers.get(topic)
+        return subscriber if isinstance(subscriber, ZenohSubscriber) else None
+
+    def has_topic(self, topic: str) -> bool:
+        """Whether this module has anything to do with a topic."""
+        return topic in self._hub.space.topics
+
+    # Subscribers that come and go
+
+    def joined(self, topic: str, session: int, window: int) -> None:
+        """A subscriber's token appeared, or has another window."""
+        subscriber = self.subscriber(topic)
+        current = subscriber is not None and subscriber.topic is self._hub.space.topics.get(topic)
+        if subscriber is not None and current and subscriber.has_session(session):
+            subscriber.add_session(session, window)
+        else:
+            self.reachability.add(topic, session, window)
+
+    def admit(self, topic: str, session: int, window: int, *, leaving: bool = False) -> None:
+        """Send to a subscriber that messages reach: what is latched, and all that is published from now on."""
+        here = self._hub.space.topics[topic]
+        subscriber = self.subscriber(topic)
+        if subscriber is not None and subscriber.topic is here:
+            subscriber.add_session(session, window)
+            subscriber.resend_latched()
+        else:
+            self.batcher.flush()  # of an earlier subscriber, whose serials this one continues
+            subscriber = self._subscribers[topic] = ZenohSubscriber(self, here)
+            subscriber.add_session(session, window)
+            here.join(subscriber)
+        if leaving:
+            subscriber.set_leaving(session, leaving=True)
+
+    def left(self, topic: str, session: int, *, gone: bool) -> None:
+        """Send no more to a subscriber. `gone`: its token is, too; else it goes on to accept what is on the way."""
+        self.reachability.remove(topic, session)
+        subscriber = self.subscriber(topic)
+        unacknowledged = 0 if subscriber is None else subscriber.remove_session(session)
+        if unacknowledged and gone and self.link.up:
+            self.final_credits.expect(topic, session, unacknowledged)
+        elif unacknowledged and gone:  # no credit comes on a link that is down
+            self._count_unknown(unacknowledged)
+
+    def final_credit_received(self, topic: str, session: int) -> None:
+        """A subscriber says that it leaves."""
+        self.final_credits.received(topic, session)
+        self.reachability.set_leaving(topic, session)
+
+    def _count_unknown(self, count: int) -> None:
+        self.link.stats.lost["unknown at disconnect"] += count
+
+    def report_unreachable(self, topic: str, session: int) -> None:
+        """Tell the user that messages do not reach a subscriber."""
+        modules = self.link.discovery.modules.values()
+        module = next((each.name for each in modules if each.instance == session), "?")
+        key = f"{self._prefix}/topic/{topic}"
+        text = (
+            f"topic {topic} does not reach module {module}: does the access control of a router deny {key} to either?"
+        )
+        self._hub.link_notice(self.link, "unheard", text, trouble=True)
+
+    # Publishers
+
+    def origin(self, topic: Topic, sample: Sample) -> Origin:
+        """Return what the headers say of the publisher of a message."""
+        own, source = self._hub.instance, sample.source
+        return Origin(
+            sample.publisher_class,
+            own,
+            self._instance_of(source.module) if source.link else own,
+            ANY_TYPE if topic.layout is None else topic.layout.fingerprint,
+            self._source_name(source),
+            source.node,
+        )
+
+    def _source_name(self, source: Source) -> str:
+        """Return the name that the module of a message has on this network."""
+        hooks = self.link.gateway_hooks
+        return name_for(source.module if hooks is None else hooks.source_name(source))
+
+    def _instance_of(self, module: str) -> int:
+        """Return the number of a module on any link; 0: firmware, or not known."""
+        links = (each for each in self._hub.space.links if isinstance(each, Link))
+        found = (each.discovery.modules.get(module) for each in links)
+        return next((info.instance for info in found if info is not None and info.instance is not None), 0)
+
+
+# Credit
+
+CREDIT_PAUSE_S = 0.02
+"""Seconds after which credit is read that no publisher waits for."""
+
+_CREDIT_RING = 1024
+"""Credits that come in that time at most."""
+
+_CREDIT_BYTES_MAX = 256
+
+
+class CreditReader:
+    """Reads what subscribers grant, when a publisher has come to the end of its credit.
+
+    Under load the thread of the event loop seldom lets another one run, and credit that had to come through another
+    thread would come when the publisher has stopped for it. So it stays in zenoh's ring until a publisher has no room,
+    or for CREDIT_PAUSE_S.
+    """
+
+    def __init__(self, sender: ZenohSender) -> None:
+        self._sender = sender
+        self._loop = sender.loop
+        self._lost = sender.link.stats.lost
+        self._reader: SubscriptionReader | None = None
+        self._waits = False
+        self._pause: asyncio.TimerHandle | None = None
+
+    def connect(self, session: ZenohSession, key: str) -> None:
+        """Subscribe to this module's credit."""
+        self._reader = session.subscribe(key, _CREDIT_RING, self._arrived)
+        self._waits = True
+
+    def receive(self) -> None:
+        """Read what has come; publishers that wait for it go on when the present work is done."""
+        if self._reader is not None:
+            first = self._reader.receive()
+            if first is not None:
+                self._read(first)
+                self._loop.call_soon(self._serve)
+
+    def wait(self) -> None:
+        """Have the next credit read as soon as it comes: a publisher waits."""
+        if self._reader is not None and not self._waits:
+            self._waits = True
+            self._reader.wait()
+
+    def close(self) -> None:
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.close()
+        if self._pause is not None:
+            self._pause.cancel()
 
     def _arrived(self, first: "zenoh.Sample | None") -> None:
-        self._expected = False
-        self._take(first)
+        self._waits = False
+        self._read(first)
         self._serve()
 
-    def _take(self, sample: "zenoh.Sample | None") -> None:
-        outlets = {each.topic.name: each for each in self._outlets()}
-        while sample is not None and self._tap is not None:
-            self._stats.lost.guard(self._grant, sample.payload, outlets)
-            sample = self._tap.take()
+    def _read(self, sample: "zenoh.Sample | None") -> None:
+        subscribers = {each.topic.name: each for each in self._sender.subscribers()}
+        while sample is not None and self._reader is not None:
+            self._lost.guard(self._apply, sample.payload, subscribers)
+            sample = self._reader.receive()
 
-    def _grant(self, payload: "zenoh.ZBytes", outlets: dict[str, "ZenohSubscriber"]) -> None:
+    def _apply(self, payload: "zenoh.ZBytes", subscribers: dict[str, ZenohSubscriber]) -> None:
         try:
-            credit = decode_credit(payload.to_bytes() if len(payload) <= _LONGEST else b"")
-            publisher_class = PublisherClass(credit.publisher_class)
+            credit = decode_credit(payload.to_bytes() if len(payload) <= _CREDIT_BYTES_MAX else b"")
+            PublisherClass(credit.publisher_class)
         except UnknownType:
-            self._stats.lost["unknown type"] += 1
+            self._lost["unknown type"] += 1
         except (DecodeError, ValueError):
-            self._stats.lost["undecodable"] += 1
+            self._lost["undecodable"] += 1
         else:
-            outlet = outlets.get(credit.topic)
-            if outlet is not None:
-                outlet.credited(credit.session, publisher_class, credit.serial, leaving=credit.leaving)
+            subscriber = subscribers.get(credit.topic)
+            if subscriber is not None:
+                subscriber.acknowledge(credit)
             if credit.leaving:
-                self._left(credit.topic, credit.session)
+                self._sender.final_credit_received(credit.topic, credit.session)
 
     def _serve(self) -> None:
-        """Those who wait."""
-        if self._tap is None:
+        """Let publishers that wait go on."""
+        if self._reader is None:
             return
-        outlets = list(self._outlets())
-        for outlet in outlets:
-            if outlet.wait_queue():
-                self._stats.lost.guard(outlet.refill)
-        if any(outlet.expects for outlet in outlets):
-            self.expect()
-        elif not self._expected and self._rest is None:
-            self._rest = self._loop.call_later(REST, self._rested)
+        subscribers = list(self._sender.subscribers())
+        for subscriber in subscribers:
+            if subscriber.wait_queue():
+                self._lost.guard(subscriber.refill)
+        if any(subscriber.awaits_credit for subscriber in subscribers):
+            self.wait()
+        elif not self._waits and self._pause is None:
+            self._pause = self._loop.call_later(CREDIT_PAUSE_S, self._pause_over)
 
-    def _rested(self) -> None:
-        self._rest = None
-        self.expect()
-
-
-# Whether messages reach the subscribers that tokens tell of: looked at before they are let in, and after.
+    def _pause_over(self) -> None:
+        self._pause = None
+        self.wait()
 
 
-_NEXT = 0.002
-"""Seconds between two looks whether messages reach a new subscriber; longer each time."""
+# New subscribers
 
-_TRIES = 50
-"""Looks, together 2.5 s, after which somebody has to be told."""
+_RETRY_S = 0.002
+"""Seconds until the second look whether messages reach a new subscriber; each further one takes that much longer."""
 
-_CHECK = 0.25
-"""Seconds between two looks whether what was sent is heard."""
+_RETRY_FACTOR_MAX = 100
 
-_REPEATS = 6
+_RETRIES = 50
+"""Looks, together 2.5 s, after which the user has to know."""
+
+_CHECK_S = 0.25
+"""Seconds between two looks whether what was sent is acknowledged."""
+
+_RESENDS = 6
+"""Looks at which latched values are sent once more, before the user has to know."""
 
 
-class _Guest(msgspec.Struct, eq=False):
-    """A subscriber that is there, but not known to be within reach."""
+class _PendingSubscriber(msgspec.Struct, eq=False):
+    """A subscriber whose token is there, while messages are not known to reach it."""
 
     window: int
-    waited: int = 0
+    retries: int = 0
     leaving: bool = False
 
 
 class Reachability:
-    """The subscribers of one link, by topic and session."""
+    """Whether messages reach the subscribers: looked at before they are sent to, and after.
 
-    def __init__(self, link: "ZenohLink", loop: "asyncio.AbstractEventLoop") -> None:
-        self._link = link
-        self._loop = loop
-        self._guests: dict[tuple[str, int], _Guest] = {}
-        self._checking: asyncio.TimerHandle | None = None
+    Tokens and routes for messages spread through the network at different times, and a router's access control may let
+    pass the one and not the other.
+    """
 
-    def came(self, topic: str, session: int, window: int) -> None:
-        """A subscriber is new: let it in as soon as messages reach it."""
-        guest = self._guests[topic, session] = _Guest(window)
-        self._look(topic, session, guest)
+    def __init__(self, sender: ZenohSender) -> None:
+        self._sender = sender
+        self._loop = sender.loop
+        self._lost = sender.link.stats.lost
+        self._pending: dict[tuple[str, int], _PendingSubscriber] = {}
+        self._check_timer: asyncio.TimerHandle | None = None
 
-    def leaves(self, topic: str, session: int) -> None:
-        """It has sent its last credit, but its token is still there: should it be let in, it is known to be leaving."""
-        guest = self._guests.get((topic, session))
-        if guest is not None:
-            guest.leaving = True
+    def add(self, topic: str, session: int, window: int) -> None:
+        """Admit a new subscriber as soon as messages reach it."""
+        pending = self._pending[topic, session] = _PendingSubscriber(window)
+        self._try(topic, session, pending)
 
-    def left(self, topic: str, session: int) -> None:
-        self._guests.pop((topic, session), None)
+    def set_leaving(self, topic: str, session: int) -> None:
+        """Note that a subscriber has sent its final credit while its token is still there."""
+        pending = self._pending.get((topic, session))
+        if pending is not None:
+            pending.leaving = True
+
+    def remove(self, topic: str, session: int) -> None:
+        """Forget a subscriber whose token is gone."""
+        self._pending.pop((topic, session), None)
 
     def close(self) -> None:
-        """Look no more."""
-        self._guests.clear()
-        if self._checking is not None:
-            self._checking.cancel()
+        self._pending.clear()
+        if self._check_timer is not None:
+            self._check_timer.cancel()
 
-    def _look(self, topic: str, session: int, guest: _Guest) -> None:
-        if self._guests.get((topic, session)) is not guest or not self._link.knows(topic):
+    def _try(self, topic: str, session: int, pending: _PendingSubscriber) -> None:
+        if self._pending.get((topic, session)) is not pending or not self._sender.has_topic(topic):
             return
         if not self._reaches(topic):
-            guest.waited += 1
-            if guest.waited == _TRIES:
-                self._link.tell_unheard(topic, session)
-            self._loop.call_later(_NEXT * min(guest.waited, 100), self._look, topic, session, guest)
+            pending.retries += 1
+            if pending.retries == _RETRIES:
+                self._sender.report_unreachable(topic, session)
+            delay = _RETRY_S * min(pending.retries, _RETRY_FACTOR_MAX)
+            self._loop.call_later(delay, self._try, topic, session, pending)
             return
-        del self._guests[topic, session]
-        self._link.stats.lost.guard(self._link.let_in, topic, session, guest.window, leaving=guest.leaving)
-        if self._checking is None:
-            self._checking = self._loop.call_later(_CHECK, self._check)
+        del self._pending[topic, session]
+        self._lost.guard(self._sender.admit, topic, session, pending.window, leaving=pending.leaving)
+        if self._check_timer is None:
+            self._check_timer = self._loop.call_later(_CHECK_S, self._check)
 
     def _reaches(self, topic: str) -> bool:
         try:
-            return self._link.senders.reach(topic)
-        except Exception as error:  # noqa: BLE001 - counted and logged; it is looked at again
-            self._link.stats.lost.internal_error(error)
+            return self._sender.publishers.reaches(topic)
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
+            self._lost.internal_error(error)
             return False
 
     def _check(self) -> None:
-        self._checking = None
-        self._link.credits.look()
-        outlets = list(self._link.zenoh_outlets())
-        for outlet in outlets:
-            self._link.stats.lost.guard(self._check_outlet, outlet)
-        if outlets:
-            self._checking = self._loop.call_later(_CHECK, self._check)
+        self._check_timer = None
+        self._sender.credits.receive()
+        subscribers = list(self._sender.subscribers())
+        for subscriber in subscribers:
+            self._lost.guard(self._check_subscriber, subscriber)
+        if subscribers:
+            self._check_timer = self._loop.call_later(_CHECK_S, self._check)
 
-    def _check_outlet(self, outlet: "ZenohSubscriber") -> None:
-        for session in outlet.unacknowledged():
-            outlet.tries[session] += 1
-            if outlet.tries[session] <= _REPEATS:
-                outlet.resend_latched()
-            elif outlet.tries[session] == _REPEATS + 1:
-                self._link.tell_unheard(outlet.topic.name, session)
-
-
-# Subscribers whose token is gone, and whose last credit may still come.
+    def _check_subscriber(self, subscriber: ZenohSubscriber) -> None:
+        for session in subscriber.unacknowledged():
+            subscriber.silent_checks[session] += 1
+            if subscriber.silent_checks[session] <= _RESENDS:
+                subscriber.resend_latched()
+            elif subscriber.silent_checks[session] == _RESENDS + 1:
+                self._sender.report_unreachable(subscriber.topic.name, session)
 
 
-LATEST = 1.0
-"""Seconds after the end of a token in which a last credit may come: far more than threads and networks take."""
+# Subscribers that left
+
+FINAL_CREDIT_S = 1.0
+"""Seconds after the end of a token in which a final credit may come: far more than threads and networks take."""
 
 
-class _Gone(msgspec.Struct, eq=False):
-    """So many messages are not confirmed; they are counted when the timer ends."""
+class _DepartedSubscriber(msgspec.Struct, eq=False):
+    """A subscriber whose token is gone; what it did not acknowledge is counted when the timer ends."""
 
-    unconfirmed: int
-    timer: "asyncio.TimerHandle"
+    unacknowledged: int
+    timer: asyncio.TimerHandle
 
 
 class FinalCredits:
-    """Those of one link, by topic and session. `look` takes in the credits that have come; `count` gets the number of
-    messages of a subscriber that has not left in order.
+    """Waits for the last credit of subscribers whose token is gone; only what then stays open counts as unknown.
+
+    `receive` reads the credits that have come; `count` gets the number of messages of a subscriber that has not left in
+    order.
     """
 
     def __init__(
-        self, loop: "asyncio.AbstractEventLoop", look: Callable[[], object], count: Callable[[int], object]
+        self, loop: asyncio.AbstractEventLoop, receive: Callable[[], object], count: Callable[[int], object]
     ) -> None:
         self._loop = loop
-        self._look = look
+        self._receive = receive
         self._count = count
-        self._gone: dict[tuple[str, int], _Gone] = {}
+        self._departed: dict[tuple[str, int], _DepartedSubscriber] = {}
 
-    def expect(self, topic: str, session: int, unconfirmed: int) -> None:
-        """The token of a subscriber is gone, and so many messages are not confirmed."""
+    def expect(self, topic: str, session: int, unacknowledged: int) -> None:
+        """Wait for the final credit of a subscriber that did not acknowledge this many messages."""
         key = topic, session
-        before = self._gone.pop(key, None)
+        before = self._departed.pop(key, None)
         if before is not None:  # it came back meanwhile, and is gone again
             before.timer.cancel()
-            unconfirmed += before.unconfirmed
-        self._gone[key] = _Gone(unconfirmed, self._loop.call_later(LATEST, self._late, key))
+            unacknowledged += before.unacknowledged
+        timer = self._loop.call_later(FINAL_CREDIT_S, self._expired, key)
+        self._departed[key] = _DepartedSubscriber(unacknowledged, timer)
 
-    def came(self, topic: str, session: int) -> None:
-        """A last credit: the subscriber did not want what is not confirmed."""
-        gone = self._gone.pop((topic, session), None)
-        if gone is not None:
-            gone.timer.cancel()
+    def received(self, topic: str, session: int) -> None:
+        """A final credit has come: the subscriber did not want what it did not acknowledge."""
+        departed = self._departed.pop((topic, session), None)
+        if departed is not None:
+            departed.timer.cancel()
 
     def close(self) -> None:
-        """Nothing comes any more."""
-        self._look()
-        gone, self._gone = self._gone, {}
-        for each in gone.values():
+        """Count what is open: no credit comes any more."""
+        self._receive()
+        departed, self._departed = self._departed, {}
+        for each in departed.values():
             each.timer.cancel()
-            self._count(each.unconfirmed)
+            self._count(each.unacknowledged)
 
-    def _late(self, key: tuple[str, int]) -> None:
-        self._look()  # which may be the very credit
-        gone = self._gone.pop(key, None)
-        if gone is not None:
-            self._count(gone.unconfirmed)
+    def _expired(self, key: tuple[str, int]) -> None:
+        self._receive()  # which may be the very credit
+        departed = self._departed.pop(key, None)
+        if departed is not None:
+            self._count(departed.unacknowledged)

@@ -1,4 +1,4 @@
-"""Why there is no connection, in words. zenoh itself says only that there is none; so we try each step ourselves."""
+"""Explains why there is no connection. zenoh itself says only that there is none; so this module tries each step."""
 
 import asyncio
 import contextlib
@@ -10,17 +10,17 @@ from pathlib import Path
 
 import msgspec
 
-_PATIENCE = 2.0
-"""Seconds for each step."""
+_STEP_TIMEOUT_S = 2.0
+"""Seconds for an endpoint to answer."""
 
-_ALERT = 0.5
-"""Seconds in which a server that does not like our certificate says so, after it seemed to."""
+_ALERT_TIMEOUT_S = 0.5
+"""Seconds in which a server refuses our certificate, after the handshake has succeeded: TLS 1.3 lets it do so."""
 
-_HANDSHAKE = 1.0
-"""Seconds for one that speaks TLS to answer in it."""
+_HANDSHAKE_TIMEOUT_S = 1.0
+"""Seconds for a server that speaks TLS to answer in it."""
 
-NOT_US = "takes the connection, but not us"
-"""What also seems so for a moment when a router comes back, until zenoh tries again."""
+NOT_ADMITTED = "accepts the connection, but not this module"
+"""Part of a text that is also right for a moment when a router comes back, until zenoh tries again."""
 
 _STREAMS = {"tcp", "tls", "ws"}
 _DATAGRAMS = {"udp", "quic"}
@@ -46,8 +46,8 @@ class ConnectionSettings(msgspec.Struct, frozen=True):
     listens: list[str] = []
 
 
-class _Place(msgspec.Struct, frozen=True):
-    """An endpoint `PROTOCOL/HOST:PORT#iface=NAME`, taken apart; the port is empty where a protocol has none."""
+class _ParsedEndpoint(msgspec.Struct, frozen=True):
+    """The parts of `PROTOCOL/HOST:PORT#iface=NAME`; the port is empty where a protocol has none."""
 
     protocol: str
     address: str
@@ -55,97 +55,97 @@ class _Place(msgspec.Struct, frozen=True):
     port: str
     interface: str
 
-    def trouble(self) -> str:
-        """What is wrong with its interface; empty: nothing."""
+    def interface_error(self) -> str:
+        """Return what is wrong with the interface; empty: nothing."""
         there = [name for _, name in socket.if_nameindex()]
         if not self.interface or self.interface in there:
             return ""
         return f"there is no network interface {self.interface} here: there are {', '.join(there)}"
 
 
-def why_not_listening(way: ConnectionSettings) -> str:
-    """What keeps a session from listening, and what to do; empty: it is none of what can be tried here.
+def diagnose_listening(settings: ConnectionSettings) -> str:
+    """Return what keeps a session from listening, and what to do; empty: nothing that can be tried here.
 
     Blocks as long as it takes to look names up.
     """
-    return next(filter(None, map(_why_not_listening, way.listens)), "")
+    return next(filter(None, map(_diagnose_listener, settings.listens)), "")
 
 
-async def why(way: ConnectionSettings) -> str:
-    """What keeps us from connecting, and what to check."""
-    return "; ".join([await _why(endpoint, way) for endpoint in way.endpoints]) or "nobody is there"
+async def diagnose_connection(settings: ConnectionSettings) -> str:
+    """Return what keeps a session from connecting, and what to check."""
+    return "; ".join([await _diagnose_endpoint(each, settings) for each in settings.endpoints]) or "no peer was found"
 
 
-async def _why(endpoint: str, way: ConnectionSettings) -> str:
-    place = _place(endpoint)
-    protocol, address = place.protocol, place.address
-    if protocol not in {"tcp", "tls"} or not place.port:
-        return f"{endpoint}: no answer; check the endpoint, and that a router listens there"
-    if trouble := place.trouble():
-        return trouble
+async def _diagnose_endpoint(text: str, settings: ConnectionSettings) -> str:
+    endpoint = _parse_endpoint(text)
+    protocol, address = endpoint.protocol, endpoint.address
+    if protocol not in {"tcp", "tls"} or not endpoint.port:
+        return f"{text}: no answer; check the endpoint, and that a router listens there"
+    if problem := endpoint.interface_error():
+        return problem
     try:
-        async with asyncio.timeout(_PATIENCE), _connection(place.host, int(place.port)) as (reader, writer):
+        async with asyncio.timeout(_STEP_TIMEOUT_S), _connection(endpoint.host, int(endpoint.port)) as (reader, writer):
             if protocol == "tls":
-                await _shake_hands(reader, writer, place.host, way.tls)
+                await _start_tls(reader, writer, endpoint.host, settings.tls)
     except TimeoutError:
         return f"{address} does not answer: is the computer on, is there a firewall?"
     except socket.gaierror:
-        return _no_such_host(place)
+        return _no_such_host(endpoint)
     except ssl.SSLError as error:
-        return f"{address}: {_tls_words(error, way.tls)}"
+        return f"{address}: {_tls_text(error, settings.tls)}"
     except ConnectionRefusedError:
-        return f"nobody listens at {address}: is the router running, is the port the right one?"
+        return f"no program listens at {address}: is the router running, is the port the right one?"
     except (OSError, OverflowError) as error:
         return f"{address}: {error}"
-    return f"{address} {NOT_US}: {_refusal_words(protocol, way)}"
+    return f"{address} {NOT_ADMITTED}: {_not_admitted_text(protocol, settings)}"
 
 
-def _place(endpoint: str) -> _Place:
-    protocol, _, rest = endpoint.partition("/")
+def _parse_endpoint(text: str) -> _ParsedEndpoint:
+    protocol, _, rest = text.partition("/")
     rest, _, options = rest.partition("#")
     address = rest.partition("?")[0]
     host, _, port = address.rpartition(":")
     interface = next((each[len("iface=") :] for each in options.split(";") if each.startswith("iface=")), "")
-    return _Place(protocol, address, host.strip("[]"), port if port.isdecimal() else "", interface)
+    return _ParsedEndpoint(protocol, address, host.strip("[]"), port if port.isdecimal() else "", interface)
 
 
-def _no_such_host(place: _Place) -> str:
-    return f"{place.host} is the name of no computer that is known here"
+def _no_such_host(endpoint: _ParsedEndpoint) -> str:
+    return f"{endpoint.host} is not the name of a known computer"
 
 
-def _why_not_listening(endpoint: str) -> str:
-    place = _place(endpoint)
-    if not place.port or place.protocol not in _STREAMS | _DATAGRAMS:
+def _diagnose_listener(text: str) -> str:
+    endpoint = _parse_endpoint(text)
+    if not endpoint.port or endpoint.protocol not in _STREAMS | _DATAGRAMS:
         return ""
     try:
-        _try_to_listen(place)
+        _try_to_listen(endpoint)
     except socket.gaierror:
-        return _no_such_host(place)
+        return _no_such_host(endpoint)
     except OSError as error:
-        return _listening_words(error, place)
-    return place.trouble()
+        return _listening_text(error, endpoint)
+    return endpoint.interface_error()
 
 
-def _try_to_listen(place: _Place) -> None:
-    kind = socket.SOCK_DGRAM if place.protocol in _DATAGRAMS else socket.SOCK_STREAM
-    family, _, _, _, address = socket.getaddrinfo(place.host, int(place.port), type=kind)[0]
+def _try_to_listen(endpoint: _ParsedEndpoint) -> None:
+    kind = socket.SOCK_DGRAM if endpoint.protocol in _DATAGRAMS else socket.SOCK_STREAM
+    family, _, _, _, address = socket.getaddrinfo(endpoint.host, int(endpoint.port), type=kind)[0]
     with socket.socket(family, kind) as here:
-        if kind == socket.SOCK_STREAM:  # what has just been closed is free
+        if kind == socket.SOCK_STREAM:  # a port that was closed just before is free, as for zenoh
             here.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         here.bind(address)
 
 
-def _listening_words(error: OSError, place: _Place) -> str:
+def _listening_text(error: OSError, endpoint: _ParsedEndpoint) -> str:
     match error.errno:
         case errno.EADDRINUSE:
             other = "listen at another port, at 0 for any that is free, or end the other program"
-            return f"can't listen at {place.address}: the port is in use; {other} (ss -ltnp tells which)"
+            return f"can't listen at {endpoint.address}: the port is in use; {other} (see: ss -ltnp)"
         case errno.EADDRNOTAVAIL:
-            return f"can't listen at {place.address}: {place.host} is no address of this computer (ip address tells)"
+            return f"can't listen at {endpoint.address}: this computer has no address {endpoint.host} (see: ip address)"
         case errno.EACCES:
-            return f"can't listen at {place.address}: ports below 1024 are for root; take another one"
+            return f"can't listen at {endpoint.address}: ports below 1024 are for root; take another one"
         case _:
-            return f"can't listen at {place.address}: {error.strerror}"
+            return f"can't listen at {endpoint.address}: {error.strerror}"
 
 
 @contextlib.asynccontextmanager
@@ -157,16 +157,16 @@ async def _connection(host: str, port: int) -> AsyncIterator[tuple[asyncio.Strea
         writer.transport.abort()
 
 
-async def _shake_hands(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str, tls: Tls) -> None:
-    """As zenoh does it; raises what it does not say."""
+async def _start_tls(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str, tls: Tls) -> None:
+    """Start TLS as zenoh does; raises what zenoh does not say."""
     context = _context(tls)
     try:
-        async with asyncio.timeout(_HANDSHAKE):
+        async with asyncio.timeout(_HANDSHAKE_TIMEOUT_S):
             await writer.start_tls(context, server_hostname=host)
     except TimeoutError as error:
         raise ConnectionError(_NO_TLS) from error
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(_ALERT):
+        async with asyncio.timeout(_ALERT_TIMEOUT_S):
             await reader.read(1)  # a server that refuses our certificate says so only now
 
 
@@ -181,7 +181,7 @@ def _context(tls: Tls) -> ssl.SSLContext:
     return context
 
 
-def _tls_words(error: ssl.SSLError, tls: Tls) -> str:
+def _tls_text(error: ssl.SSLError, tls: Tls) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
         check = f"{tls.root or 'root_ca_certificate'} has to be the authority that signed it, and its name the host's"
         return f"its certificate is not accepted here ({error.verify_message}): {check}"
@@ -194,9 +194,9 @@ def _tls_words(error: ssl.SSLError, tls: Tls) -> str:
     return f"TLS fails ({reason})"
 
 
-def _refusal_words(protocol: str, way: ConnectionSettings) -> str:
-    if way.user is not None:
-        asks = f"check the password of user {way.user} (transport/auth/usrpwd), and that it"
+def _not_admitted_text(protocol: str, settings: ConnectionSettings) -> str:
+    if settings.user is not None:
+        asks = f"check the password of user {settings.user} (transport/auth/usrpwd), and that it"
         return f"{asks} is a zenoh 1 router that does not hang"
     checks = "it may ask for a user and a password (transport/auth/usrpwd), hang, or be no zenoh 1 router"
     return checks if protocol == "tls" else f"{checks}, or want TLS (tls/ instead of tcp/)"

@@ -1,55 +1,50 @@
-"""A module's place on a zenoh network: its tokens, its topics, and whether the network can be reached.
+"""A module's link to a zenoh network: its tokens, its topics, and whether the network can be reached.
 
 Keys, all under `r2p/NETWORK/`:
 
     live/...                what each module has, as liveliness tokens (r2p.codecs.liveliness)
     topic/TOPIC             messages: one or several, packed; the rest is in the attachment (r2p.codecs.attachment)
     credit/SESSION          to a publisher's module: how far a subscriber has come
-    control                 management messages, from a module to all; who sends them is in the attachment
+    control                 management messages, from a module to all; the attachment says who sends them
     schema/SESSION/TYPE     asks a module for the fields of a type, by fingerprint
 """
 
+import asyncio
 import functools
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from collections.abc import Callable, Hashable
+from typing import Any, ClassVar, cast
 
 from r2p.codecs import UnknownType, liveliness, schemas
-from r2p.codecs.attachment import Credit, decode_sender, encode_credit, encode_sender, name_for
+from r2p.codecs.attachment import decode_sender, encode_sender
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
 from r2p.names import NAMESPACED_MAX
 from r2p.protocols.discovery.events import Declare, Event, QueryTokens, SubscriberJoined, SubscriberLeft, Undeclare
-from r2p.protocols.liveliness.session import TOKENS, LivelinessDiscovery
-from r2p.runtime.sample import PublisherClass, Source
+from r2p.protocols.liveliness.session import TOKENS_MAX, LivelinessDiscovery
+from r2p.runtime.sample import PublisherClass
 from r2p.runtime.topic import Topic
 from r2p.transports.announcement import NOTHING
 from r2p.transports.link import Hub, Link, unique_name
 from r2p.transports.stats import LoggedCounter
-from r2p.transports.zenoh.credit import Credits, FinalCredits, Reachability
-from r2p.transports.zenoh.publish import Batcher, PublisherCache, ZenohSubscriber
-from r2p.transports.zenoh.session import ErrorOfZenoh, LoopQueue, SubscriptionReader, ZenohSession
-from r2p.transports.zenoh.subscribe import RING, RxStreams
+from r2p.transports.zenoh.credit import ZenohSender
+from r2p.transports.zenoh.session import LoopQueue, ZenohSession
+from r2p.transports.zenoh.subscribe import ZenohReceiver
 
-if TYPE_CHECKING:
-    import asyncio
+_EVENTS_MAX = 65_536
+"""Tokens, messages of the protocol and the like that wait for the loop."""
 
-    import zenoh
+_ANSWERS_MAX = 4 * _EVENTS_MAX
+"""Tokens that were queried and wait for the loop: more than are queried at once, so the end of the answers has room."""
 
-_EVENTS = 65_536
-"""Tokens, messages of the protocol and the like that wait for the loop at most."""
+_TYPE_QUERIES_MAX = 1024
+"""Queries for types that wait for the loop."""
 
-_TOKENS_FOUND = 4 * _EVENTS
-"""Tokens that were asked for and wait for the loop: more than zenoh is asked for at once, so the last word has room."""
+_TOKENS_TIMEOUT_S = 30.0
+"""Seconds for the network to answer with all its tokens."""
 
-_LOOK = 30.0
-"""Seconds for the network to tell of all its tokens."""
-
-_QUERIES = 1024
-"""Queries for types that wait for the loop at most."""
-
-_ANSWER = 1.0
-"""Seconds for the modules to answer a query."""
+_TYPE_TIMEOUT_S = 1.0
+"""Seconds for the modules to answer a query for a type."""
 
 _GUARANTEES = {
     PublisherClass.NON_REAL_TIME: "in order, waits for room in every subscriber; zenoh priority data",
@@ -62,114 +57,152 @@ class ZenohLink(Link):
     """One module on one zenoh network."""
 
     max_payload: ClassVar[int] = SIZE_MAX
-    send_error: ClassVar[type[Exception]] = ErrorOfZenoh
-    """What sending raises when the session is closed."""
     max_name: ClassVar[int] = NAMESPACED_MAX
     passes_probes: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool) -> None:
-        """`connects`: it is up while it is connected; else it takes those who come, and is up even alone.
+        """`connects`: it is up while it is connected; else it takes connections, and is up even alone.
 
         `batching`: several messages may share a payload.
         """
-        self.prefix = ""
-        """What all keys of the network begin with."""
         self._connects = connects
         self.instance = hub.instance
         name = unique_name(name, hub)
-        presence = LivelinessDiscovery(
-            hub.space.module, hub.instance, observer=hub.observer, counts=LoggedCounter(name, hub.space.clock)
-        )
-        super().__init__(name, hub, discovery=presence)
-        self._presence = presence
+        counts = LoggedCounter(name, hub.space.clock)
+        self._liveliness = LivelinessDiscovery(hub.space.module, hub.instance, observer=hub.observer, counts=counts)
+        super().__init__(name, hub, discovery=self._liveliness)
         self._session: ZenohSession | None = None
-        self._funnels: list[LoopQueue] = []
+        self._prefix = ""
+        self._queues: list[LoopQueue] = []
         self._transports: set[str] = set()
-        self._tokens = TokenDebouncer(hub.space.loop, self._believed, self._refused)
-        self._changes = self._funnel(self._token_changed)
-        self._overflown = 0
-        self._found = self._funnel(self._token_found, most=_TOKENS_FOUND)
-        self.senders = PublisherCache()
-        self.burst = Batcher(hub.space.loop, self.stats, self.send_error, batching=batching)
-        self.credits = Credits(hub.space.loop, self.stats, self.zenoh_outlets, self._left)
-        self._reach = Reachability(self, hub.space.loop)
-        self._farewells = FinalCredits(hub.space.loop, self.credits.look, self._count_unknown)
-        self._streams = RxStreams(
-            name,
-            hub.space.loop,
-            self.stats,
-            longest=self.max_payload,
-            latched=self.latched,
-            credit=self._credit,
-            subscribe=self._subscribe,
-        )
+        """The zenoh sessions that it is connected to, by id."""
+        self._tokens = TokenDebouncer(hub.space.loop, self._token_settled, self._token_refused)
+        self._token_changes = self._queue(self._token_changed)
+        self._token_answers = self._queue(self._token_answered, most=_ANSWERS_MAX)
+        self._overflowed = 0
+        self.sender = ZenohSender(self, hub, self._subscribers, batching=batching)
+        self.receiver = ZenohReceiver(self, hub)
 
     # For the transport
 
     def use(self, session: ZenohSession, prefix: str) -> None:
-        """There is a session: take part in the network."""
+        """Take part in the network; all its keys begin with the prefix."""
         self._session = session
-        self.prefix = prefix
+        self._prefix = prefix
         session.outbound.failed = self.stats.lost.internal_error
-        self.senders.connect(session, f"{prefix}/topic/")
-        self._streams.connect()
-        for name, told in self._announced.items():
-            if told.publishes:
-                self.senders.declare(self._space.topics[name])
-        hexed = f"{self.instance:x}"
+        self.sender.connect(session, prefix)
+        self.receiver.connect(session, prefix)
+        for name, announced in self._announced.items():
+            if announced.publishes:
+                self.sender.publishers.declare(self._space.topics[name])
         if not self._connects:
             self.on_up()
-        session.watch(self._funnel(self._transport_changed))
-        session.watch_tokens(f"{self.prefix}/{liveliness.PLACE}", self._changes)
-        session.listen(f"{self.prefix}/control", self._funnel(self._controlled))
-        session.serve(f"{self.prefix}/schema/{hexed}/*", self._schema, functools.partial(self._funnel, most=_QUERIES))
-        self.credits.connect(session, f"{self.prefix}/credit/{hexed}")
+        session.watch_transports(self._queue(self._transport_changed))
+        session.watch_tokens(f"{prefix}/{liveliness.PLACE}", self._token_changes)
+        session.listen(f"{prefix}/control", self._queue(self._control_received))
+        queue = functools.partial(self._queue, most=_TYPE_QUERIES_MAX)
+        session.answer_queries(f"{prefix}/schema/{self.instance:x}/*", self._schema, queue)
 
-    def _funnel(self, take: Callable[[Any], None], most: int = _EVENTS) -> LoopQueue:
-        funnel = LoopQueue(self._space.loop, take, self.stats.lost, most=most)
-        self._funnels.append(funnel)
-        return funnel
+    def _queue(self, handle: Callable[[Any], None], most: int = _EVENTS_MAX) -> LoopQueue:
+        """Make a way from zenoh's threads into the loop."""
+        queue = LoopQueue(self._space.loop, handle, self.stats.lost, most=most)
+        self._queues.append(queue)
+        return queue
 
     # Link
 
     @property
     def losses(self) -> Counter[str]:
-        overflown = sum(each.overflown for each in self._funnels)
-        return super().losses + Counter({"events overflown": overflown})
+        overflowed = sum(each.overflowed for each in self._queues)
+        return super().losses + Counter({"events overflown": overflowed})
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         if self._session is not None and self._session.outbound.full and not urgent:
             self.stats.lost["management, send buffer full"] += 1
         elif self._session is not None:
             sender = encode_sender(self.instance)
-            self._session.put(f"{self.prefix}/control", data, attachment=sender, urgent=urgent)
+            self._session.put(f"{self._prefix}/control", data, attachment=sender, urgent=urgent)
 
     def discard(self) -> int:
-        for outlet in self._subscribers.values():
-            outlet.wait_queue().reject_all("link down")
-        return self.burst.discard()
+        for subscriber in self.sender.subscribers():
+            subscriber.wait_queue().reject_all("link down")
+        return self.sender.batcher.discard()
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
         return _GUARANTEES[publisher_class]
 
     def topic_changed(self, topic: Topic) -> None:
         super().topic_changed(topic)
-        told = self._announced.get(topic.name, NOTHING)
-        if told.publishes:
-            self.senders.declare(topic)
+        announced = self._announced.get(topic.name, NOTHING)
+        if announced.publishes:
+            self.sender.publishers.declare(topic)
         else:
-            self.senders.undeclare(topic.name)
-        if told.subscribes:
-            self._streams.begin(topic)
+            self.sender.publishers.undeclare(topic.name)
+        if announced.subscribes:
+            self.receiver.subscribe(topic)
 
     def window(self, topic: Topic) -> int:
-        return self._streams.window(topic)
+        return self.receiver.window(topic)
+
+    def on_up(self) -> None:
+        self.receiver.resumed()
+        super().on_up()
+        self._tokens.on_up()
+
+    def on_down(self, reason: str) -> None:
+        self._tokens.on_down()
+        self.receiver.interrupted()
+        super().on_down(reason)
+
+    def close(self) -> None:
+        self.sender.batcher.flush()
+        self._tokens.on_down()
+        super().close()
+        self.sender.close()
+        self._session = None
+
+    def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
+        self.receiver.add_publisher(topic, source)
+
+    def remove_publisher(self, name: str, source: Hashable) -> None:
+        self.receiver.remove_publisher(name, source)
+
+    def remove_publishers(self, name: str) -> None:
+        self.receiver.unsubscribe(name)
+
+    def _subscriber_joined(self, event: SubscriberJoined) -> None:
+        self.sender.joined(event.topic, cast("int", event.source), event.queue)
+
+    def _remove_subscriber(self, name: str) -> None:
+        self.sender.batcher.flush()  # before the publishers that it is sent with are undeclared
+        super()._remove_subscriber(name)
+
+    def _release_topics(self) -> None:
+        super()._release_topics()
+        self.receiver.close()
+
+    def _act(self, event: Event) -> None:
+        match event:
+            case Declare(key):
+                if self._session is not None:
+                    self._session.declare_token(f"{self._prefix}/{liveliness.place(key)}")
+            case Undeclare(key):
+                if self._session is not None:
+                    self._session.undeclare_token(f"{self._prefix}/{liveliness.place(key)}")
+            case QueryTokens():
+                self._query_tokens()
+            case SubscriberLeft(topic, int(session), gone):
+                self.sender.left(topic, session, gone=gone)
+            case _:
+                super()._act(event)
+
+    # Types
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         session = self._session
         if session is None:
             return None
-        for answer in await session.ask(f"{self.prefix}/schema/*/{fingerprint.hex()}", _ANSWER):
+        for answer in await session.query(f"{self._prefix}/schema/*/{fingerprint.hex()}", _TYPE_TIMEOUT_S):
             try:
                 return message_type(*schemas.decode(answer, fingerprint))
             except (DecodeError, MessageError):
@@ -177,141 +210,12 @@ class ZenohLink(Link):
         return None
 
     def _schema(self, key: str) -> bytes | None:
-        """What we know of the type that a query asks for."""
+        """Return what this module knows of the type that a query asks for."""
         wanted = key.rpartition("/")[2]
         for topic in self._space.topics.values():
             if topic.layout is not None and topic.layout.fingerprint.hex() == wanted:
                 return schemas.encode(topic.layout.cls.__name__, topic.layout.schema)
         return None
-
-    def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
-        self._streams.begin(topic)
-        self._streams.open(topic, size, source)
-
-    def remove_publisher(self, name: str, source: Hashable) -> None:
-        self._streams.shut(name, source)
-
-    def remove_publishers(self, name: str) -> None:
-        self._streams.shut_all(name)
-
-    def _release_topics(self) -> None:
-        super()._release_topics()
-        self._streams.close()
-
-    def close(self) -> None:
-        self.burst.flush()
-        self._tokens.on_down()
-        super().close()
-        self._reach.close()
-        self._farewells.close()
-        self.credits.close()
-        self.senders.close()
-        self._session = None
-
-    def _remove_subscriber(self, name: str) -> None:
-        self.burst.flush()  # before what it is sent with is undeclared
-        super()._remove_subscriber(name)
-
-    def _act(self, event: Event) -> None:
-        match event:
-            case Declare(key):
-                if self._session is not None:
-                    self._session.declare(f"{self.prefix}/{liveliness.place(key)}")
-            case Undeclare(key):
-                if self._session is not None:
-                    self._session.undeclare(f"{self.prefix}/{liveliness.place(key)}")
-            case QueryTokens():
-                self._look()
-            case SubscriberLeft(topic, int(session), gone):
-                self._part(topic, session, gone=gone)
-            case _:
-                super()._act(event)
-
-    # Subscribers
-
-    def _subscriber_joined(self, event: SubscriberJoined) -> None:
-        """A subscriber is new, or has another window."""
-        name, session, window = event.topic, cast("int", event.source), event.queue
-        outlet = self._outlet(name)
-        if outlet is not None and outlet.topic is self._space.topics.get(name) and outlet.knows(session):
-            outlet.joined(session, window)
-        else:
-            self._reach.came(name, session, window)
-
-    def _part(self, name: str, session: int, *, gone: bool) -> None:
-        """Nothing is sent to a subscriber any more. One that is still there goes on taking what is on the way."""
-        self._reach.left(name, session)
-        outlet = self._outlet(name)
-        unconfirmed = 0 if outlet is None else outlet.parted(session)
-        if unconfirmed and gone and self.up:
-            self._farewells.expect(name, session, unconfirmed)
-        elif unconfirmed and gone:  # nothing comes on a link that is down
-            self._count_unknown(unconfirmed)
-
-    def _left(self, name: str, session: int) -> None:
-        """A subscriber says that it leaves."""
-        self._farewells.came(name, session)
-        self._reach.leaves(name, session)
-
-    def _count_unknown(self, count: int) -> None:
-        self.stats.lost["unknown at disconnect"] += count
-
-    def let_in(self, name: str, session: int, window: int, *, leaving: bool = False) -> None:
-        """Messages reach it: send it what is latched, and all that comes."""
-        topic = self._space.topics[name]
-        outlet = self._outlet(name)
-        if outlet is not None and outlet.topic is topic:
-            outlet.joined(session, window)
-            outlet.resend_latched()
-        else:
-            self.burst.flush()  # of an outlet before it, with whose numbers it goes on
-            outlet = self._subscribers[name] = ZenohSubscriber(self, topic)
-            outlet.joined(session, window)
-            topic.join(outlet)
-        if leaving:
-            outlet.leaves(session, leaving=True)
-
-    def tell_unheard(self, topic: str, session: int) -> None:
-        """Messages do not reach a subscriber."""
-        module = next((each.name for each in self._presence.modules.values() if each.instance == session), "?")
-        key = f"{self.prefix}/topic/{topic}"
-        text = (
-            f"topic {topic} does not reach module {module}: does the access control of a router deny {key} to either?"
-        )
-        self._hub.link_notice(self, "unheard", text, trouble=True)
-
-    def knows(self, topic: str) -> bool:
-        """Whether this module has anything to do with a topic."""
-        return topic in self._space.topics
-
-    def zenoh_outlets(self) -> Iterator[ZenohSubscriber]:
-        return (each for each in self._subscribers.values() if isinstance(each, ZenohSubscriber))
-
-    def _outlet(self, name: str) -> ZenohSubscriber | None:
-        outlet = self._subscribers.get(name)
-        return outlet if isinstance(outlet, ZenohSubscriber) else None
-
-    # For outlets and streams
-
-    def source_name(self, source: Source) -> str:
-        """What the module of a message is called on this network."""
-        return name_for(source.module if self.gateway_hooks is None else self.gateway_hooks.source_name(source))
-
-    def instance_of(self, module: str) -> int:
-        """The number of a module on any link; 0: firmware, or not known."""
-        links = (each for each in self._space.links if isinstance(each, Link))
-        found = (each.discovery.modules.get(module) for each in links)
-        return next((info.instance for info in found if info is not None and info.instance is not None), 0)
-
-    def _subscribe(self, topic: str, arrived: Callable[["zenoh.Sample"], None]) -> "SubscriptionReader | None":
-        if self._session is None:
-            return None
-        return self._session.subscribe(f"{self.prefix}/topic/{topic}", RING, arrived)
-
-    def _credit(self, topic: str, sender: int, publisher_class: int, serial: int, *, leaving: bool = False) -> None:
-        if self._session is not None:
-            data = encode_credit(Credit(self.instance, publisher_class, serial, topic, leaving))
-            self._session.put(f"{self.prefix}/credit/{sender:x}", data, final=leaving)
 
     # What comes in; in the loop
 
@@ -328,54 +232,44 @@ class ZenohLink(Link):
             if not self._transports:
                 self.on_down("the connection is lost")
 
-    def on_up(self) -> None:
-        self._streams.resumed()
-        super().on_up()
-        self._tokens.on_up()
-
-    def on_down(self, reason: str) -> None:
-        self._tokens.on_down()
-        self._streams.interrupted()
-        super().on_down(reason)
-
     def _token_changed(self, change: tuple[str, bool]) -> None:
         if self._closed:
             return
-        if self._changes.overflown != self._overflown:
-            overflown = self._changes.overflown
-            missed, self._overflown = overflown - self._overflown, overflown
-            self._apply(self._presence.missed(self._clock.monotonic(), missed))
+        if self._token_changes.overflowed != self._overflowed:
+            overflowed = self._token_changes.overflowed
+            missed, self._overflowed = overflowed - self._overflowed, overflowed
+            self._apply(self._liveliness.missed(self._clock.monotonic(), missed))
         self._tokens.changed(*change)
 
-    def _refused(self) -> None:
-        self._apply(self._presence.refused(self._clock.monotonic()))
+    def _token_refused(self) -> None:
+        self._apply(self._liveliness.refused(self._clock.monotonic()))
 
-    def _look(self) -> None:
-        """Ask for all tokens: zenoh tells of each but once, and some were refused."""
+    def _query_tokens(self) -> None:
+        """Query all tokens: zenoh reports each only once, and some were refused."""
         if self._session is not None:
-            self._tokens.look()
-            self._session.look_for_tokens(f"{self.prefix}/{liveliness.PLACE}", _LOOK, self._found)
+            self._tokens.query_started()
+            self._session.query_tokens(f"{self._prefix}/{liveliness.PLACE}", _TOKENS_TIMEOUT_S, self._token_answers)
 
-    def _token_found(self, found: str | bool) -> None:
+    def _token_answered(self, answer: str | bool) -> None:
         """A token, or at last whether these were all."""
         if self._closed:
             return
-        if isinstance(found, str):
-            self._tokens.found(found)
+        if isinstance(answer, str):
+            self._tokens.answered(answer)
         else:
-            usable = self._tokens.looked()
-            self._apply(self._presence.looked(self._clock.monotonic(), complete=found and usable))
+            usable = self._tokens.query_ended()
+            self._apply(self._liveliness.query_ended(self._clock.monotonic(), complete=answer and usable))
 
-    def _believed(self, key: str, there: bool) -> None:
+    def _token_settled(self, key: str, there: bool) -> None:
         now = self._clock.monotonic()
         try:
-            events = self._presence.appeared(now, key) if there else self._presence.disappeared(now, key)
+            events = self._liveliness.appeared(now, key) if there else self._liveliness.disappeared(now, key)
         except Exception as error:  # noqa: BLE001 - counted and logged; the next token follows
             self.stats.lost.internal_error(error)
         else:
             self._apply(events)
 
-    def _controlled(self, message: tuple[bytes, bytes]) -> None:
+    def _control_received(self, message: tuple[bytes, bytes]) -> None:
         header, data = message
         try:
             sender = decode_sender(header)
@@ -388,31 +282,30 @@ class ZenohLink(Link):
                 self.manage(data, sender)
 
 
-# When the tokens of others are believed: not while the link is down, and not that they went for a moment.
+# Tokens of other modules
 
-
-_SETTLE = 0.02
-"""Seconds after which a token that went is believed to: when the network goes, tokens go a moment before it."""
+_SETTLE_S = 0.02
+"""Seconds after which a token that went is believed to be gone: when a connection is lost, tokens go just before it."""
 
 
 class TokenDebouncer:
-    """The tokens of a link as zenoh tells of them; `believed(key, there)` gets what is to be taken for true, and
-    `refused` is called for each that has no room before the link is up.
+    """Decides when a token that zenoh reports is believed to be there, or to be gone: not while the link is down.
+
+    `settled(key, there)` gets what is to be believed; `refused` is called for each token that has no room before the
+    link is up.
     """
 
     def __init__(
-        self,
-        loop: "asyncio.AbstractEventLoop",
-        believed: Callable[[str, bool], None],
-        refused: Callable[[], None],
+        self, loop: asyncio.AbstractEventLoop, settled: Callable[[str, bool], None], refused: Callable[[], None]
     ) -> None:
         self._loop = loop
-        self._believed = believed
+        self._settled = settled
         self._refused = refused
         self._up = False
         self._early: dict[str, None] = {}
         self._going: dict[str, asyncio.TimerHandle] = {}
-        self._went: set[str] | None = None  # during a look: answers about these may be older than their end
+        self._went: set[str] | None = None
+        """What went since a query started: the answers about these may be older than their end. None: no query."""
 
     def changed(self, key: str, there: bool) -> None:
         """A token came or went."""
@@ -420,37 +313,37 @@ class TokenDebouncer:
             self._changed_early(key, there)
         elif there:
             timer = self._going.pop(key, None)
-            if timer is not None:  # it has not gone
+            if timer is not None:  # it was back in time: nothing has changed
                 timer.cancel()
             else:
-                self._believed(key, True)
+                self._settled(key, True)
         elif key not in self._going:
-            self._going[key] = self._loop.call_later(_SETTLE, self._gone, key)
+            self._going[key] = self._loop.call_later(_SETTLE_S, self._gone, key)
             self._note_end(key)
 
-    def look(self) -> None:
-        """All tokens are asked for: what goes from now on is newer than the answers."""
+    def query_started(self) -> None:
+        """All tokens are queried: what goes from now on is newer than the answers."""
         self._went = set(self._going)
 
-    def found(self, key: str) -> None:
+    def answered(self, key: str) -> None:
         """A token is among the answers."""
         if self._went is not None and key not in self._went:
-            self._believed(key, True)
+            self._settled(key, True)
 
-    def looked(self) -> bool:
-        """All answers have come. Says whether they could be used."""
+    def query_ended(self) -> bool:
+        """All answers have come. Return whether they could be used."""
         usable, self._went = self._went is not None, None
         return usable
 
     def on_up(self) -> None:
-        """The link is up: what came before is there."""
+        """The link is up: believe what came before."""
         self._up = True
         early, self._early = self._early, {}
         for key in early:
-            self._believed(key, True)
+            self._settled(key, True)
 
     def on_down(self) -> None:
-        """It is down, or closed: nothing that goes now has gone by itself."""
+        """The link is down, or closed: tokens that go now have not gone by themselves."""
         self._up = False
         self._went = None
         for timer in self._going.values():
@@ -460,7 +353,7 @@ class TokenDebouncer:
     def _changed_early(self, key: str, there: bool) -> None:
         if not there:
             self._early.pop(key, None)
-        elif key in self._early or len(self._early) < TOKENS:
+        elif key in self._early or len(self._early) < TOKENS_MAX:
             self._early[key] = None
         else:
             self._refused()
@@ -468,9 +361,9 @@ class TokenDebouncer:
     def _note_end(self, key: str) -> None:
         if self._went is not None:
             self._went.add(key)
-            if len(self._went) > TOKENS:  # too many to remember: the answers are of no use
+            if len(self._went) > TOKENS_MAX:  # too many to remember: the answers are of no use
                 self._went = None
 
     def _gone(self, key: str) -> None:
         del self._going[key]
-        self._believed(key, False)
+        self._settled(key, False)

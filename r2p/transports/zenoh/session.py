@@ -1,15 +1,14 @@
-"""One zenoh session. Everything that comes from zenoh's threads enters the event loop here.
+"""One zenoh session, and the way from zenoh's threads into the event loop.
 
-A thread waits at zenoh's channel of each subscriber. There nothing is done but to hand what came to the loop: no code
-of the user, and none of the protocols, runs outside of it. What blocks (opening, closing) runs in a thread, so the loop
-never waits for a network.
+A thread waits at zenoh's channel of each subscriber, and only hands what came to the loop: no code of the user, and
+none of the protocols, runs outside of the loop. What blocks (opening, closing) runs in a thread, so the loop never
+waits for a network.
 """
 
 import asyncio
 import contextlib
 import functools
 import json
-import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -23,12 +22,19 @@ from r2p.errors import TransportError
 from r2p.transports.link import MESSAGES_PER_TURN
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh import threads
-from r2p.transports.zenoh.config import is_network_name
+from r2p.transports.zenoh.config import is_network_name, plain_text
 from r2p.transports.zenoh.threads import OutboundThread
 
 T = TypeVar("T")
 
-ErrorOfZenoh = zenoh.ZError
+ZenohError = zenoh.ZError
+
+_CONTROL_BYTES_MAX = 4096
+
+_CHANNEL_MAX = 65_536
+"""Items that wait in zenoh until their thread runs: more than there can be. zenoh may put in all of them during the
+very call that asks for them, while it holds its locks, and would wait there for ever if they did not fit.
+"""
 
 _PRIORITIES = {
     1: zenoh.Priority.DATA,
@@ -38,52 +44,54 @@ _PRIORITIES = {
 
 
 class Unreachable(Exception):
-    """Nobody to connect to, for now."""
+    """There is nothing to connect to, for now."""
 
 
 class LoopQueue:
-    """The way from zenoh's threads into the loop: what they put in comes out of `take`, in order."""
+    """A queue from zenoh's threads into the event loop, which calls `handle` with each item, in order."""
 
     def __init__(
-        self, loop: asyncio.AbstractEventLoop, take: Callable[[Any], None], lost: LoggedCounter, *, most: int
+        self, loop: asyncio.AbstractEventLoop, handle: Callable[[Any], None], lost: LoggedCounter, *, most: int
     ) -> None:
         self._loop = loop
-        self._take = take
+        self._handle = handle
         self._lost = lost
         self._most = most
-        self._waiting: deque[Any] = deque()
-        self._woken = False
-        self.overflown = 0
-        """What did not fit any more."""
+        self._items: deque[Any] = deque()
+        self._scheduled = False
+        self.overflowed = 0
+        """Items that did not fit, as `most` were in it."""
 
     def put(self, item: Any) -> None:
-        """In any thread."""
-        if len(self._waiting) >= self._most:
-            self.overflown += 1
+        """Append an item; in any thread."""
+        if len(self._items) >= self._most:
+            self.overflowed += 1
             return
-        self._waiting.append(item)
-        if not self._woken:
-            self._woken = True
+        self._items.append(item)
+        if not self._scheduled:
+            self._scheduled = True
             with contextlib.suppress(RuntimeError):  # the loop is closed
-                self._loop.call_soon_threadsafe(self._empty)
+                self._loop.call_soon_threadsafe(self._drain)
 
     def failed(self, error: Exception) -> None:
-        """In any thread: something raised before it could be put in."""
+        """Count an error that kept an item from being put in; in any thread."""
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._lost.internal_error, error)
 
-    def _empty(self) -> None:
-        self._woken = False
-        waiting = self._waiting
-        self._lost.drain(waiting, self._take, MESSAGES_PER_TURN)
-        if waiting and not self._woken:  # a flood; others have their turn in between
-            self._woken = True
-            self._loop.call_soon(self._empty)
+    def _drain(self) -> None:
+        # Cleared before the items are read: one that comes from now on schedules the next call.
+        self._scheduled = False
+        items = self._items
+        self._lost.drain(items, self._handle, MESSAGES_PER_TURN)
+        if items and not self._scheduled:  # a flood; other callbacks of the loop have their turn in between
+            self._scheduled = True
+            self._loop.call_soon(self._drain)
 
 
 class SubscriptionReader:
-    """A subscription. A thread waits for samples, and hands them to the loop; when that falls behind, the thread rests,
-    and the loop takes what else there is by itself, without a switch of threads for each.
+    """Reads one subscription: a thread waits for the first sample, and the loop receives those behind it by itself.
+
+    So while the loop falls behind, the thread pauses, and there is no switch of threads for each sample.
     """
 
     def __init__(
@@ -95,168 +103,173 @@ class SubscriptionReader:
         self._subscriber = subscriber
         self._loop = loop
         self._arrived = arrived
-        self._receive = subscriber.handler.try_recv
-        self._handed: deque[zenoh.Sample] = deque()
-        self._taken = 0
-        self._idle = True
-        self._thread_rests = False
+        self._try_receive = subscriber.handler.try_recv
+        self._passed: deque[zenoh.Sample] = deque()
+        """Samples that the thread has passed to the loop."""
+        self._received = 0
+        """... of which the loop has received so many; the thread compares that with what it passed."""
+        self._waits = True
+        self._thread_paused = False
         self._closed = False
-        self._go_on = threading.Lock()
-        self._go_on.acquire()
-        threads.start(self._watch)
+        self._resume_thread = threading.Lock()
+        self._resume_thread.acquire()
+        threads.start(self._run)
 
-    def take(self) -> zenoh.Sample | None:
-        """The next sample that waits, or None."""
-        if self._handed:
-            self._taken += 1
-            return self._handed.popleft()
-        return self._receive() if self._thread_rests else None
+    def receive(self) -> zenoh.Sample | None:
+        """Return the next sample that waits, or None."""
+        if self._passed:
+            self._received += 1
+            return self._passed.popleft()
+        # Only while the thread is paused: else it may have the next sample in its hands, and the order would change.
+        return self._try_receive() if self._thread_paused else None
 
     def wait(self) -> None:
-        """Call `arrived` with the next sample, or soon with one that was handed over meanwhile."""
-        self._idle = True
-        if self._handed:
-            self._loop.call_soon(self._pass_on)
-        elif self._thread_rests:
-            self._thread_rests = False
-            self._go_on.release()
+        """Call `arrived` with the next sample; soon with one that was passed meanwhile."""
+        self._waits = True
+        if self._passed:
+            self._loop.call_soon(self._hand_out)
+        elif self._thread_paused:
+            self._thread_paused = False
+            self._resume_thread.release()
 
     def close(self) -> None:
         self._closed = True
-        self._thread_rests = False
+        self._thread_paused = False
         self._subscriber.undeclare()
-        with contextlib.suppress(RuntimeError):  # the thread waits for a sample, not for us
-            self._go_on.release()
+        with contextlib.suppress(RuntimeError):  # the thread waits for a sample, and was not paused
+            self._resume_thread.release()
 
-    def _watch(self) -> None:
+    def _run(self) -> None:
+        """In the thread: pass samples, and pause while the loop has not received the one before the last."""
         receive = self._subscriber.handler.recv
         count = 0
         with contextlib.suppress(zenoh.ZError, RuntimeError):  # it is undeclared; the loop is closed
             while not self._closed:
                 sample = receive()
                 count += 1
-                rests = count - self._taken > 1
-                self._loop.call_soon_threadsafe(self._hand_over, sample, rests)
-                if rests:
-                    self._go_on.acquire()
+                pauses = count - self._received > 1
+                self._loop.call_soon_threadsafe(self._pass, sample, pauses)
+                if pauses:
+                    self._resume_thread.acquire()
 
-    def _hand_over(self, sample: zenoh.Sample, rests: bool) -> None:
-        """In the loop, one sample after the other; behind the last one the thread may rest."""
-        self._thread_rests = rests
-        if self._idle and not self._handed:
-            self._idle = False
-            self._taken += 1
+    def _pass(self, sample: zenoh.Sample, pauses: bool) -> None:
+        """In the loop, for each sample of the thread; behind the last one the thread may pause."""
+        self._thread_paused = pauses
+        if self._waits and not self._passed:
+            self._waits = False
+            self._received += 1
             self._arrived(sample)
         else:
-            self._handed.append(sample)
+            self._passed.append(sample)
 
-    def _pass_on(self) -> None:
-        """What was handed over before `wait` comes before all that is handed over after it."""
-        if not self._idle or self._closed:
+    def _hand_out(self) -> None:
+        """What was passed before `wait` comes before all that is passed after it."""
+        if not self._waits or self._closed:
             return
-        if self._handed:
-            self._idle = False
-            self._taken += 1
-            self._arrived(self._handed.popleft())
-        else:  # it has been taken meanwhile
+        if self._passed:
+            self._waits = False
+            self._received += 1
+            self._arrived(self._passed.popleft())
+        else:  # it has been received meanwhile
             self.wait()
 
 
 async def open_session(config: zenoh.Config) -> "ZenohSession":
-    """Open it in a thread. Raises Unreachable where it may work later, TransportError where it can't."""
+    """Open a session. Raises Unreachable where that may work later, TransportError where it can't."""
     try:
         return ZenohSession(await _in_thread(lambda: zenoh.open(config), _close))
     except zenoh.ZError as error:
-        text = _plain(error)
+        text = plain_text(error)
         if text.startswith("Unable to connect"):
             raise Unreachable(text) from error
         raise TransportError(text) from error
 
 
 class ZenohSession:
-    """An open session, as the loop sees it. Declarations last until they are undeclared, or the session is closed."""
+    """An open session, as the loop uses it. Declarations last until they are undeclared, or the session is closed."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self.outbound = OutboundThread(asyncio.get_running_loop())
-        self._kept: list[Any] = []
+        self._declared: list[Any] = []
+        """Kept, as zenoh undeclares what Python collects."""
         self._publishers: set[zenoh.Publisher] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
-        self._watched = 0
+        self._token_count = 0
 
-    def watch(self, funnel: LoopQueue) -> None:
-        """Tell of each transport, those that are there included: (id, whether it opened)."""
+    def watch_transports(self, queue: LoopQueue) -> None:
+        """Report each transport to another session, those that are open included: (its id, whether it opened)."""
 
         def changed(event: zenoh.TransportEvent) -> None:
-            funnel.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
+            queue.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
 
-        events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_AT_ONCE)
-        self._hear(self._session.info.declare_transport_events_listener(events, history=True), changed, funnel)
+        events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_CHANNEL_MAX)
+        self._forward(self._session.info.declare_transport_events_listener(events, history=True), changed, queue)
 
-    def watch_tokens(self, prefix: str, funnel: LoopQueue) -> None:
-        """Tell of each token under a prefix, also those that are there: (rest of its key, whether it is there)."""
+    def watch_tokens(self, prefix: str, queue: LoopQueue) -> None:
+        """Report each token under a prefix, those that are there included: (rest of its key, whether it is there)."""
         start = len(prefix) + 1
 
         def changed(sample: zenoh.Sample) -> None:
             there = sample.kind == zenoh.SampleKind.PUT
-            self._watched += 1 if there else -1
-            self.outbound.watch(self._watched)
-            funnel.put((liveliness.token_at(str(sample.key_expr)[start:]), there))
+            self._token_count += 1 if there else -1
+            self.outbound.set_token_count(self._token_count)
+            queue.put((liveliness.token_at(str(sample.key_expr)[start:]), there))
 
-        tokens: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
+        tokens: FifoChannel[zenoh.Sample] = FifoChannel(_CHANNEL_MAX)
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
-        self._hear(declared, changed, funnel)
+        self._forward(declared, changed, queue)
 
-    def look_for_tokens(self, prefix: str, timeout: float, funnel: LoopQueue) -> None:
-        """Ask for the tokens under a prefix that is watched: the rest of each key, and at last whether these are all.
+    def query_tokens(self, prefix: str, timeout: float, queue: LoopQueue) -> None:
+        """Query the tokens under a prefix that is watched: the rest of each key, and at last whether these are all.
 
-        A thread waits for them, not that of `outbound`: it may take seconds where there are many.
+        A thread of its own waits for them, not that of `outbound`: it may take seconds where there are many.
         """
         start = len(prefix) + 1
 
-        def ask() -> bool:
-            if self._watched > _AT_ONCE // 2:
+        def query() -> bool:
+            if self._token_count > _CHANNEL_MAX // 2:  # they might not fit into the channel
                 return False
-            replies: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
+            replies: FifoChannel[zenoh.Reply] = FifoChannel(_CHANNEL_MAX)
             complete = True
             for reply in self._session.liveliness().get(f"{prefix}/**", replies, timeout=timeout):
                 if reply.ok is None:  # the time is over
                     complete = False
                 else:
-                    funnel.put(liveliness.token_at(str(reply.ok.key_expr)[start:]))
+                    queue.put(liveliness.token_at(str(reply.ok.key_expr)[start:]))
             return complete
 
-        def look() -> None:
+        def run() -> None:
             complete = False
             try:
-                complete = ask()
+                complete = query()
             except zenoh.ZError:  # the session is closed
                 pass
             except Exception as error:  # noqa: BLE001 - counted and logged in the loop
-                funnel.failed(error)
+                queue.failed(error)
             finally:
-                funnel.put(complete)
+                queue.put(complete)
 
-        threads.start(look)
+        threads.start(run)
 
-    def listen(self, key: str, funnel: LoopQueue) -> None:
-        """Tell of each message: (its attachment, payload), either of them empty if it is longer than any of ours.
+    def listen(self, key: str, queue: LoopQueue) -> None:
+        """Report each message of a key: (its attachment, payload), either of them empty if it is too long to be ours.
 
-        A key without a wildcard: of each session that is closed, zenoh keeps 3 kB for ever in the router if it has
-        subscribed with a wildcard, and another session has by the same key expression.
+        The key has no wildcard: zenoh's router keeps 3 kB for ever of each closed session that subscribed with a
+        wildcard, if another session has subscribed by the same key expression.
         """
 
         def arrived(sample: zenoh.Sample) -> None:
-            funnel.put((_bytes_of(sample.attachment), _bytes_of(sample.payload)))
+            queue.put((_bytes_of(sample.attachment), _bytes_of(sample.payload)))
 
-        messages: FifoChannel[zenoh.Sample] = FifoChannel(_AT_ONCE)
+        messages: FifoChannel[zenoh.Sample] = FifoChannel(_CHANNEL_MAX)
         declared = self._session.declare_subscriber(key, messages, allowed_origin=zenoh.Locality.REMOTE)
-        self._hear(declared, arrived, funnel)
+        self._forward(declared, arrived, queue)
 
-    def serve(
-        self, key: str, answer: Callable[[str], bytes | None], funnel_to: Callable[[Callable[[Any], None]], LoopQueue]
+    def answer_queries(
+        self, key: str, answer: Callable[[str], bytes | None], make_queue: Callable[[Callable[[Any], None]], LoopQueue]
     ) -> None:
-        """Answer queries: `answer` gives, in the loop, the payload for a key. `funnel_to` makes a way into the loop."""
+        """Answer queries: `answer` returns, in the loop, the payload for a key."""
 
         def reply(query: zenoh.Query) -> None:
             name = str(query.key_expr)
@@ -266,12 +279,12 @@ class ZenohSession:
                     query.reply(key.replace("*", name.rpartition("/")[2]), payload)
                 query.drop()
 
-        funnel = funnel_to(reply)
-        queries: FifoChannel[zenoh.Query] = FifoChannel(_AT_ONCE)
-        self._hear(self._session.declare_queryable(key, queries), funnel.put, funnel)
+        queue = make_queue(reply)
+        queries: FifoChannel[zenoh.Query] = FifoChannel(_CHANNEL_MAX)
+        self._forward(self._session.declare_queryable(key, queries), queue.put, queue)
 
-    def _hear(self, declared: Any, heard: Callable[[Any], object], funnel: LoopQueue) -> None:
-        """Call it, in a thread, with each item that comes; it puts that into the funnel."""
+    def _forward(self, declared: Any, put: Callable[[Any], object], queue: LoopQueue) -> None:
+        """Call `put` in a thread with each item that comes."""
 
         def listen() -> None:
             receive = declared.handler.recv
@@ -281,15 +294,15 @@ class ZenohSession:
                 except zenoh.ZError:  # it is undeclared
                     return
                 try:
-                    heard(item)
+                    put(item)
                 except Exception as error:  # noqa: BLE001 - counted and logged in the loop; the next one follows
-                    funnel.failed(error)
+                    queue.failed(error)
 
-        self._kept.append(declared)
+        self._declared.append(declared)
         threads.start(listen)
 
     def subscribe(self, key: str, most: int, arrived: Callable[[zenoh.Sample], None]) -> "SubscriptionReader":
-        """Tell in the loop of the first sample that comes; the ones behind it are there to be taken out of the tap.
+        """Call `arrived` in the loop with the first sample that comes; those behind it are received from the reader.
 
         Of more than `most` that wait, the oldest are lost.
         """
@@ -299,8 +312,8 @@ class ZenohSession:
             self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE), loop, arrived
         )
 
-    def publisher(self, key: str, publisher_class: int) -> zenoh.Publisher:
-        """What sends on a key as the class deserves. Never BLOCK: that would stop the loop, not the publisher."""
+    def declare_publisher(self, key: str, publisher_class: int) -> zenoh.Publisher:
+        """Declare a publisher with the priority of the class. Never BLOCK: that would stop the loop."""
         periodic = publisher_class == 3
         publisher = self._session.declare_publisher(
             key,
@@ -313,18 +326,17 @@ class ZenohSession:
         self._publishers.add(publisher)
         return publisher
 
-    def ends(self, publisher: zenoh.Publisher) -> None:
-        """Send no more with it."""
+    def undeclare_publisher(self, publisher: zenoh.Publisher) -> None:
         self._publishers.discard(publisher)
         self.outbound.call(publisher.undeclare)
 
     def put(
         self, key: str, data: bytes, *, attachment: bytes | None = None, urgent: bool = False, final: bool = False
     ) -> None:
-        """Send something of the protocol's own. `final`: nothing makes up for it if it is lost, so a thread waits where
-        zenoh has no room for it, and with it what is sent afterwards.
+        """Send something of the protocol's own. `final`: nothing makes up for it if it is lost, so where zenoh has no
+        room for it a thread waits, and what is sent afterwards waits behind it.
         """
-        call = self.outbound.call_by_thread if final else self.outbound.call
+        call = self.outbound.call_in_thread if final else self.outbound.call
         call(
             self._session.put,
             key,
@@ -336,84 +348,76 @@ class ZenohSession:
             allowed_destination=zenoh.Locality.REMOTE,
         )
 
-    def declare(self, key: str) -> None:
-        """Keep a liveliness token."""
-        self.outbound.call(self._declare, key)
+    def declare_token(self, key: str) -> None:
+        """Declare a liveliness token."""
+        self.outbound.call(self._declare_token, key)
 
-    def undeclare(self, key: str) -> None:
-        self.outbound.call(self._undeclare, key)
+    def undeclare_token(self, key: str) -> None:
+        self.outbound.call(self._undeclare_token, key)
 
-    def _declare(self, key: str) -> None:
+    def _declare_token(self, key: str) -> None:
         self._tokens[key] = self._session.liveliness().declare_token(key)
 
-    def _undeclare(self, key: str) -> None:
+    def _undeclare_token(self, key: str) -> None:
         token = self._tokens.pop(key, None)
         if token is not None:
             token.undeclare()
 
-    async def ask(self, key: str, timeout: float) -> list[bytes]:
-        """All answers to a query, within `timeout` seconds."""
+    async def query(self, key: str, timeout: float) -> list[bytes]:
+        """Return all answers to a query, within `timeout` seconds."""
 
-        def ask() -> list[bytes]:
-            channel: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
+        def query() -> list[bytes]:
+            channel: FifoChannel[zenoh.Reply] = FifoChannel(_CHANNEL_MAX)
             replies = self._session.get(key, channel, timeout=timeout, consolidation=zenoh.ConsolidationMode.NONE)
             return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
 
-        return await _in_thread(ask)
+        return await _in_thread(query)
 
-    async def networks(self, *, tools: bool) -> set[str]:
-        """The names of the r2p networks on which there are modules, or else a publisher, or else `tools` that look."""
+    async def find_networks(self, *, tools: bool) -> set[str]:
+        """Return the names of the r2p networks with modules; or else with a publisher; or else with `tools`."""
 
         def tokens(kind: str) -> list[tuple[str, str]]:
-            replies: FifoChannel[zenoh.Reply] = FifoChannel(_AT_ONCE)
+            replies: FifoChannel[zenoh.Reply] = FifoChannel(_CHANNEL_MAX)
             found = self._session.liveliness().get(f"r2p/*/{liveliness.PLACE}/**/{kind}/**", replies, timeout=1.0)
             keys = [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
             found_at = [(network, liveliness.token_at(key)) for _, network, _, key in keys if is_network_name(network)]
             return [(network, token) for network, token in found_at if token.split("/")[2:3] == [kind]]
 
-        def ask() -> set[str]:
-            everybody = tokens("module")
-            found = {network for network, token in everybody if liveliness.is_module(token)}
+        def find() -> set[str]:
+            modules = tokens("module")
+            found = {network for network, token in modules if liveliness.is_module(token)}
             found = found or {network for network, _ in tokens("pub")}
-            return found or {network for network, _ in everybody if tools}
+            return found or {network for network, _ in modules if tools}
 
-        return await _in_thread(ask)
+        return await _in_thread(find)
 
-    async def listening(self) -> list[str]:
-        """The endpoints where it takes connections."""
+    async def listening_endpoints(self) -> list[str]:
+        """Return the endpoints where the session takes connections, as its admin space has them."""
 
-        def ask() -> list[str]:
+        def find() -> list[str]:
             answers = self._session.get(f"@/{self._session.zid()}/*", timeout=1.0)
             found = [json.loads(each.ok.payload.to_bytes()) for each in answers if each.ok is not None]
             return [str(locator) for each in found for locator in each.get("locators", [])]
 
-        return await _in_thread(ask)
+        return await _in_thread(find)
 
     async def close(self) -> None:
-        """Close it; what was put before is sent."""
+        """Close the session; what was put before is sent."""
         publishers, self._publishers = self._publishers, set()
         await _in_thread(functools.partial(self._close, publishers))
 
     def _close(self, publishers: Iterable[zenoh.Publisher]) -> None:
-        """zenoh keeps 34 kB for ever of each session that is closed with a publisher in it."""
         self.outbound.finish()
         with contextlib.suppress(zenoh.ZError):  # it is closed already
-            for publisher in publishers:
+            for publisher in publishers:  # zenoh keeps 34 kB for ever of each session that is closed with one
                 publisher.undeclare()
         self._session.close()
 
 
-_MESSAGE_MAX = 4096
-_AT_ONCE = 65_536
-"""What waits in zenoh until its thread runs, at most: more than there is, as zenoh may hand out all in the very call
-that asks for it, holding its locks, and would wait there for ever.
-"""
-
-
 async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] | None = None) -> T:
-    """What `function` returns or raises, in a thread that nobody waits for when this is cancelled.
+    """Call `function` in a thread; return what it returns, or raise what it raises.
 
-    What it returns then goes to `abandoned`.
+    When this is cancelled the thread goes on, and what it returns then goes to `abandoned`.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -449,10 +453,5 @@ def _close(session: zenoh.Session) -> None:
     session.close()
 
 
-def _plain(error: Exception) -> str:
-    """zenoh's text without the places in its source."""
-    return re.sub(r" at /\S+?\.rs:\d+\.?", "", str(error)).strip()
-
-
 def _bytes_of(data: zenoh.ZBytes | None) -> bytes:
-    return data.to_bytes() if data is not None and len(data) <= _MESSAGE_MAX else b""
+    return data.to_bytes() if data is not None and len(data) <= _CONTROL_BYTES_MAX else b""

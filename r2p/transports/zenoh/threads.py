@@ -1,9 +1,10 @@
-"""What is given to zenoh: by the event loop itself, or by a thread while there are very many tokens.
+"""The threads that wait inside of zenoh: the one that makes the calls of a session, and how all of them end.
 
-zenoh's router, which is in this process where a session takes connections, holds its tables while it tells a newcomer
-of every token, and while it forgets those of one that is gone. That takes time with the square of their number: some
-20 ms for a thousand, seconds for twenty thousand. Each call that sends or declares something waits for it. So from
-CROWD tokens on a thread makes these calls, one after the other, and the event loop goes on.
+The event loop makes the calls of zenoh itself, except while there are very many tokens. zenoh's router, which is in
+this process where a session takes connections, holds its tables while it sends every token to a new session, and while
+it forgets those of one that is gone. That takes time with the square of their number: some 20 ms for a thousand,
+seconds for twenty thousand. Each call that sends or declares something waits for it. So from MANY_TOKENS on a thread
+makes these calls, one after the other, and the event loop goes on.
 """
 
 import asyncio
@@ -15,122 +16,25 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 from weakref import WeakSet
 
-from r2p.transports.zenoh import threads
-
 T = TypeVar("T")
 
-CROWD = 1000
-"""Tokens from which on a thread sends."""
+MANY_TOKENS = 1000
+"""Tokens from which on the thread makes the calls; until there are half as many."""
 
-MOST = 512
+WAITING_MAX = 512
 """Packets that wait for the thread."""
 
-MOST_URGENT = 16
-"""Those of events and periods, which are of no use when they are late."""
+WAITING_MAX_URGENT = 16
+"""Packets of events and periodic messages, which are of no use when they are late."""
 
-
-class OutboundThread:
-    """The calls of one session that may wait for zenoh, in order. `failed` gets what they raise in the thread."""
-
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
-        self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
-        self._crowded = False
-        self._running = False
-        self._handed = 0
-        self._done = 0
-        self.failed: Callable[[Exception], object] = lambda _error: None
-
-    def watch(self, tokens: int) -> None:
-        """So many are there; in any thread."""
-        self._crowded = tokens >= (CROWD // 2 if self._crowded else CROWD)
-
-    @property
-    def waiting(self) -> int:
-        """Calls that the thread has yet to make."""
-        return self._handed - self._done
-
-    @property
-    def by_thread(self) -> bool:
-        """Whether the thread makes the calls now."""
-        return self._crowded or self._handed != self._done
-
-    @property
-    def full(self) -> bool:
-        """Whether there is no room for more of what can be sent later, or not at all."""
-        return self.waiting >= MOST
-
-    def put(self, send: Callable[..., object], most: int, data: bytes, *, attachment: bytes) -> None:
-        """Send a packet of messages. Raises BlockingIOError if `most` calls wait already."""
-        if not self.by_thread:
-            send(data, attachment=attachment)
-        elif self.waiting >= most:
-            raise BlockingIOError
-        else:
-            self._hand_over(lambda: send(data, attachment=attachment))
-
-    def call(self, function: Callable[..., object], *args: Any, **kwargs: Any) -> None:
-        """Call it, now or later."""
-        if not self.by_thread:
-            function(*args, **kwargs)
-        else:
-            self.call_by_thread(function, *args, **kwargs)
-
-    def call_by_thread(self, function: Callable[..., object], *args: Any, **kwargs: Any) -> None:
-        """Have the thread call it: it may take long."""
-        self._hand_over(lambda: function(*args, **kwargs))
-
-    def ask(self, function: Callable[[], T], then: Callable[[T | None], object]) -> None:
-        """Call it in the thread, and `then` with what it returns, in the loop; with None if it raises."""
-
-        def answer() -> None:
-            result: T | None = None
-            try:
-                result = function()
-            finally:
-                self._in_loop(then, result)
-
-        self._hand_over(answer)
-
-    def finish(self) -> None:
-        """Wait for what was handed over, and end the thread. Not in the loop, which hands over nothing any more."""
-        if self._running:
-            over: queue.SimpleQueue[None] = queue.SimpleQueue()
-            self._hand_over(lambda: over.put(None))
-            self._jobs.put(None)
-            over.get()
-
-    def _hand_over(self, job: Callable[[], object]) -> None:
-        if not self._running:
-            self._running = True
-            threads.start(self._work)
-        self._handed += 1
-        self._jobs.put(job)
-
-    def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                job()
-            except Exception as error:  # noqa: BLE001 - told in the loop; the next one follows
-                self._in_loop(self.failed, error)
-            self._done += 1
-
-    def _in_loop(self, function: Callable[[Any], object], value: object) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop is closed
-            self._loop.call_soon_threadsafe(function, value)
-
-
-# Threads that wait inside of zenoh. None of them may be there any more when Python ends.
-
-
-_PATIENCE = 2.0
-"""Seconds for which the end of the program waits for one of them: who connects to nobody may take longer."""
+_JOIN_TIMEOUT_S = 2.0
+"""Seconds for which the end of the program waits for a thread: one that connects in vain may take longer."""
 
 _threads: "WeakSet[threading.Thread]" = WeakSet()
 
 
 def start(function: Callable[[], object]) -> None:
-    """Run it in a thread of its own, for which nobody waits before the program ends."""
+    """Call it in a thread of its own, which does not keep the program from ending."""
     thread = threading.Thread(target=function, name="r2p zenoh", daemon=True)
     _threads.add(thread)
     thread.start()
@@ -138,5 +42,100 @@ def start(function: Callable[[], object]) -> None:
 
 @atexit.register
 def _join() -> None:
+    # A daemon thread that is inside of zenoh when Python ends aborts the process.
     for thread in list(_threads):
-        thread.join(_PATIENCE)
+        thread.join(_JOIN_TIMEOUT_S)
+
+
+class OutboundThread:
+    """Makes the calls of one session that may wait for zenoh, in order: at once, or in a thread.
+
+    `failed` gets what they raise in the thread.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
+        self._many_tokens = False
+        self._running = False
+        self._submitted = 0
+        self._done = 0
+        self.failed: Callable[[Exception], object] = lambda _error: None
+
+    def set_token_count(self, tokens: int) -> None:
+        """Note how many tokens there are; in any thread."""
+        self._many_tokens = tokens >= (MANY_TOKENS // 2 if self._many_tokens else MANY_TOKENS)
+
+    @property
+    def waiting(self) -> int:
+        """Calls that the thread has yet to make."""
+        return self._submitted - self._done
+
+    @property
+    def uses_thread(self) -> bool:
+        """Whether the thread makes the calls now; also the last ones that wait, to keep their order."""
+        return self._many_tokens or self._submitted != self._done
+
+    @property
+    def full(self) -> bool:
+        """Whether too many calls wait already to add what can be sent later, or not at all."""
+        return self.waiting >= WAITING_MAX
+
+    def put(self, send: Callable[..., object], most: int, data: bytes, *, attachment: bytes) -> None:
+        """Send a packet of messages. Raises BlockingIOError if `most` calls wait already."""
+        if not self.uses_thread:
+            send(data, attachment=attachment)
+        elif self.waiting >= most:
+            raise BlockingIOError
+        else:
+            self._submit(lambda: send(data, attachment=attachment))
+
+    def call(self, function: Callable[..., object], *args: Any, **kwargs: Any) -> None:
+        """Call it, now or later."""
+        if not self.uses_thread:
+            function(*args, **kwargs)
+        else:
+            self.call_in_thread(function, *args, **kwargs)
+
+    def call_in_thread(self, function: Callable[..., object], *args: Any, **kwargs: Any) -> None:
+        """Call it in the thread: it may take long."""
+        self._submit(lambda: function(*args, **kwargs))
+
+    def call_with_result(self, function: Callable[[], T], then: Callable[[T | None], object]) -> None:
+        """Call it in the thread, and `then` with what it returns in the loop; with None if it raises."""
+
+        def answer() -> None:
+            result: T | None = None
+            try:
+                result = function()
+            finally:
+                self._call_in_loop(then, result)
+
+        self._submit(answer)
+
+    def finish(self) -> None:
+        """Wait for all calls, and end the thread. Not to be called in the loop, which must submit nothing any more."""
+        if self._running:
+            over: queue.SimpleQueue[None] = queue.SimpleQueue()
+            self._submit(lambda: over.put(None))
+            self._jobs.put(None)
+            over.get()
+
+    def _submit(self, job: Callable[[], object]) -> None:
+        if not self._running:
+            self._running = True
+            start(self._work)
+        self._submitted += 1
+        self._jobs.put(job)
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except Exception as error:  # noqa: BLE001 - reported in the loop; the next one follows
+                self._call_in_loop(self.failed, error)
+            self._done += 1
+
+    def _call_in_loop(self, function: Callable[[Any], object], value: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._loop.call_soon_threadsafe(function, value)

@@ -1,4 +1,4 @@
-"""Opens a zenoh session for a module, and keeps it: zenoh itself reconnects, and we say why it can't."""
+"""Opens a zenoh session for a module, and keeps it: zenoh itself reconnects, and this module explains why it can't."""
 
 import asyncio
 import importlib
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from r2p.clock import Backoff
 from r2p.errors import TransportError
 from r2p.transports.link import Hub, Transport
-from r2p.transports.zenoh.config import ZenohOptions, chosen, default_network, listed
-from r2p.transports.zenoh.diagnose import NOT_US, why, why_not_listening
+from r2p.transports.zenoh.config import ZenohOptions, choose_network, default_network, list_networks
+from r2p.transports.zenoh.diagnose import NOT_ADMITTED, diagnose_connection, diagnose_listening
 
 if TYPE_CHECKING:
     import zenoh
@@ -17,22 +17,27 @@ if TYPE_CHECKING:
     from r2p.transports.zenoh.link import ZenohLink
     from r2p.transports.zenoh.session import ZenohSession
 
-_SCOUTING = 0.5
+_SCOUTING_S = 0.5
 """Seconds in which peers find each other."""
 
-_LOOKS = 5
+_SCOUTING_LOOKS = 5
 
-_LOOK = 1.0
+_BACKOFF_MAX_S = 0.5
+"""Seconds between two attempts to open a session."""
+
+_DIAGNOSE_EVERY_S = 1.0
 """Seconds between two looks whether a link that is down should be explained."""
 
-_ALONE = 3.0
-"""Seconds without anybody else after which a module looks whether they are on other networks; then ever more rarely."""
+_ALONE_S = 3.0
+"""Seconds without another module after which a module looks for other networks; twice as long each further time."""
 
-_RESTRICT = "zenoh:?listen=tcp/127.0.0.1:7447 keeps to this one, docs/how-to/zenoh.md has TLS and passwords"
+_ALONE_TOOL_S = 0.3
+"""... a tool's."""
+
+_ALONE_MAX_S = 60.0
+
+_RESTRICT = "zenoh:?listen=tcp/127.0.0.1:7447 restricts it to this one, docs/how-to/zenoh.md has TLS and passwords"
 """What to do about a port that is open to all."""
-
-_TOOL_ALONE = 0.3
-_RARELY = 60.0
 
 
 class ZenohTransport(Transport):
@@ -44,27 +49,27 @@ class ZenohTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         try:  # in a thread: loading zenoh takes longer than a loop should be blocked
             await asyncio.to_thread(importlib.import_module, "r2p.transports.zenoh.link")
-            from r2p.transports.zenoh.config import config_of, open_to_all, way_of
+            from r2p.transports.zenoh.config import build_config, connection_settings, open_endpoints
             from r2p.transports.zenoh.link import ZenohLink
         except ImportError as error:
             if (error.name or "").partition(".")[0] != "zenoh":
                 raise
             raise self._options.error("zenoh is missing: pip install 'r2p[zenoh]'") from error
         options = self._options
-        config = config_of(options)
-        connects = bool(way_of(config).endpoints)
+        config = build_config(options)
+        connects = bool(connection_settings(config).endpoints)
         link = ZenohLink(options.name, hub, connects=connects, batching=options.batching)
         hub.attach(link)
         session = None
         try:
-            session = await self._open(config, link, Backoff(hub.random, longest=0.5), opened)
+            session = await self._open(config, link, Backoff(hub.random, longest=_BACKOFF_MAX_S), opened)
             network = await self._network(session, hub)
             link.use(session, f"r2p/{network}")
-            await self._tell_addresses(session, link, hub, open_to_all(config))
+            await self._report_addresses(session, link, hub, open_endpoints(config))
             opened()
             async with asyncio.TaskGroup() as tasks:  # neither ends but by being cancelled
-                tasks.create_task(self._watch(config, link))
-                tasks.create_task(self._look_around(session, link, hub, network))
+                tasks.create_task(self._explain(config, link))
+                tasks.create_task(self._look_for_others(session, link, hub, network))
         finally:
             link.close()
             hub.detach(link)
@@ -74,93 +79,93 @@ class ZenohTransport(Transport):
     async def _open(
         self, config: "zenoh.Config", link: "ZenohLink", backoff: Backoff, opened: Callable[[], object]
     ) -> "ZenohSession":
-        from r2p.transports.zenoh.config import take_any_port, way_of
+        from r2p.transports.zenoh.config import connection_settings, use_any_port
         from r2p.transports.zenoh.session import Unreachable, open_session
 
         while True:
             try:
                 return await open_session(config)
             except TransportError as error:
-                if take_any_port(config, self._options):
+                if use_any_port(config, self._options):
                     continue
-                reason = await asyncio.to_thread(why_not_listening, way_of(config))
+                reason = await asyncio.to_thread(diagnose_listening, connection_settings(config))
                 raise self._options.error(reason or str(error)) from error
             except Unreachable:
                 opened()
-                link.unreachable(await why(way_of(config)))
+                link.unreachable(await diagnose_connection(connection_settings(config)))
                 await asyncio.sleep(backoff.delay())
 
     async def _network(self, session: "ZenohSession", hub: Hub) -> str:
-        """Its name. A tool looks which there are; a robot's program must not depend on who came first."""
+        """Return the network's name. A tool looks for one; a robot's program must not depend on what came first."""
         if self._options.network is not None or not hub.observer:
             return self._options.network or default_network()
         found: set[str] = set()
-        for _ in range(_LOOKS):
-            found = await session.networks(tools=True)
+        for _ in range(_SCOUTING_LOOKS):
+            found = await session.find_networks(tools=True)
             if found:
                 break
-            await asyncio.sleep(_SCOUTING / _LOOKS)
+            await asyncio.sleep(_SCOUTING_S / _SCOUTING_LOOKS)
         try:
-            return chosen(found)
+            return choose_network(found)
         except ValueError as error:
             raise self._options.error(str(error)) from error
 
-    async def _tell_addresses(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, exposed: list[str]) -> None:
-        """Where it takes connections. That it does not ask of whom is no news for the user of a tool."""
-        addresses = await session.listening() if self._options.listen is not None or exposed else []
+    async def _report_addresses(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, exposed: list[str]) -> None:
+        """Report where it accepts connections, and, but for a tool, that it does so without authentication."""
+        addresses = await session.listening_endpoints() if self._options.listen is not None or exposed else []
         if self._options.listen is not None:
             for address in addresses:
                 hub.listening(self._options.name, address)
         if exposed and addresses and not hub.observer:
             ports = ", ".join(sorted({each.rpartition(":")[2] for each in addresses}))
-            text = f"takes connections of other computers at port {ports}, and does not ask who they are: "
+            text = f"accepts connections from other computers at port {ports} without authentication: "
             hub.link_notice(link, "open to all", f"{text}{_RESTRICT}", trouble=True)
 
-    async def _watch(self, config: "zenoh.Config", link: "ZenohLink") -> None:
-        """For ever: say what is wrong while the link is down."""
-        from r2p.transports.zenoh.config import way_of
+    async def _explain(self, config: "zenoh.Config", link: "ZenohLink") -> None:
+        """Say what is wrong whenever the link is down; never returns."""
+        from r2p.transports.zenoh.config import connection_settings
 
         reason = ""
         while True:
-            await asyncio.sleep(_LOOK)
+            await asyncio.sleep(_DIAGNOSE_EVERY_S)
             if link.up:
                 continue
             try:
-                before, reason = reason, await why(way_of(config))
+                before, reason = reason, await diagnose_connection(connection_settings(config))
             except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
                 link.stats.lost.internal_error(error)
                 continue
-            if NOT_US in reason and reason != before:
+            if NOT_ADMITTED in reason and reason != before:
                 continue  # zenoh may be about to try again
             if not link.up:
                 link.unreachable(reason)
 
-    async def _look_around(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, network: str) -> None:
-        """Until somebody else is on the network: say once on which networks there are others."""
-        pause = _TOOL_ALONE if hub.observer else _ALONE
+    async def _look_for_others(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, network: str) -> None:
+        """Until another module is on the network: say once which other networks have modules."""
+        pause = _ALONE_TOOL_S if hub.observer else _ALONE_S
         while True:
             await asyncio.sleep(pause)
-            others = await self._others(session, link, network)
-            if _has_company(link):
+            others = await self._other_networks(session, link, network)
+            if _has_peers(link):
                 return
             if others:
-                text = f"nobody else is on the network {network}, but there are modules on {listed(others)}"
+                text = f"no other module is on the network {network}, but there are modules on {list_networks(others)}"
                 text += f": is ?network={others[0]} meant?"
                 # A program without a log handler shows warnings only; a tool shows both.
                 hub.link_notice(link, "elsewhere", text, trouble=not hub.observer)
                 return
-            pause = min(2 * pause, _RARELY)
+            pause = min(2 * pause, _ALONE_MAX_S)
 
-    async def _others(self, session: "ZenohSession", link: "ZenohLink", network: str) -> list[str]:
+    async def _other_networks(self, session: "ZenohSession", link: "ZenohLink", network: str) -> list[str]:
         try:
-            return sorted(await session.networks(tools=False) - {network}) if link.up else []
+            return sorted(await session.find_networks(tools=False) - {network}) if link.up else []
         except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
             link.stats.lost.internal_error(error)
             return []
 
 
-def _has_company(link: "ZenohLink") -> bool:
-    """Whether anybody is there but tools that look."""
+def _has_peers(link: "ZenohLink") -> bool:
+    """Whether there are modules besides tools."""
     known = link.discovery
     publish = any(topic.advertised_at is not None for topic in known.topics.values())
     return publish or any(not module.observer for module in known.modules.values())

@@ -8,9 +8,7 @@ from r2p.codecs import liveliness
 from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ROLE_PUBLISHES
 from r2p.protocols.discovery.events import Event, ModuleChanged, PublisherFound, QueryTokens
-from r2p.protocols.liveliness import modules as census
-from r2p.protocols.liveliness import refused
-from r2p.protocols.liveliness import session as presence
+from r2p.protocols.liveliness import modules, session
 from r2p.protocols.liveliness.session import LivelinessDiscovery
 
 SECOND = 1_000_000_000
@@ -54,12 +52,12 @@ class Network:
         self.looks.append(self.now)
         for key in self.keys:
             self.events += self.module.appeared(self.now, key)
-        self.events += self.module.looked(self.now, complete=self.complete)
+        self.events += self.module.query_ended(self.now, complete=self.complete)
 
 
 @pytest.fixture
 def network(monkeypatch: pytest.MonkeyPatch) -> Network:
-    monkeypatch.setattr(presence, "TOKENS", MOST)
+    monkeypatch.setattr(session, "TOKENS_MAX", MOST)
     return Network()
 
 
@@ -173,13 +171,13 @@ def test_nothing_is_asked_of_a_network_that_is_away(network: Network) -> None:
 
 
 def test_a_token_that_is_refused_twice_in_a_look_does_not_need_room_for_two() -> None:
-    count = refused.Refused(1000, 0)
+    count = session.RefusedTokens(1000, 0)
     count.add()
     count.review(0, 1)
-    assert count.due(5 * SECOND, 1)
+    assert count.is_due(5 * SECOND, 1)
     count.add()  # it came
     count.add()  # and is among the answers
-    count.answered(complete=True)
+    count.query_ended(complete=True)
     count.review(5 * SECOND, 1)
     assert count.next_deadline() == 15 * SECOND
 
@@ -187,7 +185,7 @@ def test_a_token_that_is_refused_twice_in_a_look_does_not_need_room_for_two() ->
 def test_modules_ask_one_by_one() -> None:
     due = set()
     for number in range(256):
-        each = refused.Refused(MOST, number)
+        each = session.RefusedTokens(MOST, number)
         each.add()
         each.review(0, MOST)
         due.add(each.next_deadline())
@@ -195,7 +193,7 @@ def test_modules_ask_one_by_one() -> None:
 
 
 def test_a_module_without_room_is_there_when_another_one_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(census, "MOST", 2)
+    monkeypatch.setattr(modules, "MOST", 2)
     network = Network()
     network.add(*KEYS[:4], liveliness.encode(TopicToken(3, ROLE_PUBLISHES, "leds", 3, "node")))
     assert list(network.module.modules) == ["M1", "M2"]
@@ -214,7 +212,7 @@ def test_a_module_without_room_is_there_when_another_one_goes(monkeypatch: pytes
 
 
 def test_modules_without_room_do_not_appear_while_the_network_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(census, "MOST", 2)
+    monkeypatch.setattr(modules, "MOST", 2)
     network = Network()
     network.add(*KEYS[:6])
     assert not [each for each in network.module.link_down(0) if isinstance(each, ModuleChanged)]

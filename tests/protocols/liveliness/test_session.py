@@ -44,17 +44,17 @@ class World:
         self.told: dict[int, list[Event]] = {}
 
     def add(self, name: str, instance: int, *, observer: bool = False) -> LivelinessDiscovery:
-        presence = LivelinessDiscovery(name, instance, observer=observer)
-        self.members[instance] = presence
+        discovery = LivelinessDiscovery(name, instance, observer=observer)
+        self.members[instance] = discovery
         self.told[instance] = []
         self.connect(instance)
-        return presence
+        return discovery
 
     def connect(self, instance: int) -> None:
-        presence = self.members[instance]
-        self.act(instance, presence.link_up(self.now))
+        discovery = self.members[instance]
+        self.act(instance, discovery.link_up(self.now))
         for key in self.keys:
-            self.act(instance, presence.appeared(self.now, key))
+            self.act(instance, discovery.appeared(self.now, key))
         self.settle()
 
     def crash(self, instance: int) -> None:
@@ -255,8 +255,8 @@ def test_nothing_is_kept_of_modules_that_left(world: World) -> None:
     for instance in (2, 3):
         world.crash(instance)
     assert not any([watcher.modules, watcher.endpoints, watcher.topics])
-    census, matching = watcher._census, watcher._matching
-    assert not any([census._names, census._endpoints_of, matching._telling, matching._refused])
+    modules, matching = watcher._modules, watcher._matching
+    assert not any([modules._names, modules._endpoints_of, matching._sessions_of, matching._mismatches])
 
 
 def test_a_type_that_changes_ends_what_flowed(world: World) -> None:
@@ -393,7 +393,7 @@ def test_r2p_modules_behind_a_gateway(world: World) -> None:
 
 
 def test_a_module_behind_a_gateway_starts_anew(world: World) -> None:
-    """Its new start is told before the farewell of the old one, which takes back nothing else."""
+    """Its new start is announced before the end of the old one, which removes nothing else."""
     gateway = world.add("GW", 1)
     pc = world.add("PC", 2)
     for instance, flags in ((98, 0), (99, 0), (98, management.HELLO_LEAVING)):

@@ -9,11 +9,11 @@ import pytest
 
 import r2p
 from r2p.transports.url import open_transport, parse
-from r2p.transports.zenoh.config import ZenohOptions, chosen, default_network, options_of
+from r2p.transports.zenoh.config import ZenohOptions, choose_network, default_network, parse_options
 
 
 def options(text: str) -> ZenohOptions:
-    return options_of(parse(text))
+    return parse_options(parse(text))
 
 
 def test_alone_it_is_a_peer_of_the_hosts_network() -> None:
@@ -43,12 +43,12 @@ def test_a_file_decides_what_the_url_does_not() -> None:
 @pytest.mark.parametrize(
     ("url", "says"),
     [
-        ("zenoh:7447", "no zenoh endpoint"),
-        ("zenoh:tpc/HOST:2324", "'tpc' is no protocol of zenoh: use one of tcp, udp, tls"),
+        ("zenoh:7447", "is not a zenoh endpoint"),
+        ("zenoh:tpc/HOST:2324", "'tpc' is not a protocol of zenoh: use one of tcp, udp, tls"),
         ("zenoh:tcp/HOST", "the port is missing: tcp/HOST:7447"),
         ("zenoh:tcp/[::1]", "the port is missing"),
         ("zenoh:?listen=tls/0.0.0.0", "the port is missing"),
-        ("zenoh:tcp/HOST:65536", "65536 is no port"),
+        ("zenoh:tcp/HOST:65536", "65536 is not a valid port"),
         ("zenoh:?mode=server", "peer, client, router"),
         ("zenoh:?listen=7447", "tcp/ADDRESS:PORT"),
         ("zenoh:?network=a/b", "letters"),
@@ -70,11 +70,11 @@ def test_what_it_does_not_take(url: str, says: str) -> None:
     ],
 )
 def test_a_file_that_zenoh_does_not_take(tmp_path: Path, text: str, says: str) -> None:
-    from r2p.transports.zenoh.config import config_of
+    from r2p.transports.zenoh.config import build_config
 
     (tmp_path / "zenoh.json5").write_text(text)
     with pytest.raises(r2p.TransportError) as caught:
-        config_of(options(f"zenoh:?config={tmp_path}/zenoh.json5"))
+        build_config(options(f"zenoh:?config={tmp_path}/zenoh.json5"))
     assert f"zenoh: can't read {tmp_path}/zenoh.json5: " in str(caught.value)
     assert says in str(caught.value)
     assert ".rs" not in str(caught.value)
@@ -82,13 +82,13 @@ def test_a_file_that_zenoh_does_not_take(tmp_path: Path, text: str, says: str) -
 
 def test_the_network_of_a_tool_that_was_told_none() -> None:
     own = default_network()
-    assert chosen(set()) == own
-    assert chosen({"robot1", own}) == own
-    assert chosen({"robot1"}) == "robot1"
+    assert choose_network(set()) == own
+    assert choose_network({"robot1", own}) == own
+    assert choose_network({"robot1"}) == "robot1"
     with pytest.raises(ValueError, match="networks robot1, robot2: say which"):
-        chosen({"robot2", "robot1"})
+        choose_network({"robot2", "robot1"})
     with pytest.raises(ValueError, match=r"n0, n1, n2, n3, n4, n5, n6, n7 and 2 more: say which, as \?network=n0$"):
-        chosen({f"n{number}" for number in range(10)})
+        choose_network({f"n{number}" for number in range(10)})
 
 
 @pytest.mark.anyio
@@ -111,50 +111,50 @@ async def test_files_that_are_none(tmp_path: Path, text: str | None, says: str) 
 
 @pytest.mark.anyio
 async def test_what_the_file_says_counts(tmp_path: Path) -> None:
-    from r2p.transports.zenoh.config import config_of, way_of
+    from r2p.transports.zenoh.config import build_config, connection_settings
 
     file = tmp_path / "zenoh.json5"
     file.write_text(
         "{mode: 'client', connect: {endpoints: ['tls/robot:7447'], retry: {period_init_ms: 7}},"
         " transport: {link: {tx: {lease: 4000}, tls: {root_ca_certificate: 'ca.pem'}}}}"
     )
-    config = config_of(options(f"zenoh:?config={file}"))
+    config = build_config(options(f"zenoh:?config={file}"))
     assert config.get_json("mode") == '"client"'
     assert config.get_json("transport/link/tx/lease") == "4000"
-    assert way_of(config).endpoints == ["tls/robot:7447"]
-    assert way_of(config).tls.root == "ca.pem"
-    ours = config_of(options("zenoh:"))
+    assert connection_settings(config).endpoints == ["tls/robot:7447"]
+    assert connection_settings(config).tls.root == "ca.pem"
+    ours = build_config(options("zenoh:"))
     assert ours.get_json("transport/link/tx/lease") == "1000"
 
 
 @pytest.mark.parametrize(("url", "listens"), [("zenoh:tcp/robot:7447", False), ("zenoh:", True)])
 def test_only_sessions_that_listen_have_an_admin_space(url: str, listens: bool) -> None:
     """zenoh's memory grows with each session that had one."""
-    from r2p.transports.zenoh.config import config_of
+    from r2p.transports.zenoh.config import build_config
 
-    assert json.loads(config_of(options(url)).get_json("adminspace/enabled")) is listens
+    assert json.loads(build_config(options(url)).get_json("adminspace/enabled")) is listens
 
 
 def test_a_peer_listens_at_one_port() -> None:
-    from r2p.transports.zenoh.config import config_of, take_any_port, way_of
+    from r2p.transports.zenoh.config import build_config, connection_settings, use_any_port
 
     peer = options("zenoh:")
-    config = config_of(peer)
-    assert way_of(config).listens == ["tcp/[::]:7447"]
-    assert take_any_port(config, peer)
-    assert way_of(config).listens == ["tcp/[::]:0"]
-    assert not take_any_port(config, peer)
+    config = build_config(peer)
+    assert connection_settings(config).listens == ["tcp/[::]:7447"]
+    assert use_any_port(config, peer)
+    assert connection_settings(config).listens == ["tcp/[::]:0"]
+    assert not use_any_port(config, peer)
 
 
 @pytest.mark.parametrize("listen", ["tcp/[::]:7447", "tcp/127.0.0.1:0"])
 @pytest.mark.parametrize("mode", ["peer", "router"])
 def test_it_listens_where_it_is_told_and_nowhere_else(mode: str, listen: str) -> None:
-    from r2p.transports.zenoh.config import config_of, take_any_port, way_of
+    from r2p.transports.zenoh.config import build_config, connection_settings, use_any_port
 
     told = options(f"zenoh:?mode={mode}&listen={listen}")
-    config = config_of(told)
-    assert not take_any_port(config, told)
-    assert way_of(config).listens == [listen]
+    config = build_config(told)
+    assert not use_any_port(config, told)
+    assert connection_settings(config).listens == [listen]
 
 
 @pytest.mark.parametrize(
@@ -171,9 +171,9 @@ def test_it_listens_where_it_is_told_and_nowhere_else(mode: str, listen: str) ->
     ],
 )
 def test_where_it_is_open_to_all(url: str, endpoints: list[str]) -> None:
-    from r2p.transports.zenoh.config import config_of, open_to_all
+    from r2p.transports.zenoh.config import build_config, open_endpoints
 
-    assert open_to_all(config_of(options(url))) == endpoints
+    assert open_endpoints(build_config(options(url))) == endpoints
 
 
 @pytest.mark.parametrize(
@@ -186,11 +186,11 @@ def test_where_it_is_open_to_all(url: str, endpoints: list[str]) -> None:
     ],
 )
 def test_where_a_file_leaves_it_open_to_all(tmp_path: Path, text: str, endpoints: list[str]) -> None:
-    from r2p.transports.zenoh.config import config_of, open_to_all
+    from r2p.transports.zenoh.config import build_config, open_endpoints
 
     file = tmp_path / "zenoh.json5"
     file.write_text("{mode: 'router', listen: {endpoints: ['tls/[::]:1', 'tcp/[::]:1']}, " + text + "}")
-    assert open_to_all(config_of(options(f"zenoh:?config={file}"))) == endpoints
+    assert open_endpoints(build_config(options(f"zenoh:?config={file}"))) == endpoints
 
 
 @pytest.mark.anyio
@@ -200,15 +200,13 @@ async def test_the_usual_port_is_in_use(monkeypatch: pytest.MonkeyPatch, caplog:
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        monkeypatch.setattr(config, "_USUAL", [f"tcp/127.0.0.1:{port}"])
+        monkeypatch.setattr(config, "_DEFAULT_LISTEN", [f"tcp/127.0.0.1:{port}"])
         monkeypatch.setitem(config._ANY_PORT, "listen/endpoints", ["tcp/127.0.0.1:0"])
         monkeypatch.setattr(config, "_LOOPBACK", re.compile("unix"))
         for observer in (True, False):
             caplog.clear()
             async with r2p.Module("A", via="zenoh:?scouting=off&network=lab", watchdog=False, observer=observer):
-                told = re.search(
-                    r"zenoh: takes connections of other computers at port (\d+), and does not", caplog.text
-                )
+                told = re.search(r"zenoh: accepts connections from other computers at port (\d+) without", caplog.text)
                 assert bool(told) is not observer
         assert told is not None
         assert int(told[1]) != port

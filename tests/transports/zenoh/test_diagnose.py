@@ -9,7 +9,7 @@ import pytest
 import r2p
 from r2p.transports.url import open_transport
 from r2p.transports.zenoh import transport
-from r2p.transports.zenoh.diagnose import ConnectionSettings, why, why_not_listening
+from r2p.transports.zenoh.diagnose import ConnectionSettings, diagnose_connection, diagnose_listening
 from r2p.transports.zenoh.session import ZenohSession
 from tests.transports.test_conformance import first, until
 from tests.transports.zenoh.cable import Net, guarded, module
@@ -36,35 +36,35 @@ async def test_a_port_in_use() -> None:
 @pytest.mark.parametrize(
     ("endpoint", "says"),
     [
-        (f"tcp/{NOWHERE}:7447", f"^{NOWHERE} is the name of no computer"),
-        (f"udp/{FAR}:7447", f"^can't listen at {FAR}:7447: {FAR} is no address of this computer"),
+        (f"tcp/{NOWHERE}:7447", f"^{NOWHERE} is not the name of a known computer"),
+        (f"udp/{FAR}:7447", f"^can't listen at {FAR}:7447: this computer has no address {FAR}"),
         ("tcp/127.0.0.1:0#iface=nosuch0", "^there is no network interface nosuch0 here: there are .*lo"),
         ("tcp/[::1]:0", "^$"),
         ("unixsock-stream//tmp/nothing", "^$"),
     ],
 )
 async def test_where_nobody_can_listen(endpoint: str, says: str) -> None:
-    assert re.search(says, why_not_listening(ConnectionSettings([], listens=[endpoint])))
+    assert re.search(says, diagnose_listening(ConnectionSettings([], listens=[endpoint])))
 
 
 async def test_the_port_of_datagrams_is_another_one() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert "in use" in why_not_listening(
+        assert "in use" in diagnose_listening(
             ConnectionSettings([], listens=["tcp/127.0.0.1:0", f"ws/127.0.0.1:{port}"])
         )
-        assert not why_not_listening(ConnectionSettings([], listens=[f"udp/127.0.0.1:{port}"]))
+        assert not diagnose_listening(ConnectionSettings([], listens=[f"udp/127.0.0.1:{port}"]))
 
 
 @pytest.mark.parametrize(
     ("endpoint", "says"),
     [
-        (f"tcp/{NOWHERE}:7447", f"{NOWHERE} is the name of no computer"),
+        (f"tcp/{NOWHERE}:7447", f"{NOWHERE} is not the name of a known computer"),
         ("tcp/127.0.0.1:7447#iface=nosuch0", "there is no network interface nosuch0 here"),
     ],
 )
 async def test_where_nobody_can_connect(endpoint: str, says: str) -> None:
-    assert says in await why(ConnectionSettings([endpoint]))
+    assert says in await diagnose_connection(ConnectionSettings([endpoint]))
 
 
 @guarded
@@ -73,14 +73,14 @@ async def test_alone_on_a_network_while_others_are_elsewhere(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, observer: bool
 ) -> None:
     caplog.set_level("INFO")
-    monkeypatch.setattr(transport, "_ALONE", 0.01)
+    monkeypatch.setattr(transport, "_ALONE_S", 0.01)
     robot = Net("robot1")
     wrong = robot.join.replace(robot.name, "robot2")
     lonely = tool("_b", wrong) if observer else module("B", wrong)
     events = lonely.events()
     async with module("A", robot.listen), tool("_c", wrong), lonely:
         notice = await first(events, r2p.LinkNotice)
-    expected = "nobody else is on the network robot2, but there are modules on robot1: is ?network=robot1 meant?"
+    expected = "no other module is on the network robot2, but there are modules on robot1: is ?network=robot1 meant?"
     assert (notice.kind, notice.text) == ("elsewhere", expected)
     levels = {each.levelname for each in caplog.records if expected in each.getMessage()}
     assert ("WARNING" in levels) != observer, "a program without a handler shows warnings only"
@@ -89,16 +89,16 @@ async def test_alone_on_a_network_while_others_are_elsewhere(
 @guarded
 async def test_tools_are_no_company_and_no_place_to_go(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tool on a network of a wrong name is not where another one should be."""
-    monkeypatch.setattr(transport, "_TOOL_ALONE", 0.01)
-    monkeypatch.setattr(transport, "_RARELY", 0.01)
+    monkeypatch.setattr(transport, "_ALONE_TOOL_S", 0.01)
+    monkeypatch.setattr(transport, "_ALONE_MAX_S", 0.01)
     looks: list[bool] = []
-    networks = ZenohSession.networks
+    networks = ZenohSession.find_networks
 
     async def look(session: ZenohSession, *, tools: bool) -> set[str]:
         looks.append(tools)
         return await networks(session, tools=tools)
 
-    monkeypatch.setattr(ZenohSession, "networks", look)
+    monkeypatch.setattr(ZenohSession, "find_networks", look)
     net = Net("robot1")
     first_tool, second_tool = tool("_one", net.listen), tool("_two", net.join.replace(net.name, "typo"))
     told = first_tool.events()

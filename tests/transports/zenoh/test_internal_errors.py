@@ -12,7 +12,7 @@ import r2p
 from r2p.codecs.attachment import Credit, encode_credit
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.config import ZenohOptions
-from r2p.transports.zenoh.credit import Credits, Reachability
+from r2p.transports.zenoh.credit import CreditReader, Reachability
 from r2p.transports.zenoh.link import ZenohLink
 from r2p.transports.zenoh.transport import ZenohTransport
 from tests.faults import once
@@ -20,17 +20,19 @@ from tests.faults import once
 pytestmark = [pytest.mark.virtual_time, pytest.mark.internal_errors]
 
 
-def outlet(topic: str, **faults: Callable[..., Any]) -> Any:
+def subscriber(topic: str, **faults: Callable[..., Any]) -> Any:
     """Stands for a topic on its way out, with a subscriber that waits and has not said anything."""
     calls: list[str] = []
-    outlet = SimpleNamespace(topic=SimpleNamespace(name=topic), calls=calls, tries=Counter(), wait_queue=lambda: True)
-    outlet.expects = False
-    outlet.unacknowledged = lambda: {7}
-    for name in ("credited", "refill", "resend_latched"):
-        setattr(outlet, name, lambda *_, name=name, **__: calls.append(name))
+    subscriber = SimpleNamespace(
+        topic=SimpleNamespace(name=topic), calls=calls, silent_checks=Counter(), wait_queue=lambda: True
+    )
+    subscriber.awaits_credit = False
+    subscriber.unacknowledged = lambda: {7}
+    for name in ("acknowledge", "refill", "resend_latched"):
+        setattr(subscriber, name, lambda *_, name=name, **__: calls.append(name))
     for name, fault in faults.items():
-        setattr(outlet, name, fault)
-    return outlet
+        setattr(subscriber, name, fault)
+    return subscriber
 
 
 class Payload(bytes):
@@ -39,45 +41,48 @@ class Payload(bytes):
 
 
 async def test_credits() -> None:
-    stats = LinkStats()
-    outlets = [outlet("a", credited=once(print)), outlet("b", refill=once(print)), outlet("c")]
-    credits_of = Credits(asyncio.get_running_loop(), stats, lambda: outlets, lambda *_: None)
+    stats, loop = LinkStats(), asyncio.get_running_loop()
+    subscribers = [subscriber("a", acknowledge=once(print)), subscriber("b", refill=once(print)), subscriber("c")]
+    sender: Any = SimpleNamespace(loop=loop, link=SimpleNamespace(stats=stats), subscribers=lambda: subscribers)
+    credits_of = CreditReader(sender)
     waiting = [SimpleNamespace(payload=Payload(encode_credit(Credit(7, 1, 5, each)))) for each in "abc"]
     session: Any = SimpleNamespace(
         subscribe=lambda *_: SimpleNamespace(
-            take=lambda: waiting.pop(0) if waiting else None, wait=lambda: None, close=lambda: None
+            receive=lambda: waiting.pop(0) if waiting else None, wait=lambda: None, close=lambda: None
         )
     )
     credits_of.connect(session, "credit")
     credits_of._arrived(waiting.pop(0))  # type: ignore[arg-type]
-    assert [each.calls for each in outlets] == [["refill"], ["credited"], ["credited", "refill"]]
+    assert [each.calls for each in subscribers] == [["refill"], ["acknowledge"], ["acknowledge", "refill"]]
     assert stats.lost == {"internal error": 2}
     credits_of.close()
 
 
-@pytest.mark.parametrize("fault", ["reach", "let_in", "unacknowledged"])
+@pytest.mark.parametrize("fault", ["reaches", "admit", "unacknowledged"])
 async def test_subscribers(fault: str) -> None:
     calls: list[str] = []
-    outlets = [outlet("a"), outlet("b")]
-    link: Any = SimpleNamespace(
-        stats=LinkStats(),
-        knows=lambda _: True,
-        senders=SimpleNamespace(reach=lambda _: True),
-        let_in=lambda topic, *_, **__: calls.append(topic),
-        credits=SimpleNamespace(look=lambda: None),
-        zenoh_outlets=lambda: outlets,
-        tell_unheard=lambda *_: None,
+    subscribers = [subscriber("a"), subscriber("b")]
+    stats = LinkStats()
+    sender: Any = SimpleNamespace(
+        loop=asyncio.get_running_loop(),
+        link=SimpleNamespace(stats=stats),
+        has_topic=lambda _: True,
+        publishers=SimpleNamespace(reaches=lambda _: True),
+        admit=lambda topic, *_, **__: calls.append(topic),
+        credits=SimpleNamespace(receive=lambda: None),
+        subscribers=lambda: subscribers,
+        report_unreachable=lambda *_: None,
     )
-    place = {"reach": link.senders, "let_in": link, "unacknowledged": outlets[0]}[fault]
+    place = {"reaches": sender.publishers, "admit": sender, "unacknowledged": subscribers[0]}[fault]
     setattr(place, fault, once(getattr(place, fault)))
-    reach = Reachability(link, asyncio.get_running_loop())
-    reach.came("a", 7, 16)
-    reach.came("b", 7, 16)
+    reach = Reachability(sender)
+    reach.add("a", 7, 16)
+    reach.add("b", 7, 16)
     await asyncio.sleep(1.0)
-    assert sorted(calls) == (["b"] if fault == "let_in" else ["a", "b"])
-    assert len(outlets[1].calls) >= 3
-    assert len(outlets[0].calls) >= 2
-    assert link.stats.lost == {"internal error": 1}
+    assert sorted(calls) == (["b"] if fault == "admit" else ["a", "b"])
+    assert len(subscribers[1].calls) >= 3
+    assert len(subscribers[0].calls) >= 2
+    assert stats.lost == {"internal error": 1}
     reach.close()
 
 
@@ -103,7 +108,7 @@ async def test_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_looks_around(monkeypatch: pytest.MonkeyPatch) -> None:
     """What looks for modules on other networks goes on, and so does the link."""
 
-    async def networks(*, tools: bool) -> set[str]:
+    async def find_networks(*, tools: bool) -> set[str]:
         return {"lab", "field"}
 
     async with r2p.Module("PC", via=[], watchdog=False) as module:
@@ -113,8 +118,8 @@ async def test_looks_around(monkeypatch: pytest.MonkeyPatch) -> None:
         link.on_up()
         notices: list[str] = []
         monkeypatch.setattr(hub, "link_notice", lambda _link, _kind, text, **_: notices.append(text))
-        session: Any = SimpleNamespace(networks=once(networks))
-        await ZenohTransport(ZenohOptions("zenoh:"))._look_around(session, link, hub, "lab")
+        session: Any = SimpleNamespace(find_networks=once(find_networks))
+        await ZenohTransport(ZenohOptions("zenoh:"))._look_for_others(session, link, hub, "lab")
         assert link.losses == {"internal error": 1}
-        assert notices[0].startswith("nobody else is on the network lab, but there are modules on field")
+        assert notices[0].startswith("no other module is on the network lab, but there are modules on field")
         link.close()

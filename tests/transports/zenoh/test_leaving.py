@@ -70,9 +70,9 @@ async def test_a_last_credit_is_for_all_classes_and_may_come_after_the_end_of_th
         reader.undeclare()
         await until(lambda: not publisher.subscribers)
         if late:
-            assert link._farewells._gone
+            assert link.sender.final_credits._departed
             alien.put(f"r2p/lab/credit/{link.instance:x}", last)
-        await until(lambda: not link._farewells._gone)
+        await until(lambda: not link.sender.final_credits._departed)
     assert link.losses["unknown at disconnect"] == 0
 
 

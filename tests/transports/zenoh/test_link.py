@@ -20,11 +20,10 @@ from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import layout
 from r2p.msg import Led, Text
 from r2p.protocols.flow_control import NO_LIMIT
-from r2p.protocols.liveliness import refused
-from r2p.protocols.liveliness import session as presence
+from r2p.protocols.liveliness import session as liveliness_session
 from r2p.testing.network import node_in
+from r2p.transports.zenoh.credit import ZenohSubscriber
 from r2p.transports.zenoh.link import ZenohLink
-from r2p.transports.zenoh.publish import ZenohSubscriber
 from r2p.transports.zenoh.session import ZenohSession
 from r2p.transports.zenoh.subscribe import WINDOW
 from tests.transports.test_conformance import first, other, until
@@ -61,8 +60,8 @@ def link_of(node: r2p.Node) -> ZenohLink:
 def knows(publisher: r2p.Publisher[Any], node: r2p.Node) -> bool:
     """Whether a publisher sends to a module."""
     return any(
-        isinstance(outlet, ZenohSubscriber) and outlet.knows(link_of(node).instance)
-        for outlet in publisher._topic.remote_subscribers
+        isinstance(subscriber, ZenohSubscriber) and subscriber.has_session(link_of(node).instance)
+        for subscriber in publisher._topic.remote_subscribers
     )
 
 
@@ -169,7 +168,7 @@ async def test_a_node_that_joins_a_tool_in_its_module_is_waited_for_from_then_on
         for number in range(2 * WINDOW):
             await publisher.publish(Led(number))
         subscriber = bob.subscribe("leds", Led, queue=4 * WINDOW)
-        await until(lambda: link_of(alice).senders.flow("leds", 1).limit != NO_LIMIT)
+        await until(lambda: link_of(alice).sender.publishers.window("leds", 1).limit != NO_LIMIT)
         for number in range(2 * WINDOW):  # would take 30 s if it waited for credit that nobody thinks of
             await publisher.publish(Led(number))
         await until(lambda: len(subscriber.queue) >= 2 * WINDOW)
@@ -243,8 +242,8 @@ async def test_a_subscriber_is_let_in_when_messages_reach_it() -> None:
         await publisher.publish(Led(1))
         told = liveliness.encode(TopicToken(7, ROLE_SUBSCRIBES, "leds", 7, "node", window=8))
         token = alien.liveliness().declare_token(f"r2p/lab/live/{told}")
-        reach = link_of(alice)._reach
-        await until(lambda: ("leds", 7) in reach._guests and reach._guests["leds", 7].waited > 3)
+        reach = link_of(alice).sender.reachability
+        await until(lambda: ("leds", 7) in reach._pending and reach._pending["leds", 7].retries > 3)
         assert not publisher.subscribers
         heard = alien.declare_subscriber("r2p/lab/topic/leds", zenoh.handlers.FifoChannel(8))
         await publisher.wait_subscriber()
@@ -257,10 +256,10 @@ async def test_a_subscriber_is_let_in_when_messages_reach_it() -> None:
 async def test_who_is_not_let_in_is_forgotten_with_the_link() -> None:
     async with nodes(Net(), "A") as (alice,):
         alice.advertise("leds", Led)
-        reach = link_of(alice)._reach
-        reach.came("leds", 7, 8)
-        assert reach._guests
-    assert not reach._guests
+        reach = link_of(alice).sender.reachability
+        reach.add("leds", 7, 8)
+        assert reach._pending
+    assert not reach._pending
 
 
 @guarded
@@ -296,7 +295,7 @@ async def test_a_router_that_asks_who_is_there_is_not_stopped_by_many_answers() 
         assert session is not None
         found: set[str] = set()
         while "full" not in found:
-            found = await session.networks(tools=False)
+            found = await session.find_networks(tools=False)
         assert found == {"lab", "full"}
         del tokens
 
@@ -304,8 +303,8 @@ async def test_a_router_that_asks_who_is_there_is_not_stopped_by_many_answers() 
 @guarded
 @pytest.mark.parametrize("asks", ["router", "client"])
 async def test_refused_tokens_are_believed_when_there_is_room(monkeypatch: pytest.MonkeyPatch, asks: str) -> None:
-    monkeypatch.setattr(presence, "TOKENS", 8)
-    monkeypatch.setattr(refused, "_FIRST", 1)
+    monkeypatch.setattr(liveliness_session, "TOKENS_MAX", 8)
+    monkeypatch.setattr(liveliness_session, "_FIRST_PAUSE", 1)
     async with nodes(net := Net(), "A", "B") as (alice, bob), alien_on(net) as alien:
         link, live = link_of(alice if asks == "router" else bob), alien.liveliness()
         tokens = [live.declare_token(f"r2p/lab/live/*/1/{n:x}/module/M{n}/{n:x}/0/0") for n in range(1, 13)]
@@ -327,7 +326,7 @@ async def test_what_cannot_be_the_name_of_a_network_is_none() -> None:
         assert session is not None
         found: set[str] = set()
         while "other" not in found:
-            found = await session.networks(tools=False)
+            found = await session.find_networks(tools=False)
         assert found == {"lab", "other"}
         del tokens
 
@@ -357,7 +356,7 @@ async def test_modules_share_no_wildcard_of_which_zenoh_would_keep_memory(monkey
 
         return declared
 
-    for name in ("listen", "serve", "subscribe"):
+    for name in ("listen", "answer_queries", "subscribe"):
         monkeypatch.setattr(ZenohSession, name, recorded(getattr(ZenohSession, name)))
     net = Net()
     async with nodes(net, "A", "B") as (alice, bob):
@@ -439,7 +438,7 @@ async def test_what_is_lost_on_the_way_is_counted_by_source() -> None:
             assert (await subscriber.fetch()).led == serial
         link = link_of(alice)
         assert link.losses["on the way"] == 11
-        assert link._streams.gaps == {("leds", r2p.Source("ALIEN", "node", link.name)): 11}
+        assert link.receiver.gaps == {("leds", r2p.Source("ALIEN", "node", link.name)): 11}
 
 
 @guarded
@@ -455,7 +454,7 @@ async def test_what_comes_by_two_links_comes_once() -> None:
 
         await publisher.wait_subscriber()
         links = [link for link in b.links if isinstance(link, ZenohLink)]
-        await until(lambda: all("leds" in link._streams._streams for link in links))  # the second one listened first
+        await until(lambda: all("leds" in link.receiver._streams for link in links))  # the second one listened first
         while not dropped():  # until both links have it
             await publisher.publish(Led())
         for number in range(2 * WINDOW):  # further than it would get if what is dropped earned no credit

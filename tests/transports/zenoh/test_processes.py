@@ -14,7 +14,7 @@ import r2p
 from r2p.msg import Float32
 from r2p.protocols.discovery.events import ModuleChanged, ModuleGone
 from r2p.testing.network import node_in
-from r2p.transports.zenoh.publish import ZenohSubscriber
+from r2p.transports.zenoh.credit import ZenohSubscriber
 from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.cable import Net, guarded, module
 from tests.transports.zenoh.peer import MODULES, TOPICS, Page
@@ -85,7 +85,7 @@ async def test_a_router_that_dies_and_comes_back_while_messages_flow() -> None:
             router.kill()
             await first(events, r2p.LinkDown)
             assert not other(b, "A")
-            assert "nobody listens" in (await first(events, r2p.LinkWaits)).reason
+            assert "no program listens" in (await first(events, r2p.LinkWaits)).reason
         received = len(subscriber.queue)
         async with running("router", "ROUTER", net.listen):
             assert (await first(events, r2p.LinkUp)).outage > 0
@@ -103,11 +103,11 @@ async def test_a_router_that_dies_and_comes_back_while_messages_flow() -> None:
 async def _confirmed(publisher: r2p.Publisher[Float32], subscriber: r2p.Subscriber[Float32]) -> None:
     """A message comes, and who sent it knows that: else it would suspect a router's access control."""
     await publisher.wait_subscriber()
-    (outlet,) = publisher._topic.remote_subscribers
-    assert isinstance(outlet, ZenohSubscriber)
+    (remote,) = publisher._topic.remote_subscribers
+    assert isinstance(remote, ZenohSubscriber)
     await publisher.publish(Float32(1.0))
     await subscriber.fetch()
-    await until(lambda: not outlet.unacknowledged())
+    await until(lambda: not remote.unacknowledged())
 
 
 async def _flow(module: r2p.Module, node: r2p.Node, publisher: r2p.Publisher[Float32], enough: asyncio.Event) -> int:
@@ -206,7 +206,7 @@ async def test_a_module_that_waits_for_its_router() -> None:
     waiting = module("B", net.join)
     events = waiting.events()
     async with waiting as b:
-        assert "nobody listens" in (await first(events, r2p.LinkWaits)).reason
+        assert "no program listens" in (await first(events, r2p.LinkWaits)).reason
         async with running("router", "ROUTER", net.listen):
             await first(events, r2p.LinkUp)
             await until(lambda: other(b, "ROUTER"))

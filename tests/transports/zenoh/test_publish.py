@@ -11,7 +11,7 @@ from r2p.codecs.attachment import ClockOffset, Origin
 from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.sample import Sample, Source
 from r2p.transports.stats import LinkStats
-from r2p.transports.zenoh.publish import FLOOD, MOST_WAITING, TURNS, Batcher, TxStream
+from r2p.transports.zenoh.publish import BATCH_MAX, FLOOD, FLOOD_TURNS, Batcher, TxStream
 
 pytestmark = pytest.mark.virtual_time
 
@@ -27,10 +27,10 @@ class Wire:
         self.sent: list[bytes] = []
         self.headers: list[attachment.Header] = []
         self.stats = LinkStats()
-        self.burst = Batcher(asyncio.get_running_loop(), self.stats, ConnectionError, batching=batching)
-        self.lanes = {urgent: TxStream(SendWindow(), urgent=urgent) for urgent in (False, True)}
-        for lane in self.lanes.values():
-            lane.prepare(HERE, ORIGIN, self.put)
+        self.batcher = Batcher(asyncio.get_running_loop(), self.stats, ConnectionError, batching=batching)
+        self.streams = {urgent: TxStream(SendWindow(), urgent=urgent) for urgent in (False, True)}
+        for stream in self.streams.values():
+            stream.prepare(HERE, ORIGIN, self.put)
         self.sequence = 0
 
     def put(self, data: bytes, *, attachment: bytes) -> None:
@@ -40,14 +40,14 @@ class Wire:
         self.headers.append(_decode(attachment))
 
     def add(self, data: bytes, *, urgent: bool = False, **fields: Any) -> None:
-        """As an outlet does it."""
+        """As a subscriber does it."""
         self.sequence += 1
-        lane = self.lanes[urgent]
-        lane.flow.serial += 1
+        stream = self.streams[urgent]
+        stream.window.serial += 1
         sample = Sample(data, HERE, 1000 + self.sequence, sequence=self.sequence)
-        lane.waiting.append(msgspec.structs.replace(sample, **fields))
-        if urgent or len(lane.waiting) in (1, MOST_WAITING):
-            self.burst.add(lane)
+        stream.waiting.append(msgspec.structs.replace(sample, **fields))
+        if urgent or len(stream.waiting) in (1, BATCH_MAX):
+            self.batcher.add(stream)
 
 
 _decode = attachment.decode
@@ -76,11 +76,11 @@ async def test_the_first_goes_at_once_the_others_together_and_the_urgent_never_w
 async def test_a_flood_goes_out_every_few_turns_and_when_it_ends() -> None:
     wire = Wire()
     wire.add(b"0")
-    for _ in range(TURNS + 2):
+    for _ in range(FLOOD_TURNS + 2):
         for _ in range(FLOOD):
             wire.add(b"1")
         await turns(1)
-    assert wire.sent == [b"0", TURNS * FLOOD * b"1"]
+    assert wire.sent == [b"0", FLOOD_TURNS * FLOOD * b"1"]
     await turns(1)
     assert wire.sent[2:] == [2 * FLOOD * b"1"]
 
@@ -101,27 +101,27 @@ async def test_one_topic_can_be_sent_before_the_others() -> None:
     other.prepare(HERE, ORIGIN, wire.put)
     for data in (b"0", b"1", b"2"):
         wire.add(data)
-    wire.burst.send(other)
+    wire.batcher.send(other)
     assert wire.sent == [b"0"]
-    wire.burst.send(wire.lanes[False])
-    wire.burst.send(wire.lanes[False])
+    wire.batcher.send(wire.streams[False])
+    wire.batcher.send(wire.streams[False])
     assert wire.sent == [b"0", b"12"]
 
 
 async def test_a_turn_that_does_not_end_is_no_reason_to_keep_all_of_it() -> None:
     wire = Wire()
-    for _ in range(1 + MOST_WAITING):
+    for _ in range(1 + BATCH_MAX):
         wire.add(b"1")
-    assert wire.sent == [b"1", MOST_WAITING * b"1"]
-    assert not wire.lanes[False].waiting
+    assert wire.sent == [b"1", BATCH_MAX * b"1"]
+    assert not wire.streams[False].waiting
 
 
 async def test_a_link_that_goes_down_takes_along_what_waits() -> None:
     wire = Wire()
     for data in (b"1", b"2", b"3"):
         wire.add(data)
-    assert wire.burst.discard() == 2
-    await turns(TURNS)
+    assert wire.batcher.discard() == 2
+    await turns(FLOOD_TURNS)
     assert wire.sent == [b"1"]
     wire.add(b"4")
     assert [each.serial for each in wire.headers] == [1, 2]  # it was counted here, so nobody else has to
@@ -131,10 +131,10 @@ async def test_what_zenoh_does_not_take_is_counted() -> None:
     wire = Wire()
     for data in (b"1", b"x", b"y", b"long", b"2"):
         wire.add(data)
-    wire.burst.flush()
+    wire.batcher.flush()
     assert wire.sent == [b"1", b"long", b"2"]
     assert [each.serial for each in wire.headers] == [1, 2, 3]  # they were counted here, so nobody else has to
-    assert wire.lanes[False].flow.serial == 3
+    assert wire.streams[False].window.serial == 3
     assert (wire.stats.sent, dict(wire.stats.lost)) == (3, {"link down": 2})
 
 
@@ -162,10 +162,10 @@ async def test_what_shares_a_header(changes: list[dict[str, Any]], packets: list
     expected = []
     for serial, (data, fields) in enumerate(zip((b"a", b"b", b"c", b"d"), changes, strict=True), 2):
         wire.add(data, **fields)
-        each = wire.lanes[False].waiting[-1]
+        each = wire.streams[False].waiting[-1]
         hops = each.hops + bool(each.source.link)
         expected.append((serial, each.sequence, each.stamp, each.deadline, hops, each.stamped, each.clock))
-    wire.burst.flush()
+    wire.batcher.flush()
     assert wire.sent[1:] == packets
     told = []
     for header in wire.headers[1:]:
@@ -189,7 +189,7 @@ async def test_long_messages_go_alone() -> None:
     wire = Wire()
     for size in (1, 5000, 5000, 5000, 5000, 20_000, 20_000):
         wire.add(bytes(size))
-    wire.burst.flush()
+    wire.batcher.flush()
     assert [len(each) for each in wire.sent] == [1, 15_000, 5000, 20_000, 20_000]
 
 
@@ -199,7 +199,7 @@ async def test_a_packet_that_raises_does_not_stop_the_others() -> None:
     wire.add(b"0")
     wire.add(b"1", stamp=-(2**80))
     wire.add(b"22")
-    wire.burst.flush()
+    wire.batcher.flush()
     assert wire.sent == [b"0", b"22"]
     assert [each.serial for each in wire.headers] == [1, 2]
     assert (wire.stats.sent, wire.stats.lost) == (2, {"internal error": 1})

@@ -18,17 +18,17 @@ pytestmark = pytest.mark.anyio
 
 async def test_a_flood_lets_others_have_their_turn() -> None:
     taken: list[int] = []
-    funnel = LoopQueue(asyncio.get_running_loop(), taken.append, LoggedCounter(), most=2 * MESSAGES_PER_TURN + 1)
+    queue = LoopQueue(asyncio.get_running_loop(), taken.append, LoggedCounter(), most=2 * MESSAGES_PER_TURN + 1)
     for number in range(2 * MESSAGES_PER_TURN + 3):
-        funnel.put(number)
-    assert funnel.overflown == 2
+        queue.put(number)
+    assert queue.overflowed == 2
     turns = set()
     while len(taken) < 2 * MESSAGES_PER_TURN + 1:
         await asyncio.sleep(0)
         turns.add(len(taken))
     assert taken == list(range(2 * MESSAGES_PER_TURN + 1))
     assert turns >= {MESSAGES_PER_TURN, 2 * MESSAGES_PER_TURN}
-    funnel.put(-1)
+    queue.put(-1)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert taken[-1] == -1
@@ -72,22 +72,22 @@ class Reader:
         self.more = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         subscriber: Any = channel
-        self.tap = SubscriptionReader(subscriber, self._loop, self._arrived)
+        self.reader = SubscriptionReader(subscriber, self._loop, self._arrived)
 
     def _arrived(self, item: Any) -> None:
         for _ in range(3):
             self.taken.append(item)
             self.more.set()
-            item = self.tap.take()
+            item = self.reader.receive()
             if item is None:
                 self._loop.call_soon(self._look_again)
                 return
         self._loop.call_soon(self._arrived, item)
 
     def _look_again(self) -> None:
-        item = self.tap.take()
+        item = self.reader.receive()
         if item is None:
-            self.tap.wait()
+            self.reader.wait()
         else:
             self._arrived(item)
 
@@ -97,7 +97,7 @@ class Reader:
             await self.more.wait()
 
 
-async def test_a_tap_gives_everything_once_and_in_order_fast_or_slow() -> None:
+async def test_a_reader_gives_everything_once_and_in_order_fast_or_slow() -> None:
     channel = Channel()
     reader = Reader(channel)
     for number in range(1, 101):  # each for itself: the thread hands it over
@@ -110,40 +110,44 @@ async def test_a_tap_gives_everything_once_and_in_order_fast_or_slow() -> None:
     await reader.until(5001)
     assert reader.taken == list(range(1, 5002))
     feeding.join()
-    reader.tap.close()
+    reader.reader.close()
 
 
 @pytest.mark.parametrize("taken_meanwhile", [False, True])
-async def test_what_was_handed_over_before_a_tap_waits_comes_before_what_comes_after_it(taken_meanwhile: bool) -> None:
+async def test_what_was_passed_before_a_reader_waits_comes_before_what_comes_after_it(
+    taken_meanwhile: bool,
+) -> None:
     subscriber: Any = Channel()
     taken: list[int] = []
-    tap = SubscriptionReader(subscriber, asyncio.get_running_loop(), taken.append)  # type: ignore[arg-type]
+    reader = SubscriptionReader(subscriber, asyncio.get_running_loop(), taken.append)  # type: ignore[arg-type]
     for number in (1, 2):
-        tap._hand_over(number, rests=False)  # type: ignore[arg-type]
-    tap.wait()
+        reader._pass(number, pauses=False)  # type: ignore[arg-type]
+    reader.wait()
     if taken_meanwhile:
-        taken.append(tap.take())  # type: ignore[arg-type]
-    tap._hand_over(3, rests=False)  # type: ignore[arg-type]
+        taken.append(reader.receive())  # type: ignore[arg-type]
+    reader._pass(3, pauses=False)  # type: ignore[arg-type]
     await asyncio.sleep(0)
-    tap.wait()
+    reader.wait()
     await asyncio.sleep(0)
     assert taken == [1, 2, 3]
-    tap.close()
+    reader.close()
 
 
 @pytest.mark.parametrize("waiting", [0, 1, 5])
-async def test_the_thread_of_a_tap_ends_with_it(waiting: int) -> None:
+async def test_the_thread_of_a_reader_ends_with_it(waiting: int) -> None:
     before = set(threading.enumerate())
     channel = Channel()
     subscriber: Any = channel
     arrived: asyncio.Queue[Any] = asyncio.Queue()
-    tap = SubscriptionReader(subscriber, asyncio.get_running_loop(), arrived.put_nowait)  # never ready for a second one
+    reader = SubscriptionReader(
+        subscriber, asyncio.get_running_loop(), arrived.put_nowait
+    )  # never ready for a second one
     for number in range(waiting):
         channel.put(number)
     if waiting:
         assert await arrived.get() == 0
     (thread,) = set(threading.enumerate()) - before
-    tap.close()
+    reader.close()
     await asyncio.to_thread(thread.join)
     assert arrived.empty()
 
@@ -159,16 +163,16 @@ async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
             ended.set()
         taken.append(10 // item)
 
-    funnel = LoopQueue(loop, take, losses, most=9)
+    queue = LoopQueue(loop, take, losses, most=9)
     for number in (5, 0, 2, 0, 1):
-        funnel.put(number)
+        queue.put(number)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert (taken, losses) == ([2, 5, 10], {"internal error": 2})
 
     channel, nothing = Channel(), None
     session = ZenohSession(nothing)  # type: ignore[arg-type]
-    session._hear(channel, lambda item: funnel.put(len(item)), funnel)
+    session._forward(channel, lambda item: queue.put(len(item)), queue)
     channel.put_all(["12345", 7, "1234567890"])
     await ended.wait()
     channel.undeclare()
@@ -204,7 +208,7 @@ async def test_publishers_are_undeclared_before_their_session_is_closed() -> Non
     bare = Zenoh()
     stand_in: Any = bare
     session = ZenohSession(stand_in)
-    session.publisher("stays", 1)
-    session.ends(session.publisher("ended", 2))
+    session.declare_publisher("stays", 1)
+    session.undeclare_publisher(session.declare_publisher("ended", 2))
     await session.close()
     assert bare.calls == ["ended", "stays", "close"]

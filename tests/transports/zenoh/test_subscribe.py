@@ -16,7 +16,7 @@ from r2p.runtime.backpressure import Sink
 from r2p.runtime.sample import Sample
 from r2p.runtime.topic import SubscriberQueue, Topic, WakeScheduler
 from r2p.transports.stats import LinkStats
-from r2p.transports.zenoh.subscribe import WINDOW, RxStream, RxStreams
+from r2p.transports.zenoh.subscribe import WINDOW, RxStream, ZenohReceiver
 
 pytestmark = pytest.mark.virtual_time
 
@@ -36,17 +36,13 @@ class Ring:
         self.topic.layout = layout(Led) if typed else None
         self._ring: deque[Any] = deque()
         self._idle = True
-        self.streams = RxStreams(
-            "zenoh:",
-            loop,
-            self.stats,
-            longest=1024,
-            latched=lambda _: False,
-            credit=self._credit,
-            subscribe=self._subscribe,
-        )
+        hub: Any = SimpleNamespace(space=SimpleNamespace(loop=loop, clock=clock_of(loop)), instance=1)
+        link: Any = SimpleNamespace(name="zenoh:", stats=self.stats, max_payload=1024, latched=lambda _: False)
+        self.receiver = ZenohReceiver(link, hub)
+        session: Any = SimpleNamespace(subscribe=self._subscribe, put=self._put_credit)
+        self.receiver.connect(session, "r2p/lab")
         self.sink = self.subscribe(queue)
-        self.streams.begin(self.topic)
+        self.receiver.subscribe(self.topic)
 
     def subscribe(self, queue: int) -> SubscriberQueue:
         owner: Any = SimpleNamespace(name="node", priority=0)
@@ -54,15 +50,17 @@ class Ring:
         self.topic.join(sink)
         return sink
 
-    def _subscribe(self, _topic: str, arrived: Any) -> Any:
+    def _subscribe(self, _key: str, _most: int, arrived: Any) -> Any:
         self._arrived = arrived
-        return SimpleNamespace(take=self._take, wait=self._wait, close=lambda: None)
+        return SimpleNamespace(receive=self._receive, wait=self._wait, close=lambda: None)
 
-    def _credit(self, _topic: str, _sender: int, publisher_class: int, serial: int, *, leaving: bool = False) -> None:
-        self.credits.append((publisher_class, serial))
-        self.last_words += leaving
+    def _put_credit(self, _key: str, data: bytes, *, final: bool) -> None:
+        credit = attachment.decode_credit(data)
+        assert credit.leaving == final
+        self.credits.append((credit.publisher_class, credit.serial))
+        self.last_words += final
 
-    def _take(self) -> Any:
+    def _receive(self) -> Any:
         return self._ring.popleft() if self._ring else None
 
     def _wait(self) -> None:
@@ -215,13 +213,13 @@ async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
     ring.put(1, 2)
     await turns()
     ring.topic.layout = layout(Led)
-    ring.streams.begin(ring.topic)
+    ring.receiver.subscribe(ring.topic)
     ring.put(3, size=SIZE + 1)
     ring.put(4)
     await turns()
     assert ring.stats.lost == {"wrong size": 1}
     again = attachment.encode(Header(Origin(1, 8, 7, bytes(8), "A", "node"), 1, 4, 40))
-    ring.streams._streams["leds"]._unpack(bytes(SIZE), again)  # by another gateway
+    ring.receiver._streams["leds"]._unpack(bytes(SIZE), again)  # by another gateway
     assert numbers(ring.sink) == [1, 2, 4]
     assert ring.stats.lost["seen before"] == 1
 
@@ -268,13 +266,13 @@ async def test_a_message_that_raises_does_not_stop_the_others(queue: int, publis
     assert taken == [each for each in (1, 3, 4, 5, 7) if each in taken]
     assert len(taken) + ring.sink.lost == 5
     assert ring.stats.lost == {"internal error": 3}
-    assert ring.streams._streams["leds"]._blocked is None
+    assert ring.receiver._streams["leds"].backlog.blocked is None
 
 
 @pytest.mark.internal_errors
 async def test_a_packet_that_raises_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     ring = Ring(queue=99)
-    unpack, stream = RxStream._unpack, ring.streams._streams["leds"]
+    unpack, stream = RxStream._unpack, ring.receiver._streams["leds"]
 
     def faulty(data: bytes, header: bytes) -> int:
         if data[0] == 2:
@@ -307,11 +305,11 @@ async def test_a_sink_that_raises_while_a_message_waits_for_it_does_not_stop_the
 
 def reconnect(ring: Ring) -> None:
     """The link goes down and comes up; its topics are subscribed anew then."""
-    ring.streams.interrupted()
-    ring.streams.shut("leds", 7)
-    ring.streams.resumed()
-    ring.streams.shut_all("leds")
-    ring.streams.begin(ring.topic)
+    ring.receiver.interrupted()
+    ring.receiver.remove_publisher("leds", 7)
+    ring.receiver.resumed()
+    ring.receiver.unsubscribe("leds")
+    ring.receiver.subscribe(ring.topic)
 
 
 async def test_what_was_sent_while_the_link_was_down_is_counted_when_it_is_back() -> None:
@@ -330,8 +328,8 @@ async def test_what_was_sent_before_a_topic_is_subscribed_again_is_not_lost() ->
     ring.put(1, 3)
     await turns()
     reconnect(ring)
-    ring.streams.shut_all("leds")  # nobody here subscribes it any more
-    ring.streams.begin(ring.topic)
+    ring.receiver.unsubscribe("leds")  # nobody here subscribes it any more
+    ring.receiver.subscribe(ring.topic)
     ring.idle()
     ring.put(10)
     await turns()
@@ -342,11 +340,11 @@ async def test_what_came_by_another_link_in_the_meantime_is_not_lost() -> None:
     ring = Ring(queue=16)
     ring.put(1, 3)
     await turns()
-    ring.streams.interrupted()
-    ring.streams.shut_all("leds")
-    ring.streams.resumed()
+    ring.receiver.interrupted()
+    ring.receiver.unsubscribe("leds")
+    ring.receiver.resumed()
     await asyncio.sleep(11)  # the topic is used elsewhere
-    ring.streams.begin(ring.topic)
+    ring.receiver.subscribe(ring.topic)
     ring.idle()
     ring.put(10)
     await turns()
@@ -357,13 +355,13 @@ async def test_a_topic_that_went_on_after_an_outage_begins_anew_when_it_was_clos
     ring = Ring(queue=16)
     ring.put(1, 3)
     await turns()
-    ring.streams.interrupted()
-    ring.streams.resumed()
+    ring.receiver.interrupted()
+    ring.receiver.resumed()
     ring.put(6)
     await turns()
     assert ring.stats.lost == {"on the way": 2}
-    ring.streams.shut_all("leds")  # nobody here subscribes it any more
-    ring.streams.begin(ring.topic)
+    ring.receiver.unsubscribe("leds")  # nobody here subscribes it any more
+    ring.receiver.subscribe(ring.topic)
     ring.idle()
     ring.put(500)
     await turns()
@@ -374,13 +372,13 @@ async def test_a_later_outage_does_not_count_what_was_sent_before_it_to_nobody_h
     ring = Ring(queue=16)
     ring.put(1, 3)
     await turns()
-    ring.streams.interrupted()
-    ring.streams.shut_all("leds")
-    ring.streams.resumed()
+    ring.receiver.interrupted()
+    ring.receiver.unsubscribe("leds")
+    ring.receiver.resumed()
     await asyncio.sleep(60)
-    ring.streams.interrupted()
-    ring.streams.resumed()
-    ring.streams.begin(ring.topic)
+    ring.receiver.interrupted()
+    ring.receiver.resumed()
+    ring.receiver.subscribe(ring.topic)
     ring.idle()
     ring.put(500)
     await turns()
@@ -390,11 +388,11 @@ async def test_a_later_outage_does_not_count_what_was_sent_before_it_to_nobody_h
 @pytest.mark.internal_errors
 async def test_a_last_credit_that_fails_does_not_keep_the_stream() -> None:
     ring = Ring(queue=1)
-    ring.streams.open(ring.topic, SIZE, 7)
+    ring.receiver.add_publisher(ring.topic, 7)
     ring.put(1, 3)
     await turns()
-    ring.streams.credit = lambda *_, **__: 1 // 0  # type: ignore[assignment]
-    ring.streams.shut_all("leds")
+    ring.receiver.send_credit = lambda *_, **__: 1 // 0  # type: ignore[assignment]
+    ring.receiver.unsubscribe("leds")
     assert (ring.topic.remote_publishers, ring.topic.latched_sources) == (0, [])
     assert ring.stats.lost == {"internal error": 1, "not subscribed": 1}
 
@@ -402,19 +400,19 @@ async def test_a_last_credit_that_fails_does_not_keep_the_stream() -> None:
 async def test_who_unsubscribes_tells_those_of_whom_nothing_has_come_yet() -> None:
     """What they sent may be on the way."""
     ring = Ring(queue=2)
-    ring.streams.open(ring.topic, SIZE, 7)
-    ring.streams.shut("leds", 7)  # as discovery does, before the stream ends
-    ring.streams.shut_all("leds")
+    ring.receiver.add_publisher(ring.topic, 7)
+    ring.receiver.remove_publisher("leds", 7)  # as discovery does, before the stream ends
+    ring.receiver.unsubscribe("leds")
     assert (ring.last_words, ring.credits) == (1, [(1, 0)])
 
 
 async def test_who_unsubscribes_tells_those_who_publish_and_counts_what_waits() -> None:
     ring = Ring(queue=2)
-    ring.streams.open(ring.topic, SIZE, 7)
+    ring.receiver.add_publisher(ring.topic, 7)
     for serial in range(1, 5):
         ring.put(serial)
     await turns()
-    ring.streams.shut_all("leds")
+    ring.receiver.unsubscribe("leds")
     assert ring.last_words == 1
     assert ring.credits[-1] == (1, 4)
     assert ring.stats.received == 4

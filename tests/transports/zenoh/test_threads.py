@@ -1,11 +1,173 @@
-"""Python does not end while a thread is inside of zenoh: that would abort the process."""
+"""The calls that may wait for zenoh, made at once, or by a thread while there are very many tokens; and its threads."""
 
-from __future__ import annotations
-
+import asyncio
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+
+from r2p.protocols.flow_control import SendWindow
+from r2p.runtime.sample import Sample, Source
+from r2p.transports.stats import LinkStats
+from r2p.transports.zenoh.publish import PublisherCache, TxStream
+from r2p.transports.zenoh.threads import MANY_TOKENS, WAITING_MAX_URGENT, OutboundThread
+from tests.transports.zenoh.test_publish import ORIGIN
+
+pytestmark = pytest.mark.anyio
+
+
+class Busy:
+    """Stands for zenoh: its calls wait until it is free."""
+
+    def __init__(self) -> None:
+        self.free = threading.Event()
+        self.calls: list[Any] = []
+        self.threads: set[int] = set()
+
+    def call(self, what: object, *, attachment: bytes = b"") -> object:
+        self.free.wait()
+        self.calls.append(what)
+        self.threads.add(threading.get_ident())
+        return what
+
+
+def outbound() -> OutboundThread:
+    return OutboundThread(asyncio.get_running_loop())
+
+
+async def idle(out: OutboundThread) -> None:
+    while out.waiting:  # noqa: ASYNC110 - the thread is about to be done
+        await asyncio.sleep(0)
+
+
+async def test_with_few_tokens_every_call_is_made_at_once() -> None:
+    out, busy = outbound(), Busy()
+    busy.free.set()
+    out.set_token_count(MANY_TOKENS - 1)
+    out.call(busy.call, 1)
+    out.put(busy.call, 1, b"2", attachment=b"")
+    out.finish()
+    assert busy.calls == [1, b"2"]
+    assert busy.threads == {threading.get_ident()}
+
+
+async def test_what_may_take_long_is_called_by_the_thread_and_what_follows_stays_behind_it() -> None:
+    out, busy = outbound(), Busy()
+    out.call_in_thread(busy.call, 1)
+    out.call(busy.call, 2)
+    assert busy.calls == []
+    busy.free.set()
+    await idle(out)
+    out.call(busy.call, 3)
+    out.finish()
+    assert busy.calls == [1, 2, 3]
+    assert len(busy.threads) == 2
+
+
+async def test_with_many_a_thread_makes_them_in_order_and_the_loop_goes_on() -> None:
+    out, busy = outbound(), Busy()
+    out.set_token_count(MANY_TOKENS)
+    answer: asyncio.Future[object] = asyncio.get_running_loop().create_future()
+    for number in range(3):
+        out.call(busy.call, number)
+    out.put(busy.call, 9, b"data", attachment=b"")
+    out.call_with_result(lambda: busy.call("asked"), answer.set_result)
+    out.set_token_count(0)
+    out.call(busy.call, "behind them")
+    assert (busy.calls, out.waiting) == ([], 6)
+    busy.free.set()
+    assert await answer == "asked"
+    await idle(out)
+    assert busy.calls == [0, 1, 2, b"data", "asked", "behind them"]
+    assert threading.get_ident() not in busy.threads
+    out.call(busy.call, "at once")
+    assert busy.calls[-1] == "at once"
+    await asyncio.to_thread(out.finish)
+
+
+async def test_what_does_not_fit_is_counted() -> None:
+    out, busy, stats = outbound(), Busy(), LinkStats()
+    out.set_token_count(MANY_TOKENS)
+    stream = TxStream(SendWindow(), urgent=True)
+    stream.prepare(Source("PC1", "talk"), ORIGIN, _putting(out, busy))
+    for sequence in range(1, WAITING_MAX_URGENT + 4):
+        stream.window.serial += 1
+        stream.waiting.append(Sample(b"x", Source("PC1", "talk"), 1, sequence=sequence))
+        stream.send(stats, ConnectionError, batching=True)
+    assert (stats.sent, dict(stats.lost)) == (WAITING_MAX_URGENT, {"send buffer full": 3})
+    assert stream.window.serial == WAITING_MAX_URGENT  # so the next one that is sent leaves no gap to count once more
+    busy.free.set()
+    await asyncio.to_thread(out.finish)
+    assert len(busy.calls) == WAITING_MAX_URGENT
+
+
+def _putting(out: OutboundThread, busy: Busy) -> Callable[..., None]:
+    def put(data: bytes, *, attachment: bytes) -> None:
+        out.put(busy.call, WAITING_MAX_URGENT, data, attachment=attachment)
+
+    return put
+
+
+async def test_what_fails_in_the_thread_is_told_and_the_next_call_is_made() -> None:
+    out, busy = outbound(), Busy()
+    failed: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
+    answer: asyncio.Future[object] = asyncio.get_running_loop().create_future()
+    out.failed = failed.set_result
+    busy.free.set()
+    out.set_token_count(MANY_TOKENS)
+    out.call_with_result(lambda: [][0], answer.set_result)
+    out.call(busy.call, "next")
+    assert isinstance(await failed, IndexError)
+    assert await answer is None
+    await asyncio.to_thread(out.finish)
+    assert busy.calls == ["next"]
+
+
+async def test_it_takes_half_the_crowd_to_go_back() -> None:
+    out, busy = outbound(), Busy()
+    busy.free.set()
+    out.set_token_count(MANY_TOKENS)
+    out.set_token_count(MANY_TOKENS - 1)
+    out.call(busy.call, "by the thread")
+    await idle(out)
+    out.set_token_count(MANY_TOKENS // 2 - 1)
+    out.call(busy.call, "at once")
+    await asyncio.to_thread(out.finish)
+    assert len(busy.threads) == 2
+
+
+async def test_whether_messages_reach_a_subscriber_is_asked_in_the_thread() -> None:
+    out, busy, publishers = outbound(), Busy(), PublisherCache()
+    session: Any = SimpleNamespace(outbound=out, declare_publisher=lambda *_: Publisher(busy))
+    publishers.connect(session, "r2p/lab/topic/")
+    assert not publishers.reaches("leds")
+    publishers._publisher("leds", 1)
+    out.set_token_count(MANY_TOKENS)
+    assert not publishers.reaches("leds")
+    assert not publishers.reaches("leds")
+    assert out.waiting == 1
+    busy.free.set()
+    await idle(out)
+    await asyncio.sleep(0)
+    assert publishers.reaches("leds")
+    await asyncio.to_thread(out.finish)
+
+
+class Publisher:
+    """One that takes its time to say whom it reaches."""
+
+    def __init__(self, busy: Busy) -> None:
+        self._busy = busy
+
+    @property
+    def matching_status(self) -> Any:
+        self._busy.free.wait()
+        return SimpleNamespace(matching=True)
+
 
 PROGRAM = """
 import sys
@@ -16,5 +178,6 @@ threads.start(lambda: print(sys.stdin.read()))
 
 @pytest.mark.processes
 def test_the_program_waits_for_its_threads() -> None:
+    """Python that ends while a thread is inside of zenoh would abort the process."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], input="heard", capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("heard\n", "")

@@ -32,41 +32,41 @@ async def test_an_answer_that_is_older_than_the_end_of_its_token_is_not_believed
     for key in ("before", "during", "again"):
         believer.tokens.changed(key, True)
     believer.tokens.changed("before", False)
-    believer.tokens.look()
+    believer.tokens.query_started()
     for key in ("during", "again"):
         believer.tokens.changed(key, False)
     await asyncio.sleep(1.0)
     believer.tokens.changed("again", True)
     for key in ("before", "during", "again", "refused"):
-        believer.tokens.found(key)
-    assert believer.tokens.looked()
+        believer.tokens.answered(key)
+    assert believer.tokens.query_ended()
     await asyncio.sleep(1.0)
     assert believer.there == {"again", "refused"}
 
 
 async def test_answers_are_of_no_use_once_the_link_was_down() -> None:
     believer = Believer()
-    believer.tokens.look()
+    believer.tokens.query_started()
     believer.tokens.on_down()
     believer.tokens.on_up()
-    believer.tokens.found("old")
-    assert not believer.tokens.looked()
+    believer.tokens.answered("old")
+    assert not believer.tokens.query_ended()
     assert not believer.there
 
 
 async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tokens, "TOKENS", 4)
+    monkeypatch.setattr(tokens, "TOKENS_MAX", 4)
     believer = Believer()
-    believer.tokens.look()
+    believer.tokens.query_started()
     for number in range(5):
         believer.tokens.changed(f"{number}", False)
-    believer.tokens.found("0")
-    assert not believer.tokens.looked()
+    believer.tokens.answered("0")
+    assert not believer.tokens.query_ended()
     assert not believer.there
 
 
 async def test_what_has_no_room_before_the_link_is_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tokens, "TOKENS", 2)
+    monkeypatch.setattr(tokens, "TOKENS_MAX", 2)
     believer = Believer(up=False)
     for key in ("a", "b", "b", "c", "d"):
         believer.tokens.changed(key, True)
