@@ -17,9 +17,8 @@ from collections.abc import AsyncIterator, Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from r2p.clock import clock_of
+from r2p.clock import SHORTEST, check_seconds, clock_of
 from r2p.codecs.rtcan import Frame, OtherFrame
-from r2p.durations import SHORTEST, seconds
 from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import Mailbox, Outcome
@@ -160,7 +159,7 @@ class BusMonitor:
         Periods are those of the frames' stamps, so the loads are right even when this program is late. Raises
         MessageError for what is not a number of seconds.
         """
-        seconds("the period of loads", period, least=SHORTEST)
+        check_seconds("the period of loads", period, least=SHORTEST)
         length = round(period * _SECOND)
         end = self._now()
         self._monitor.begin(end, length)
@@ -194,7 +193,7 @@ class BusMonitor:
 
         Raises MessageError for what is not a number of seconds.
         """
-        seconds("the timeout of cycles", timeout, least=0.0)
+        check_seconds("the timeout of cycles", timeout, least=0.0)
         self._monitor.reset(self._now())
         while self._monitor.cycles < count:
             self._synced.clear()

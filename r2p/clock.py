@@ -1,11 +1,11 @@
-"""The only place, with `r2p.sim`, that knows where time comes from.
+"""Time: clocks, timers, durations and back-off. Only this module and `r2p.sim` know where time comes from.
 
 An event loop may bring its own clock and its own random numbers, as `loop.clock` and `loop.random`; `clock_of` and
-`random_of` ask it, and fall back to the machine's. So the same code runs live and under virtual time. All instants are
-integer nanoseconds.
+`random_of` ask it, and fall back to the computer's. So the same code runs live and under virtual time. All instants are
+integer nanoseconds; durations in programs are numbers of seconds, and texts such as "10ms" in URLs and options.
 
-`Alarm` is one timer that can be moved, for the shell around a protocol. `Ticker` is a period that never drifts: on
-Linux a timerfd, because event loops count their timers in milliseconds. So is `ExactAlarm`.
+`Alarm` is one timer that can be moved, for what drives a protocol. `Ticker` is a period that never drifts, and
+`ExactAlarm` an alarm that is exact: on Linux both use a timerfd, because event loops count in milliseconds.
 """
 
 from __future__ import annotations
@@ -13,43 +13,60 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
+import math
 import os
 import random
+import re
 import sys
 import time
 from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from r2p.errors import MessageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 logger = logging.getLogger("r2p.clock")
 
+SHORTEST: Final = 1e-6
+"""Seconds of the shortest period or deadline."""
+
+LONGEST: Final = 1e9
+"""Seconds of the longest one: 30 years, which fit a timer of any event loop."""
+
 _SECOND: Final = 1_000_000_000
-_WORTH_TELLING: Final = _SECOND // 10  # ns by which UTC is set back
-_SHORTEST_PERIOD: Final = 1_000
+_SET_BACK_WARNING: Final = (
+    _SECOND // 10
+)  # ns that UTC may be set back before the log says so: less is daily work of NTP
+_SHORTEST_PERIOD: Final = 1_000  # ns; SHORTEST as an integer
 _NO_TIMERFD: Final = (OSError, AttributeError)  # AttributeError: a C library, or a Python, without it
 _RETRY: Final = 1_000_000  # ns; uvloop's timers have whole milliseconds, and may go off half a one early
+_UNITS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
+
+
+# Clocks
 
 
 class Clock(Protocol):
-    """What tells the time."""
+    """A source of time."""
 
     virtual: bool
     """True when time is simulated: it stands still while code runs, and only loop timers know it."""
 
     def now(self) -> int:
-        """UTC in ns since 1970. Never jumps back, even when somebody sets the computer's clock."""
+        """UTC in ns since 1970. Never jumps back, even when the computer's clock is set back."""
         ...
 
     def monotonic(self) -> int:
-        """Ns since an arbitrary instant, never set by anybody: for deadlines and intervals."""
+        """Ns since an arbitrary instant; cannot be set: for deadlines and intervals."""
         ...
 
 
 class SystemClock:
     """The computer's clock. When UTC is set back, `now()` goes on at half speed until UTC has caught up with it.
 
-    That takes twice as long as UTC was set back by; the log says so. Meanwhile `now()` is ahead of other computers'.
+    Stamps must not repeat or run backwards: deadlines and the order of messages depend on them. Catching up takes twice
+    as long as UTC was set back by, and the log says so. Meanwhile `now()` is ahead of other computers' clocks.
     """
 
     virtual = False
@@ -57,10 +74,10 @@ class SystemClock:
     def __init__(self, utc: Callable[[], int] = time.time_ns, monotonic: Callable[[], int] = time.monotonic_ns) -> None:
         self.monotonic = monotonic
         self._utc = utc
-        self._last = 0  # what now() said last
-        self._slowed = -1  # ... and what it said last at half speed
-        self._ahead = 0  # by how much it was ahead of UTC when the log last said so
-        self._anchor = (0, 0)  # where half speed began: what now() had said, and the monotonic instant
+        self._last = 0  # the last result of now()
+        self._slowed = -1  # ... and the last one at half speed
+        self._ahead = 0  # of UTC, when the log last said so
+        self._anchor = (0, 0)  # where half speed began: UTC as now() had it, and the monotonic instant
 
     def now(self) -> int:
         utc = self._utc()
@@ -75,15 +92,15 @@ class SystemClock:
         if self._last != self._slowed:  # full speed in between: UTC was set back again
             self._anchor = (self._last, monotonic)
             self._ahead = 0
-        if ahead > self._ahead + _WORTH_TELLING:
-            _tell_set_back(ahead)
+        if ahead > self._ahead + _SET_BACK_WARNING:
+            _warn_set_back(ahead)
             self._ahead = ahead
         began, at = self._anchor
         self._last = self._slowed = began + (monotonic - at) // 2
         return self._last
 
 
-def _tell_set_back(ahead: int) -> None:
+def _warn_set_back(ahead: int) -> None:
     logger.warning(
         "the computer's clock was set back by %.1f s: r2p's goes on at half speed for %.0f s, until both agree again; "
         "meanwhile what other computers stamp looks too old here (max_age= drops and counts it)",
@@ -97,13 +114,13 @@ _RANDOM: Final = random.Random()
 
 
 def clock_of(loop: asyncio.AbstractEventLoop | None = None) -> Clock:
-    """The clock of this loop (default: the running one): its attribute `clock`, else the computer's."""
+    """The clock of a loop (default: the running one): its attribute `clock`, or else the computer's."""
     clock: Clock = getattr(loop or _running(), "clock", _SYSTEM)
     return clock
 
 
 def random_of(loop: asyncio.AbstractEventLoop | None = None) -> random.Random:
-    """The random numbers of this loop (default: the running one): its attribute `random`, else freely seeded ones."""
+    """The random numbers of a loop (default: the running one): its attribute `random`, or else freely seeded ones."""
     numbers: random.Random = getattr(loop or _running(), "random", _RANDOM)
     return numbers
 
@@ -115,18 +132,21 @@ def _running() -> asyncio.AbstractEventLoop | None:
         return None
 
 
+# Timers
+
+
 def in_background(timer: asyncio.TimerHandle, background: bool | Callable[[], bool] = True) -> None:
-    """Mark a timer that only repeats itself, or says so when it is asked: under virtual time it keeps nothing going."""
+    """Mark a timer that only repeats itself, always or while a function says so: it keeps no virtual time going."""
     if hasattr(timer, "background"):
         timer.background = background
 
 
 class Alarm:
-    """One timer that can be moved: calls `callback()` in the loop once the deadline is reached, never before it.
+    """One timer that can be moved: calls `callback()` in the loop when the deadline is reached, never before.
 
-    It comes up to about a millisecond late on a real loop, and at the very nanosecond under virtual time.
+    The call comes up to about a millisecond late on a real loop, and at the very nanosecond under virtual time.
 
-    `background` is what only repeats itself, such as announcements: under virtual time it keeps no program going.
+    `background` is for what only repeats itself, such as announcements: under virtual time it keeps no program going.
     """
 
     def __init__(
@@ -142,14 +162,14 @@ class Alarm:
         self._callback = callback
         self._deadline: int | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._armed: int | None = None  # when it looks; before the deadline, when that was put off
+        self._armed: int | None = None  # when the loop calls; earlier than the deadline, if that was put off
 
     def set(self, deadline: int | None) -> None:
-        """Move to this instant of `Clock.monotonic()`, in ns; in the past means as soon as possible. None: off."""
+        """Move to this instant of `Clock.monotonic()` in ns; one in the past is as soon as possible. None: off."""
         self._deadline = deadline
         if self._armed is not None:
             if deadline is not None and self._armed <= deadline:
-                return  # putting it off is frequent, and costs nothing: the timer looks again when it goes off
+                return  # putting it off is frequent, so it costs nothing: `_fire` looks at the deadline again
             self._disarm()
         if deadline is not None:
             self._arm(deadline, max(0, deadline - self._clock.monotonic()))
@@ -184,7 +204,7 @@ class Alarm:
 
 
 class ExactAlarm(Alarm):
-    """An alarm that comes some ten microseconds late, where there is a timerfd to be had. Has to be closed."""
+    """An alarm that comes some ten microseconds late where the system has timerfds. Has to be closed."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], object]) -> None:
         super().__init__(loop, callback)
@@ -232,9 +252,9 @@ class ExactAlarm(Alarm):
 class Ticker:
     """A period on absolute phase: tick k is due at start + k * period of the monotonic clock.
 
-    `callback(scheduled, late, skipped)`: when the tick was due, by how much it is late (both ns), and how many ticks
-    before it were lost because the loop was blocked; those are never made up for. What it raises goes to the loop's
-    exception handler, and the ticker goes on.
+    `callback(scheduled, late, skipped)` gets the instant at which the tick was due, by how much it is late (both ns),
+    and how many ticks before it were lost because the loop was blocked: those are not made up for. An exception that it
+    raises goes to the loop's exception handler, and the ticker goes on.
     """
 
     def __init__(
@@ -245,7 +265,7 @@ class Ticker:
         *,
         background: bool = False,
     ) -> None:
-        """`period` in ns, at least 1000; `background` as of an Alarm. Raises ValueError for a shorter period."""
+        """`period` is in ns, `background` as in `Alarm`. Raises ValueError for a period of less than 1000 ns."""
         if period < _SHORTEST_PERIOD:
             raise ValueError(f"a period of {period} ns is too short: the shortest is {_SHORTEST_PERIOD} ns")
         self._loop = loop
@@ -258,7 +278,7 @@ class Ticker:
         self._next = 1
 
     def start(self) -> None:
-        """Begin now: the first tick is due one period later. Begins anew when it was started already."""
+        """Start, or start anew: the first tick is due one period from now."""
         self.close()
         self._start = self._clock.monotonic()
         self._next = 1
@@ -275,7 +295,7 @@ class Ticker:
             self._fd = None
 
     def _start_timerfd(self, first: int) -> bool:
-        """Use a timerfd. False where there is none to be had (not Linux, no descriptors left): loop timers do it."""
+        """Use a timerfd. False where there is none (not Linux, no descriptors left): then loop timers do."""
         if sys.platform != "linux":
             return False
         try:
@@ -320,7 +340,7 @@ else:
 
     @functools.cache
     def _ctypes() -> tuple[Any, Any]:
-        """The module, loaded by whoever needs it first, and the C library."""
+        """The module, imported at the first use, and the C library."""
         import ctypes
 
         return ctypes, ctypes.CDLL(None, use_errno=True)
@@ -338,11 +358,49 @@ else:
         libc.timerfd_settime(fd, 1, times, None)  # 1: TFD_TIMER_ABSTIME
 
 
-# How long to wait before the next try: longer each time, never the same for two who failed together.
+# Durations
+
+
+def duration(text: str) -> float:
+    """Seconds from "10ms", "20us", "1.5s" or "1.5". Raises ValueError for any other text."""
+    match = re.fullmatch(r"([0-9.eE+-]+)\s*(ns|us|ms|s|)", text.strip())
+    if match is None:
+        raise ValueError(f"{text!r} is not a duration: use 10ms, 20us or seconds")
+    value = float(match[1]) * _UNITS[match[2]]
+    if not 0.0 <= value < math.inf:
+        raise ValueError(f"{text!r} is not a duration: it can't be negative or endless")
+    return value
+
+
+def check_seconds(what: str, value: object, *, least: float) -> None:
+    """Raise MessageError for what is not a duration of `least` seconds or more that a clock can count."""
+    if not _is_number(value) or not least <= value <= LONGEST:  # type: ignore[operator]
+        raise MessageError(f"{what} is in seconds, {least:g} to {LONGEST:g}, not {value!r}{_hint(value)}")
+
+
+def check_timeout(what: str, value: object) -> None:
+    """Raise MessageError for what is neither None (for ever) nor a number of seconds; 0 or less is over at once."""
+    if value is not None and (not _is_number(value) or not value <= LONGEST):  # type: ignore[operator]
+        raise MessageError(f"{what} is in seconds, or None to wait for ever, not {value!r}{_hint(value)}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _hint(value: object) -> str:
+    """What to write for a text as URLs have it."""
+    try:
+        return f": write {duration(value):g}" if isinstance(value, str) else ""
+    except ValueError:
+        return ""
 
 
 class Backoff:
-    """Delays from `first` to `longest` seconds, doubling, each shortened by up to a half at random."""
+    """Delays between tries, from `first` to `longest` seconds, doubling.
+
+    Each is shortened by up to a half at random: what failed together is not tried again together.
+    """
 
     def __init__(self, rng: random.Random, *, first: float = 0.1, longest: float = 2.0) -> None:
         self._rng = rng
@@ -351,13 +409,14 @@ class Backoff:
         self._next = first
 
     def reset(self) -> None:
+        """Start again with the first delay."""
         self._next = self._first
 
     def slow_down(self) -> None:
-        """Take the longest delay next."""
+        """Go on with the longest delay."""
         self._next = self._longest
 
     def delay(self) -> float:
-        """Seconds to wait now."""
+        """The seconds to wait before the next try."""
         delay, self._next = self._next, min(self._next * 2, self._longest)
         return delay * self._rng.uniform(0.5, 1.0)

@@ -1,71 +1,74 @@
-"""Every exception that r2p raises, and who has to act.
+"""Every exception that r2p raises, and what each of them means.
 
     Error
-    ├── InvalidName(ValueError)      a name with a character that the wire does not know
-    │   └── NameTooLong              ... or with more characters than its field
-    ├── MessageError(ValueError)     a class without a fixed layout, or a value that does not fit its field
-    ├── DecodeError(ValueError)      bytes that are no such message; inside r2p it is counted, never let out
+    ├── InvalidName(ValueError)      a name with a character that the wire does not carry
+    │   └── NameTooLong              ... or with more characters than its field has
+    ├── MessageError(ValueError)     a class without a fixed layout, or a value that does not fit
+    ├── DecodeError(ValueError)      bytes that are not a message of this class
     ├── TypeMismatch(TypeError)      one topic, two layouts
     ├── TransportError               a transport that can't be made from its URL
-    │   ├── Closed                   you closed it
-    │   └── Broken                   the world broke it, for good
+    │   ├── Closed                   used after it was closed, or before it was opened
+    │   └── Broken                   a transport that failed for good
     ├── NodeCrashed(ExceptionGroup)  what the nodes of a module raised
     └── Deadlock                     virtual time with nothing left to wait for
 
-Bad bytes from a wire raise none of these: they are counted in `link.stats` and dropped.
+Bad bytes from a wire raise none of these: they are dropped, and counted in `link.stats`. Links that are down raise
+nothing either: r2p tries them again for ever.
 """
 
 from collections.abc import Sequence
 
 
 class Error(Exception):
-    """The root of all r2p exceptions."""
+    """The base class of all r2p exceptions; itself raised for calls that make no sense, as opening a module twice."""
 
 
 class InvalidName(Error, ValueError):
-    """A module, node or topic name with a character outside `[A-Za-z0-9_]`, or without any."""
+    """A name of a module, node or topic that is empty, or has a character other than letters, digits and `_`."""
 
 
 class NameTooLong(InvalidName):
-    """A name that does not fit its field on the wire (PROTOCOL.md 1)."""
+    """A name that does not fit its field on the wire: 7 characters for modules, 8 for nodes, 16 for topics."""
 
 
 class MessageError(Error, ValueError):
-    """A message class without a fixed layout, or a value that does not fit its field."""
+    """A message class without a fixed layout, a value that does not fit its field, or an option that makes no sense."""
 
 
 class DecodeError(Error, ValueError):
-    """Bytes that are no such message."""
+    """Bytes that are not a message of this class: of the wrong length, or with a value that a field can't have."""
 
 
 class TypeMismatch(Error, TypeError):
-    """The same topic with another layout. A changed layout is a new topic."""
+    """A topic that is already used with another layout. A changed layout needs a topic of its own."""
 
 
 class TransportError(Error):
-    """A transport that can't be made: unknown scheme or option, missing extra, refused address."""
+    """A transport that can't be made: its URL has an unknown scheme or option, its library is missing, its address is
+    refused; or, with `strict=True`, one that does not give what a publisher asks for.
+    """
 
 
 class Closed(TransportError):
-    """Used after you closed it."""
+    """A module, node, publisher or subscription that was closed, or is not open yet."""
 
 
 class Broken(TransportError):
-    """The world broke it, and trying again can't mend it: the module that uses it ends with this.
+    """A transport that failed for good: trying again can't help, and the module that uses it ends with this.
 
-    r2p's own links don't: they say that they are down, and are tried again for ever. A transport of your own raises it
-    from `run` when what it had is gone for good.
+    The links of r2p never raise it: they report that they are down, and are tried again for ever. A transport of your
+    own raises it from `run` when what it works on is gone for good.
     """
 
 
 class NodeCrashed(Error, ExceptionGroup[Exception]):
-    """What the nodes of a module raised, one exception a node; each carries a note that names its node."""
+    """What the nodes of a module raised: one exception for each node, with a note that names the node."""
 
-    # The overload for BaseException is not ours to give: nodes raise Exceptions, so parts of this group hold no other.
+    # Without the overload for BaseException: nodes raise Exceptions, so parts of this group hold nothing else.
     def derive(self, excs: Sequence[Exception]) -> "NodeCrashed":  # type: ignore[override]
-        """What `except*` and `split` leave is still a NodeCrashed."""
+        """Keep the class for the parts that `except*` and `split` make."""
         return NodeCrashed(self.message, excs)
 
 
 class Deadlock(Error):
-    """Virtual time stands still: every task waits, and nothing is scheduled that could wake one."""
+    """Virtual time can't go on: every task waits, and nothing is scheduled that could wake one."""

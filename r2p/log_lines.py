@@ -1,29 +1,32 @@
-"""Text from outside on its way to a person: what would move the cursor, or forge a line, is shown as an escape.
+"""Lines of the log about what others send: their texts can't forge a line, and their number is limited.
 
-Names and texts of other modules may hold anything, sequences for terminals too. What people read goes through
-`printable`; what this package logs goes through the filter of `get_logger`, since a log file is read at a terminal.
+Names and texts of other modules may hold anything, also control sequences of terminals. A log is read at a terminal: so
+loggers made by `get_logger` show each character that would move the cursor as an escape. Tools do the same by
+`printable`. Events that another module can cause any number of times a second are logged within a `LineLimit`.
 """
 
 import logging
 import unicodedata
 
+_SECOND = 1_000_000_000
+
 
 def printable(text: str, allowed: str = "") -> str:
     r"""The text with each character that shows nothing by itself as an escape: `\x1b`, `\n`, `\u202e`.
 
-    Spaces stay, and so does what `allowed` holds.
+    Spaces stay, and so do the characters in `allowed`.
     """
-    return text if text.isprintable() else "".join(_shown(each, allowed) for each in text)
+    return text if text.isprintable() else "".join(_escaped(each, allowed) for each in text)
 
 
-def _shown(character: str, allowed: str) -> str:
+def _escaped(character: str, allowed: str) -> str:
     if character.isprintable() or character in allowed or unicodedata.category(character) == "Zs":
         return character
     return character.encode("unicode_escape").decode("ascii")
 
 
-class _Escape(logging.Filter):
-    """Makes the texts that a record is about printable; its format is ours."""
+class _EscapeArguments(logging.Filter):
+    """Makes texts and exceptions among the arguments of a record printable; its format is the program's own."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         if isinstance(record.args, tuple):
@@ -33,35 +36,29 @@ class _Escape(logging.Filter):
         return True
 
 
-_ESCAPE = _Escape()
+_ESCAPE_ARGUMENTS = _EscapeArguments()
 
 
 def get_logger(name: str) -> logging.Logger:
-    """The logger of that name, with arguments that may come from outside: each stays on its line."""
+    """The logger of that name, for arguments that may come from outside: each record stays on its line."""
     logger = logging.getLogger(name)
-    logger.addFilter(_ESCAPE)  # once, however often it is called
+    logger.addFilter(_ESCAPE_ARGUMENTS)  # a second time it has no effect
     return logger
 
 
-# How many lines of the program's log others can make happen.
-
-
-_SECOND = 1_000_000_000
-
-
 class LineLimit:
-    """At most `rate` lines of one kind in `period` ns; the next one after them says how many were left out."""
+    """At most `rate` lines of one kind in `period` ns; the first line after that says how many were left out."""
 
     def __init__(self, rate: int = 10, period: int = _SECOND) -> None:
         self._rate = rate
         self._period = period
         self._lines: dict[str, list[int]] = {}
-        """Of each kind: since when (ns), and how many there would have been since then."""
+        """Of each kind: the start of its period (ns), and how many lines there would have been since."""
 
     def suffix(self, kind: str, now: int) -> str | None:
-        """What to append to one more line (monotonic `now` in ns); None: leave it out."""
+        """What to append to one more line at `now` (monotonic ns). None: leave the line out."""
         lines = self._lines.get(kind)
-        if lines is not None and now - lines[0] < self._period:  # first: it is so for most lines of a flood
+        if lines is not None and now - lines[0] < self._period:  # first, as this is so for most lines of a flood
             lines[1] += 1
             return "" if lines[1] <= self._rate else None
         left_out = lines[1] - self._rate if lines is not None else 0

@@ -1,6 +1,7 @@
-"""Names as they fit the wire: `module/node/topic` (PROTOCOL.md 1).
+"""Names of modules, nodes and topics, with as many characters as the wire carries (PROTOCOL.md 1).
 
-Names are checked where a person gives them; names that come from a wire are only compared.
+Names are checked where a program gives them. Those that come from a wire are only compared: no bytes from outside may
+raise an error.
 """
 
 import re
@@ -8,18 +9,22 @@ from hashlib import blake2b
 
 from r2p.errors import InvalidName, NameTooLong
 
+# Characters of names. The first three are fields of firmware's messages; other links carry longer names.
 MODULE_MAX = 7
-MODULE_PATH_MAX = 24
-"""`robot1/MOTOR1`: a module of a robot on a network of several."""
-MODULE_PATH = r"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,24}"
-"""What the name of a module on a network of several robots looks like; it has MODULE_PATH_MAX characters in all."""
 NODE_MAX = 8
 TOPIC_MAX = 16
+MODULE_PATH_MAX = 24
+"""Of `robot1/MOTOR1`: a module of one robot on a network of several."""
 NAMESPACED_MAX = 2 * TOPIC_MAX + 1
-"""`robot1/encoder`: a robot's topic on a network of several, which only links without the wire's limit carry."""
+"""Of `robot1/encoder`: a topic of one robot on a network of several."""
+
+MODULE_PATH = r"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,24}"
+"""The name of a module on a network of several robots, as a regular expression; at most MODULE_PATH_MAX characters."""
 
 MANAGEMENT = "R2P"
+"""The topic of management messages."""
 LOADER_PREFIX = "BOOT_"
+"""The topics of boot loaders begin with this; the module's name follows."""
 
 _ALLOWED = re.compile(r"[A-Za-z0-9_]+")
 _DIGITS = "0123456789abcdefghijklmnopqrstuvwxyz"
@@ -27,12 +32,15 @@ _ALIAS_DIGITS = 4
 
 
 def module_name(name: str) -> str:
-    """Check a module's name: 1 to 7 characters of `[A-Za-z0-9_]`."""
+    """Return a valid name of a module: 1 to 7 characters of `[A-Za-z0-9_]`. Raises InvalidName or NameTooLong."""
     return _checked("module", name, MODULE_MAX)
 
 
 def module_path(name: str) -> str:
-    """Check the name of a module of any robot, which may have a prefix: `robot1/MOTOR1`, `robot1_MOTOR1`."""
+    """Return a valid name of a module of any robot, which may have a prefix: `robot1/MOTOR1`, `robot1_MOTOR1`.
+
+    Raises InvalidName or NameTooLong.
+    """
     if name.count("/") != 1 and (len(name) <= MODULE_MAX or "_" not in name):
         return module_name(name)
     namespace, slash, inner = name.rpartition("/")
@@ -45,8 +53,10 @@ def module_path(name: str) -> str:
 
 
 def module_alias(name: str) -> str:
-    """What a module is called where names of 7 characters travel: as it is, or for a longer name, or one in a
-    namespace, the first 3 characters and 4 that follow from it (PROTOCOL.md 9).
+    """The name of a module where the wire carries 7 characters (PROTOCOL.md 9).
+
+    A name that fits is its own alias. For a longer one, or one in a namespace, it is the first 3 characters and 4
+    digits of a hash: the same everywhere, without anything to agree on.
     """
     if len(name) <= MODULE_MAX and "/" not in name:
         return name
@@ -59,14 +69,15 @@ def module_alias(name: str) -> str:
 
 
 def node_name(name: str) -> str:
-    """Check a node's name: 1 to 8 characters of `[A-Za-z0-9_]`."""
+    """Return a valid name of a node: 1 to 8 characters of `[A-Za-z0-9_]`. Raises InvalidName or NameTooLong."""
     return _checked("node", name, NODE_MAX)
 
 
 def topic_name(name: str) -> str:
-    """Check a topic's name: 1 to 16 characters of `[A-Za-z0-9_]`; a leading slash, as in the thesis, is taken off.
+    """Return a valid name of a topic: 1 to 16 characters of `[A-Za-z0-9_]`. Raises InvalidName or NameTooLong.
 
-    It may be in a namespace, as `robot1/encoder`, of which the same holds.
+    A leading slash, as in the thesis, is removed. The name may be in a namespace, such as `robot1/encoder`, whose name
+    follows the same rules.
     """
     name = name.removeprefix("/")
     namespace, _, inner = name.partition("/")
@@ -76,7 +87,7 @@ def topic_name(name: str) -> str:
 
 
 def module_name_from(hostname: str) -> str:
-    """The default module name on a machine: its host name as far as it fits ("lab-pc.local" -> "labpc")."""
+    """The default name of a module: as much of the computer's host name as fits ("lab-pc.local" -> "labpc")."""
     letters = "".join(_ALLOWED.findall(hostname.partition(".")[0]))
     return letters[:MODULE_MAX] or "PC"
 

@@ -16,8 +16,9 @@ from r2p.bridge.port import BridgePort, PortsByKind, by_kind
 from r2p.bridge.shaping import RelayedPeriodic, Shaper
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.duplicates import DuplicateFilter, LastReceived
+from r2p.runtime.queues import SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import RemoteSubscriber, SlotPublisher, SubscriberQueue, Topic, WakeScheduler
+from r2p.runtime.topic import RemoteSubscriber, SlotPublisher, Topic
 
 MOST_HOPS = 15
 """Gateways that a message crosses at most: the last defence against loops where messages carry hops."""
@@ -192,7 +193,7 @@ class BridgedTopic(Topic):
             if port is not None:
                 port.count_dropped("converging")
             return None
-        waits = subscriber.wait_queue().queue_of(sample) or not subscriber.offer(sample)
+        waits = subscriber.wait_queue().line_of(sample) or not subscriber.offer(sample)
         return [subscriber] if waits else None
 
     # Subscribers
@@ -312,7 +313,7 @@ def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sin
     if subscriber is None:  # it has left while the message was on its way through the routes
         return blocked
     route.forwarded += 1
-    if not subscriber.wait_queue().queue_of(sample) and subscriber.offer(sample):
+    if not subscriber.wait_queue().line_of(sample) and subscriber.offer(sample):
         return blocked
     if not subscriber.waits and sample.publisher_class == PublisherClass.NON_REAL_TIME:
         subscriber.force(sample)

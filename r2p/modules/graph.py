@@ -1,22 +1,21 @@
-"""What a module knows of the network: topics, nodes and modules, its own and what its links have heard.
+"""What a module knows of the network: topics, nodes and modules, its own and those that its links have discovered.
 
-r2p modules tell everything; firmware tells its name and its topics, one step each half second, and not which node they
-belong to. Ages say how old the knowledge is.
+r2p modules announce all of it at once. Firmware announces its name and its topics, one of them each half second, and
+not the nodes that they belong to. The views have ages, which say how old the knowledge is.
 """
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES
 from r2p.messages import Layout, Message
-from r2p.protocols.discovery.events import Mismatched, ModuleInfo
+from r2p.modules.link_manager import LinkManager
+from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.sample import PublisherClass
-
-if TYPE_CHECKING:
-    from r2p.runtime.topic import Topic, TopicSpace
-    from r2p.transports.link import Link
+from r2p.runtime.topic import Topic
+from r2p.transports.link import Link
 
 _SECOND = 1_000_000_000
 
@@ -31,11 +30,13 @@ class Endpoint(msgspec.Struct, frozen=True, order=True):
 
 
 class TopicView(msgspec.Struct):
-    """A topic as far as it is known here.
+    """A topic, as far as this module knows it.
 
-    `size` in bytes, 0: unknown; `fingerprint` of its layout, None: unknown. `layout` only where this module uses it.
-    `publishers` and `subscribers` are those known by node; `published_on` and `subscribed_on` name the links ("": this
-    module) on which somebody publishes or subscribes, known by node or not. `age`: seconds since it was last heard of.
+    `size` is in bytes (0: unknown), `fingerprint` that of its layout (None: unknown). `layout` is set only where this
+    module uses the topic.
+
+    `publishers` and `subscribers` are those whose node is known; `published_on` and `subscribed_on` name all links
+    ("": this module) on which it is published and subscribed. `age` is in seconds since it was last announced.
     """
 
     name: str
@@ -64,63 +65,35 @@ class ModuleView(msgspec.Struct):
     instance: int | None
 
 
-class GraphOwner(Protocol):
-    """The module whose view it is."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def instance(self) -> int: ...
-    @property
-    def observer(self) -> bool: ...
-    @property
-    def stopped(self) -> bool: ...
-    @property
-    def rebooted(self) -> bool: ...
-    @property
-    def space(self) -> "TopicSpace": ...
-    @property
-    def links(self) -> Sequence["Link"]: ...
-
-
 class NetworkView:
-    """The views of one module; each call looks anew. Raises Closed before the module is open."""
+    """The network as one module knows it, looked up anew by each call. Raises Closed before the module is open."""
 
-    def __init__(self, module: GraphOwner) -> None:
-        self._module = module
+    def __init__(self, opened: Callable[[], LinkManager]) -> None:
+        """`opened` returns the link manager of the module, or raises Closed."""
+        self._opened = opened
 
     def modules(self) -> list[ModuleView]:
         """All modules, this one first, then by name; observers included."""
-        module = self._module
+        module = self._opened()
         now = module.space.clock.monotonic()
-        state = "observer" if module.observer else "stopped" if module.stopped else "running"
-        own = ModuleView(module.name, state, module.rebooted, 0.0, "", module.instance)
-        others = [
-            ModuleView(
-                info.name,
-                _state(info),
-                bool(info.flags & FLAG_REBOOTED),
-                (now - info.last_heard) / _SECOND,
-                link.name,
-                info.instance,
-            )
-            for link in module.links
-            for info in link.discovery.modules.values()
-        ]
+        state = _state(module.flags, observer=module.observer)
+        own = ModuleView(module.space.module, state, bool(module.flags & FLAG_REBOOTED), 0.0, "", module.instance)
+        others = [_module_view(link, info, now) for link in module.links for info in link.discovery.modules.values()]
         return [own, *sorted(others, key=lambda view: (view.name, view.link))]
 
     def topics(self) -> dict[str, TopicView]:
         """All topics by name, in order."""
+        module = self._opened()
         views: dict[str, TopicView] = {}
-        for topic in self._module.space.topics.values():
+        for topic in module.space.topics.values():
             if not topic.unused:
-                self._add_own(views.setdefault(topic.name, TopicView(topic.name)), topic)
-        for link in self._module.links:
-            self._add_link(views, link)
+                _add_own(views.setdefault(topic.name, TopicView(topic.name)), topic, module.space.module)
+        for link in module.links:
+            _add_discovered(views, link, module.space.clock.monotonic())
         return dict(sorted(views.items()))
 
     def nodes(self) -> dict[tuple[str, str], tuple[list[str], list[str]]]:
-        """(module, node) -> the topics that it publishes, and those that it subscribes; in order."""
+        """(module, node) -> the topics that it publishes, and those that it subscribes to; in order."""
         table: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
         for view in self.topics().values():
             for index, endpoints in enumerate((view.publishers, view.subscribers)):
@@ -130,67 +103,66 @@ class NetworkView:
         return dict(sorted(table.items()))
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
-        """A message class of this layout, from whoever on the network has it and can be asked; may take a second."""
-        for link in list(self._module.links):
+        """A message class of this layout, from a module on the network that has it. May take a second; None: no answer.
+
+        Only links that carry such questions are asked (zenoh).
+        """
+        for link in list(self._opened().links):
             found = await link.message_type(fingerprint) if link.up else None
             if found is not None:
                 return found
         return None
 
-    def _add_own(self, view: TopicView, topic: "Topic") -> None:
-        view.age = 0.0
-        view.layout = topic.layout
-        if topic.layout is not None:
-            view.size, view.fingerprint = topic.layout.size, topic.layout.fingerprint
-        name = self._module.name
-        view.publishers += [Endpoint(name, each.node.name, each.publisher_class) for each in topic.publishers]
-        view.subscribers += [Endpoint(name, each.owner) for each in topic.queues]
-        if topic.publishers:
-            view.published_on.append("")
-        if topic.queues:
-            view.subscribed_on.append("")
 
-    def _add_link(self, views: dict[str, TopicView], link: "Link") -> None:
-        now = self._module.space.clock.monotonic()
-        for info in link.discovery.topics.values():
-            view = views.setdefault(info.name, TopicView(info.name))
-            view.size = view.size or info.size
-            view.fingerprint = view.fingerprint or info.fingerprint
-            view.mismatch |= info.mismatch
-            if info.advertised_at is not None:
-                _add(view.published_on, link.name)
-            if info.requested_at is not None:
-                _add(view.subscribed_on, link.name)
-            heard = max(info.advertised_at or 0, info.requested_at or 0)
-            age = (now - heard) / _SECOND
-            view.age = age if view.age is None else min(view.age, age)
-        names = {info.instance: info.name for info in link.discovery.modules.values()}
-        for endpoint in link.discovery.endpoints.values():
-            module = endpoint.module or names.get(endpoint.instance, "")  # it may be told before its module's name
-            view = views.setdefault(endpoint.topic, TopicView(endpoint.topic))
-            publishes = endpoint.role == ROLE_PUBLISHES
-            klass = PublisherClass(endpoint.publisher_class & 3 or 1) if publishes else None  # a byte from outside
-            (view.publishers if publishes else view.subscribers).append(
-                Endpoint(module, endpoint.node, klass, link.name)
-            )
+def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:
+    state = _state(info.flags, observer=info.observer)
+    age = (now - info.last_heard) / _SECOND
+    return ModuleView(info.name, state, bool(info.flags & FLAG_REBOOTED), age, link.name, info.instance)
 
 
-def describe_mismatch(event: Mismatched) -> str:
-    """What is wrong, and what to do."""
-    role = "publish" if event.role == ROLE_PUBLISHES else "subscribe"
-    if event.ours.size != event.theirs.size:
-        what = f"messages of {event.theirs.size} bytes, here they have {event.ours.size}"
-    else:
-        what = f"another layout of the same {event.ours.size} bytes"
-    return f"others {role} {what}; use one message type on both sides, or another topic"
-
-
-def _state(info: ModuleInfo) -> str:
-    if info.observer:
+def _state(flags: int, *, observer: bool) -> str:
+    if observer:
         return "observer"
-    if info.flags & FLAG_BOOT:
+    if flags & FLAG_BOOT:
         return "boot"
-    return "stopped" if info.flags & FLAG_STOPPED else "running"
+    return "stopped" if flags & FLAG_STOPPED else "running"
+
+
+def _add_own(view: TopicView, topic: Topic, module: str) -> None:
+    """Add what this module publishes and subscribes to."""
+    view.age = 0.0
+    view.layout = topic.layout
+    if topic.layout is not None:
+        view.size, view.fingerprint = topic.layout.size, topic.layout.fingerprint
+    view.publishers += [Endpoint(module, each.node.name, each.publisher_class) for each in topic.publishers]
+    view.subscribers += [Endpoint(module, each.owner) for each in topic.queues]
+    if topic.publishers:
+        view.published_on.append("")
+    if topic.queues:
+        view.subscribed_on.append("")
+
+
+def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
+    """Add what the discovery of a link has found."""
+    for info in link.discovery.topics.values():
+        view = views.setdefault(info.name, TopicView(info.name))
+        view.size = view.size or info.size
+        view.fingerprint = view.fingerprint or info.fingerprint
+        view.mismatch |= info.mismatch
+        if info.advertised_at is not None:
+            _add(view.published_on, link.name)
+        if info.requested_at is not None:
+            _add(view.subscribed_on, link.name)
+        announced = max(info.advertised_at or 0, info.requested_at or 0)
+        age = (now - announced) / _SECOND
+        view.age = age if view.age is None else min(view.age, age)
+    names = {info.instance: info.name for info in link.discovery.modules.values()}
+    for endpoint in link.discovery.endpoints.values():
+        module = endpoint.module or names.get(endpoint.instance, "")  # it may be announced before its module's name
+        view = views.setdefault(endpoint.topic, TopicView(endpoint.topic))
+        publishes = endpoint.role == ROLE_PUBLISHES
+        klass = PublisherClass(endpoint.publisher_class & 3 or 1) if publishes else None  # a byte from outside
+        (view.publishers if publishes else view.subscribers).append(Endpoint(module, endpoint.node, klass, link.name))
 
 
 def _add(names: list[str], name: str) -> None:

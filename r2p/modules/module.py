@@ -1,25 +1,29 @@
 """A module: nodes, the topics between them, and the links that make those topics part of a network.
 
-The module is where everything that runs is owned: one task for each node and each transport, all of which have ended
-when its `async with` block has.
+The module owns everything that runs: one task for each node and each transport, all of which have ended when its
+`async with` block has.
+
+    STOP    LinkManager.discovered -> CommandHandler.handle -> Module.stop: cancel all nodes, wait for their clean-up
+    REBOOT  ... -> Module.reboot: the same, then start the same functions from the beginning; links stay up throughout
 """
 
 import asyncio
 import logging
 import os
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Iterable
 from types import TracebackType
 from typing import Self
 
 from r2p.bridge import BridgeOptions, GatewayStatistics
-from r2p.clock import clock_of, random_of
+from r2p.clock import clock_of
 from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import Closed, Error, NodeCrashed
 from r2p.log_lines import LineLimit, get_logger
 from r2p.modules.graph import NetworkView
 from r2p.modules.link_manager import LinkManager
-from r2p.modules.supervisor import LogTopic, NodeFunction, Supervisor, check_function, name_of
+from r2p.modules.log_topic import LogTopic
+from r2p.modules.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.modules.watchdog import Watchdog, watch
 from r2p.names import module_name, module_name_from, module_path, node_name, topic_name
 from r2p.protocols.discovery.events import Command
@@ -33,7 +37,10 @@ from r2p.transports.url import open_transport
 logger = get_logger("r2p.module")
 
 CLEANUP_WARNING_AFTER = 1.0
-"""Seconds after which the log names the nodes whose clean-up is being waited for."""
+"""Seconds after which the log names the nodes whose clean-up the module still waits for."""
+
+_COMMAND_LINES = 1  # of the log in a second about one kind of command
+_SECOND = 1_000_000_000
 
 
 class Module:
@@ -43,12 +50,13 @@ class Module:
             module.start(blink, priority=10)
             await module.wait()
 
-    `name` has at most 7 characters (default: from the host name). `via` are transport URLs; None takes those of the
-    environment variable R2P_VIA (separated by blanks), and without it the module is local only. `remap` renames
-    topics for all its nodes. An `observer` is a tool that only looks: it sends no ALIVE and has no `log` topic.
+    `name` has at most 7 characters (default: from the host name). `via` are the URLs of its transports, one or several;
+    None takes those of the environment variable R2P_VIA, separated by blanks, and without it the module is local only.
+    `remap` renames topics for all its nodes. An `observer` is a tool that only looks: it sends no ALIVE and has no
+    `log` topic. The `watchdog` logs which code blocks the event loop.
 
-    With `bridge` it joins its links: it is a gateway (r2p.bridge), and takes part in each network as the gateways there
-    have agreed. BridgeOptions say what it lets through.
+    With `bridge` the module joins its links: it is a gateway, and forwards on each network what the gateways there have
+    agreed on. BridgeOptions say what it lets through. Raises InvalidName or NameTooLong.
     """
 
     def __init__(
@@ -67,43 +75,40 @@ class Module:
         """Whether REBOOT has restarted its nodes."""
         self.stopped = False
         """Whether STOP has ended its nodes; REBOOT starts them again."""
-        self.links: list[Link] = []
-        """Its links, also those that are down."""
         self.refused: dict[str, int] = {}
-        """Commands that were not obeyed, by name."""
-        self.network = NetworkView(self)
+        """Commands from the network that it refused, by name: how many."""
+        self.network = NetworkView(lambda: self._opened)
         """What it knows of the network."""
         self._via = _urls(via)
         self._remap = _checked_remap(remap)
         self._with_watchdog = watchdog
-        self._bridging = BridgeOptions() if bridge is True else bridge or None
+        self._bridge_options = BridgeOptions() if bridge is True else bridge or None
         self._supervisors: dict[str, Supervisor] = {}
         self._crashes: dict[str, Exception] = {}
         self._events = EventHub()
-        self._hub: LinkManager | None = None
+        self._link_manager: LinkManager | None = None
         self._transports: list[asyncio.Task[None]] = []
         self._tasks: asyncio.TaskGroup | None = None
-        self._orders = CommandHandler(self.name, self.refused, self.stop, self.reboot)
+        self._commands = CommandHandler(self)
         self._open = False
 
-    # Life
+    # Opening and closing
 
     async def __aenter__(self) -> Self:
-        """Open it. Raises TransportError for a URL that can't work, and Error when it was open before."""
+        """Open it, and wait until its transports work. Raises TransportError for a URL that can't work, and Error if it
+        was open before.
+        """
         if self._tasks is not None:
             raise Error(f"module {self.name} was opened before: make a new one")
         loop = asyncio.get_running_loop()
         clock = clock_of(loop)
-        self._hub = LinkManager(
+        self._link_manager = LinkManager(
             TopicSpace(self.name, loop, clock),
-            self.links,
-            random_of(loop),
             self._events,
-            self._orders.take,
+            self._commands.handle,
             observer=self.observer,
-            bridging=self._bridging,
+            bridge=self._bridge_options,
         )
-        self.instance = self._hub.instance
         self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
@@ -111,11 +116,11 @@ class Module:
         self._tasks = asyncio.TaskGroup()
         await self._tasks.__aenter__()
         self._open = True
-        self._orders.tasks = self._tasks
+        self._commands.tasks = self._tasks
         try:
             for via in self._via:
                 await self._open_transport(self._tasks, via)
-        except BaseException:  # cancelled, too: who does not come to the block does not leave it either
+        except BaseException:  # cancelled, too: without the block's beginning its end is not called either
             await self._close(self._tasks)
             raise
         if self._with_watchdog and not clock.virtual:  # not before: opening imports the transports' libraries
@@ -125,7 +130,9 @@ class Module:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the nodes, then the links. Raises NodeCrashed if nodes crashed; another error on its way gets notes."""
+        """End the nodes, then the links. Raises NodeCrashed if nodes crashed; if another error is on its way, that one
+        gets a note of each crash.
+        """
         if self._tasks is not None:
             await self._close(self._tasks)
         crashed = list(self._crashes.values())
@@ -138,12 +145,12 @@ class Module:
     def gateway_statistics(self) -> GatewayStatistics:
         """What it has forwarded so far, and where.
 
-        Raises Closed before it is open, and Error if it is no gateway (`bridge`).
+        Raises Closed unless it is open, and Error if it is not a gateway (`bridge`).
         """
         self._running()
         bridge = self._opened.bridge
         if bridge is None:
-            raise Error(f"module {self.name} is no gateway: make it with bridge=True")
+            raise Error(f"module {self.name} is not a gateway: make it with bridge=True")
         return bridge.statistics()
 
     @property
@@ -152,32 +159,44 @@ class Module:
         return self._opened.space
 
     @property
+    def instance(self) -> int:
+        """The random 32-bit number of this run of the module. Raises Closed before it is opened."""
+        return self._opened.instance
+
+    @property
+    def links(self) -> list[Link]:
+        """Its links, also those that are down."""
+        return [] if self._link_manager is None else self._link_manager.links
+
+    @property
     def addresses(self) -> list[tuple[str, str]]:
-        """Where it takes connections: each URL that was opened, and its address. Raises Closed before it is opened."""
+        """Where it accepts connections: the URLs that were opened, each with its address. Raises Closed before it is
+        opened.
+        """
         return list(self._opened.addresses)
 
     @property
     def closed_links(self) -> LinkStats:
-        """The sum of what links have counted that are closed for good, as those of clients of a `tcp-listen:`."""
+        """The sum of what links counted that are closed for good, such as those of the clients of a `tcp-listen:`."""
         return self._opened.closed_links
 
     @property
     def _opened(self) -> LinkManager:
-        if self._hub is None:
+        if self._link_manager is None:
             raise self._not_open()
-        return self._hub
+        return self._link_manager
 
     def _running(self) -> asyncio.TaskGroup:
-        """The owner of its tasks. Raises Closed unless it is open."""
+        """The task group of all that it runs. Raises Closed unless it is open."""
         if self._tasks is None or not self._open:
             raise self._not_open()
         return self._tasks
 
     def _not_open(self) -> Closed:
-        return Closed(f"module {self.name} is not open: use it in `async with`")
+        return Closed(f"module {self.name} is not open: use it in an `async with` block")
 
     async def _open_transport(self, tasks: asyncio.TaskGroup, via: str | Transport) -> None:
-        """Let it run, and wait until it works; what it raises cancels the caller, and `_close` raises it."""
+        """Run a transport, and wait until it works. If it raises, that cancels the caller, and `_close` raises it."""
         transport = open_transport(via) if isinstance(via, str) else via
         opened = self.space.loop.create_future()
 
@@ -193,7 +212,7 @@ class Module:
         if not self._open:
             return
         self._open = False
-        self._orders.tasks = None
+        self._commands.tasks = None
         try:
             await self._end_nodes()
         finally:
@@ -203,7 +222,7 @@ class Module:
                 transport.cancel()
             try:
                 await tasks.__aexit__(None, None, None)
-            except BaseExceptionGroup as group:  # of transports: what a node raises, its supervisor keeps
+            except BaseExceptionGroup as group:  # of transports only: a supervisor keeps what its node raises
                 raise group.exceptions[0] if len(group.exceptions) == 1 else group from None
             finally:
                 self._opened.close()
@@ -213,7 +232,7 @@ class Module:
                 self._events.close()
 
     async def _end_nodes(self) -> None:
-        """Cancel all nodes, and wait until each has ended."""
+        """Cancel all nodes, and wait until each has cleaned up."""
         tasks = [task for each in self._supervisors.values() if (task := each.cancel()) is not None]
         if not tasks:
             return
@@ -234,19 +253,21 @@ class Module:
         remap: dict[str, str] | None = None,
         restart: bool = False,
     ) -> Node:
-        """Run `function(node, *args)` as a node; its name is the function's unless given, at most 8 characters.
+        """Run `function(node, *args)` as a node. Its name, at most 8 characters, is the function's unless given.
 
-        Nodes of higher priority get their messages first. With `restart` a crash restarts it, after a pause that grows.
-        Raises NameTooLong, InvalidName, Error if the name is taken, the function none of a node, or the module stopped,
-        and Closed if it is not open.
+        Nodes of higher `priority` get their messages first. `remap` renames topics for this node. With `restart` it is
+        started again after a crash, after a pause that grows from 0.5 to 30 s.
+
+        Raises NameTooLong or InvalidName for the name; Error if another node has it, if `function` is not a coroutine
+        function, or if the module is stopped; and Closed if it is not open.
         """
         tasks = self._running()
         if self.stopped:
-            raise Error(f"module {self.name} is stopped: reboot it first")
+            raise Error(f"module {self.name} is stopped: call its reboot() first")
         check_function(function)
         name = node_name(name) if name is not None else name_of(function)
         if name in self._supervisors and self._supervisors[name].running:
-            raise Error(f"module {self.name} has a node {name} already: give this one another name=")
+            raise Error(f"module {self.name} already has a node {name}: give this one another name=")
         names = self._remap | _checked_remap(remap)
         log = self._log.publish if self._log is not None else _no_log
 
@@ -270,20 +291,21 @@ class Module:
             await self._changed.wait()
 
     async def stop(self) -> None:
-        """End all nodes; links and management go on (ALIVE says so)."""
+        """End all nodes, and wait for that. Links stay up, and other modules are informed (by a flag of ALIVE)."""
         async with self._switching:
             self.stopped = True
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
             await self._end_nodes()
 
     async def reboot(self) -> None:
-        """End all nodes and start them from the beginning."""
+        """End all nodes, wait for that, and start them from the beginning. Raises Closed if it is not open."""
         tasks = self._running()
-        await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))  # it ends who asks
+        # In a task of its own: if a node calls this, the reboot cancels its caller.
+        await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))
 
     async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
         async with self._switching:
-            # Others notice each reboot by it, not only the first one.
+            # Stopped in between: by this others notice each reboot, as FLAG_REBOOTED stays set after the first one.
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
             await self._end_nodes()
             if not self._open:
@@ -291,13 +313,13 @@ class Module:
             self.stopped = False
             self.rebooted = True
             for supervisor in self._supervisors.values():
-                if not supervisor.running:  # one was started meanwhile
+                if not supervisor.running:  # `start` may have been called meanwhile
                     supervisor.start(tasks, self._node_ended)
             self._opened.set_flags(FLAG_REBOOTED)
 
     @property
     def _held(self) -> bool:
-        """Whether nodes that have ended may start again."""
+        """Whether nodes that have ended will start again, or may."""
         return self.stopped or self._switching.locked()
 
     def _node_ended(self, supervisor: Supervisor) -> None:
@@ -308,24 +330,24 @@ class Module:
     # Network
 
     def command(self, command: Command, module: str) -> None:
-        """Send STOP, REBOOT or BOOTLOAD to another module, by all links. None of them is an emergency stop.
+        """Send STOP, REBOOT or BOOTLOAD to another module, by all links. STOP is not an emergency stop.
 
-        Raises NameTooLong or InvalidName, Error for a STOP of a module in boot mode (it would hang its management until
-        its power is cut), and Closed if this module is not open.
+        Raises NameTooLong or InvalidName; Error for a STOP of a module in boot mode, which would hang its management
+        until its power is cut; and Closed if this module is not open.
         """
         self._running()
-        self._opened.order(command, module_path(module))
+        self._opened.command(command, module_path(module))
 
     def query(self) -> None:
-        """Ask all others to repeat what they publish and subscribe. Raises Closed if this module is not open."""
+        """Ask all other modules to announce their topics again. Raises Closed if it is not open."""
         self._running()
         for link in self.links:
             link.query()
 
     def events(self) -> AsyncIterator[ModuleEvent]:
-        """What happens to the links and on the network, from this call on, until the module closes.
+        """Iterate over what happens to the links and on the network, from this call on, until the module closes.
 
-        Who reads too slowly loses the oldest of 256 events.
+        The iterator holds 256 events; if it is read too slowly, the oldest are lost.
         """
         return self._events.listen()
 
@@ -341,60 +363,43 @@ def _checked_remap(remap: dict[str, str] | None) -> dict[str, str]:
 
 
 def _no_log(level: int, node: str, text: str) -> None:
-    """An observer keeps its log lines to itself."""
-
-
-# Orders from the network to a module: STOP, REBOOT, and BOOTLOAD, which a program on a PC refuses.
-
-
-_LINES = 1
-"""Lines of the log in a second about one kind of order."""
-
-_SECOND = 1_000_000_000
+    """Drop a record: an observer has no `log` topic."""
 
 
 class CommandHandler:
-    """Those of one module. `refused` counts the ones that were not obeyed, by name."""
+    """Carries out the commands that come in from the network: STOP and REBOOT. A program on a PC refuses BOOTLOAD."""
 
-    def __init__(
-        self,
-        module: str,
-        refused: dict[str, int],
-        stop: Callable[[], Awaitable[None]],
-        reboot: Callable[[], Awaitable[None]],
-    ) -> None:
+    def __init__(self, module: Module) -> None:
         self.tasks: asyncio.TaskGroup | None = None
-        """The owner of the module's tasks while it is open: without it nothing is obeyed."""
+        """The owner of the module's tasks while it is open; without it nothing is carried out."""
         self._module = module
-        self._refused = refused
-        self._stop = stop
-        self._reboot = reboot
-        self._limit = LineLimit(_LINES)
+        self._limit = LineLimit(_COMMAND_LINES)
         self._latest: Command | None = None
-        self._obeying: asyncio.Task[None] | None = None
+        self._running: asyncio.Task[None] | None = None
 
-    def take(self, command: Command) -> None:
-        """An order has come in."""
-        self._log(logging.WARNING, f"module {self._module}: {command.name} from the network")
+    def handle(self, command: Command) -> None:
+        """Log a command, and carry it out in a task of its own; of those that come meanwhile only the last counts."""
+        name = self._module.name
+        self._log(logging.WARNING, f"module {name}: {command.name} from the network")
         if self.tasks is None:
             return
         if command is Command.BOOTLOAD:
-            count = self._refused[command.name] = self._refused.get(command.name, 0) + 1
-            text = f"module {self._module} is a program on a PC, it has no boot loader: BOOTLOAD refused"
+            refused = self._module.refused
+            count = refused[command.name] = refused.get(command.name, 0) + 1
+            text = f"module {name} is a program on a PC, it has no boot loader: BOOTLOAD refused"
             self._log(logging.ERROR, text, f" ({count} so far)")
             return
         self._latest = command
-        if self._obeying is None or self._obeying.done():
-            self._obeying = self.tasks.create_task(self._obey(), name=f"{self._module} orders")
+        if self._running is None or self._running.done():
+            self._running = self.tasks.create_task(self._run(), name=f"{name} commands")
+
+    async def _run(self) -> None:
+        while self._latest is not None and self.tasks is not None:
+            command, self._latest = self._latest, None
+            await (self._module.stop() if command is Command.STOP else self._module.reboot())
 
     def _log(self, level: int, text: str, detail: str = "") -> None:
-        """What others can make happen any number of times a second."""
-        more = self._limit.suffix(text, int(asyncio.get_running_loop().time() * _SECOND))
-        if more is not None:
-            logger.log(level, "%s%s%s", text, detail, more)
-
-    async def _obey(self) -> None:
-        """One order at a time; of those that come meanwhile the last one counts."""
-        while self._latest is not None and self.tasks is not None:
-            order, self._latest = self._latest, None
-            await (self._stop() if order is Command.STOP else self._reboot())
+        """Log what other modules can make happen any number of times a second."""
+        suffix = self._limit.suffix(text, int(asyncio.get_running_loop().time() * _SECOND))
+        if suffix is not None:
+            logger.log(level, "%s%s%s", text, detail, suffix)

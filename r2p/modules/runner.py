@@ -1,7 +1,7 @@
-"""Running a program: the fastest event loop there is, and signals that end everything in order.
+"""Running a program: on the fastest event loop there is, with signals that end everything in order.
 
-The first SIGINT or SIGTERM cancels the program, which ends its nodes, says good-bye on its links, and returns. A second
-one ends the process at once, and so does a program that has not ended GRACE seconds after the first.
+The first SIGINT or SIGTERM cancels the program: it ends its nodes, says good-bye on its links, and returns. A second
+one ends the process at once; so does the first one, if the program has not ended GRACE seconds later.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from r2p.transports.link import Transport
 T = TypeVar("T")
 
 GRACE = 1.8
-"""Seconds that a program has to end in order; with what the interpreter takes, it is gone after two."""
+"""Seconds that a program has to end in order: with the interpreter's own end, the process is gone after two."""
 
 
 def run(
@@ -33,7 +33,8 @@ def run(
 ) -> None:
     """Run functions as the nodes of one module, until all have ended or a signal ends them.
 
-    Parameters as for `Module` and `Module.start`. Raises NodeCrashed at the end if a node crashed.
+    `via` and `remap` are as for `Module`, which `module` is the name of; `restart` is as for `Module.start`. Raises
+    NodeCrashed at the end if a node crashed, and what `Module` and `Module.start` raise.
     """
 
     async def main() -> None:
@@ -46,7 +47,7 @@ def run(
 
 
 def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
-    """Run `main()` on the fastest event loop; None if a signal ended it."""
+    """Run `main()` on the fastest event loop, and return its result; None if SIGINT or SIGTERM ended it."""
 
     async def guarded() -> T | None:
         if not signals.guard(asyncio.get_running_loop(), asyncio.current_task()):
@@ -63,7 +64,7 @@ def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    """uvloop's, where it is installed; else None, asyncio's own."""
+    """uvloop's, where it is installed; otherwise None, which means asyncio's own."""
     try:
         import uvloop
     except ImportError:
@@ -72,10 +73,10 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
 
 
 class _Signals:
-    """Lets the first SIGINT or SIGTERM cancel a task; until the loop is closed, and all its threads have ended.
+    """Lets the first SIGINT or SIGTERM cancel a task, until the loop is closed and all its threads have ended.
 
     The handlers are Python's, not the loop's, so that they also work while a node blocks the loop. Only the main thread
-    gets signals: in another one this does nothing.
+    gets signals: in any other thread this does nothing.
     """
 
     def __init__(self) -> None:
@@ -100,17 +101,17 @@ class _Signals:
         self._over.set()
 
     def guard(self, loop: asyncio.AbstractEventLoop, task: asyncio.Task[object] | None) -> bool:
-        """Cancel this task at the first signal. False if that has come already."""
+        """Cancel this task at the first signal. False if one has come already."""
         if task is not None:
             self._cancel = functools.partial(loop.call_soon_threadsafe, task.cancel)
         return not self.received
 
     def _interrupt(self, number: int, _frame: FrameType | None) -> None:
         for each in self._before:
-            signal.signal(each, signal.SIG_DFL)
+            signal.signal(each, signal.SIG_DFL)  # the second signal ends the process
         self.received.append(number)
         self._over.set()
-        with contextlib.suppress(RuntimeError):  # the loop is closed: the end has come by itself
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the program has ended by itself
             self._cancel()
 
     def _enforce(self) -> None:

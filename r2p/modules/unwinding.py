@@ -1,9 +1,9 @@
 """Whether a coroutine that waits is in its clean-up: in a `finally`, or on its way out of an `async with`.
 
-An exception that passes through a node's function is invisible from outside until the function has ended, and clean-up
-such as stopping a motor takes its time before that. Python keeps no record of it but the place where each frame waits:
-the compiler has a copy of its own of each `finally` for the case of an exception. So this looks the place up in the
-compiled code. Where that is not understood, the answer is no.
+An exception on its way through a node's function can't be seen from outside before the function has ended, and
+clean-up, such as stopping a motor, takes time. The only trace is the place where each frame waits: the compiler makes a
+copy of each `finally` for the case of an exception. So this module looks the place up in the compiled code. Where it
+does not understand the code, the answer is no.
 """
 
 import dis
@@ -15,14 +15,14 @@ from types import CodeType, FrameType
 from typing import NamedTuple
 
 _CATCHES = ("CHECK_EXC_MATCH", "CHECK_EG_MATCH")
-_MOST = 1024  # functions to remember
+_REMEMBERED = 1024  # functions whose handlers are kept
 _STEPS = {"async_generator_asend", "async_generator_athrow", "anext_awaitable", "coroutine_wrapper"}
-"""Types that stand between a coroutine and what it waits in, and tell of that to the garbage collector alone."""
+"""Types between a coroutine and what it waits for, which only the garbage collector can look into."""
 _CLOSES = ("COPY", "POP_EXCEPT", "RERAISE")  # how the compiled code of each handler ends
 
 
 class _Handler(NamedTuple):
-    """The code of one `except`, `finally` or `with`, by offsets; an exception in flight goes on from `end`."""
+    """The code of one `except`, `finally` or `with`, by offsets. A `finally` raises its exception again at `end`."""
 
     start: int
     end: int
@@ -30,7 +30,7 @@ class _Handler(NamedTuple):
 
 
 def ends(coroutine: object) -> bool:
-    """Whether an exception has reached a `finally` or an `async with` in which it waits, and no `except` is around."""
+    """Whether an exception that no `except` will catch has reached a `finally` or an `async with` in which it waits."""
     return cleans_up(coroutine) and _uncaught(
         [(each.f_code, each.f_lasti) for each in frames(coroutine, closing=False)]
     )
@@ -46,9 +46,9 @@ def _uncaught(places: list[tuple[CodeType, int]]) -> bool:
 
 
 def cleans_up(coroutine: object, *, handlers: bool = False) -> bool:
-    """Whether an exception has reached a `finally` or an `async with` in which it waits; with `handlers`, an `except`.
+    """Whether an exception has reached a `finally` or `async with` in which it waits; with `handlers`, or an `except`.
 
-    What comes after it does not matter: also in the middle of a program that goes on, clean-up is not to be disturbed.
+    An `except` further out does not matter: clean-up is not to be disturbed in the middle of a program either.
     """
     for frame in frames(coroutine):
         offset = frame.f_lasti
@@ -59,9 +59,9 @@ def cleans_up(coroutine: object, *, handlers: bool = False) -> bool:
 
 
 def frames(awaitable: object, *, closing: bool = True) -> Iterator[FrameType]:
-    """Where each coroutine and generator of a chain waits, the outermost first.
+    """The frames of all coroutines and generators of a chain, the outermost first.
 
-    Without `closing`, up to an async generator that is closed: what ends that (GeneratorExit) does not leave `aclose`.
+    Without `closing`, up to an async generator that is being closed: GeneratorExit does not leave its `aclose`.
     """
     while awaitable is not None:
         if type(awaitable).__name__ in _STEPS:
@@ -86,13 +86,13 @@ def _waits(each: object) -> bool:
 
 
 _known: dict[int, tuple[CodeType, tuple[_Handler, ...]]] = {}
-"""By identity, each kept alive by its entry: a code's own hash takes longer than all the rest."""
+"""By identity, each kept alive by its entry: the hash of a code object takes longer than all the rest."""
 
 
 def _handlers(code: CodeType) -> tuple[_Handler, ...]:
     known = _known.get(id(code))
     if known is None:
-        if len(_known) >= _MOST:
+        if len(_known) >= _REMEMBERED:
             _known.clear()
         known = _known[id(code)] = code, _find_handlers(code)
     return known[1]
@@ -115,9 +115,9 @@ def _find_handlers(code: CodeType) -> tuple[_Handler, ...]:
     return () if opened else tuple(found)
 
 
-@functools.lru_cache(maxsize=_MOST)
+@functools.lru_cache(maxsize=_REMEMBERED)
 def _escapes(code: CodeType, offset: int) -> bool:
-    """Whether an exception that is raised at this offset leaves the function, past no `except`."""
+    """Whether an exception that is raised at this offset leaves the function without an `except` that catches it."""
     entries = dis.Bytecode(code).exception_entries  # type: ignore[attr-defined]  # since Python 3.11, unlisted
     by_start = {handler.start: handler for handler in _handlers(code)}
     for _ in range(len(entries) + 1):
@@ -132,7 +132,7 @@ def _escapes(code: CodeType, offset: int) -> bool:
 
 
 def _reraised(code: CodeType, target: int) -> int:
-    """Where a piece of clean-up that the compiler adds raises the exception again."""
+    """The offset at which clean-up that the compiler adds raises the exception again."""
     return next(
         each.offset
         for each in dis.get_instructions(code)

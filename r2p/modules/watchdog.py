@@ -1,14 +1,13 @@
-"""The watchdog: tells which code blocks the event loop, while it blocks it.
+"""The watchdog: logs which code blocks the event loop, while it blocks it.
 
-A thread asks the loop for a sign of life, four times in each LIMIT. Where none comes for LIMIT seconds, it logs the
-stack that the loop is stuck in, and afterwards how long it took. One block of 100 ms is ten missed periods of a 100 Hz
-node: worth a log line.
+A thread asks the loop for a sign of life four times in each LIMIT. When none comes for LIMIT seconds, it logs the stack
+in which the loop is stuck, and afterwards how long that took. A block of 100 ms is ten missed periods of a 100 Hz node.
 
 All modules of a loop share one watchdog. It reports at most once a second, with the number of blocks in between, and
 each stack only once: later blocks in the same place name its last line.
 
-It blames nobody for what the computer did: where the thread itself did not run either, and nothing in this process
-used the processor meanwhile, the process was stopped (Ctrl-Z, a debugger, a computer that slept), and that is said.
+A process that did not run at all blocked nothing: if the thread did not run either, and nothing in this process used
+the processor meanwhile, it was stopped (Ctrl-Z, a debugger, a computer that slept), and the log says that instead.
 """
 
 import asyncio
@@ -27,19 +26,20 @@ from r2p.log_lines import LineLimit
 logger = logging.getLogger("r2p.watchdog")
 
 _SECOND = 1_000_000_000
-_REPORTS = 1  # in a second
-_MOST_KNOWN = 256  # stacks that are remembered
-
 LIMIT = 0.1
 """Seconds that the loop may be blocked."""
 
-_MOMENT = 1.0  # seconds that the process may be stopped without a word
+_REPORTS = 1  # a second
+_REMEMBERED = 256  # stacks that were logged
+_MOST_STOPPED = 1.0  # seconds that the process may be stopped without a line of the log
+_IDLE = 0.5  # of a processor: code that blocks by working uses more than that, and a process that waits less
+
 STOPPED = "this process did not run for %.1f s: it was stopped, or the computer slept or was busy"
 BLOCKED = "%s has blocked the event loop for over %.0f ms%s:\n%s"
 AGAIN = "%s has blocked the event loop for over %.0f ms%s, again in %s"
-NOBODY = "the event loop did not come round for over %.0f ms, and none of its code runs: is the computer busy?"
-_IDLE = 0.5  # of a processor: whatever runs uses more than that, and what waits less
-_RUNS_IT = {each.__file__ for each in (asyncio.base_events, asyncio.events, asyncio.runners)} | {
+NOT_RUNNING = "the event loop did not come round for over %.0f ms, and none of its code runs: is the computer busy?"
+
+_LOOP_FILES = {each.__file__ for each in (asyncio.base_events, asyncio.events, asyncio.runners)} | {
     str(Path(__file__).with_name("supervisor.py"))
 }
 
@@ -49,7 +49,7 @@ _lock = threading.Lock()
 
 
 def watch(loop: asyncio.AbstractEventLoop) -> "Watchdog":
-    """The watchdog of this thread's loop, running; it ends when all who have called this have closed it."""
+    """The watchdog of this thread's loop, which runs until each caller has closed it."""
     with _lock:
         watchdog = _watchdogs.get(loop)
         if watchdog is None:
@@ -61,7 +61,7 @@ def watch(loop: asyncio.AbstractEventLoop) -> "Watchdog":
 
 
 class Watchdog:
-    """Watches the loop of the thread that starts it, for so many `users`."""
+    """Watches the loop of the thread that starts it, on behalf of so many `users`."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, limit: float = LIMIT) -> None:
         self.users = 1
@@ -73,11 +73,11 @@ class Watchdog:
         self._watched = 0
         self._known: set[str] = set()  # stacks that have been logged
         self._line_limit = LineLimit(_REPORTS)
-        self._base: FrameType | None = None  # whatever runs a loop that is not written in Python
+        self._base: FrameType | None = None  # the caller of a loop that is not written in Python, such as uvloop
         self._thread = threading.Thread(target=self._watch, name="r2p-watchdog", daemon=True)
 
     def start(self) -> None:
-        """Watch from now on."""
+        """Start the thread."""
         self._watched = threading.get_ident()
         self._base = _runner()
         self._thread.start()
@@ -107,7 +107,7 @@ class Watchdog:
             if self._ended.is_set() or self._alive.wait(self._limit):
                 continue
             if self._was_stopped(asked, used, self._limit) and self._alive.wait(self._limit):
-                self._tell_stopped(asked)
+                self._log_stopped(asked)
                 continue
             reported = self._report()
             self._alive.wait()  # close() sets it too
@@ -116,66 +116,66 @@ class Watchdog:
                 logger.warning("the event loop runs again after %.0f ms", took)
 
     def _pause(self) -> bool:
-        """Until the next look; True: there is none."""
+        """Wait until the next look; True if there is none, as the watchdog ends."""
         start, used = self._clock.monotonic(), _used()
         if self._ended.wait(self._limit / 4):
             return True
-        if self._was_stopped(start, used, _MOMENT):
-            self._tell_stopped(start)
+        if self._was_stopped(start, used, _MOST_STOPPED):
+            self._log_stopped(start)
         return False
 
     def _was_stopped(self, since: int, used: float, limit: float) -> bool:
-        """Whether this thread, which waited for a moment, was late by more than `limit` seconds, and nobody busy."""
+        """Whether this thread's wait was late by more than `limit` seconds, while this process used no processor."""
         passed = (self._clock.monotonic() - since) / _SECOND
         return passed > 2 * limit and _used() - used < _IDLE * passed
 
-    def _tell_stopped(self, since: int) -> None:
+    def _log_stopped(self, since: int) -> None:
         passed = (self._clock.monotonic() - since) / _SECOND
         logger.warning(STOPPED, passed)
 
     def _report(self) -> bool:
-        """Log where the loop is stuck; False: there was a report less than a second ago."""
-        more = self._line_limit.suffix("", self._clock.monotonic())
-        if more is None:
+        """Log where the loop is stuck; False if there was a report less than a second ago."""
+        suffix = self._line_limit.suffix("", self._clock.monotonic())
+        if suffix is None:
             return False
         frame = sys._current_frames().get(self._watched)  # noqa: SLF001 - documented, for exactly this use
         stack = _own_part(frame) if frame is not None and frame is not self._base else []
         if not stack:
-            logger.warning(NOBODY, self._limit * 1e3)
+            logger.warning(NOT_RUNNING, self._limit * 1e3)
             return True
         task = asyncio.current_task(self._loop)
         who = f"task {task.get_name()}" if task is not None else "a callback"
         text = "".join(traceback.format_list(stack)).rstrip()
         if text in self._known:
             last = stack[-1]
-            logger.warning(AGAIN, who, self._limit * 1e3, more, f"{last.filename}:{last.lineno}, {last.name}")
+            logger.warning(AGAIN, who, self._limit * 1e3, suffix, f"{last.filename}:{last.lineno}, {last.name}")
         else:
             self._remember(text)
-            logger.warning(BLOCKED, who, self._limit * 1e3, more, text)
+            logger.warning(BLOCKED, who, self._limit * 1e3, suffix, text)
         return True
 
     def _remember(self, stack: str) -> None:
-        if len(self._known) >= _MOST_KNOWN:
+        if len(self._known) >= _REMEMBERED:
             self._known.clear()
         self._known.add(stack)
 
 
 def _used() -> float:
-    """Seconds of a processor that this process has used so far."""
+    """The processor time that this process has used so far, in seconds."""
     return sum(os.times()[:2])
 
 
 def _runner() -> FrameType | None:
-    """The frame below the task that is running."""
+    """The frame that called the one of the running task: of the event loop, or of what runs it."""
     task = asyncio.current_task()
     frame = getattr(task.get_coro(), "cr_frame", None) if task is not None else None
     return frame.f_back if frame is not None else None
 
 
 def _own_part(frame: FrameType) -> list[traceback.FrameSummary]:
-    """The stack from where a node or a callback begins; what runs it is always the same. Empty: only that."""
+    """The part of a stack that belongs to a node or a callback, without the event loop that called it; may be empty."""
     stack = traceback.extract_stack(frame)
-    begin = max((at for at, each in enumerate(stack, 1) if each.filename in _RUNS_IT), default=0)
+    begin = max((at for at, each in enumerate(stack, 1) if each.filename in _LOOP_FILES), default=0)
     own = stack[begin:]
     if begin and stack[begin - 1].name == "_run_once" and all(each.filename == selectors.__file__ for each in own):
         return []  # it waits for events

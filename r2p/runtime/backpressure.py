@@ -1,8 +1,10 @@
-"""Room: what takes samples, who waits for a free place in it, and in which order they get one.
+"""Backpressure: who waits while a subscriber's queue or a link's send buffer is full, and in which order they go on.
 
-Two lines before each place, both first come first served: events and periods get a free place before messages that do
-not expire. Whoever has places serves the lines as soon as one is free; so while somebody waits there is none, and
-nobody can slip in.
+A `Sink` accepts samples: the queue of a subscriber, or one topic on its way out by a link. A publisher or a link that
+finds it full, and may wait, leaves a `PendingDelivery` in the sink's `WaitQueue`. A place that becomes free goes to
+that queue at once. So while anything waits there is no free place, and nothing published later can overtake it.
+
+Each wait queue has two lines, both first come, first served: what expires gets a place before what does not.
 """
 
 import abc
@@ -14,33 +16,33 @@ from r2p.runtime.sample import PublisherClass, Sample
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-
-LINK_DOWN = "link down"
-"""Why samples for a link are lost while it is down: its publishers were told when that began."""
-
-INTERNAL_ERROR = "internal error"
-"""Why something is lost whose handling raised what it never should."""
-
+# Why samples are lost: the reasons in `Missed` and in the counters of links.
 
 NO_ROOM = "no room"
-"""Why a sample is lost that does not wait, or waits no longer."""
+"""A sample found no room, and does not wait, or waits no longer."""
+
+LINK_DOWN = "link down"
+"""A sample for a link came while the link was down; its publishers were informed when that began."""
 
 CANCELLED = "publish cancelled"
-"""Why a sample is lost whose `publish()` was cancelled while it waited for room."""
+"""The `publish()` of a sample was cancelled while it waited for room."""
 
 GIVEN_UP = "given up by its publisher"
-"""Why a link lacks a sample that its publisher kept until it was stale, or too many waited, or it was closed."""
+"""A publisher kept a sample for a link until it was stale, or too many waited, or the publisher was closed."""
+
+INTERNAL_ERROR = "internal error"
+"""The handling of a sample raised what it never should."""
 
 
 class Sink(abc.ABC):
-    """What takes samples: a subscriber's queue, or a link's send buffer."""
+    """Accepts samples: the queue of a subscriber, or one topic on its way out by a link."""
 
     __slots__ = ("lost", "waits")
 
     def __init__(self) -> None:
         self.lost = 0
         self.waits = True
-        """Whether publishers wait for room in it; False while it is considered lossy."""
+        """Whether publishers wait while it is full; False while it is considered lossy."""
 
     @property
     @abc.abstractmethod
@@ -49,41 +51,41 @@ class Sink(abc.ABC):
 
     @property
     def reachable(self) -> bool:
-        """Whether it can take anything at all."""
+        """Whether it can accept anything at all."""
         return True
 
     @abc.abstractmethod
     def offer(self, sample: Sample) -> bool:
-        """Take the sample if there is room."""
+        """Accept the sample, if there is room."""
 
     @abc.abstractmethod
     def force(self, sample: Sample) -> None:
-        """Take the sample even without room, losing and counting one."""
+        """Accept the sample even without room: then one sample is lost, and counted."""
 
     def count_lost(self, reason: str) -> None:
-        """Count a sample that waited for room and does not any more; links count it by reason, too."""
+        """Count a sample that waited, and does not any more; links also count it by reason."""
         self.lost += 1
 
     @abc.abstractmethod
     def wait_queue(self) -> "WaitQueue":
-        """Those who wait for room in it."""
+        """The queue of what waits for room in it."""
 
     @abc.abstractmethod
     def refill(self) -> None:
-        """Give them what room there is."""
+        """Give what waits the room that there is."""
 
     def offer_latched(self, sample: Sample) -> None:
-        """Take a value that its publisher latches: as soon as there is room."""
-        room = self.wait_queue()
+        """Accept a value that its publisher latches, as soon as there is room."""
+        queue = self.wait_queue()
         if not self.reachable:
             self.force(sample)
-        elif room.queue_of(sample) or not self.offer(sample):
-            room.enqueue_latched(self, sample)
+        elif queue.line_of(sample) or not self.offer(sample):
+            queue.add_latched(self, sample)
 
-    def become_lossy(self, refusal: str) -> None:
-        """It made no room in time: lossy until it has."""
+    def become_lossy(self, reason: str) -> None:
+        """Stop making publishers wait, until it has plenty of room again: it made none in time."""
         self.waits = False
-        self.wait_queue().reject(self, refusal)
+        self.wait_queue().reject(self, reason)
         self.wait_queue().recoveries.append(self._recover)
 
     def _recover(self) -> None:
@@ -98,22 +100,22 @@ class PendingDelivery(abc.ABC):
     def __init__(self, sample: Sample, sinks: list[Sink]) -> None:
         self.sample = sample
         self.remaining = sinks
-        """Who has not got it yet."""
+        """The sinks that do not have it yet."""
         for sink in sinks:
             sink.wait_queue().add(sink, self)
 
     @abc.abstractmethod
-    def completed(self, sink: Sink, refusal: str) -> None:
-        """The sink has got it, or lost it (counted there) for the reason `refusal`."""
+    def completed(self, sink: Sink, reason: str) -> None:
+        """Called when the sink has the sample, or has lost it, and counted that, for this reason."""
 
-    def complete(self, sink: Sink, refusal: str = "") -> None:
-        """The sink has got it or lost it."""
-        if sink in self.remaining:  # else somebody who was told of another one has withdrawn it
+    def complete(self, sink: Sink, reason: str = "") -> None:
+        """Take the sink off the list: it has the sample, or has lost it for this reason."""
+        if sink in self.remaining:  # a callback of another sink may have withdrawn the delivery meanwhile
             self.remaining.remove(sink)
-            self.completed(sink, refusal)
+            self.completed(sink, reason)
 
     def withdraw(self) -> list[Sink]:
-        """Wait no more; says who has not got it."""
+        """Wait no more; returns the sinks that do not have the sample."""
         without, self.remaining = self.remaining, []
         for sink in without:
             sink.wait_queue().remove(sink, self)
@@ -121,111 +123,111 @@ class PendingDelivery(abc.ABC):
 
 
 class _LatchedDelivery(PendingDelivery):
-    """A latched value on its way to somebody who has joined."""
+    """A latched value on its way to a new subscriber."""
 
     __slots__ = ()
 
-    def completed(self, sink: Sink, refusal: str) -> None:
-        """Nobody waits for it."""
+    def completed(self, sink: Sink, reason: str) -> None:
+        """The publisher does not wait for it."""
 
 
 _Line = deque[tuple[Sink, PendingDelivery]]
 
 
 class WaitQueue:
-    """The lines before one place; several sinks may share it."""
+    """What waits for places that one or several sinks share."""
 
-    __slots__ = ("deliveries", "events", "recoveries")
+    __slots__ = ("non_real_time", "real_time", "recoveries")
 
     def __init__(self) -> None:
-        self.events: _Line = deque()
-        self.deliveries: _Line = deque()
+        self.real_time: _Line = deque()
+        self.non_real_time: _Line = deque()
         self.recoveries: list[Callable[[], None]] = []
-        """What to call when there is plenty of room: from those who went on without waiting."""
+        """What to call when there is plenty of room: from those that went on without waiting."""
 
     def __bool__(self) -> bool:
-        return bool(self.events or self.deliveries or self.recoveries)
+        return bool(self.real_time or self.non_real_time or self.recoveries)
 
-    def queue_of(self, sample: Sample) -> _Line:
+    def line_of(self, sample: Sample) -> _Line:
         """The line in which such a sample waits."""
-        return self.deliveries if sample.publisher_class == PublisherClass.NON_REAL_TIME else self.events
+        return self.non_real_time if sample.publisher_class == PublisherClass.NON_REAL_TIME else self.real_time
 
-    def add(self, sink: Sink, claim: PendingDelivery) -> None:
-        self.queue_of(claim.sample).append((sink, claim))
+    def add(self, sink: Sink, delivery: PendingDelivery) -> None:
+        self.line_of(delivery.sample).append((sink, delivery))
 
-    def enqueue_latched(self, sink: Sink, sample: Sample) -> None:
-        """A latched value waits, too; of one publisher only the last."""
-        for each, claim in self.queue_of(sample):
-            if each is sink and isinstance(claim, _LatchedDelivery) and claim.sample.source == sample.source:
-                claim.sample = sample
+    def add_latched(self, sink: Sink, sample: Sample) -> None:
+        """Let a latched value wait, too; of one publisher only the last."""
+        for each, delivery in self.line_of(sample):
+            if each is sink and isinstance(delivery, _LatchedDelivery) and delivery.sample.source == sample.source:
+                delivery.sample = sample
                 return
         _LatchedDelivery(sample, [sink])
 
-    def remove(self, sink: Sink, claim: PendingDelivery) -> None:
-        line = self.queue_of(claim.sample)
-        if (sink, claim) in line:
-            line.remove((sink, claim))
+    def remove(self, sink: Sink, delivery: PendingDelivery) -> None:
+        line = self.line_of(delivery.sample)
+        if (sink, delivery) in line:
+            line.remove((sink, delivery))
 
     def serve(self) -> None:
-        """There may be room for some."""
-        for line in (self.events, self.deliveries):
+        """Hand out what room there is, in order."""
+        for line in (self.real_time, self.non_real_time):
             while line:
                 first = line.popleft()
-                sink, claim = first
+                sink, delivery = first
                 try:
-                    taken = sink.offer(claim.sample)
+                    accepted = sink.offer(delivery.sample)
                 except Exception:
-                    claim.complete(sink, INTERNAL_ERROR)  # nothing else would ever end the wait
+                    delivery.complete(sink, INTERNAL_ERROR)  # nothing else would ever end the wait
                     raise
-                if not taken:
+                if not accepted:
                     line.appendleft(first)
                     break
-                claim.complete(sink)
+                delivery.complete(sink)
 
     def recover(self) -> None:
-        """There is plenty of room."""
+        """Call those that went on without waiting: there is plenty of room."""
         recoveries, self.recoveries = self.recoveries, []
         for callback in recoveries:
             callback()
 
     def drop_sink(self, sink: Sink) -> None:
-        """Nobody is behind this sink any more: nobody lacks what waits for it."""
-        for line in (self.events, self.deliveries):
-            for claim in _take(line, sink):
-                claim.complete(sink)
+        """Complete everything that waits for this sink, without a loss: nothing is behind it any more."""
+        for line in (self.real_time, self.non_real_time):
+            for delivery in _pop(line, sink):
+                delivery.complete(sink)
 
-    def reject(self, sink: Sink, refusal: str) -> None:
-        """No room in this sink for messages that do not expire: it loses those that wait, or older ones."""
-        for claim in _take(self.deliveries, sink):
-            sink.force(claim.sample)
-            claim.complete(sink, refusal)
+    def reject(self, sink: Sink, reason: str) -> None:
+        """Force what does not expire into this sink, which loses that, or older samples, for this reason."""
+        for delivery in _pop(self.non_real_time, sink):
+            sink.force(delivery.sample)
+            delivery.complete(sink, reason)
+
+    def reject_all(self, reason: str) -> None:
+        """Force everything into its sinks, which lose samples for this reason."""
+        for line in (self.real_time, self.non_real_time):
+            while line:
+                sink, delivery = line.popleft()
+                sink.force(delivery.sample)
+                delivery.complete(sink, reason)
 
     def pop_earlier(self, sink: Sink, sample: Sample) -> list[PendingDelivery]:
-        """Take out what waits for this sink, and its publisher has published before this sample."""
-        line = self.queue_of(sample)
+        """Remove and return what waits for this sink, and what its publisher published before this sample."""
+        line = self.line_of(sample)
         earlier = [
-            claim
-            for each, claim in line
-            if each is sink and claim.sample.source is sample.source and claim.sample.sequence < sample.sequence
+            delivery
+            for each, delivery in line
+            if each is sink and delivery.sample.source is sample.source and delivery.sample.sequence < sample.sequence
         ]
-        for claim in earlier:
-            line.remove((sink, claim))
+        for delivery in earlier:
+            line.remove((sink, delivery))
         return earlier
 
-    def reject_all(self, refusal: str) -> None:
-        """No room for anything."""
-        for line in (self.events, self.deliveries):
-            while line:
-                sink, claim = line.popleft()
-                sink.force(claim.sample)
-                claim.complete(sink, refusal)
 
-
-def _take(line: _Line, sink: Sink) -> list[PendingDelivery]:
-    """Take out of the line what waits for this sink."""
-    taken = [claim for each, claim in line if each is sink]
-    if taken:
+def _pop(line: _Line, sink: Sink) -> list[PendingDelivery]:
+    """Remove and return what waits for this sink in the line."""
+    popped = [delivery for each, delivery in line if each is sink]
+    if popped:
         rest = [entry for entry in line if entry[0] is not sink]
         line.clear()
         line.extend(rest)
-    return taken
+    return popped

@@ -1,7 +1,6 @@
-"""What happens to a module's links and on its network, for programs and tools that want to know.
+"""What happens to a module's links and on its network, as events that programs and tools iterate over.
 
-A listener is a bounded queue that lives as long as somebody holds it: one that is never read, or given up, costs
-nothing once it is forgotten.
+A listener is a bounded queue that lives as long as its iterator: one that is never read, or not any more, is garbage.
 """
 
 import asyncio
@@ -15,11 +14,11 @@ import msgspec
 from r2p.protocols.discovery.events import Mismatched, ModuleChanged, ModuleGone, NameConflict
 
 EVENTS = 256
-"""Events that a listener holds before it loses the oldest."""
+"""Events that a listener holds; one more drops the oldest."""
 
 
 class LinkUp(msgspec.Struct, frozen=True):
-    """A link works (again): after `outage` seconds, in which `lost` messages found it down."""
+    """A link is up: for the first time, or after `outage` seconds, in which `lost` messages found it down."""
 
     link: str
     outage: float
@@ -27,21 +26,21 @@ class LinkUp(msgspec.Struct, frozen=True):
 
 
 class LinkDown(msgspec.Struct, frozen=True):
-    """A link works no more."""
+    """A link is down; it is tried again for ever."""
 
     link: str
     reason: str
 
 
 class LinkWaits(msgspec.Struct, frozen=True):
-    """A link can't be had yet; it is tried again and again."""
+    """A link can't be set up yet; it is tried again for ever. One event for each new reason."""
 
     link: str
     reason: str
 
 
 class LinkNotice(msgspec.Struct, frozen=True):
-    """Something on a link that is worth knowing, such as another master: `kind` for programs, `text` for people."""
+    """Something else about a link, such as another master on its bus: `kind` is for programs, `text` for people."""
 
     link: str
     kind: str
@@ -49,7 +48,7 @@ class LinkNotice(msgspec.Struct, frozen=True):
 
 
 class Listening(msgspec.Struct, frozen=True):
-    """A transport takes connections."""
+    """A transport accepts connections at this address."""
 
     url: str
     address: str
@@ -61,7 +60,7 @@ ModuleEvent = (
 
 
 class EventHub:
-    """Tells every listener what happens, until it is closed."""
+    """Hands events to all listeners, until it is closed."""
 
     def __init__(self) -> None:
         self._listeners: weakref.WeakValueDictionary[int, _Listener] = weakref.WeakValueDictionary()
@@ -69,7 +68,7 @@ class EventHub:
         self._closed = False
 
     def listen(self) -> AsyncIterator[ModuleEvent]:
-        """All events from this call on, until the hub is closed."""
+        """Iterate over all events from this call on, until the hub is closed."""
         listener = _Listener()
         listener.closed = self._closed
         self._listeners[next(self._numbers)] = listener
@@ -81,7 +80,7 @@ class EventHub:
             listener.arrived.set()
 
     def close(self) -> None:
-        """Nothing happens any more: listeners end when they have read what they hold."""
+        """Let each listener end when it has read what it holds."""
         self._closed = True
         for listener in list(self._listeners.values()):
             listener.closed = True

@@ -1,7 +1,7 @@
 """A node: one asyncio task of a module, and what it publishes and subscribes.
 
-The function's body is initialisation and loop; cancellation is termination. Whatever the node opened is closed when
-its function ends, however it ends.
+The body of its function is initialisation and loop; cancellation is termination. Everything that the node opened is
+closed when its function ends, however it ends.
 """
 
 import asyncio
@@ -11,16 +11,16 @@ import traceback
 from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple, TypeVar, overload
 
-from r2p.clock import Ticker
-from r2p.durations import SHORTEST, seconds, timeout_or_none
+from r2p.clock import SHORTEST, Ticker, check_seconds, check_timeout
 from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.messages import Message, layout
 from r2p.names import MANAGEMENT, topic_name
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
-from r2p.runtime.subscriber import Callback, Keep, Subscriber, check_options
-from r2p.runtime.topic import TopicSpace, checkpoint
+from r2p.runtime.queues import checkpoint
+from r2p.runtime.subscriber import Callback, Keep, Subscriber, SubscriberOptions
+from r2p.runtime.topic import TopicSpace
 
 M = TypeVar("M", bound=Message)
 
@@ -31,7 +31,7 @@ _SECOND = 1_000_000_000
 
 
 class Tick(NamedTuple):
-    """One period of `Node.every`: when it was due (monotonic ns), how late it came (s), periods that were skipped."""
+    """One period of `Node.every`: when it was due (monotonic ns), how late it is (s), periods skipped before it."""
 
     due: int
     late: float
@@ -39,7 +39,7 @@ class Tick(NamedTuple):
 
 
 class NodeLogger(logging.LoggerAdapter[logging.Logger]):
-    """Logs as usual, under `r2p.MODULE.NODE`; records from INFO up also go to the module's `log` topic."""
+    """A logger named `r2p.MODULE.NODE`; its records from INFO up also go to the module's `log` topic."""
 
     def __init__(self, logger: logging.Logger, publish: Callable[[int, str], None]) -> None:
         super().__init__(logger)
@@ -67,7 +67,7 @@ def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -
 
 
 class Node:
-    """What a node's function gets: the way to its topics. Made by `Module.start`."""
+    """The first argument of a node's function: publishes, subscribes, ticks and logs for it. Made by `Module.start`."""
 
     def __init__(
         self,
@@ -86,20 +86,20 @@ class Node:
             logging.getLogger(f"r2p.{space.module}.{name}"), lambda level, text: log(level, name, text)
         )
         self.publishers: dict[AnyPublisher, None] = {}
-        """Its open publishers, in order; None means nothing."""
+        """Its open publishers, in order (the values mean nothing)."""
         self.subscribers: dict[Subscriber[Any], None] = {}
-        """Its open subscribers."""
+        """Its open subscribers, in order."""
         self.closed = False
         self.crashed: Callable[[Exception], None] = self._log_crash
-        """What to do with an error outside the node's own task; its supervisor sets it."""
+        """Handles an error outside the node's own task; set by its supervisor."""
         self.unwinds: Callable[[], bool] = lambda: False
-        """Whether its function is on its way out by an exception; its supervisor sets it."""
+        """Says whether an exception is on its way out of the node's function; set by its supervisor."""
         self._ending = False
         self._space = space
         self._remap = remap or {}
         self._events = events or EventHub()
         self._tickers: set[Ticker] = set()
-        self._entered = False
+        self._started = False
 
     @overload
     def advertise(
@@ -125,12 +125,13 @@ class Node:
         latch: bool = False,
         strict: bool = False,
     ) -> Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]:
-        """Publish a topic; the class value says how: `NonRealTime()`, `Sporadic(deadline)`, `Periodic(period, fill)`.
+        """Publish a topic. The class value says how: `NonRealTime()`, `Sporadic(deadline)` or `Periodic(period, fill)`.
 
-        `latch` sends the last value to every subscriber that joins later, and again when its module reboots.
-        `strict` raises TransportError where a link is known not to give what the class asks for.
-        Raises InvalidName or NameTooLong, MessageError (a type without a layout, a class value without sense),
-        TypeMismatch, and Closed once the node has ended.
+        With `latch` the last message is sent to every subscriber that joins later, and again when its module reboots.
+        With `strict` a link that is known not to keep what the class asks for raises TransportError.
+
+        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or a class value
+        that makes no sense, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
         shape = layout(type)
         name = self._resolve(topic)
@@ -147,7 +148,7 @@ class Node:
                 case Periodic():
                     publisher = PeriodicPublisher(self._space, self, where, shape, klass, latch=latch)
                     publisher.start()
-        except BaseException:  # whatever it was, the topic must not keep the type of a publisher that is not there
+        except BaseException:  # else the topic would keep the type of a publisher that does not exist
             self._space.release(where)
             raise
         where.publishers.append(publisher)
@@ -200,33 +201,22 @@ class Node:
         timeout: float | None = None,
         on_timeout: Callable[[], object] | None = None,
     ) -> Subscriber[Any]:
-        """Subscribe a topic; with the type None messages are packed bytes.
+        """Subscribe to a topic. With the type None, messages are packed bytes.
 
-        `queue` messages are held. When it is full, non real-time publishers wait for it, up to their stall time, unless
-        it is `lossy`; whoever does not wait drops its oldest message, or with `keep="oldest"` the new one, counted in
-        `lost`. Messages older than `max_age` seconds are skipped, counted in `stale`: by the publisher's stamp and this
-        computer's clock, so the two have to agree, and a clock that is set makes messages look too old. When nothing
-        comes for `timeout` seconds, `on_timeout` is called once; without it, the iteration raises TimeoutError.
-        A `callback` is called, in this node's task, from `spin()`.
-        Raises InvalidName or NameTooLong, MessageError (a type without a layout, an option without sense),
-        TypeMismatch, and Closed once the node has ended.
+        The subscription holds `queue` messages. When it is full, non real-time publishers wait for it, up to their
+        stall time, unless it is `lossy`. A publisher that does not wait makes the queue drop its oldest message, or
+        with `keep="oldest"` the new one; both are counted in `lost`.
+
+        Messages older than `max_age` seconds are skipped, and counted in `stale`. The age is measured from the
+        publisher's stamp to this computer's clock, so the two clocks have to agree.
+
+        When nothing comes for `timeout` seconds, `on_timeout` is called once; without it, reading raises TimeoutError.
+        A `callback` is called from `spin()`, in this node's task.
+
+        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or an option
+        that makes no sense, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
-        check_options(
-            topic,
-            queue=queue,
-            keep=keep,
-            callback=callback,
-            max_age=max_age,
-            timeout=timeout,
-            on_timeout=on_timeout,
-        )
-        shape = None if type is None else layout(type)
-        where = self._space.open(self._resolve(topic), shape)
-        subscriber: Subscriber[Any] = Subscriber(
-            self._space,
-            self,
-            where,
-            shape,
+        options = SubscriberOptions(
             queue=queue,
             lossy=lossy,
             keep=keep,
@@ -235,24 +225,29 @@ class Node:
             timeout=timeout,
             on_timeout=on_timeout,
         )
+        options.check(topic)
+        shape = None if type is None else layout(type)
+        where = self._space.open(self._resolve(topic), shape)
+        subscriber: Subscriber[Any] = Subscriber(self._space, self, where, shape, options)
         self.subscribers[subscriber] = None
         subscriber.open()
         return subscriber
 
     async def spin(self, timeout: float | None = None) -> bool:
-        """Wait for messages of subscriptions with a callback, and call those; False after `timeout` seconds without.
+        """Wait for messages of subscriptions with a callback, and call it for each; False if there was none.
 
-        Callbacks run in this node's task, one at a time; a coroutine function is awaited. False also when one of the
-        subscriptions has a time-out of its own, no `on_timeout`, and its time is up.
-        A node of periodic publishers spins, too: their `fill` is called meanwhile.
-        Raises Error if there is neither: nothing would ever be called; MessageError for a time-out that is not a number
-        of seconds.
+        Callbacks run in this node's task, one at a time; a coroutine function is awaited. The wait ends without a
+        message after `timeout` seconds, or when a subscription without `on_timeout` has had none for its own `timeout`.
+        A node with only periodic publishers may spin as well: their `fill` is called meanwhile.
+
+        Raises Error if the node has neither, as nothing would ever be called, and MessageError for a time-out that is
+        not a number of seconds.
         """
-        timeout_or_none("the time-out of spin", timeout)
+        check_timeout("the time-out of spin", timeout)
         deadline = None if timeout is None else self._space.loop.time() + timeout
         while not await self._serve():
             try:
-                if deadline is None:  # a time-out costs more than a message
+                if deadline is None:  # apart, as a time-out costs more than a message
                     await self._arrival()
                 else:
                     async with asyncio.timeout_at(deadline):
@@ -263,11 +258,12 @@ class Node:
         return True
 
     def every(self, period: float) -> AsyncIterator[Tick]:
-        """Tick each `period` seconds on absolute phase, first after one period; a slow body skips periods, counted.
+        """Iterate over ticks, one each `period` seconds on absolute phase, the first after one period.
 
-        Raises MessageError at once for what is not a number of seconds, of 1e-6 or more.
+        A loop body that takes longer than a period skips ticks, which `Tick.skipped` counts. Raises MessageError, at
+        once, for a period that is not a number of seconds, 1e-6 or more.
         """
-        seconds("the period of every()", period, least=SHORTEST)
+        check_seconds("the period of every()", period, least=SHORTEST)
         return self._tick(period)
 
     async def _tick(self, period: float) -> AsyncIterator[Tick]:
@@ -298,58 +294,58 @@ class Node:
             self._tickers.discard(ticker)
 
     def now(self) -> int:
-        """UTC in ns; never jumps back."""
+        """UTC in ns since 1970; never jumps back."""
         return self._space.clock.now()
 
     def network_time(self) -> int | None:
-        """The time in ns that all nodes on the module's RTCAN bus share, of the first one of several.
+        """The time in ns that all nodes on the module's RTCAN bus share; of several buses, the first one's.
 
-        None: there is no bus, or no master on it.
+        None: there is no bus, or it has no master.
         """
         return next((time for link in self._space.links if (time := link.network_time()) is not None), None)
 
     def events(self) -> AsyncIterator[ModuleEvent]:
-        """What happens to the module's links and on the network, from this call on, as `Module.events`."""
+        """Iterate over what happens to the module's links and on the network, from this call on: `Module.events`."""
         return self._events.listen()
 
     def crash(self, error: Exception) -> None:
-        """End this node with an error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
+        """End this node with the error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
         self.crashed(error)
 
     @property
     def ending(self) -> bool:
-        """Whether its end has begun: it was stopped, has crashed, or its function is in a `finally` by an exception.
+        """Whether its end has begun: it was stopped, it crashed, or an exception has reached a `finally` in it.
 
-        From then on only its function has a say: no `fill`, `on_missed`, `on_timeout` or the like is called.
+        From then on no `fill`, `on_missed`, `on_timeout` or the like is called: only its clean-up runs.
         """
         return self._ending or self.unwinds()
 
     def end(self) -> None:
-        """Its end begins: periodic publishers fall silent, so that nothing contradicts what its clean-up publishes."""
+        """Begin the end: silence periodic publishers, so that nothing contradicts what the clean-up publishes."""
         self._ending = True
         for publisher in self.publishers:
             if isinstance(publisher, PeriodicPublisher):
                 publisher.silence()
 
-    def forget(self, user: object) -> None:
-        """A publisher or subscriber of the node was closed."""
+    def forget(self, endpoint: object) -> None:
+        """Drop a publisher or subscriber of the node that was closed."""
         # The type checker wants a key that may be there; it is in one of the two at most.
-        self.publishers.pop(user, None)  # type: ignore[call-overload]
-        self.subscribers.pop(user, None)  # type: ignore[call-overload]
+        self.publishers.pop(endpoint, None)  # type: ignore[call-overload]
+        self.subscribers.pop(endpoint, None)  # type: ignore[call-overload]
 
-    def enter(self) -> None:
-        """The node's function starts: its priority counts from now on."""
-        self._entered = True
-        self._space.wake_scheduler.enter(self.priority)
+    def started(self) -> None:
+        """Note that the node's function starts: from now on its priority holds back less important nodes."""
+        self._started = True
+        self._space.wake_scheduler.node_started(self.priority)
 
     def close(self) -> None:
-        """Close all its publishers and subscribers; the module does so when the node's function has ended."""
+        """Close all its publishers and subscribers. The module does so when the node's function has ended."""
         self.closed = self._ending = True
         for each in (*self.publishers, *self.subscribers, *self._tickers):
             each.close()
-        if self._entered:
-            self._entered = False
-            self._space.wake_scheduler.leave(self.priority)
+        if self._started:
+            self._started = False
+            self._space.wake_scheduler.node_ended(self.priority)
 
     def _log_crash(self, error: Exception) -> None:
         self.log.error("node %s, which does not run: %r", self.name, error, exc_info=error)
@@ -360,30 +356,30 @@ class Node:
         name = topic_name(topic)
         name = topic_name(self._remap.get(name, name))
         if name == MANAGEMENT:
-            raise InvalidName(f"topic {name} is the management's: take another name")
+            raise InvalidName(f"topic {name} is reserved for management messages: choose another name")
         return name
 
     async def _serve(self) -> bool:
         served = False
-        for subscriber in self._listening():
+        for subscriber in self._with_callback():
             served |= await subscriber.serve()
         return served
 
     async def _arrival(self) -> None:
-        """Wait until a subscription with a callback gets a message."""
-        listening = self._listening()
-        if not listening and not any(isinstance(each, PeriodicPublisher) for each in self.publishers):
+        """Wait until a message comes for a subscription with a callback."""
+        subscribers = self._with_callback()
+        if not subscribers and not any(isinstance(each, PeriodicPublisher) for each in self.publishers):
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
         waiter = self._space.loop.create_future()
         try:
-            for subscriber in listening:
+            for subscriber in subscribers:
                 subscriber.wait_by(waiter)
             await waiter
         finally:
-            for subscriber in listening:
+            for subscriber in subscribers:
                 subscriber.wait_no_more(waiter)
 
-    def _listening(self) -> list[Subscriber[Any]]:
+    def _with_callback(self) -> list[Subscriber[Any]]:
         return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
 
 
@@ -396,7 +392,7 @@ def _check_links(
     *,
     strict: bool,
 ) -> None:
-    """Tell of links that do not take the topic; `strict` raises TransportError where they give less than its class."""
+    """Warn of links that can't send the topic; `strict` raises TransportError where one gives less than its class."""
     for link in space.links:
         reason = link.refusal(size)
         if reason and not strict:

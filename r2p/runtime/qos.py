@@ -1,23 +1,23 @@
-"""The three classes of publisher as values (thesis 5.3.6), and what they signal."""
+"""The three classes of publisher as values (thesis 5.3.6), and what they report to the callbacks given with them."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import msgspec
 
-from r2p.durations import SHORTEST, seconds
+from r2p.clock import SHORTEST, check_seconds
 from r2p.errors import MessageError
 from r2p.messages import Message
 from r2p.runtime.sample import PublisherClass
-from r2p.runtime.topic import number
 
 M = TypeVar("M", bound=Message)
 
 
 class Missed(msgspec.Struct, frozen=True):
-    """A message that did not reach everybody in time, or the news that it may not from now on.
+    """A message that did not reach every subscriber in time, or the notice that messages may not from now on.
 
-    `where` names the subscriber's node or the link; `late` is in seconds (0: unknown); `count` is how many messages.
+    Publishers log it, and give it to `on_missed`, `on_late` or `on_degraded` of their class. `where` names the node of
+    the subscriber, or the link; `late` is in seconds (0: unknown); `count` is the number of messages.
     """
 
     topic: str
@@ -36,19 +36,25 @@ Signal = Callable[[Missed], object]
 
 
 class NonRealTime(msgspec.Struct, frozen=True, kw_only=True):
-    """Class of a publisher whose messages do not expire: `publish` waits for room up to `stall` seconds."""
+    """The class of a publisher whose messages do not expire.
+
+    `publish()` waits for room up to `stall` seconds; after that it goes on without the subscribers that have none,
+    which is reported to `on_missed`. `on_degraded` is called when a link that carried the topic goes down.
+    """
 
     publisher_class: ClassVar = PublisherClass.NON_REAL_TIME
+    on_late: ClassVar = None
     stall: float = 1.0
     on_missed: Signal | None = None
     on_degraded: Signal | None = None
 
 
 class Sporadic(msgspec.Struct, frozen=True):
-    """Class of an event-triggered publisher: messages must be in every queue `deadline` seconds after `publish`.
+    """The class of an event-triggered publisher: a message is due in every queue `deadline` seconds after `publish()`.
 
-    At most `pending` messages wait for room, in order. One that is overdue is given up (`late="drop"`) or still sent
-    (`late="send"`); it is counted and signalled either way.
+    At most `pending` messages wait for room, in order; one more drops the oldest of them. An overdue message is dropped
+    (`late="drop"`) and reported to `on_missed`, or still sent (`late="send"`) and reported to `on_late`. `on_degraded`
+    is called when a link can't do what the class asks for any more.
     """
 
     publisher_class: ClassVar = PublisherClass.SPORADIC
@@ -61,9 +67,12 @@ class Sporadic(msgspec.Struct, frozen=True):
 
 
 class Periodic(msgspec.Struct, Generic[M], frozen=True):
-    """Class of a time-triggered publisher: `fill()` gives the message of each period (seconds); None skips one.
+    """The class of a time-triggered publisher: `fill()` returns the message of each period; None skips the period.
 
-    Where a link has slots for it, they are the clock: `fill` is called `lead` seconds before each.
+    `period` is in seconds. Where a link has reserved slots for the topic, these are the clock: `fill` is called `lead`
+    seconds before each slot. A message that misses its period or its slot is reported to `on_missed`; a period that
+    begins late, or was skipped because the event loop was blocked, to `on_late`; the loss of a link or of its slots to
+    `on_degraded`.
     """
 
     publisher_class: ClassVar = PublisherClass.PERIODIC
@@ -76,23 +85,29 @@ class Periodic(msgspec.Struct, Generic[M], frozen=True):
 
 
 def check_class(topic: str, klass: NonRealTime | Sporadic | Periodic[Any]) -> None:
-    """Raise MessageError for a class value without sense."""
+    """Raise MessageError for a class value that makes no sense."""
     match klass:
         case NonRealTime():
-            seconds(f"topic {topic}: stall", klass.stall, least=0.0)
+            check_seconds(f"topic {topic}: stall", klass.stall, least=0.0)
         case Sporadic():
-            seconds(f"topic {topic}: deadline", klass.deadline, least=SHORTEST)
-            number(topic, "pending", klass.pending)
+            check_seconds(f"topic {topic}: deadline", klass.deadline, least=SHORTEST)
+            check_count(topic, "pending", klass.pending)
             if klass.late not in ("drop", "send"):
                 raise MessageError(f"topic {topic}: late is 'drop' or 'send', not {klass.late!r}")
         case Periodic():
-            seconds(f"topic {topic}: period", klass.period, least=SHORTEST)
-            seconds(f"topic {topic}: lead", klass.lead, least=0.0)
+            check_seconds(f"topic {topic}: period", klass.period, least=SHORTEST)
+            check_seconds(f"topic {topic}: lead", klass.lead, least=0.0)
             if not callable(klass.fill):
-                raise MessageError(f"topic {topic}: fill is a function that gives the message, not {klass.fill!r}")
+                raise MessageError(f"topic {topic}: fill is a function that returns the message, not {klass.fill!r}")
         case _:
             raise MessageError(f"topic {topic}: give a class value, such as r2p.Sporadic(deadline=0.02), not {klass!r}")
     for name in ("on_missed", "on_late", "on_degraded"):
         signal = getattr(klass, name, None)
         if signal is not None and not callable(signal):
             raise MessageError(f"topic {topic}: {name} is a function that takes an r2p.Missed, not {signal!r}")
+
+
+def check_count(topic: str, option: str, value: object) -> None:
+    """Raise MessageError for what is not a number of messages."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise MessageError(f"topic {topic}: {option} is a number of messages, 1 or more, not {value!r}")

@@ -1,7 +1,7 @@
-"""What flows: one published message on its way from a publisher to every queue.
+"""A sample: one published message on its way from a publisher to every queue.
 
-A sample carries the message both as the object that was published and as packed bytes. A local subscriber takes the
-object, a link takes the bytes, and a gateway never needs the type.
+It carries the message both as the object that was published and as packed bytes. A local subscriber gets the object, a
+link sends the bytes, and a gateway never needs the type.
 """
 
 import enum
@@ -21,9 +21,10 @@ class PublisherClass(enum.IntEnum):
 
 
 class Source(msgspec.Struct, frozen=True):
-    """Where a sample comes from; names that a link can't tell are empty.
+    """Where a sample comes from; names that the link does not carry are empty.
 
-    `link` names the link of this module that it came in by; it is empty for a sample published in this module.
+    `link` names the link of this module by which it came in; it is empty for a sample that was published in this
+    module.
     """
 
     module: str = ""
@@ -35,17 +36,19 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Sample(msgspec.Struct, gc=False):
-    """One published message.
+    """One published message, with what is known of its publication.
 
-    `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none), by the clock of the computer that stamped it,
-    which may show another time than this one's. `expires` is the deadline by the clock here (`protocols.time_left`); 0:
-    it is `deadline`. `stamped` says whether the stamp is the sender's, or else the reception's. `sequence` counts the
-    messages of one publisher from 1; 0 where the link does not carry it.
-    `message` is None until somebody decodes a sample that came over a link. `drop_late`: a link that could not send it
-    by its deadline gives it up, and does not send it late. `hops` counts the gateways that it has crossed.
+    `data` are the packed bytes; `message` is None until a subscriber decodes a sample that came over a link.
 
-    `clock` is how the time of the network where it was stamped translates to UTC, and how well: `clock.utc(...)` is for
-    such times in the payload, which no gateway touches.
+    `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none) by the clock of the computer that stamped it,
+    which may differ from this computer's. `expires` is the deadline by the clock here; 0: the same as `deadline`.
+    `stamped` says whether the stamp is the sender's; otherwise it is the time of reception.
+
+    `sequence` counts the messages of one publisher from 1; 0 where the link does not carry it. `drop_late`: a link that
+    could not send it by its deadline drops it instead of sending it late. `hops` counts the gateways that it crossed.
+
+    `clock` says how the time of the network where it was stamped translates to UTC, and how accurately:
+    `clock.utc(...)` is for such times in the payload, which no gateway changes.
     """
 
     data: bytes

@@ -1,25 +1,24 @@
-"""Subscribers: one bounded queue, and the ways to empty it: `async for`, `fetch`, callbacks.
+"""Subscribers: one bounded queue each, and the ways to read it: `async for`, `fetch`, callbacks.
 
-Nothing is awaited between taking a message and handing it out, so a cancelled reader loses none.
+Nothing is awaited between popping a message and handing it out, so a cancelled reader loses none.
 """
 
 import asyncio
 import inspect
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from types import TracebackType
+from typing import Any, Generic, Literal, Self, TypeVar
 
-from r2p.clock import Alarm
-from r2p.durations import LONGEST, SHORTEST, seconds, timeout_or_none
+import msgspec
+
+from r2p.clock import LONGEST, SHORTEST, Alarm, check_seconds, check_timeout
 from r2p.errors import Closed, DecodeError, MessageError
 from r2p.messages import Layout
+from r2p.runtime.qos import check_count
+from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, SubscriberQueue, checkpoint
 from r2p.runtime.sample import Sample
-from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, SubscriberQueue, Topic, TopicSpace, checkpoint, number
-
-if TYPE_CHECKING:
-    from types import TracebackType
-    from typing import Self
-
+from r2p.runtime.topic import Topic, TopicSpace
 
 T = TypeVar("T")
 
@@ -29,24 +28,35 @@ Keep = Literal["newest", "oldest"]
 _SECOND = 1_000_000_000
 
 
-def check_options(
-    topic: str, *, queue: object, keep: object, callback: object, max_age: object, timeout: object, on_timeout: object
-) -> None:
-    """Raise MessageError for options of `Node.subscribe` without sense."""
-    number(topic, "queue", queue)
-    if keep not in ("newest", "oldest"):
-        raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {keep!r}")
-    if callback is not None and not callable(callback):
-        raise MessageError(f"topic {topic}: a callback is a function, not {callback!r}: options are given by name")
-    if on_timeout is not None and (timeout is None or not callable(on_timeout)):
-        raise MessageError(f"topic {topic}: on_timeout is a function, called after a timeout= without messages")
-    for option, value in (("max_age", max_age), ("timeout", timeout)):
-        if value is not None:
-            seconds(f"topic {topic}: {option}", value, least=SHORTEST)
+class SubscriberOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of `Node.subscribe`, as described there."""
+
+    queue: int
+    lossy: bool
+    keep: Keep
+    callback: Callback[Any] | None
+    max_age: float | None
+    timeout: float | None
+    on_timeout: Callable[[], object] | None
+
+    def check(self, topic: str) -> None:
+        """Raise MessageError for options that make no sense."""
+        check_count(topic, "queue", self.queue)
+        if self.keep not in ("newest", "oldest"):
+            raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {self.keep!r}")
+        if self.callback is not None and not callable(self.callback):
+            raise MessageError(
+                f"topic {topic}: a callback is a function, not {self.callback!r}: options are given by name"
+            )
+        if self.on_timeout is not None and (self.timeout is None or not callable(self.on_timeout)):
+            raise MessageError(f"topic {topic}: on_timeout is a function, called after a timeout= without messages")
+        for option, value in (("max_age", self.max_age), ("timeout", self.timeout)):
+            if value is not None:
+                check_seconds(f"topic {topic}: {option}", value, least=SHORTEST)
 
 
-class _GuardedQueue(deque[Sample]):
-    """A queue that notes when the last message that is fresh enough came in; only for subscribers with a time-out."""
+class _MonitoredQueue(deque[Sample]):
+    """A queue that notes when messages come in; only for subscribers with a time-out, as it costs time."""
 
     def __init__(self, note: Callable[[Sample], None]) -> None:
         super().__init__()
@@ -60,7 +70,7 @@ class _GuardedQueue(deque[Sample]):
 class Subscriber(Generic[T]):
     """One subscription of a node. Made by `Node.subscribe`.
 
-    Iterate it (`async for message in sub`), `fetch()` single messages, or give a callback that `node.spin()` serves.
+    Iterate it (`async for message in sub`), `fetch()` single messages, or give a callback that `node.spin()` calls.
     Leaving an `async for` keeps the subscription; `close()` or `async with` ends it.
     """
 
@@ -70,66 +80,59 @@ class Subscriber(Generic[T]):
         node: EndpointOwner,
         topic: Topic,
         layout: Layout[Any] | None,
-        *,
-        queue: int,
-        lossy: bool,
-        keep: Keep,
-        callback: Callback[T] | None,
-        max_age: float | None,
-        timeout: float | None,
-        on_timeout: Callable[[], object] | None,
+        options: SubscriberOptions,
     ) -> None:
         self.topic = topic.name
-        self.callback = callback
+        self.callback: Callback[T] | None = options.callback
         self.undecodable = 0
-        """Messages whose bytes are none of the type; skipped."""
+        """Messages whose bytes don't decode as the type; skipped."""
         self.stale = 0
         """Messages older than `max_age` when their turn came; skipped."""
         self.timeouts = 0
         """Times that nothing (fresh) came for `timeout` seconds."""
         self._sink = SubscriberQueue(
-            space.wake_scheduler, node, queue, node.priority, lossy=lossy, keep_oldest=keep == "oldest"
+            space.wake_scheduler, node, options.queue, lossy=options.lossy, keep_oldest=options.keep == "oldest"
         )
         self._node = node
         self._space = space
         self._topic = topic
         self._layout = layout
         self._type = None if layout is None else layout.cls
-        self._max_age = None if max_age is None else round(max_age * _SECOND)
-        self._on_timeout = on_timeout
+        self._max_age = None if options.max_age is None else round(options.max_age * _SECOND)
+        self._on_timeout = options.on_timeout
         self._closed = False
         self._silent = False
-        self._credit = 0
-        self._timeout = 0 if timeout is None else round(timeout * _SECOND)
-        self._heard = space.clock.monotonic()
-        self._alarm = Alarm(space.loop, self._check_silence, background=self._unattended)
-        if timeout is not None:
-            self._sink.queue = _GuardedQueue(self._note)
-            self._alarm.set(self._heard + self._timeout)
+        self._since_yield = 0
+        self._timeout = 0 if options.timeout is None else round(options.timeout * _SECOND)
+        self._last_message = space.clock.monotonic()
+        self._alarm = Alarm(space.loop, self._check_silence, background=self._is_idle)
+        if options.timeout is not None:
+            self._sink.queue = _MonitoredQueue(self._note)
+            self._alarm.set(self._last_message + self._timeout)
         self.queue = self._sink.queue
-        """What waits to be read, oldest first."""
+        """The messages that wait to be read, oldest first."""
 
     @property
     def lost(self) -> int:
-        """Messages that found the queue full, or were pushed out of it."""
+        """Messages that a full queue dropped."""
         return self._sink.lost
 
     @property
     def publishers(self) -> int:
-        """Who publishes the topic, as far as this module knows: local publishers and remote ones that answered."""
+        """The number of publishers of the topic that this module knows: its own, and remote ones that answered."""
         return len(self._topic.publishers) + self._topic.remote_publishers
 
     async def wait_publisher(self) -> None:
-        """Wait until somebody publishes the topic. Raises Closed if the subscription is closed before."""
+        """Wait until the topic has a publisher. Raises Closed if the subscription is closed before."""
         if self._closed:
             raise self._is_closed()
         if not self.publishers:
             waiter = self._space.loop.create_future()
-            self._sink.matches.append(waiter)
+            self._sink.publisher_waiters.append(waiter)
             try:
                 await waiter
             finally:
-                self._sink.matches.remove(waiter)
+                self._sink.publisher_waiters.remove(waiter)
 
     def __aiter__(self) -> AsyncIterator[T]:
         return self._iterate(whole=False)
@@ -139,9 +142,10 @@ class Subscriber(Generic[T]):
         return self._iterate(whole=True)
 
     async def _iterate(self, *, whole: bool) -> AsyncIterator[Any]:  # noqa: C901 - see below
-        # One long function, because this is where every message passes: calls would take as long as the work.
+        # One long function with everything in local variables, because this is where every message passes: calls would
+        # take as long as the work. `_next` and `_yield_sometimes` are the same for what is less frequent.
         sink, kind, create_future = self._sink, self._type, self._space.loop.create_future
-        queue, wake_scheduler, fussy = sink.queue, self._space.wake_scheduler, self._max_age is not None
+        queue, wake_scheduler, ages = sink.queue, self._space.wake_scheduler, self._max_age is not None
         while not self._closed:
             if not queue:
                 if sink.waiter is not None:
@@ -152,13 +156,14 @@ class Subscriber(Generic[T]):
                 finally:
                     if sink.waiter is waiter:
                         sink.waiter = None
+            # A node of low priority yields after each message, so that a more important one comes in between.
             credit = YIELD_EVERY if sink.priority >= wake_scheduler.top else 1
             while queue:
                 sample = queue.popleft()
                 if sink.waiting is not None:
                     sink.refill()
                 message = sample.message
-                if fussy or message.__class__ is not kind:
+                if ages or message.__class__ is not kind:
                     message = self._examine(sample)
                     if message is None:
                         continue
@@ -166,7 +171,7 @@ class Subscriber(Generic[T]):
                 credit -= 1
                 if not credit:
                     if queue:
-                        await self._give_way()
+                        await self._yield()
                     break
 
     async def fetch(self, timeout: float | None = None) -> T:
@@ -175,9 +180,9 @@ class Subscriber(Generic[T]):
         Raises MessageError for a time-out that is not a number of seconds.
         """
         if timeout is not None and (timeout.__class__ is not float or not timeout <= LONGEST):
-            timeout_or_none(f"topic {self.topic}: the time-out of fetch", timeout)
+            check_timeout(f"topic {self.topic}: the time-out of fetch", timeout)
         if self.queue:
-            await self._use_credit()
+            await self._yield_sometimes()
         message = self._next()
         if message is not None:
             return message
@@ -195,7 +200,7 @@ class Subscriber(Generic[T]):
         raise self._is_closed()
 
     def close(self) -> None:
-        """End the subscription; whoever waits for its next message is woken."""
+        """End the subscription. A reader that waits for its next message is woken."""
         if not self._closed:
             self._closed = True
             self._alarm.close()
@@ -206,27 +211,27 @@ class Subscriber(Generic[T]):
             self._sink.refill()
             if (reader := self._sink.waiter) is not None and not reader.done():
                 reader.set_result(None)
-            for waiter in self._sink.matches:
+            for waiter in self._sink.publisher_waiters:
                 if not waiter.done():
                     waiter.set_exception(self._is_closed())
 
-    async def __aenter__(self) -> "Self":
+    async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: "TracebackType | None"
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
 
-    # For the node
+    # Called by the node
 
     def open(self) -> None:
-        """Join the topic; a latched value is there at once."""
+        """Join the topic. A latched value is there at once."""
         self._topic.join(self._sink)
         self._space.changed(self._topic)
 
     async def serve(self) -> bool:
-        """Hand what waits now to the callback; says whether there was anything. For `Node.spin`."""
+        """Call the callback with each message that waits now; returns whether there was any. For `Node.spin`."""
         served = False
         for _ in range(len(self.queue)):
             message = self._next()
@@ -235,22 +240,22 @@ class Subscriber(Generic[T]):
             served = True
             if self.callback is not None and inspect.isawaitable(pending := self.callback(message)):
                 await pending
-            await self._use_credit()
+            await self._yield_sometimes()
         return served
 
     def wait_by(self, waiter: asyncio.Future[None]) -> None:
-        """Wake this future at the next message."""
+        """Let the next message wake this future. Raises RuntimeError if another reader waits."""
         if self._sink.waiter is not None:
             raise self._two_readers()
         self._sink.waiter = waiter
 
     def wait_no_more(self, waiter: asyncio.Future[None]) -> None:
-        """Take it back, if it has not been woken."""
+        """Take the future back, if it has not been woken."""
         if self._sink.waiter is waiter:
             self._sink.waiter = None
 
     def _next(self) -> T | None:
-        """The next good message that waits, or None."""
+        """Pop messages up to the next one that is fresh and decodes. None: there is none."""
         sink, queue = self._sink, self.queue
         while queue:
             sample = queue.popleft()
@@ -262,7 +267,7 @@ class Subscriber(Generic[T]):
         return None
 
     def _examine(self, sample: Sample) -> Any:
-        """The sample's message as this subscriber's type; None, counted, if it is too old or does not decode."""
+        """The sample's message as this subscriber's type. None, counted: it is too old, or does not decode."""
         if self._max_age is not None and self._space.clock.now() - sample.stamp > self._max_age:
             self.stale += 1
             return None
@@ -277,12 +282,12 @@ class Subscriber(Generic[T]):
             self.undecodable += 1
             return None
         if sample.message is None:
-            sample.message = message
+            sample.message = message  # for the other subscribers
         return message
 
     async def _arrival(self) -> None:
         """Wait until something is in the queue, or the subscription is closed."""
-        self._credit = 0
+        self._since_yield = 0
         waiter = self._space.loop.create_future()
         self.wait_by(waiter)
         try:
@@ -291,46 +296,46 @@ class Subscriber(Generic[T]):
             self.wait_no_more(waiter)
 
     def _two_readers(self) -> RuntimeError:
-        return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each")
+        return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each task")
 
     def _is_closed(self) -> Closed:
         return Closed(f"the subscription of {self.topic} is closed: subscribe again")
 
-    async def _use_credit(self) -> None:
-        """Let others run after YIELD_EVERY messages in a row; a node of low priority after each."""
-        self._credit += 1
-        if self._credit >= YIELD_EVERY or self._sink.priority < self._space.wake_scheduler.top:
-            self._credit = 0
-            await self._give_way()
+    async def _yield_sometimes(self) -> None:
+        """Let other tasks run after YIELD_EVERY messages in a row; a node of low priority after each."""
+        self._since_yield += 1
+        if self._since_yield >= YIELD_EVERY or self._sink.priority < self._space.wake_scheduler.top:
+            self._since_yield = 0
+            await self._yield()
 
-    async def _give_way(self) -> None:
+    async def _yield(self) -> None:
         wake_scheduler, priority = self._space.wake_scheduler, self._sink.priority
         if priority >= wake_scheduler.top:
             await checkpoint()
         else:
             turn = self._space.loop.create_future()
-            wake_scheduler.queue(priority, turn)
+            wake_scheduler.wake_later(priority, turn)
             await turn
 
     def _note(self, sample: Sample) -> None:
         if self._max_age is None or self._space.clock.now() - sample.stamp <= self._max_age:
-            self._heard = self._space.clock.monotonic()
+            self._last_message = self._space.clock.monotonic()
             if self._silent:
                 self._silent = False
-                self._alarm.set(self._heard + self._timeout)
+                self._alarm.set(self._last_message + self._timeout)
 
-    def _unattended(self) -> bool:
-        """Whether nothing comes of a time-out now: nobody waits for a message, and there is nothing to call."""
+    def _is_idle(self) -> bool:
+        """Whether a time-out has no effect now: no reader waits, and there is no function to call."""
         return self._sink.waiter is None and self._on_timeout is None
 
     def _check_silence(self) -> None:
         now = self._space.clock.monotonic()
-        if now < self._heard + self._timeout:
-            self._alarm.set(self._heard + self._timeout)
+        if now < self._last_message + self._timeout:
+            self._alarm.set(self._last_message + self._timeout)
             return
         self.timeouts += 1
         if self._on_timeout is not None:
-            self._silent = True
+            self._silent = True  # called once: the next message starts the alarm again
             if self._node.ending:
                 return
             try:
@@ -338,7 +343,7 @@ class Subscriber(Generic[T]):
             except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
                 self._node.crash(error)
             return
-        self._heard = now
+        self._last_message = now
         self._alarm.set(now + self._timeout)
         if (reader := self._sink.waiter) is not None and not reader.done():
             reader.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / _SECOND} s"))

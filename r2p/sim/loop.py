@@ -23,8 +23,7 @@ from heapq import heappush
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, TypeVarTuple, Unpack
 
-from r2p.clock import SystemClock
-from r2p.durations import timeout_or_none
+from r2p.clock import SystemClock, check_timeout
 from r2p.errors import Deadlock
 from r2p.modules.unwinding import frames
 
@@ -64,7 +63,7 @@ def run(
     going: Deadlock comes when it has woken no task for half a second of real time and 20 seconds of virtual time. Where
     nodes talk to each other for ever, only `limit` ends that: Deadlock comes after so many seconds of virtual time.
     """
-    timeout_or_none("the limit", limit)
+    check_timeout("the limit", limit)
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed=seed, limit=limit)) as runner:
         return runner.run(main() if callable(main) else main)
 

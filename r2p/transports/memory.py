@@ -14,9 +14,8 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from r2p.clock import in_background, random_of
+from r2p.clock import check_seconds, in_background, random_of
 from r2p.codecs.attachment import ClockOffset
-from r2p.durations import seconds
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
@@ -87,8 +86,8 @@ class MemoryNetwork:
         jitter: float = 0.0,
         seed: int | None = None,
     ) -> None:
-        seconds("the delay of a memory network", delay, least=0.0)
-        seconds("the jitter of a memory network", jitter, least=0.0)
+        check_seconds("the delay of a memory network", delay, least=0.0)
+        check_seconds("the jitter of a memory network", jitter, least=0.0)
         self.loss = loss
         self.duplicate = duplicate
         self.reorder = reorder

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import msgspec
 
-from r2p.durations import duration as duration  # for the options of URLs
+from r2p.clock import duration as duration  # for the options of URLs
 from r2p.errors import TransportError
 from r2p.transports.link import Transport
 

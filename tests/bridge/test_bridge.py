@@ -322,10 +322,10 @@ async def test_an_order_that_goes_nowhere_is_refused_once() -> None:
 
 async def test_an_order_without_a_prefix_does_not_ask_for_all_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     async with gateway(networks="abcd") as gw:
-        assert gw._hub is not None
-        assert gw._hub.bridge is not None
+        assert gw._link_manager is not None
+        assert gw._link_manager.bridge is not None
         asked = Mock(return_value=[])
-        monkeypatch.setattr(gw._hub.bridge.directory, "own_modules", asked)
+        monkeypatch.setattr(gw._link_manager.bridge.directory, "own_modules", asked)
         a, b = Tap("a"), Tap("b")
         a.say(management.Stop("IMU1"))
         await asyncio.sleep(0.1)

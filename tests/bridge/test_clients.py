@@ -209,7 +209,7 @@ async def test_nothing_is_lost_where_a_gateway_stood_still_and_is_alone() -> Non
 
 def stand_still(gateway: r2p.Module, seconds: float) -> None:
     """As if its event loop had not run for so long, in which no other module sent anything."""
-    bridge = gateway._hub.bridge if gateway._hub is not None else None
+    bridge = gateway._link_manager.bridge if gateway._link_manager is not None else None
     assert bridge is not None
     tree = bridge.tree
     tree._updated_at -= round(seconds * 1e9)
@@ -242,7 +242,7 @@ async def test_a_line_without_a_gateway_goes_on_at_once() -> None:
         one.hear(manage(management.Advertise("leds", 5)))
         await asyncio.sleep(CONVERGED)
         one.hear(manage(management.SubscribeResponse("leds", 5, 5)))
-        bridge = gw._hub.bridge if gw._hub is not None else None
+        bridge = gw._link_manager.bridge if gw._link_manager is not None else None
         assert bridge is not None
         bridge.tree._updated_at -= 5_000_000_000
         one.hear(line("leds", Led(led=3).encode()))

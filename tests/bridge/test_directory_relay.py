@@ -67,7 +67,7 @@ async def test_firmware_that_was_heard_lately_is_told_and_not_one_that_is_silent
 async def test_a_link_on_which_much_comes_and_goes_is_looked_at_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     """And each change is announced all the same."""
     async with gateway() as gw, r2p.Module("B", via="memory:b") as b:
-        bridge = gw._hub.bridge if gw._hub is not None else None
+        bridge = gw._link_manager.bridge if gw._link_manager is not None else None
         assert bridge is not None
         looks = []
         look = bridge.directory._look

@@ -27,7 +27,7 @@ SETTLED = 5.0
 
 
 def bridge_of(module: r2p.Module) -> bridge.Bridge:
-    hub = module._hub
+    hub = module._link_manager
     assert hub is not None
     assert hub.bridge is not None
     return hub.bridge
@@ -124,7 +124,7 @@ async def test_the_review_of_one_topic(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_the_alarm_of_a_module_with_several_links(monkeypatch: pytest.MonkeyPatch) -> None:
     async with gateway(), r2p.Module("PC", via=["memory:a", "memory:b"]) as module:
-        multihomed = module._hub and module._hub._joints
+        multihomed = module._link_manager and module._link_manager._bridging
         assert isinstance(multihomed, MultihomedModule)
         monkeypatch.setattr(multihomed.selection, "poll", once(multihomed.selection.poll))
         await asyncio.sleep(SETTLED)

@@ -61,7 +61,7 @@ async def test_names_too_long_for_a_link_are_told_once_and_floods_of_them_once_a
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async with gateway() as module:
-        routing = module._hub.bridge.routing  # type: ignore[union-attr]
+        routing = module._link_manager.bridge.routing  # type: ignore[union-attr]
         port = routing._ports["memory:a"]
         for number in range(2 * LONG_NAMES):
             for _ in range(2):

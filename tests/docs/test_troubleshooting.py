@@ -65,7 +65,7 @@ async def test_a_module_is_stopped(r2p_network: Network, caplog: pytest.LogCaptu
 
 
 def test_the_computer_is_busy_or_was_stopped() -> None:
-    assert watchdog.NOBODY % 100 in PAGE
+    assert watchdog.NOT_RUNNING % 100 in PAGE
     assert (watchdog.BLOCKED % ("task PC1/plan", 100, "", "")).rstrip() in PAGE
     assert watchdog.AGAIN % ("task PC1/plan", 100, " (7 more since the last such line)", "...") in PAGE
     assert watchdog.STOPPED % 8 in PAGE

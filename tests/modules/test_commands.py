@@ -33,7 +33,7 @@ async def test_stop_ends_the_nodes_and_reboot_starts_them_again() -> None:
             assert (b.stopped, b.nodes["counts"].running, waiting.done()) == (True, False, False)
             assert a.links[0].discovery.modules["B"].flags & FLAG_STOPPED  # management goes on
             assert "leds" not in b.space.topics
-            with pytest.raises(r2p.Error, match="module B is stopped: reboot it first"):
+            with pytest.raises(r2p.Error, match="module B is stopped: call its reboot"):
                 b.start(hold)
             a.command(r2p.Command.REBOOT, "B")
             await settle(2.0)

@@ -8,7 +8,8 @@ import r2p
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.messages import layout
-from r2p.modules.graph import Endpoint, ModuleView, describe_mismatch
+from r2p.modules.graph import Endpoint, ModuleView
+from r2p.modules.link_manager import describe_mismatch
 from r2p.msg import Led
 from r2p.protocols.discovery.events import Mismatched, TopicType
 from tests.bench import hold, joined, local, settle

@@ -55,11 +55,11 @@ async def test_where_the_links_come_from(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.virtual_time
 async def test_a_module_is_opened_once() -> None:
     module = local()
-    with pytest.raises(r2p.Closed, match="module PC1 is not open: use it in `async with`"):
+    with pytest.raises(r2p.Closed, match="module PC1 is not open: use it in an `async with` block"):
         module.start(hold)
     with pytest.raises(r2p.Closed):
         await module.reboot()
-    with pytest.raises(r2p.Closed, match="use it in `async with`"):
+    with pytest.raises(r2p.Closed, match="use it in an `async with` block"):
         module.query()
     with pytest.raises(r2p.Closed):
         module.command(r2p.Command.STOP, "IMU1")
@@ -153,15 +153,15 @@ async def test_what_start_refuses() -> None:
 
     async with local() as module:
         module.start(hold)
-        with pytest.raises(r2p.Error, match="module PC1 has a node hold already: give this one another name="):
+        with pytest.raises(r2p.Error, match="module PC1 already has a node hold: give this one another name="):
             module.start(hold)
-        with pytest.raises(r2p.NameTooLong, match=r"'much_too_long' is no node name, .* at most 8 .*: give name="):
+        with pytest.raises(r2p.NameTooLong, match=r"'much_too_long' is not a valid node name: .* at most 8"):
             module.start(much_too_long)
         with pytest.raises(r2p.NameTooLong):
             module.start(hold, name="much_too_long")
         with pytest.raises(r2p.InvalidName):
             module.start(hold, name="a/b")
-        with pytest.raises(r2p.Error, match="is no coroutine function: write `async def name"):
+        with pytest.raises(r2p.Error, match="is not a coroutine function: write `async def name"):
             module.start(plain)  # type: ignore[arg-type]
         assert list(module.nodes) == ["hold"]
 

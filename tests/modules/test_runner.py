@@ -223,7 +223,7 @@ def test_wrong_functions_are_told_before_anything_runs() -> None:
     async def a_long_name(node: r2p.Node) -> None:
         await settle()
 
-    with pytest.raises(r2p.NameTooLong, match="function name 'a_long_name' is no node name"):
+    with pytest.raises(r2p.NameTooLong, match="function name 'a_long_name' is not a valid node name"):
         r2p.run(a_long_name)
 
 

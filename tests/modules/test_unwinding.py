@@ -258,7 +258,7 @@ def test_a_coroutine_that_has_ended_or_not_begun_cleans_nothing_up() -> None:
 def test_what_is_remembered_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     known: dict[int, Any] = {}
     monkeypatch.setattr("r2p.modules.unwinding._known", known)
-    monkeypatch.setattr("r2p.modules.unwinding._MOST", 2)
+    monkeypatch.setattr("r2p.modules.unwinding._REMEMBERED", 2)
     for shape in (in_finally, in_except, in_a_with):
         coroutine = shape()
         with contextlib.suppress(StopIteration, OSError):

@@ -104,7 +104,7 @@ async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatc
     async with robot(hold) as bot, tool() as session:
         await bot.reboot()
         await asyncio.sleep(1)
-        monkeypatch.setattr(bot._hub, "_obey", lambda _command: None)
+        monkeypatch.setattr(bot._link_manager, "_on_command", lambda _command: None)
         with pytest.raises(
             TimedOut, match=r"BOT did not confirm REBOOT in 4 s: it is running, heard .* rebooted before"
         ):
@@ -124,7 +124,7 @@ async def test_a_gateway_that_refuses_an_order_says_so_at_once(monkeypatch: pyte
 
 async def test_an_order_that_a_gateway_may_have_refused_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     async with robot(hold) as bot, tool() as session:
-        monkeypatch.setattr(bot._hub, "_obey", lambda _command: None)
+        monkeypatch.setattr(bot._link_manager, "_on_command", lambda _command: None)
         await session.settle()
         (seen,) = (view for view in session.module.network.modules() if view.name == "BOT")
         far = msgspec.structs.replace(seen, link="zenoh:tcp/10.0.0.5:7447")

@@ -10,8 +10,9 @@ import pytest
 
 from r2p.clock import clock_of
 from r2p.runtime.backpressure import WaitQueue
+from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import Sample, Source
-from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace, WakeScheduler
+from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
 from r2p.transports.buffered_link import Arrival, BufferedLink
 from r2p.transports.receive_backpressure import FULL_QUEUE_TURNS, LONGEST_STALL
 
@@ -225,4 +226,4 @@ async def test_a_message_that_raises_while_it_waits_for_room_waits_no_more() -> 
     with pytest.raises(RuntimeError):
         other.refill()  # a link guards this, and goes on
     await asyncio.sleep(LONGEST_STALL)
-    assert (other.taken, end.reads, other.waiting.deliveries) == (ALL[2:], True, deque())
+    assert (other.taken, end.reads, other.waiting.non_real_time) == (ALL[2:], True, deque())

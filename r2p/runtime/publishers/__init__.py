@@ -1,11 +1,11 @@
-"""Publishers: the three classes of the thesis (5.3.6), and what each does when somebody has no room.
+"""Publishers: the three classes of the thesis (5.3.6), and what each does where there is no room.
 
-    non real-time   waits for room, at most `stall` seconds, then goes on without the slow one
-    sporadic        never waits; what is not in every queue and on every link by its deadline is missed
-    periodic        never waits; is asked for a message at every period, which is missed where there is no room in it
+    non_real_time   waits for room, at most `stall` seconds, then goes on without the slow subscribers
+    sporadic        never waits; a message that is not in every queue and on every link by its deadline is missed
+    periodic        never waits; `fill` is called at every period, and the message is missed where there is no room
 
-Each counts its misses, signals them by a callback of its class value, and logs them at most once a second. What waits
-stands in line before the sinks that lack it (`r2p.room`); here is what becomes of it there.
+Read `base` first: there each miss is counted, logged at most once a second, and given to the callbacks of the class
+value (`r2p.runtime.qos`). What waits is in the queues of `r2p.runtime.backpressure`.
 """
 
 from typing import Any

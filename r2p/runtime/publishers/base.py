@@ -1,4 +1,11 @@
-"""What all publishers share: their topic, their counters, and how they tell what somebody missed."""
+"""What all publishers share: their topic, their counters, and how they report what was missed or late.
+
+    _miss      a message has not reached a queue or a link: `missed`, and `on_missed`
+    link_late  a message was sent after its deadline: `late`, and `on_late`; publishers report their own delays likewise
+    link_degraded   a link, or its slots, are lost: `on_degraded`
+
+All go through `_report`: one line of the log a second at most, and the callback of the class value.
+"""
 
 import asyncio
 from collections import deque
@@ -7,21 +14,22 @@ from typing import Generic, NoReturn, TypeVar
 
 from msgspec import structs
 
-from r2p.durations import timeout_or_none
+from r2p.clock import check_timeout
 from r2p.errors import Closed, MessageError
 from r2p.log_lines import LineLimit
 from r2p.messages import Layout, Message
 from r2p.runtime.backpressure import LINK_DOWN, Sink
-from r2p.runtime.qos import Missed, Signal
+from r2p.runtime.qos import Missed, NonRealTime, Periodic, Signal, Sporadic
+from r2p.runtime.queues import YIELD_EVERY, EndpointOwner
 from r2p.runtime.sample import PublisherClass, Sample, Source
-from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, Topic, TopicSpace
+from r2p.runtime.topic import Topic, TopicSpace
 
 M = TypeVar("M", bound=Message)
 
-_LINES = 1  # of the log in a second about what is missed or late
-_AGAIN = 0.001  # seconds until a signal that publishes is told what became of that
-_AT_ONCE = 4  # of those, one by one
-_REMEMBERED = 64  # messages that were missed last
+_LOG_LINES = 1  # a second about what is missed or late
+_CALLBACK_PAUSE = 0.001  # seconds between callbacks where one causes the next: else the event loop would stand still
+_MOST_DEFERRED = 4  # callbacks that wait for that one by one; what comes on top is added to the last one
+_REMEMBERED = 64  # sequence numbers of messages that were missed last: several links may report one message
 
 
 class BasePublisher(Generic[M]):
@@ -29,7 +37,16 @@ class BasePublisher(Generic[M]):
 
     publisher_class: PublisherClass
 
-    def __init__(self, space: TopicSpace, node: EndpointOwner, topic: Topic, layout: Layout[M], *, latch: bool) -> None:
+    def __init__(
+        self,
+        space: TopicSpace,
+        node: EndpointOwner,
+        topic: Topic,
+        layout: Layout[M],
+        klass: NonRealTime | Sporadic | Periodic[M],
+        *,
+        latch: bool,
+    ) -> None:
         self.topic = topic.name
         self.type = layout.cls
         self.node = node
@@ -37,9 +54,12 @@ class BasePublisher(Generic[M]):
         self.sent = 0
         """Messages published; the sequence number of the last one."""
         self.missed = 0
-        """Messages that somebody did not get in time."""
+        """Messages that did not reach every subscriber in time."""
         self.late = 0
         """Messages that were published or sent after their time."""
+        self._on_missed = klass.on_missed
+        self._on_late: Signal | None = klass.on_late
+        self._on_degraded = klass.on_degraded
         self._space = space
         self._topic = topic
         self._encode = layout.encode
@@ -47,11 +67,11 @@ class BasePublisher(Generic[M]):
         self._now = space.clock.now
         self._source = Source(space.module, node.name)
         self._last: Sample | None = None
-        self._credit = YIELD_EVERY
-        self._lines = LineLimit(_LINES)
+        self._until_yield = YIELD_EVERY
+        self._log_limit = LineLimit(_LOG_LINES)
         self._waiters: list[asyncio.Future[None]] = []
-        self._signalling = False
-        self._later: list[tuple[Signal, Missed]] = []
+        self._in_callback = False
+        self._deferred: list[tuple[Signal, Missed]] = []
         self._missed_lately: deque[int] = deque(maxlen=_REMEMBERED)
         self._newest_missed = 0
 
@@ -62,11 +82,11 @@ class BasePublisher(Generic[M]):
 
     @property
     def subscribers(self) -> int:
-        """Who would get a message now: local queues, and one for each link with subscribers behind it."""
-        return len(self._topic.queues) + sum(outlet.reachable for outlet in self._topic.remote_subscribers)
+        """The number that would get a message now: queues of this module, and links with subscribers behind them."""
+        return len(self._topic.queues) + sum(remote.reachable for remote in self._topic.remote_subscribers)
 
     async def wait_subscriber(self) -> None:
-        """Wait until somebody subscribes. Raises Closed if the publisher is closed before."""
+        """Wait until the topic has a subscriber. Raises Closed if the publisher is closed before."""
         if self not in self._topic.publishers:
             raise self._is_closed()
         if not self.subscribers:
@@ -79,7 +99,7 @@ class BasePublisher(Generic[M]):
 
     @property
     def guarantees(self) -> dict[str, str]:
-        """What the publisher's class means on each link, by link name; "" is this module."""
+        """What the publisher's class means on each link, in words, by the name of the link; "" is this module."""
         local = {
             PublisherClass.NON_REAL_TIME: "waits for room in every queue",
             PublisherClass.SPORADIC: "in every queue by the deadline, or signalled",
@@ -89,18 +109,17 @@ class BasePublisher(Generic[M]):
         return {"": local[self.publisher_class]} | links
 
     async def ready(self, timeout: float | None = None) -> None:
-        """Wait until every link that is up has admitted the topic.
+        """Wait until every link that is up has admitted the topic; links that give best effort do so at once.
 
         Raises TimeoutError after `timeout` seconds, and MessageError for a time-out that is not a number of seconds.
-        Links that give best effort admit at once.
         """
-        timeout_or_none(f"topic {self.topic}: the time-out of ready", timeout)
+        check_timeout(f"topic {self.topic}: the time-out of ready", timeout)
         async with asyncio.timeout(timeout):
             for link in list(self._space.links):
                 await link.admission(self.topic)
 
     def close(self) -> None:
-        """Stop publishing; the links tell their peers."""
+        """Stop publishing; the links inform their peers."""
         if self in self._topic.publishers:
             self._topic.publishers.remove(self)
             self._encode = self._closed
@@ -119,7 +138,7 @@ class BasePublisher(Generic[M]):
     # Called by the topic and its links
 
     def subscriber_joined(self, sink: Sink) -> None:
-        """Somebody joined, or came back after a reboot: a latched value is sent again."""
+        """Send a latched value: a subscriber joined, or came back after a reboot."""
         if self._last is not None:
             sink.offer_latched(self._last)
         for waiter in self._waiters:
@@ -127,26 +146,22 @@ class BasePublisher(Generic[M]):
                 waiter.set_result(None)
 
     def link_degraded(self, link: str, reason: str) -> None:
-        """A link that carried the topic does not any more."""
-        self._signal(Missed(self.topic, reason, where=link, count=0), self._on_degraded)
+        """Report that a link that carried the topic does not any more, or has lost its slots."""
+        self._report(Missed(self.topic, reason, where=link, count=0), self._on_degraded)
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
-        """A link gave up a message that it had taken; `late` is in seconds.
+        """Report that a link gave up a message that it had accepted, as one in a slot that passed; `late` in seconds.
 
-        With its `sequence` a message that others missed, too, counts once.
+        With its `sequence` a message that is missed on several links counts once.
         """
         self._miss(sequence, reason, link, late)
 
     def link_late(self, link: str, reason: str, late: float = 0.0) -> None:
-        """A link sent a message after its deadline."""
+        """Report that a link sent a message after its deadline; `late` in seconds."""
         self.late += 1
-        self._signal(Missed(self.topic, reason, link, late), self._on_late)
+        self._report(Missed(self.topic, reason, link, late), self._on_late)
 
     # For the classes below
-
-    _on_missed: Signal | None = None
-    _on_late: Signal | None = None
-    _on_degraded: Signal | None = None
 
     def _sample(self, message: M, deadline: int = 0) -> Sample:
         if message.__class__ is not self.type:
@@ -165,17 +180,17 @@ class BasePublisher(Generic[M]):
         return MessageError(f"topic {self.topic} takes {self.type.__name__}, not {type(message).__name__}")
 
     def _miss(self, sequence: int, reason: str, without: str | Sequence[Sink], late: float = 0.0) -> None:
-        """A message has not reached these sinks, or this link; however many that are, it counts once."""
-        is_news = self._is_news(sequence)
-        self.missed += is_news
-        # As _line_suffix, inlined: where a queue is full, this is done for each message.
-        more = None if reason == LINK_DOWN else self._lines.suffix("", self._clock.monotonic())
-        if self._on_missed is not None or more is not None:
+        """Count and report a message that has not reached these sinks, or this link: once, however many they are."""
+        is_first = self._is_first_miss(sequence)
+        self.missed += is_first
+        # `_report`, inlined: where a queue is full, this runs for each message, mostly without a line and a callback.
+        suffix = None if reason == LINK_DOWN else self._log_limit.suffix("", self._clock.monotonic())
+        if self._on_missed is not None or suffix is not None:
             names = without if isinstance(without, str) else where(without)
-            self._tell(Missed(self.topic, reason, names, late, int(is_news)), self._on_missed, more)
+            self._log_and_call(Missed(self.topic, reason, names, late, int(is_first)), self._on_missed, suffix)
 
-    def _is_news(self, sequence: int) -> bool:
-        """Whether this message has not been missed yet; of one without a number that is not known."""
+    def _is_first_miss(self, sequence: int) -> bool:
+        """Whether this message has not been missed yet. One without a number counts each time."""
         if not sequence:
             return True
         if sequence <= self._newest_missed and (sequence == self._newest_missed or sequence in self._missed_lately):
@@ -184,56 +199,53 @@ class BasePublisher(Generic[M]):
         self._missed_lately.append(sequence)
         return True
 
-    def _line_suffix(self, reason: str) -> str | None:
-        """What to append to a line of the log; None: leave it out, as all of a link that is down: that is logged."""
-        return None if reason == LINK_DOWN else self._lines.suffix("", self._clock.monotonic())
-
-    def _unreachable(self, sample: Sample, sinks: list[Sink]) -> None:
-        """Links that are down: who is behind them misses the sample."""
+    def _miss_unreachable(self, sample: Sample, sinks: list[Sink]) -> None:
+        """Count and report a sample as missed by the subscribers behind links that are down."""
         for sink in sinks:
             sink.force(sample)
         self._miss(sample.sequence, LINK_DOWN, sinks)
 
-    def _signal(self, missed: Missed, callback: Signal | None) -> None:
-        self._tell(missed, callback, self._line_suffix(missed.reason))
+    def _report(self, missed: Missed, callback: Signal | None) -> None:
+        """Log it, and call the user's callback; a link that is down has been logged as such."""
+        suffix = None if missed.reason == LINK_DOWN else self._log_limit.suffix("", self._clock.monotonic())
+        self._log_and_call(missed, callback, suffix)
 
-    def _tell(self, missed: Missed, callback: Signal | None, more: str | None) -> None:
-        """Log it, unless `more` is None, and call the user's code."""
-        if more is not None:
-            self.node.log.warning("%s (missed %d, late %d so far)%s", missed, self.missed, self.late, more)
+    def _log_and_call(self, missed: Missed, callback: Signal | None, suffix: str | None) -> None:
+        if suffix is not None:
+            self.node.log.warning("%s (missed %d, late %d so far)%s", missed, self.missed, self.late, suffix)
         if callback is None:
             return
-        if self._signalling:
-            self._signal_later(missed, callback)
+        if self._in_callback:
+            self._defer(missed, callback)
         else:
             self._call(missed, callback)
 
     def _call(self, missed: Missed, callback: Signal) -> None:
         if self.node.ending:
             return
-        self._signalling = True
+        self._in_callback = True
         try:
             callback(missed)
         except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
             # Later: a link may be at work in the node's own task, where a crash would raise through it.
             self._space.loop.call_soon(self.node.crash, error)
         finally:
-            self._signalling = False
+            self._in_callback = False
 
-    def _signal_later(self, missed: Missed, callback: Signal) -> None:
-        """A signal publishes, and that is missed, too: signal it when that is over; what is too much becomes one."""
-        if not self._later:
-            self._space.loop.call_later(_AGAIN, self._signal_now)
-        elif len(self._later) >= _AT_ONCE and self._later[-1][0] is callback:
-            missed = structs.replace(missed, count=self._later.pop()[1].count + missed.count)
-        self._later.append((callback, missed))
+    def _defer(self, missed: Missed, callback: Signal) -> None:
+        """Report later: a callback has published a message that is missed as well, and must not be called in itself."""
+        if not self._deferred:
+            self._space.loop.call_later(_CALLBACK_PAUSE, self._call_deferred)
+        elif len(self._deferred) >= _MOST_DEFERRED and self._deferred[-1][0] is callback:
+            missed = structs.replace(missed, count=self._deferred.pop()[1].count + missed.count)
+        self._deferred.append((callback, missed))
 
-    def _signal_now(self) -> None:
-        later, self._later = self._later, []
-        for callback, missed in later:
+    def _call_deferred(self) -> None:
+        deferred, self._deferred = self._deferred, []
+        for callback, missed in deferred:
             self._call(missed, callback)
 
 
 def where(sinks: Sequence[Sink]) -> str:
-    """The names of nodes and links, for a signal."""
+    """The names of nodes and links, for a `Missed`."""
     return ", ".join(dict.fromkeys(sink.owner for sink in sinks))

@@ -1,4 +1,4 @@
-"""Non real-time: waits for room, at most `stall` seconds, then goes on without the slow one."""
+"""Non real-time: waits for room, at most `stall` seconds, then goes on without the slow subscribers."""
 
 import asyncio
 
@@ -6,8 +6,9 @@ from r2p.messages import Layout
 from r2p.runtime.backpressure import CANCELLED, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M
 from r2p.runtime.qos import NonRealTime
+from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, checkpoint
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, Topic, TopicSpace, checkpoint
+from r2p.runtime.topic import Topic, TopicSpace
 
 _NRT = PublisherClass.NON_REAL_TIME
 
@@ -27,18 +28,17 @@ class Publisher(BasePublisher[M]):
         *,
         latch: bool,
     ) -> None:
-        super().__init__(space, node, topic, layout, latch=latch)
+        super().__init__(space, node, topic, layout, klass, latch=latch)
         self._stall = klass.stall
-        self._on_missed = klass.on_missed
-        self._on_degraded = klass.on_degraded
 
     async def publish(self, message: M) -> None:
-        """Publish, and wait until everybody who can keep up has it.
+        """Publish a message, and wait until all queues and links that keep up have it.
 
-        Queues with room get it at once. A full queue (not a lossy one, nor one of this node) or send buffer is waited
-        for, at most `stall` seconds; then it loses messages, counted, until it has room again.
-        Raises MessageError if the message does not fit its type.
+        Those with room get it at once. A full send buffer or queue (but not a lossy one, nor one of this node) is
+        waited for, at most `stall` seconds; from then on it loses messages, counted in `missed`, until it has room.
+        Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """
+        # `_sample`, inlined: this is the path of every message.
         if message.__class__ is not self.type:
             raise self._wrong_type(message)
         data = self._encode(message)
@@ -49,19 +49,22 @@ class Publisher(BasePublisher[M]):
         blocked = self._topic.deliver(sample, self.node)
         if blocked is not None:
             await self._wait_for_room(sample, blocked)
-        self._credit -= 1
-        if self._credit <= 0:
-            self._credit = YIELD_EVERY
+        self._until_yield -= 1
+        if self._until_yield <= 0:
+            self._until_yield = YIELD_EVERY
             await checkpoint()
 
     def publish_nowait(self, message: M) -> bool:
-        """Publish without waiting: for callbacks. False if somebody had no room and lost a message (counted)."""
+        """Publish without waiting, as callbacks must. False if a full queue or link lost a message, which is counted.
+
+        Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
+        """
         sample = self._sample(message)
         blocked = self._topic.deliver(sample, self.node)
         return blocked is None or self._force(sample, blocked)
 
     def _force(self, sample: Sample, sinks: list[Sink]) -> bool:
-        """Give it to those for whom nobody waits; False if any of them loses a message by that."""
+        """Force the sample into full sinks without waiting; False if any of them loses a message by that."""
         without = []
         for sink in sinks:
             lost = sink.lost
@@ -73,49 +76,51 @@ class Publisher(BasePublisher[M]):
         return not without
 
     async def _wait_for_room(self, sample: Sample, blocked: list[Sink]) -> None:
-        given_up = [sink for sink in blocked if not sink.waits]
-        if given_up:
-            self._force(sample, given_up)
-            blocked = [sink for sink in blocked if sink.waits and sink not in given_up]
+        lossy = [sink for sink in blocked if not sink.waits]
+        if lossy:
+            self._force(sample, lossy)
+            # `_force` may call the user's code, which may make more of them lossy, or these wait again.
+            blocked = [sink for sink in blocked if sink.waits and sink not in lossy]
             if not blocked:
                 return
         loop = self._space.loop
-        wait = _WaitingDelivery(sample, blocked, loop.create_future())
-        timer = loop.call_later(self._stall, wait.expire, f"no room for {self._stall} s")
+        delivery = _WaitingDelivery(sample, blocked, loop.create_future())
+        timer = loop.call_later(self._stall, delivery.expire, f"no room for {self._stall} s")
         try:
-            await wait.over
+            await delivery.over
         finally:
             timer.cancel()
-            without = wait.withdraw()
+            without = delivery.withdraw()  # none, unless this task was cancelled
             for sink in without:
                 sink.count_lost(CANCELLED)
             if without:
                 self._miss(sample.sequence, CANCELLED, without)
-            if wait.refused:
-                self._miss(sample.sequence, wait.refusal, wait.refused)
+            if delivery.failed:
+                self._miss(sample.sequence, delivery.reason, delivery.failed)
 
 
 class _WaitingDelivery(PendingDelivery):
     """A `publish()` that waits for room."""
 
-    __slots__ = ("over", "refusal", "refused")
+    __slots__ = ("failed", "over", "reason")
 
     def __init__(self, sample: Sample, sinks: list[Sink], over: asyncio.Future[None]) -> None:
         self.over = over
-        self.refused: list[Sink] = []
-        self.refusal = ""
+        self.failed: list[Sink] = []
+        """The sinks that lost it."""
+        self.reason = ""
         super().__init__(sample, sinks)
 
-    def completed(self, sink: Sink, refusal: str) -> None:
-        if refusal:
-            self.refused.append(sink)
-            self.refusal = refusal
+    def completed(self, sink: Sink, reason: str) -> None:
+        if reason:
+            self.failed.append(sink)
+            self.reason = reason
         if not self.remaining and not self.over.done():
             self.over.set_result(None)
 
-    def expire(self, refusal: str) -> None:
-        """The time is up: whoever has no room is lossy from now on."""
+    def expire(self, reason: str) -> None:
+        """End the wait: sinks that have no room now are lossy from here on."""
         for sink in list(self.remaining):
-            sink.refill()
+            sink.refill()  # a link may have room that it was not asked about
         for sink in list(self.remaining):
-            sink.become_lossy(refusal)
+            sink.become_lossy(reason)

@@ -1,4 +1,15 @@
-"""Periodic: never waits; is asked for a message at every period, which is missed where there is no room in it."""
+"""Periodic: never waits; `fill` is called at every period, and the message is missed where there is no room.
+
+How a miss is reported, always by `_miss` or `_report` of the base:
+
+    tick                 the period began late, or periods were skipped: the event loop was blocked (`on_late`)
+    _deliver_later       a subscriber's queue is full (`on_missed`); a full link has until the next period
+    _give_up             a link still had no room when that began (`on_missed`)
+    delivery_completed   a link had room, but late in the period (`on_late`)
+    link_missed          a link accepted the message, and could not send it in its slot (`on_missed`): an RTCAN slot,
+                         from `SlottedTopics.done` in r2p/transports/rtcan/slots.py
+    link_degraded        a link, or its slots, are lost (`on_degraded`)
+"""
 
 from typing import Generic
 
@@ -7,15 +18,16 @@ from r2p.messages import Layout
 from r2p.runtime.backpressure import GIVEN_UP, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Periodic
+from r2p.runtime.queues import EndpointOwner, SubscriberQueue
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import EndpointOwner, SlotPublisher, SubscriberQueue, Topic, TopicSpace
+from r2p.runtime.topic import SlotPublisher, Topic, TopicSpace
 
 _SECOND = 1_000_000_000
-_LATE_SHARE = 2  # a period is late when it is off by more than half of it
+_LATE_SHARE = 2  # a message is late by more than 1/2 of its period: it is nearer to the next one
 
 
 class PeriodicPublisher(BasePublisher[M], SlotPublisher):
-    """A time-triggered publisher: it has no publish(), its class's `fill` is asked at every period."""
+    """A time-triggered publisher: it has no `publish()`; the `fill` of its class is called at every period."""
 
     publisher_class = PublisherClass.PERIODIC
 
@@ -29,26 +41,23 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         *,
         latch: bool,
     ) -> None:
-        super().__init__(space, node, topic, layout, latch=latch)
+        super().__init__(space, node, topic, layout, klass, latch=latch)
         self.period = klass.period
         self.skipped = 0
-        """Periods that passed without a message because the loop was busy."""
+        """Periods that passed without a message because the event loop was blocked."""
         self.lead = klass.lead
         self._fill = klass.fill
-        self._on_missed = klass.on_missed
-        self._on_late = klass.on_late
-        self._on_degraded = klass.on_degraded
         self._own_period = klass.period
         self._slot_link: object = None
         self._waiting: _PeriodDelivery[M] | None = None
         self._ticker = Ticker(space.loop, round(klass.period * _SECOND), self.tick, background=True)
 
     def start(self) -> None:
-        """Start the clock: the first message follows one period later."""
+        """Start the clock: the first message is due one period from now."""
         self._ticker.start()
 
     def silence(self) -> None:
-        """Ask for no message any more: the node ends."""
+        """Stop the clock for good: the node ends."""
         self._ticker.close()
 
     def close(self) -> None:
@@ -58,9 +67,9 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         self._give_up("publisher closed")
 
     def use_slot_clock(self, slot_link: object, period: float) -> bool:
-        """A link whose slots are the clock calls `tick` from now on, each `period` seconds; again: another period.
+        """Let a link call `tick` at its slots, each `period` seconds, instead of the clock; again: another period.
 
-        False if another link does already, or the publisher is closed.
+        False if the slots of another link are the clock, or the publisher is closed.
         """
         if self._slot_link not in (None, slot_link) or self not in self._topic.publishers:
             return False
@@ -70,7 +79,7 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         return True
 
     def use_own_clock(self, slot_link: object) -> None:
-        """That link does not any more: the publisher's own clock goes on, at the period that was asked for."""
+        """Go on with the publisher's own clock and period, if it used the slots of this link."""
         if self._slot_link is slot_link:
             self._slot_link = None
             self.period = self._own_period
@@ -78,7 +87,7 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
                 self._ticker.start()
 
     def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
-        """One period: due at `scheduled` (monotonic ns), `late` by ns, after so many `skipped` ones.
+        """Publish the message of one period: due at `scheduled` (monotonic ns), `late` by ns, after `skipped` periods.
 
         Local queues and all other links get the message from here; the link of the slots gets it as the result. None:
         there is no message.
@@ -90,7 +99,7 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
             self.late += 1
             self.skipped += skipped
             reason = f"{skipped} period(s) skipped, the next one late" if skipped else "late"
-            self._signal(Missed(self.topic, reason, late=late / _SECOND, count=skipped), self._on_late)
+            self._report(Missed(self.topic, reason, late=late / _SECOND, count=skipped), self._on_late)
         try:
             message = self._fill()
             if message is None or self._encode == self._closed:  # fill may have closed it
@@ -102,11 +111,11 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
             return None
         blocked = self._topic.deliver(sample, None, self._slot_link)
         if blocked is not None:
-            self._not_yet(sample, blocked)
+            self._deliver_later(sample, blocked)
         return sample
 
-    def _not_yet(self, sample: Sample, blocked: list[Sink]) -> None:
-        """Queues drop one at once; a link, which may be busy for a moment, has until the next period."""
+    def _deliver_later(self, sample: Sample, blocked: list[Sink]) -> None:
+        """Let full queues drop one at once; a full link, which may be busy for a moment, has until the next period."""
         queues = [sink for sink in blocked if isinstance(sink, SubscriberQueue)]
         waiting = [sink for sink in blocked if sink not in queues and sink.reachable]
         down = [sink for sink in blocked if sink not in queues and sink not in waiting]
@@ -117,25 +126,25 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
                 sink.force(sample)
             self._miss(sample.sequence, NO_ROOM, queues)
         if down:
-            self._unreachable(sample, down)
+            self._miss_unreachable(sample, down)
 
-    def delivery_completed(self, waited: "_PeriodDelivery[M]", sink: Sink, refusal: str) -> None:
-        """A link has got a sample that waited, or lost it."""
-        late = self._clock.monotonic() - waited.since
-        if refusal:
-            self._miss(waited.sample.sequence, refusal, [sink])
+    def delivery_completed(self, delivery: "_PeriodDelivery[M]", sink: Sink, reason: str) -> None:
+        """Note that a link has a sample that waited, or has lost it for this reason."""
+        late = self._clock.monotonic() - delivery.since
+        if reason:
+            self._miss(delivery.sample.sequence, reason, [sink])
         elif late > self.period * _SECOND / _LATE_SHARE:
             self.late += 1
-            self._signal(Missed(self.topic, "sent late", where([sink]), late / _SECOND), self._on_late)
+            self._report(Missed(self.topic, "sent late", where([sink]), late / _SECOND), self._on_late)
 
     def _give_up(self, reason: str) -> None:
-        """What still waits is stale."""
-        waited, self._waiting = self._waiting, None
-        without = waited.withdraw() if waited is not None else []
-        if waited is not None and without:
+        """Withdraw what still waits from the period before: it is stale."""
+        delivery, self._waiting = self._waiting, None
+        without = delivery.withdraw() if delivery is not None else []
+        if delivery is not None and without:
             for sink in without:
                 sink.count_lost(GIVEN_UP)
-            self._miss(waited.sample.sequence, reason, without)
+            self._miss(delivery.sample.sequence, reason, without)
 
 
 class _PeriodDelivery(PendingDelivery, Generic[M]):
@@ -148,5 +157,5 @@ class _PeriodDelivery(PendingDelivery, Generic[M]):
         self.since = since
         super().__init__(sample, sinks)
 
-    def completed(self, sink: Sink, refusal: str) -> None:
-        self.publisher.delivery_completed(self, sink, refusal)
+    def completed(self, sink: Sink, reason: str) -> None:
+        self.publisher.delivery_completed(self, sink, reason)

@@ -1,4 +1,4 @@
-"""Sporadic: never waits; what is not in every queue and on every link by its deadline is missed."""
+"""Sporadic: never waits; a message that is not in every queue and on every link by its deadline is missed."""
 
 from typing import Generic
 
@@ -7,8 +7,9 @@ from r2p.messages import Layout
 from r2p.runtime.backpressure import GIVEN_UP, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Sporadic
+from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, checkpoint
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import YIELD_EVERY, EndpointOwner, Topic, TopicSpace, checkpoint
+from r2p.runtime.topic import Topic, TopicSpace
 
 _SECOND = 1_000_000_000
 _TOO_LATE = "no room by the deadline"
@@ -22,29 +23,29 @@ class SporadicPublisher(BasePublisher[M]):
     def __init__(
         self, space: TopicSpace, node: EndpointOwner, topic: Topic, layout: Layout[M], klass: Sporadic, *, latch: bool
     ) -> None:
-        super().__init__(space, node, topic, layout, latch=latch)
+        super().__init__(space, node, topic, layout, klass, latch=latch)
         self._deadline = round(klass.deadline * _SECOND)
         self._limit = klass.pending
         self._send_late = klass.late == "send"
-        self._on_missed = klass.on_missed
-        self._on_late = klass.on_late
-        self._on_degraded = klass.on_degraded
         self._pending: list[_EventDelivery[M]] = []
         self._alarm = Alarm(space.loop, self._overdue)
 
     async def publish(self, message: M) -> None:
-        """Publish an event; returns at once, also where somebody has no room yet.
+        """Publish an event; returns at once, also where there is no room for it yet.
 
-        Raises MessageError if the message does not fit its type.
+        Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """
         self.publish_nowait(message)
-        self._credit -= 1
-        if self._credit <= 0:
-            self._credit = YIELD_EVERY
+        self._until_yield -= 1
+        if self._until_yield <= 0:
+            self._until_yield = YIELD_EVERY
             await checkpoint()
 
     def publish_nowait(self, message: M) -> bool:
-        """Publish an event; False if it has to wait for room somewhere, or can't reach somebody."""
+        """Publish an event, also from a callback. False if it waits for room somewhere, or a link is down.
+
+        Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
+        """
         sample = self._sample(message, self._deadline)
         sample.drop_late = not self._send_late
         blocked = self._topic.deliver(sample)
@@ -54,7 +55,7 @@ class SporadicPublisher(BasePublisher[M]):
         if waiting:
             self._wait(_EventDelivery(self, sample, waiting, self._clock.monotonic() + self._deadline))
         if len(waiting) < len(blocked):
-            self._unreachable(sample, [sink for sink in blocked if sink not in waiting])
+            self._miss_unreachable(sample, [sink for sink in blocked if sink not in waiting])
         return False
 
     def close(self) -> None:
@@ -69,13 +70,13 @@ class SporadicPublisher(BasePublisher[M]):
             self._give_up(self._pending[0], "too many wait")
         self._arm()
 
-    def delivery_completed(self, event: "_EventDelivery[M]", sink: Sink, refusal: str) -> None:
-        """A sink has got an event that waited, or lost it."""
+    def delivery_completed(self, event: "_EventDelivery[M]", sink: Sink, reason: str) -> None:
+        """Note that a sink has an event that waited, or has lost it for this reason."""
         if not event.remaining:
             self._pending.remove(event)
             self._arm()
-        if refusal:
-            self._miss(event.sample.sequence, refusal, [sink])
+        if reason:
+            self._miss(event.sample.sequence, reason, [sink])
 
     def _arm(self) -> None:
         self._alarm.set(next((event.due for event in self._pending if not event.overdue), None))
@@ -87,13 +88,13 @@ class SporadicPublisher(BasePublisher[M]):
                 event.overdue = True
                 self.late += 1
                 late = (now - event.due) / _SECOND
-                self._signal(Missed(self.topic, _TOO_LATE, where(event.remaining), late), self._on_late)
+                self._report(Missed(self.topic, _TOO_LATE, where(event.remaining), late), self._on_late)
             else:
                 self._give_up(event, _TOO_LATE)
         self._arm()
 
     def _give_up(self, event: "_EventDelivery[M]", reason: str) -> None:
-        if event in self._pending:  # a signal before this one may have closed the publisher
+        if event in self._pending:  # a callback for an event before it may have closed the publisher
             self._pending.remove(event)
             without = event.withdraw()
             for sink in without:
@@ -113,5 +114,5 @@ class _EventDelivery(PendingDelivery, Generic[M]):
         self.overdue = False
         super().__init__(sample, sinks)
 
-    def completed(self, sink: Sink, refusal: str) -> None:
-        self.publisher.delivery_completed(self, sink, refusal)
+    def completed(self, sink: Sink, reason: str) -> None:
+        self.publisher.delivery_completed(self, sink, reason)

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from r2p.bridge import BridgeOptions
-from r2p.durations import timeout_or_none
+from r2p.clock import check_timeout
 from r2p.msg import Speed3
 from r2p.runtime.publishers import AnyPublisher
 from r2p.sim.modules.boards import (
@@ -151,7 +151,7 @@ class Triskar2:
 
         Raises TimeoutError after `timeout` seconds, and MessageError for a time-out that is not a number of seconds.
         """
-        timeout_or_none("the time-out of ready", timeout)
+        check_timeout("the time-out of ready", timeout)
         time = asyncio.get_running_loop().time
         async with asyncio.timeout(timeout):
             since = time()

@@ -129,7 +129,7 @@ async def test_a_link_that_makes_no_room_in_time_is_lossy_until_it_has(monkeypat
         link: Any = a.links[0]
         assert link.stats.lost["send buffer full"] == 10
         assert len(link.wait_queue.recoveries) == 1  # it recovers by itself, and nobody else waits
-        assert not link.wait_queue.deliveries
+        assert not link.wait_queue.non_real_time
         full = False
         link.made_room()
         await publisher.publish(led(20))

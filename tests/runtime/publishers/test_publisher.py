@@ -225,7 +225,7 @@ BAD = 0.0, -1.0, 1e-9, math.nan, math.inf, 1e300, "1", True, None
         *((r2p.Periodic, {"period": 1, "fill": Led, "lead": bad}, "lead is in seconds") for bad in (-1, math.nan)),
         *((r2p.Sporadic, {"deadline": 1, "pending": bad}, "pending is a number") for bad in (0, -1, 1.5, True, None)),
         (r2p.Sporadic, {"deadline": 1, "late": "sned"}, "late is 'drop' or 'send', not 'sned'"),
-        (r2p.Periodic, {"period": 1, "fill": Led()}, "fill is a function that gives the message, not Led"),
+        (r2p.Periodic, {"period": 1, "fill": Led()}, "fill is a function that returns the message, not Led"),
         (r2p.NonRealTime, {"on_missed": "me"}, "on_missed is a function that takes an r2p.Missed, not 'me'"),
         (lambda: r2p.Sporadic, {}, "give a class value, such as r2p.Sporadic"),
         (lambda: None, {}, "give a class value"),

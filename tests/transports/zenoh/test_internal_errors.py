@@ -88,8 +88,8 @@ async def test_subscribers(fault: str) -> None:
 
 async def test_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
     async with r2p.Module("PC", via=[], watchdog=False) as module:
-        assert module._hub is not None
-        link = ZenohLink("zenoh:", module._hub, connects=False, batching=True)
+        assert module._link_manager is not None
+        link = ZenohLink("zenoh:", module._link_manager, connects=False, batching=True)
         link.on_up()
         presence = link.discovery
         for call in ("appeared", "disappeared"):
@@ -112,7 +112,7 @@ async def test_looks_around(monkeypatch: pytest.MonkeyPatch) -> None:
         return {"lab", "field"}
 
     async with r2p.Module("PC", via=[], watchdog=False) as module:
-        hub = module._hub
+        hub = module._link_manager
         assert hub is not None
         link = ZenohLink("zenoh:", hub, connects=False, batching=True)
         link.on_up()

@@ -110,7 +110,7 @@ async def test_what_waits_for_credit_when_the_link_goes_down_is_counted() -> Non
 
         sending = asyncio.create_task(send())
         await until(
-            lambda: bool(publisher._topic.remote_subscribers[0].waiting.deliveries)
+            lambda: bool(publisher._topic.remote_subscribers[0].waiting.non_real_time)
         )  # as its subscriber does not read
         await cable.cut()
         await sending

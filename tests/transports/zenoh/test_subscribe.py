@@ -13,8 +13,9 @@ from r2p.codecs.attachment import Header, Origin
 from r2p.messages import layout
 from r2p.msg import Led
 from r2p.runtime.backpressure import Sink
+from r2p.runtime.queues import SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import Sample
-from r2p.runtime.topic import SubscriberQueue, Topic, WakeScheduler
+from r2p.runtime.topic import Topic
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.subscribe import WINDOW, RxStream, ZenohReceiver
 
@@ -46,7 +47,7 @@ class Ring:
 
     def subscribe(self, queue: int) -> SubscriberQueue:
         owner: Any = SimpleNamespace(name="node", priority=0)
-        sink = SubscriberQueue(self.wake_scheduler, owner, queue, 0, lossy=False, keep_oldest=False)
+        sink = SubscriberQueue(self.wake_scheduler, owner, queue, lossy=False, keep_oldest=False)
         self.topic.join(sink)
         return sink
 

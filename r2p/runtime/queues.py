@@ -1,0 +1,197 @@
+"""The bounded queues of subscribers: where a full one drops its oldest message, and who is woken when one comes in.
+
+    Topic.deliver   -> there is room: append the message
+                    -> the queue is full: the publisher waits, where it may (`backpressure`)
+                    -> ... or `SubscriberQueue.drop_oldest` makes room, counted in `lost`
+
+Waking is separate from queueing. The nodes of the highest priority are woken directly, the others one for each turn of
+the event loop: so an important node waits for a few steps of less important ones at most.
+"""
+
+import asyncio
+import heapq
+import itertools
+import logging
+import types
+from collections import deque
+from collections.abc import Generator
+from typing import Protocol
+
+from r2p.runtime.backpressure import NO_ROOM, Sink, WaitQueue
+from r2p.runtime.sample import PublisherClass, Sample
+
+YIELD_EVERY = 16
+"""Messages that publish() or an iteration handles before it lets the event loop run once."""
+
+_NRT = PublisherClass.NON_REAL_TIME
+
+
+@types.coroutine
+def checkpoint() -> Generator[None, None, None]:
+    """Let the event loop run once: `asyncio.sleep(0)` without the calls around it."""
+    yield
+
+
+class EndpointOwner(Protocol):
+    """The node that a publisher or a subscriber belongs to."""
+
+    name: str
+    priority: int
+
+    @property
+    def log(self) -> logging.LoggerAdapter[logging.Logger]: ...
+
+    @property
+    def ending(self) -> bool:
+        """Whether functions that the node gave away are not to be called any more."""
+
+    def crash(self, error: Exception) -> None:
+        """End the node with an error of a function that it gave away."""
+
+    def forget(self, endpoint: object) -> None:
+        """Drop a publisher or subscriber of the node that was closed."""
+
+
+class WakeScheduler:
+    """Wakes waiting subscribers: those of the highest priority at once, the others one a turn, highest first."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
+        self._order = itertools.count()
+        self._running = False
+        self._priorities: dict[int, int] = {}
+        self.top = 0
+        """The highest priority of all nodes that run."""
+
+    def node_started(self, priority: int) -> None:
+        self._priorities[priority] = self._priorities.get(priority, 0) + 1
+        self.top = max(self._priorities)
+
+    def node_ended(self, priority: int) -> None:
+        self._priorities[priority] -= 1
+        if not self._priorities[priority]:
+            del self._priorities[priority]
+        self.top = max(self._priorities, default=0)
+
+    def wake(self, priority: int, waiter: asyncio.Future[None]) -> None:
+        """Wake now what has the highest priority, anything else in its turn."""
+        if priority < self.top:
+            self.wake_later(priority, waiter)
+        elif not waiter.done():
+            waiter.set_result(None)
+
+    def wake_later(self, priority: int, waiter: asyncio.Future[None]) -> None:
+        """Wake in its turn."""
+        heapq.heappush(self._waiting, (-priority, next(self._order), waiter))
+        if not self._running:
+            self._running = True
+            self._loop.call_soon(self._turn)
+
+    def _turn(self) -> None:
+        while self._waiting:
+            waiter = heapq.heappop(self._waiting)[2]
+            if not waiter.done():
+                waiter.set_result(None)
+                self._loop.call_soon(self._turn)
+                return
+        self._running = False
+
+
+class SubscriberQueue(Sink):
+    """The bounded queue of one subscriber: its topic fills it, the subscriber empties it."""
+
+    __slots__ = (
+        "_wake_scheduler",
+        "keep_oldest",
+        "limit",
+        "lossy",
+        "node",
+        "priority",
+        "publisher_waiters",
+        "queue",
+        "waiter",
+        "waiting",
+    )
+
+    def __init__(
+        self, wake_scheduler: WakeScheduler, node: EndpointOwner, limit: int, *, lossy: bool, keep_oldest: bool
+    ) -> None:
+        super().__init__()
+        self._wake_scheduler = wake_scheduler
+        self.node = node
+        self.limit = limit
+        self.priority = node.priority
+        self.keep_oldest = keep_oldest
+        self.lossy = lossy
+        self.waits = not lossy
+        self.queue: deque[Sample] = deque()
+        self.waiter: asyncio.Future[None] | None = None
+        """The reader's future, while it waits for a message."""
+        self.publisher_waiters: list[asyncio.Future[None]] = []
+        """The futures of those that wait for a publisher."""
+        self.waiting: WaitQueue | None = None
+        """Set only while something waits for room: then each reader that pops a message has to call `refill`."""
+
+    @property
+    def owner(self) -> str:
+        return self.node.name
+
+    def offer(self, sample: Sample) -> bool:
+        if len(self.queue) >= self.limit:
+            return False
+        self._append(sample)
+        return True
+
+    def drop_oldest(self) -> bool:
+        """Drop the oldest message of the full queue for a new one. False with `keep_oldest`: the new one is dropped."""
+        self.lost += 1
+        if self.keep_oldest:
+            return False
+        self.queue.popleft()
+        return True
+
+    def force(self, sample: Sample) -> None:
+        if self.offer(sample):
+            return
+        # What the same publisher published before, and still waits, goes in first: its messages keep their order.
+        overtaken = [] if self.waiting is None or self.keep_oldest else self.waiting.pop_earlier(self, sample)
+        for each in (*(delivery.sample for delivery in overtaken), sample):
+            if self.drop_oldest():
+                self._append(each)
+        for delivery in overtaken:  # last, with all samples in place: this may make the publisher publish more
+            delivery.complete(self, NO_ROOM)
+
+    def waits_for(self, sample: Sample) -> bool:
+        """Whether a full queue that became lossy comes back to the sender of this sample all the same.
+
+        It became lossy for what does not expire: events wait until their deadline as before. A publisher of this module
+        gets it back, too, and counts what is lost there.
+        """
+        return not self.lossy and (sample.publisher_class != _NRT or not sample.source.link)
+
+    def wait_queue(self) -> WaitQueue:
+        if self.waiting is None:
+            self.waiting = WaitQueue()
+        return self.waiting
+
+    def refill(self) -> None:
+        if (waiting := self.waiting) is not None:
+            waiting.serve()
+            if len(self.queue) <= self.limit // 2:  # plenty: with one place it would be lossy again at once
+                waiting.recover()
+            if not waiting:
+                self.waiting = None
+
+    def publisher_joined(self) -> None:
+        """Wake those that wait for a publisher."""
+        for waiter in self.publisher_waiters:
+            if not waiter.done():
+                waiter.set_result(None)
+
+    def _append(self, sample: Sample) -> None:
+        # `Topic.deliver` has a copy of this: change both.
+        self.queue.append(sample)
+        if (waiter := self.waiter) is not None:
+            self.waiter = None
+            self._wake_scheduler.wake(self.priority, waiter)
