@@ -3,10 +3,10 @@
     async with r2p.Module("A", via="sim:lab"), r2p.Module("B", via="sim:lab,drift=30"):
         lab = r2p.sim.can_bus("lab")
         lab.bus.observers.append(print)          # every frame, at its true time
-        lab.port("B").power_off()                # B dies
+        lab.port("B").power_off()                # B loses power
 
-Under virtual time all is exact to the nanosecond, and one seed gives one course of events. On an ordinary loop the bus
-is paced to real time: what happens on it is carried out a little late, with its true instants.
+Under virtual time everything is exact to the nanosecond, and the same seed gives the same run. On an ordinary loop the
+bus is paced to real time: its events run a little late, with their true instants.
 """
 
 import asyncio
@@ -22,23 +22,25 @@ from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
+from r2p.sim.can.controller import ignore
 from r2p.transports.can.port import CanPort, CanPortListener, PortAlarm
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.transport import OPTIONS, RtcanOptions, apply_options, run_link
 from r2p.transports.url import Url, duration
 
-_BILLION = 1_000_000_000
+_SECOND = 1_000_000_000
 _NO_POWER = "no power"
 _MAILBOXES = (Mailbox.HRT, *[Mailbox.SRT] * (rtcan.NRT - 1), Mailbox.NRT)  # by laxity
-_SENT, _LOST, _LATE = Outcome.SENT, Outcome.LOST, Outcome.LATE  # Python 3.11 takes its time to find a member of an enum
+_SENT, _LOST, _LATE = Outcome.SENT, Outcome.LOST, Outcome.LATE  # Python 3.11 is slow to look up a member of an enum
 DEFAULTS = RtcanOptions(priority=1, utc=0.0)
-"""Of `sim:` URLs: anybody may be the master, and knows UTC."""
+"""The options of `sim:` URLs: every module can be elected master, and knows UTC."""
 
 
 class SimCan:
     """A simulated CAN bus for modules of the running event loop; `bus` is the wire itself, with statistics and faults.
 
-    `bitrate` in bit/s; `noise` is the share of frames with a bit error; `seed` None: from the loop's random numbers.
+    `bitrate` in bit/s. `noise`: the share of frames with a bit error. `seed`: None takes it from the loop's random
+    numbers.
     """
 
     def __init__(self, *, bitrate: int = 1_000_000, noise: float = 0.0, seed: int | None = None) -> None:
@@ -46,53 +48,53 @@ class SimCan:
         numbers = random_of(loop).getrandbits(32) if seed is None else seed
         self.bus = CanBus(loop, bitrate=bitrate, noise=noise, seed=numbers)
         self.powered = True
-        """Whether modules that come have power."""
+        """Whether modules that connect have power."""
         self._ports: dict[str, SimPort] = {}
-        self._spare: dict[str, CanController] = {}
+        self._unplugged: dict[str, CanController] = {}
 
     def transport(self, options: RtcanOptions = DEFAULTS, **node: Any) -> "SimTransport":
-        """A place on this bus, for `Module(via=...)` of one module; `node` are fields of `CanNode`."""
+        """Return a transport on this bus for the `via=` of one module; `node` are fields of `CanNode`."""
         return SimTransport("", options, node, shared=self)
 
     def port(self, module: str) -> "SimPort":
-        """The port of a module that is open. Raises KeyError if it is not on this bus."""
+        """Return the port of an open module. Raises KeyError if it is not on this bus."""
         return self._ports[module]
 
     def power_off(self) -> None:
-        """All modules lose power, and those that come have none."""
+        """Cut the power of all modules, also of those that connect later."""
         self.powered = False
         for port in list(self._ports.values()):
             port.power_off()
 
     def power_on(self) -> None:
-        """All modules have power again."""
+        """Restore the power of all modules."""
         self.powered = True
         for port in list(self._ports.values()):
             port.power_on()
 
     def plug_in(self, port: "SimPort", node: CanNode) -> CanController:
-        """Connect a module. One that was here before gets the controller that it had."""
+        """Connect a module. A module that was connected before gets its controller back, with its clock and numbers."""
         name = node.name
-        while name in self._ports or (name in self._spare and self._spare[name].node != node):
+        while name in self._ports or (name in self._unplugged and self._unplugged[name].node != node):
             name += "'"
             node = msgspec.structs.replace(node, name=name)
         self._ports[name] = port
-        controller = self._spare.pop(name, None)
+        controller = self._unplugged.pop(name, None)
         if controller is None:
             return self.bus.attach(node)
         controller.power_on()
         return controller
 
     def unplug(self, controller: CanController) -> None:
-        """Its module has closed."""
+        """Disconnect the module of this controller, which has closed."""
         controller.power_off()
         controller.filters = ()
         del self._ports[controller.name]
-        self._spare[controller.name] = controller
+        self._unplugged[controller.name] = controller
 
 
 class SimPort(CanPort):
-    """A simulated controller as a port. Its clock is the node's, which may be off and drift."""
+    """A simulated controller as a port. Its clock is the node's, with its offset and drift."""
 
     now: Callable[[], int]
 
@@ -129,7 +131,7 @@ class SimPort(CanPort):
         finally:
             self._up = False
             self._user = None
-            controller.on_receive = _deaf
+            controller.on_receive = ignore
 
     def transmit(self, order: Transmit) -> None:
         last = None if order.not_after == NEVER else order.not_after
@@ -153,12 +155,12 @@ class SimPort(CanPort):
     # Faults
 
     def power_off(self) -> None:
-        """The node dies, in the middle of a frame if need be; its software notices that it can't send."""
+        """Cut the node's power, also in the middle of a frame; its software notices that it can't send."""
         self.controller.power_off()
         self._goes_down(_NO_POWER)
 
     def power_on(self) -> None:
-        """It comes back, as new."""
+        """Restore the node's power: it starts as new."""
         self.controller.power_on()
 
     # From the controller
@@ -206,12 +208,8 @@ class SimPort(CanPort):
             self._user.down(reason)
 
 
-def _deaf(_frame: Frame, _stamp: int) -> None:
-    """Its module has closed."""
-
-
 class SimTransport(Transport):
-    """A place on a simulated bus for one module: on `shared`, or on the running loop's bus of that name."""
+    """The connection of one module to a simulated bus: to `shared`, or to the running loop's bus of that name."""
 
     def __init__(
         self,
@@ -233,8 +231,8 @@ class SimTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         options = self._options
         shared = self._shared or can_bus(self._name, bitrate=options.bitrate, noise=self._noise, seed=self._seed)
-        if shared.bus.bit * options.bitrate != _BILLION:
-            raise TransportError(f"sim:{self._name} has {_BILLION // shared.bus.bit} bit/s, not {options.bitrate}")
+        if shared.bus.bit * options.bitrate != _SECOND:
+            raise TransportError(f"sim:{self._name} has {_SECOND // shared.bus.bit} bit/s, not {options.bitrate}")
         node = CanNode(hub.space.module, **{"one_shot": True} | self._node)
         port = SimPort(shared, node)
         try:
@@ -248,9 +246,9 @@ _buses: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, _Buses] = weakref.W
 
 
 def can_bus(name: str, **options: Any) -> SimCan:
-    """The running loop's simulated bus of that name, made at first use, with options as `SimCan` takes them then.
+    """Return the running loop's simulated bus of that name, made at first use with these options of `SimCan`.
 
-    It lives as long as a module is on it, or somebody holds it.
+    It lives as long as a module is on it, or the program holds a reference.
     """
     buses = _buses.setdefault(asyncio.get_running_loop(), weakref.WeakValueDictionary())
     shared = buses.get(name)
@@ -260,13 +258,14 @@ def can_bus(name: str, **options: Any) -> SimCan:
 
 
 def from_url(url: Url) -> SimTransport:
-    """`sim:NAME`; options as for `rtcan:`, and for the node `drift` (ppm), `offset` (its clock's), `latency`, `jitter`.
+    """Return the transport of `sim:NAME`. Options are those of `rtcan:`, and these.
 
-    `latency` is that of both ways, `jitter` its spread. `loss` is the share of frames that the node loses, `one_shot=0`
-    gives it a controller that tries again by itself. Of the bus, if it is the first to open it: `noise`, `seed`.
+    For the node: `drift` (ppm) and `offset` of its clock; `latency` in both directions, and `jitter`, its spread;
+    `loss`, the share of received frames that it loses; `one_shot=0` for a controller that sends again by itself. For
+    the bus, if this URL opens it: `noise`, `seed`.
     """
     if not url.address:
-        raise TransportError(f"{url}: give the bus a name: sim:lab")
+        raise TransportError(f"{url}: give the bus a name, as in sim:lab")
     values = url.parsed(OPTIONS | _OPTIONS)
     known = {key: value for key, value in values.items() if key in OPTIONS}
     latency = Latency(values.get("latency", 0), values.get("jitter", 0))
@@ -277,19 +276,19 @@ def from_url(url: Url) -> SimTransport:
 
 
 def _nanoseconds(text: str) -> int:
-    return round(duration(text) * _BILLION)
+    return round(duration(text) * _SECOND)
 
 
 def _share(text: str) -> float:
     value = float(text)
     if not 0.0 <= value <= 1.0:
-        raise ValueError("a share lies between 0 and 1")
+        raise ValueError("a share must be between 0 and 1")
     return value
 
 
 def _flag(text: str) -> bool:
     if text not in ("0", "1"):
-        raise ValueError("it is 0 or 1")
+        raise ValueError("it must be 0 or 1")
     return text == "1"
 
 

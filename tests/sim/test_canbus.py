@@ -582,5 +582,5 @@ async def test_a_saturated_bus_has_load_1() -> None:
 @pytest.mark.virtual_time
 async def test_names_are_unique() -> None:
     bus, _, _ = make("A")
-    with pytest.raises(ValueError, match="node A on this bus already"):
+    with pytest.raises(ValueError, match="already a node A on this bus"):
         bus.attach(CanNode("A"))

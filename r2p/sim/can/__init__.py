@@ -6,18 +6,21 @@
     b.on_receive = lambda frame, stamp: print(stamp, frame)
     a.request(Frame(0x19007F80, b"hello"))
 
-It needs no hardware. Under virtual time every event happens at its very nanosecond; on an ordinary loop the bus is
-paced to real time: events keep their exact instants on the bus, and are carried out as soon as the loop gets to them.
+Under virtual time every event happens at its exact nanosecond; on an ordinary loop the bus is paced to real time:
+events keep their exact instants on the bus, and run as soon as the loop gets to them.
 
-Work is done for frames, not for bits: the winner of an arbitration is the lowest of a few integers, and the length of
-its frame is counted (and cached) by the codec. One seed, one course of events: each node has its own random numbers.
+Work is done per frame, not per bit: the winner of an arbitration is the lowest of a few integers, and the codec counts
+(and caches) the length of its frame. The same seed gives the same run: each node has its own random numbers.
+
+Read `node` (settings and records) first, then `bus` (arbitration, frames) and `controller` (mailboxes, callbacks);
+`timeline` has the events and clocks, `faults` error frames and error counters, `statistics` the bus load.
 """
 
 from r2p.sim.can.bus import CanBus
 from r2p.sim.can.controller import CanController
-from r2p.sim.can.node import CanNode, ControllerState, ErrorKind, FrameRecord, Latency, LocalAlarm, LocalClock
+from r2p.sim.can.node import CanNode, ControllerState, ErrorKind, FrameRecord, Latency
 from r2p.sim.can.statistics import Count, Statistics
-from r2p.sim.can.timeline import Timeline, TimelineTimer
+from r2p.sim.can.timeline import LocalAlarm, LocalClock, Timeline, TimelineTimer
 
 __all__ = [
     "CanBus",

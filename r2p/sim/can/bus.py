@@ -1,8 +1,8 @@
-"""The wire between the controllers: who sends next, for how long, and what becomes of it.
+"""The wire between the controllers: arbitration, frames, and errors.
 
-The bus is free, or busy. While it is free it knows the start of the next frame, as soon as somebody wants to send: then
-the window of one bit time runs in which others may join. At its end arbitration is decided, and with it everything up
-to the end of the frame; that is the next event. So a frame is two events here, and one for each node that hears of it.
+The bus is either free or busy. As soon as a controller wants to send, the bus knows the start of the next frame; within
+one bit time others may join. At the end of that bit the arbitration is decided, and with it everything up to the end of
+the frame, which is the next event. So a frame is two events here, and one for each node that receives it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from r2p.codecs.rtcan import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
-from r2p.sim.can.controller import CanController, Recovery
-from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
-from r2p.sim.can.node import NEVER, CanNode, ControllerState, ErrorKind, FrameRecord
+from r2p.sim.can.controller import CanController
+from r2p.sim.can.faults import RECESSIVE_BITS, bits_until_noticed, error_frame_bits, first_difference, flip
+from r2p.sim.can.node import CanNode, ControllerState, ErrorKind, FrameRecord
 from r2p.sim.can.statistics import Statistics
-from r2p.sim.can.timeline import Timeline
+from r2p.sim.can.timeline import NEVER, Timeline
 
 if TYPE_CHECKING:
     import asyncio
@@ -27,20 +27,22 @@ if TYPE_CHECKING:
     from r2p.sim.can.controller import ControllerMailboxes, Request
 
 _SECOND: Final = 1_000_000_000
-_SUSPEND: Final = 8  # bits that an error passive sender waits longer
-_AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge
+_SUSPEND: Final = 8  # bits that an error passive sender waits longer before its next frame
+_BITS_AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge slot
+_RECOVERY_SEQUENCES: Final = 128  # times 11 recessive bits, until a controller leaves bus-off
+_CACHED_IDENTIFIERS: Final = 4096  # for which it is known which controllers they concern
 
 
 class _Transfer(msgspec.Struct, eq=False):
-    """A frame on the wire: its senders, who receives it, and whether an error frame will end it."""
+    """A frame on the wire: its senders, its receivers, and whether an error frame will end it."""
 
     frame: Frame
     requests: list[Request]
     names: tuple[str, ...]
-    heard_by: Sequence[CanController]
+    receivers: Sequence[CanController]
     start: int
     bits: int
-    doomed: bool = False
+    destroyed: bool = False
 
     @property
     def owners(self) -> list[CanController]:
@@ -50,20 +52,20 @@ class _Transfer(msgspec.Struct, eq=False):
 class CanBus:
     """A CAN 2.0B bus with extended identifiers.
 
-    `timeline` is true time. `statistics` counts from the start. `observers` get a `FrameRecord` of each frame and of
-    each attempt at one, at its end.
+    `timeline` is true time. `statistics` counts from the start. `observers` are called with a `FrameRecord` at the end
+    of each frame and of each attempt that failed.
     """
 
     def __init__(
         self, loop: asyncio.AbstractEventLoop, *, bitrate: int = 1_000_000, noise: float = 0.0, seed: int = 0
     ) -> None:
-        """`bitrate` in bit/s; a bit must take whole ns, else ValueError. `noise`: the share of frames with a bit error.
+        """`bitrate` in bit/s, such that a bit takes whole ns. `noise`: the share of frames with a bit error.
 
-        Each node has random numbers of its own, which follow from `seed` and its name.
+        Each node has its own random numbers, which follow from `seed` and its name.
         """
         bit, rest = divmod(_SECOND, bitrate)
         if rest:
-            raise ValueError(f"{bitrate} bit/s: a bit does not take whole nanoseconds")
+            raise ValueError(f"at {bitrate} bit/s a bit does not take whole nanoseconds")
         self.timeline = Timeline(loop)
         self.bit = bit
         self.noise = noise
@@ -74,91 +76,91 @@ class CanBus:
         self._names: set[str] = set()
         self._listeners = Listeners()
         self._noisy = False  # whether a node has noise of its own
-        self._disturb: list[int] = []
+        self._disturbed_bits: list[int] = []  # of the next frames
         self._free = 0  # from when on a frame may start
-        self._contenders: dict[ControllerMailboxes, None] = {}  # may have something to send; nobody else has
-        self._start: int | None = None  # when the next one does
-        self._plan = 0  # the number of that plan: it can change until the window is over
+        self._contenders: dict[ControllerMailboxes, None] = {}  # all that may have something to send, in order
+        self._start: int | None = None  # of the next frame
+        self._plan = 0  # the number of that start: an event of an earlier plan does nothing
         self._transfer: _Transfer | None = None
         self._busy = False
         self._recovery = Recovery(self.timeline, bit)
 
     def attach(self, node: CanNode) -> CanController:
-        """Connect a node, with power on. Raises ValueError when the name is taken."""
+        """Connect a node, with its power on. Raises ValueError if its name is in use."""
         if node.name in self._names:
-            raise ValueError(f"there is a node {node.name} on this bus already")
+            raise ValueError(f"there is already a node {node.name} on this bus: give this one another name")
         self._names.add(node.name)
         controller = CanController(self, node, self._seed)
-        self.joined(controller)
+        self.connected(controller)
         self._noisy = self._noisy or node.noise > 0
         return controller
 
     def disturb_next(self, bit: int) -> None:
-        """Give the next frame a bit error at this bit, counted from 1; those stuffed in count."""
-        self._disturb.append(bit)
+        """Give the next frame a bit error at this bit, counted from 1, stuff bits included."""
+        self._disturbed_bits.append(bit)
 
     def load(self) -> float:
-        """The share of the time that the bus was occupied, since the start or `reset_statistics`."""
+        """Return the share of the time that the bus was occupied since the start or `reset_statistics`."""
         return self.statistics.load(self.timeline.now())
 
     def reset_statistics(self) -> None:
-        """Count from now on."""
+        """Start to count anew."""
         self.statistics = Statistics(self.bit, self.timeline.now())
 
     def close(self) -> None:
-        """Nothing happens any more."""
+        """Drop all events: nothing happens on this bus any more."""
         self.timeline.close()
 
-    # What controllers say (`controller.Wire`)
+    # For controllers (`BusWire`)
 
     def contend(self, request: Request) -> bool:
-        """Try this frame as soon as the bus is free. False: it is not, or this frame would come too late."""
-        boxes = request.owner.mailboxes
-        self._contenders[boxes] = None
+        """Send this frame as soon as the bus is free. False: the bus is busy, or the frame would start too late."""
+        mailboxes = request.owner.mailboxes
+        self._contenders[mailboxes] = None
         if self._busy:
             return False
-        start = self._free
+        start = self._free  # comparisons instead of max(): this runs for each frame
         if start < request.ready:
             start = request.ready
-        if start < boxes.not_before:
-            start = boxes.not_before
-        if start > request.last:
+        if start < mailboxes.not_before:
+            start = mailboxes.not_before
+        if start > request.last_start:
             return False
         if self._start is None or start < self._start:
             self._plan_start(start)
         return True
 
-    def trying(self, request: Request) -> bool:
-        """Whether the start of this frame has begun, and who wins is still open."""
+    def is_starting(self, request: Request) -> bool:
+        """Return whether the start bit of this frame has begun, and arbitration is still open."""
         start = self._start
         if start is None or self.timeline.now() < max(start, request.ready):
             return False
         return request.owner.mailboxes.choose(start, start + self.bit) is request
 
-    def withdrawn(self) -> None:
-        """A frame is not to be sent any more."""
+    def request_withdrawn(self) -> None:
+        """Plan the next frame anew: one has left its mailbox."""
         if not self._busy:
             self._plan_anew()
 
-    def left(self, controller: CanController) -> None:
-        """A controller takes no part any more: no power, or bus-off."""
+    def disconnected(self, controller: CanController) -> None:
+        """Leave this controller out from now on: it has no power, or is in bus-off."""
         self._listeners.leave(controller)
         if controller.state is ControllerState.DOWN:
             self._recovery.forget(controller)
         if self._transfer:
-            self._torn(self._transfer, controller)
-        self.withdrawn()
+            self._node_died(self._transfer, controller)
+        self.request_withdrawn()
 
-    def joined(self, controller: CanController) -> None:
-        """A controller takes part again."""
+    def connected(self, controller: CanController) -> None:
+        """Let this controller send and receive again."""
         self._listeners.join(controller)
 
-    def reconsider(self) -> None:
-        """Other frames than before may concern a controller."""
-        self._listeners.reconsider()
+    def filters_changed(self) -> None:
+        """Forget which controllers are concerned by which frames."""
+        self._listeners.concerned.clear()
 
     def recover(self, controller: CanController) -> None:
-        """A controller wants to leave bus-off."""
+        """Let this controller leave bus-off after enough recessive bits."""
         self._recovery.begin(controller, max(self.timeline.now(), self._free))
 
     # The start of a frame
@@ -172,10 +174,10 @@ class CanBus:
         self._start = None
         self._plan += 1
         free, start = self._free, NEVER
-        for boxes in list(self._contenders):
-            if not boxes.requests:
-                del self._contenders[boxes]
-            elif (first := boxes.first(free)) < start:
+        for mailboxes in list(self._contenders):
+            if not mailboxes.requests:
+                del self._contenders[mailboxes]
+            elif (first := mailboxes.first(free)) < start:
                 start = first
         if start < NEVER:
             self._plan_start(start)
@@ -186,72 +188,72 @@ class CanBus:
             return
         self._start = None
         self._busy = True
-        if self._recovery.left:
+        if self._recovery.remaining:
             self._recovery.busy(start)
-        tries = self._tries(start, start + self.bit)
-        if len(tries) > 1:
-            tries = self._winners(tries, start)
-            if any(request.frame != tries[0].frame for request in tries):
-                self._collide(tries, start)
+        contestants = self._contestants(start, start + self.bit)
+        if len(contestants) > 1:
+            contestants = self._winners(contestants, start)
+            if any(request.frame != contestants[0].frame for request in contestants):
+                self._collide(contestants, start)
                 return
-        self._send(tries, start)
+        self._send(contestants, start)
 
-    def _tries(self, start: int, end: int) -> list[Request]:
-        """What takes part; `end` is one bit after the start of frame."""
-        tries = []
-        for boxes in self._contenders:
-            request = boxes.choose(start, end)
+    def _contestants(self, start: int, end: int) -> list[Request]:
+        """Return one frame of each controller that takes part; `end` is one bit after the start of frame."""
+        contestants = []
+        for mailboxes in self._contenders:
+            request = mailboxes.choose(start, end)
             if request is not None:
-                tries.append(request)
-            if request is None or len(boxes.requests) > 1:
-                boxes.passed(request)
-        return tries
+                contestants.append(request)
+            if request is None or len(mailboxes.requests) > 1:  # some frame of this controller goes on waiting
+                mailboxes.frame_started(request)
+        return contestants
 
-    def _winners(self, tries: list[Request], start: int) -> list[Request]:
-        """Arbitration: the lowest identifier wins; the others lose where they differ from it."""
-        lowest = min([request.frame.id for request in tries])
-        for request in tries:
+    def _winners(self, contestants: list[Request], start: int) -> list[Request]:
+        """Return the frames with the lowest identifier; the others lose at the bit where they differ from it."""
+        lowest = min([request.frame.id for request in contestants])
+        for request in contestants:
             if request.frame.id != lowest:
                 self._lose(request, lowest, start)
-        return [request for request in tries if request.frame.id == lowest]
+        return [request for request in contestants if request.frame.id == lowest]
 
     def _lose(self, request: Request, winner: int, start: int) -> None:
         self.statistics.add_lost(request.owner.name, request.frame.id)
-        request.owner.outdone(request, start + bits_until_lost(winner, request.frame.id) * self.bit)
+        request.owner.lost_arbitration(request, start + bits_until_lost(winner, request.frame.id) * self.bit)
 
     # A frame
 
-    def _send(self, requests: list[Request], start: int, deaf: Sequence[CanController] = ()) -> None:
-        """Put this frame on the wire, of one sender, or of several that send the same."""
-        self._transfer = transfer = self._transfer_of(requests, start, deaf)
+    def _send(self, requests: list[Request], start: int, excluded: Sequence[CanController] = ()) -> None:
+        """Put a frame on the wire, of one sender or of several that send the same."""
+        self._transfer = transfer = self._transfer_of(requests, start, excluded)
         end = start + transfer.bits * self.bit
         for request in requests:
-            request.held = end
-        if (self.noise or self._noisy or self._disturb) and self._hit(transfer):
+            request.busy_until = end
+        if (self.noise or self._noisy or self._disturbed_bits) and self._hit(transfer):
             return
-        if transfer.heard_by:
+        if transfer.receivers:
             self.timeline.at(end, self._finish, transfer, end)
         else:
-            self._destroy(transfer, wire_bits(transfer.frame)[:-_AFTER_ACK], ErrorKind.ACK, transfer.owners)
+            self._destroy(transfer, wire_bits(transfer.frame)[:-_BITS_AFTER_ACK], ErrorKind.ACK, transfer.owners)
 
-    def _transfer_of(self, requests: list[Request], start: int, deaf: Sequence[CanController]) -> _Transfer:
+    def _transfer_of(self, requests: list[Request], start: int, excluded: Sequence[CanController]) -> _Transfer:
         frame, owner = requests[0].frame, requests[0].owner
-        if len(requests) == 1 and not deaf:
-            names, heard_by = self._listeners.audience[owner]
+        if len(requests) == 1 and not excluded:
+            names, receivers = self._listeners.audience[owner]
         else:
             owners = [request.owner for request in requests]
             names = tuple([owner.name for owner in owners])
-            heard_by = [node for node in self._listeners.live if node not in owners and node not in deaf]
-        return _Transfer(frame, requests, names, heard_by, start, frame_bits(frame.id, frame.data))
+            receivers = [node for node in self._listeners.live if node not in owners and node not in excluded]
+        return _Transfer(frame, requests, names, receivers, start, frame_bits(frame.id, frame.data))
 
     def _finish(self, transfer: _Transfer, end: int) -> None:
-        if transfer.doomed:
+        if transfer.destroyed:
             return
         frame = transfer.frame
         for request in transfer.requests:
             request.owner.sent(request, end)
         for node in self._listeners.concerned[frame.id]:
-            if node in transfer.heard_by:
+            if node in transfer.receivers:
                 node.arrived(frame, end)
         self._over(transfer, transfer.bits, None, end)
 
@@ -264,61 +266,61 @@ class CanBus:
         for request in transfer.requests:
             if request.owner.confinement.passive:
                 request.owner.mailboxes.not_before = self._free + _SUSPEND * self.bit
-        if self._recovery.left:
+        if self._recovery.remaining:
             self._recovery.free(self._free)
         self._plan_anew()
-        for observer in self.observers:
+        for observer in self.observers:  # last: an observer may request the next frame
             observer(record)
 
-    # What goes wrong
+    # Errors
 
     def _hit(self, transfer: _Transfer) -> bool:
-        """Let noise hit this frame, perhaps. True: it is destroyed."""
-        if self._disturb or self._numbers.random() < self.noise:
-            bit = self._disturb.pop(0) if self._disturb else self._numbers.randrange(1, transfer.bits + 1)
+        """Decide whether noise hits this frame. True: the frame is destroyed."""
+        if self._disturbed_bits or self._numbers.random() < self.noise:
+            bit = self._disturbed_bits.pop(0) if self._disturbed_bits else self._numbers.randrange(1, transfer.bits + 1)
             bus = flip(wire_bits(transfer.frame), min(bit, transfer.bits))
             self._destroy(transfer, bus, ErrorKind.BIT, transfer.owners)
             return True
-        for node in list(transfer.heard_by):
+        for node in list(transfer.receivers):
             if node.node.noise and node.numbers.random() < node.node.noise:
                 node.disturbed(8)
                 if node.state is ControllerState.ACTIVE:
                     bit = node.numbers.randrange(1, transfer.bits + 1)
                     self._destroy(transfer, wire_bits(transfer.frame)[:bit], ErrorKind.BIT, [node])
                     return True
-                transfer.heard_by = [each for each in transfer.heard_by if each is not node]
+                transfer.receivers = [each for each in transfer.receivers if each is not node]
         return False
 
-    def _collide(self, requests: list[Request], start: int, deaf: Sequence[CanController] = ()) -> None:
-        """Several senders of one identifier: at the first other bit those that send a recessive one see an error."""
+    def _collide(self, requests: list[Request], start: int, excluded: Sequence[CanController] = ()) -> None:
+        """Let senders of one identifier collide: at the first bit that differs, those that send a 1 see an error."""
         wires = [wire_bits(request.frame) for request in requests]
         bit = first_difference(wires)
         hit = [request for request, wire in zip(requests, wires, strict=True) if wire[bit - 1] == "1"]
         if any(request.owner.state is ControllerState.ACTIVE for request in hit):
-            self._transfer = transfer = self._transfer_of(requests, start, deaf)
+            self._transfer = transfer = self._transfer_of(requests, start, excluded)
             self._destroy(transfer, flip(wire_bits(hit[0].frame), bit), ErrorKind.BIT, [r.owner for r in hit])
             return
         at = start + bit * self.bit
-        for request in hit:  # error passive: they leave the bus to the others, who do not notice
-            request.held = at
+        for request in hit:  # error passive: their error flag is invisible, so the others go on
+            request.busy_until = at
             self.timeline.at(at, request.owner.failed, request, ErrorKind.BIT, at)
         rest = [request for request in requests if request not in hit]
-        deaf = [*deaf, *(request.owner for request in hit)]
+        excluded = [*excluded, *(request.owner for request in hit)]
         if any(request.frame != rest[0].frame for request in rest):
-            self._collide(rest, start, deaf)
+            self._collide(rest, start, excluded)
         else:
-            self._send(rest, start, deaf)
+            self._send(rest, start, excluded)
 
     def _destroy(self, transfer: _Transfer, bus: str, kind: ErrorKind, by: Sequence[CanController]) -> None:
-        """After these bits on the bus these nodes know of an error, and say so."""
-        transfer.doomed = True
+        """Destroy a frame: after these bits on the bus, the nodes `by` have detected an error and send error flags."""
+        transfer.destroyed = True
         detected = transfer.start + len(bus) * self.bit
         active = any(node.state is ControllerState.ACTIVE for node in by)
-        others = any(n.state is ControllerState.ACTIVE for n in (*transfer.owners, *transfer.heard_by) if n not in by)
+        others = any(n.state is ControllerState.ACTIVE for n in (*transfer.owners, *transfer.receivers) if n not in by)
         bits = len(bus) + error_frame_bits(bus, wire_bits(transfer.frame), active=active, others=others)
         end = transfer.start + bits * self.bit
         for request in transfer.requests:
-            request.held = end
+            request.busy_until = end
         self.timeline.at(detected, self._failed, transfer, kind)
         self.timeline.at(end, self._over, transfer, bits, kind, end)
 
@@ -326,37 +328,31 @@ class CanBus:
         now = self.timeline.now()
         for request in list(transfer.requests):
             request.owner.failed(request, kind, now)
-        for node in transfer.heard_by:
+        for node in transfer.receivers:
             node.disturbed(1)
 
-    def _torn(self, transfer: _Transfer, controller: CanController) -> None:
-        """A node has died while this frame is on the wire."""
-        sent = -((transfer.start - self.timeline.now()) // self.bit)
+    def _node_died(self, transfer: _Transfer, controller: CanController) -> None:
+        """Leave a controller out of the frame that is on the wire."""
+        sent = -((transfer.start - self.timeline.now()) // self.bit)  # bits so far, rounded up
         before = len(transfer.requests)
         transfer.requests = [request for request in transfer.requests if request.owner is not controller]
-        transfer.heard_by = [node for node in transfer.heard_by if node is not controller]
-        if transfer.doomed:
+        transfer.receivers = [node for node in transfer.receivers if node is not controller]
+        if transfer.destroyed:
             return
         wire = wire_bits(transfer.frame)
         if before and not transfer.requests and sent < transfer.bits - TAIL:
             bus = wire[:sent]
             bus += "1" * bits_until_noticed(bus, wire, "1")
-            self._destroy(transfer, bus, ErrorKind.STUFF, transfer.heard_by)
-        elif transfer.requests and not transfer.heard_by and sent < transfer.bits - _AFTER_ACK:
-            self._destroy(transfer, wire[:-_AFTER_ACK], ErrorKind.ACK, transfer.owners)
-
-
-# Who takes part in a bus, who hears whom, and whom a frame matters to: needed for each frame, and seldom changed.
-
-
-_REMEMBERED: Final = 4096  # identifiers of which it is known whom they concern
+            self._destroy(transfer, bus, ErrorKind.STUFF, transfer.receivers)
+        elif transfer.requests and not transfer.receivers and sent < transfer.bits - _BITS_AFTER_ACK:
+            self._destroy(transfer, wire[:-_BITS_AFTER_ACK], ErrorKind.ACK, transfer.owners)
 
 
 class Listeners:
-    """The controllers with power that are not in bus-off, in the order in which they came.
+    """The live controllers in the order of their connection, and two caches: needed for each frame, seldom changed.
 
-    `audience[controller]`: its name, and all that hear what it sends alone. `concerned[identifier]`: to whom a good
-    frame with this identifier matters.
+    `audience[controller]`: its name, and the receivers of what it sends alone. `concerned[identifier]`: the controllers
+    that a good frame with this identifier concerns.
     """
 
     def __init__(self) -> None:
@@ -365,25 +361,21 @@ class Listeners:
         self.concerned = _Concerned(self.live)
 
     def join(self, controller: CanController) -> None:
-        """It takes part from now on."""
+        """Add a controller."""
         self.live.append(controller)
         self.audience.clear()
         self.concerned.clear()
 
     def leave(self, controller: CanController) -> None:
-        """It takes no part any more, if it did."""
+        """Remove a controller, if it is here."""
         if controller in self.live:
             self.live.remove(controller)
             self.audience.clear()
             self.concerned.clear()
 
-    def reconsider(self) -> None:
-        """Other frames than before may concern a controller."""
-        self.concerned.clear()
-
 
 class _Audience(dict["CanController", tuple[tuple[str, ...], list["CanController"]]]):
-    """Worked out at the first question."""
+    """The name of a controller, and all others; worked out at the first look-up."""
 
     def __init__(self, live: list[CanController]) -> None:
         super().__init__()
@@ -395,14 +387,61 @@ class _Audience(dict["CanController", tuple[tuple[str, ...], list["CanController
 
 
 class _Concerned(dict[int, list["CanController"]]):
-    """Worked out at the first question."""
+    """The controllers that an identifier concerns; worked out at the first look-up."""
 
     def __init__(self, live: list[CanController]) -> None:
         super().__init__()
         self._live = live
 
     def __missing__(self, identifier: int) -> list[CanController]:
-        if len(self) >= _REMEMBERED:
+        if len(self) >= _CACHED_IDENTIFIERS:
             self.clear()
         concerned = self[identifier] = [each for each in self._live if each.concerned(identifier)]
         return concerned
+
+
+class Recovery:
+    """The controllers that are on their way out of bus-off: each counts 128 times 11 recessive bits in a row."""
+
+    def __init__(self, timeline: Timeline, bit: int) -> None:
+        self._timeline = timeline
+        self._sequence = RECESSIVE_BITS * bit  # ns
+        self.remaining: dict[CanController, int] = {}
+        """Sequences that are left to count; while this is empty, `busy` and `free` need not be called."""
+        self._since: dict[CanController, int] = {}  # from when on the bus was idle
+        self._idle = 0  # counts changes between busy and idle: a timer from before a change does nothing
+
+    def begin(self, controller: CanController, since: int) -> None:
+        """Let this controller count from `since`, when the bus is idle."""
+        if not self.remaining:
+            self._idle += 1  # `busy` and `free` were not called, so older timers are void
+        self.remaining[controller] = _RECOVERY_SEQUENCES
+        self._since[controller] = since
+        self._wait(controller)
+
+    def forget(self, controller: CanController) -> None:
+        """Drop a controller that has lost power."""
+        self.remaining.pop(controller, None)
+
+    def busy(self, start: int) -> None:
+        """Count the sequences up to the start of a frame."""
+        self._idle += 1
+        for controller in self.remaining:
+            self.remaining[controller] -= max(0, start - self._since[controller]) // self._sequence
+
+    def free(self, since: int) -> None:
+        """Go on to count after a frame or an error frame, whose intermission ends at `since`."""
+        self._idle += 1
+        for controller in self.remaining:
+            if self._since[controller] < since:  # the end of a frame and its intermission are one sequence
+                self.remaining[controller] -= 1
+            self._since[controller] = max(since, self._since[controller])
+            self._wait(controller)
+
+    def _wait(self, controller: CanController) -> None:
+        when = self._since[controller] + max(0, self.remaining[controller]) * self._sequence
+        self._timeline.at(when, self._check, controller, self._idle)
+
+    def _check(self, controller: CanController, idle: int) -> None:
+        if idle == self._idle and self.remaining.pop(controller, None) is not None:
+            controller.restarted()

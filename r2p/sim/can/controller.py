@@ -1,4 +1,8 @@
-"""One node's CAN controller, as its software sees it: mailboxes to send from, callbacks for what happens, a clock."""
+"""The CAN controller of a node: mailboxes, callbacks, and a clock.
+
+`CanController` is what the node's software uses; `BusWire` is what the controller needs of the bus. Instants inside are
+true time; the stamps that callbacks get are those of the node's clock.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,9 @@ import msgspec
 
 from r2p.codecs.rtcan import FRAME_MAX
 from r2p.errors import MessageError
-from r2p.sim.can.node import NEVER, ControllerState, ErrorKind, LocalAlarm, LocalClock
+from r2p.sim.can.faults import RECESSIVE_BITS, Confinement
+from r2p.sim.can.node import ControllerState, ErrorKind
+from r2p.sim.can.timeline import NEVER, LocalAlarm, LocalClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -19,38 +25,42 @@ if TYPE_CHECKING:
     from r2p.sim.can.timeline import Timeline, TimelineTimer
 
 
+_BABBLE: Final = -1
+"""The mailbox of the frame that a babbling node sends over and over."""
+
+
 class BusWire(Protocol):
-    """What a controller needs of its bus."""
+    """What a controller needs of its bus: a Protocol, because the bus is a layer above and makes the controllers."""
 
     timeline: Timeline
     bit: int
 
     def contend(self, request: Request) -> bool:
-        """Try this frame as soon as the bus is free. False: it is not, or this frame would come too late."""
+        """Send this frame as soon as the bus is free. False: the bus is busy, or the frame would start too late."""
         ...
 
-    def trying(self, request: Request) -> bool:
-        """Whether the start of this frame has begun, and who wins is still open."""
+    def is_starting(self, request: Request) -> bool:
+        """Return whether the start bit of this frame has begun, and arbitration is still open."""
         ...
 
-    def withdrawn(self) -> None:
-        """A frame is not to be sent any more."""
+    def request_withdrawn(self) -> None:
+        """Plan the next frame anew: one has left its mailbox."""
 
-    def reconsider(self) -> None:
-        """Other frames than before may concern a controller."""
+    def filters_changed(self) -> None:
+        """Forget which controllers are concerned by which frames."""
 
-    def left(self, controller: CanController) -> None:
-        """A controller takes no part any more: no power, or bus-off."""
+    def disconnected(self, controller: CanController) -> None:
+        """Leave this controller out from now on: it has no power, or is in bus-off."""
 
-    def joined(self, controller: CanController) -> None:
-        """A controller takes part again."""
+    def connected(self, controller: CanController) -> None:
+        """Let this controller send and receive again."""
 
     def recover(self, controller: CanController) -> None:
-        """A controller wants to leave bus-off."""
+        """Let this controller leave bus-off after enough recessive bits."""
 
 
 class CanController:
-    """Made by `CanBus.attach`. Set the callbacks that you need; stamps are those of this node's clock, in ns."""
+    """A controller, made by `CanBus.attach`. Set the callbacks you need; stamps are of this node's clock, in ns."""
 
     def __init__(self, bus: BusWire, node: CanNode, seed: int) -> None:
         self.name = node.name
@@ -58,55 +68,55 @@ class CanController:
         self.clock = LocalClock(bus.timeline, node.offset, node.drift_ppm)
         self.missed = 0  # frames that the software lost (`CanNode.loss`, `lose_next`)
         self.on_receive: Callable[[Frame, int], object] = ignore
-        """A frame of another node has arrived."""
+        """A frame of another node has been received."""
         self.on_sent: Callable[[Frame, int], object] = ignore
-        """A frame that was requested here has been acknowledged."""
+        """A frame of this node has been acknowledged."""
         self.on_lost: Callable[[Frame, int], object] = ignore
-        """One-shot: a frame has lost arbitration, and leaves its mailbox now."""
+        """In one-shot mode: a frame has lost arbitration, and leaves its mailbox now."""
         self.on_error: Callable[[Frame, ErrorKind, int], object] = ignore
-        """A frame has left its mailbox because of an error: one-shot, or bus-off."""
+        """A frame has left its mailbox because of an error, in one-shot mode, or because of bus-off."""
         self.on_late: Callable[[Frame, int], object] = ignore
-        """A frame has not started by its `not_after`, and left its mailbox: nobody has seen it."""
+        """A frame has not started by its `not_after`, and has left its mailbox without being sent."""
         self.on_state: Callable[[ControllerState, int], object] = ignore
         """`state` has changed."""
         self.numbers = random.Random(f"{seed}/{node.name}")
-        self.mailboxes = ControllerMailboxes(self._guard)  # for the bus, as is the next one
+        self.mailboxes = ControllerMailboxes(self._watch)  # for the bus, as is `confinement`
         self.confinement = Confinement(self._changed)
-        self._transmit_delay = node.transmit.drawer(self.numbers)
+        self._transmit_delay = node.transmit.sampler(self.numbers)
         self._ahead = node.transmit.nominal
-        self._interrupts = Interrupts(bus.timeline, self.clock, node.receive.drawer(self.numbers))
+        self._interrupts = Interrupts(bus.timeline, self.clock, node.receive.sampler(self.numbers))
         self._bus = bus
         self._timeline = bus.timeline
         self._source = bus.timeline.source
         self._filters: Sequence[tuple[int, int]] = ()
         self._lose_next = 0
-        self._mad: Frame | None = None
+        self._babbled: Frame | None = None
 
     @property
     def state(self) -> ControllerState:
-        """Whether it takes part, and how far it trusts itself."""
+        """The error state, or DOWN."""
         return self.confinement.state
 
     @property
     def live(self) -> bool:
-        """Whether it takes part: neither down nor in bus-off."""
+        """Whether it sends and receives: it is neither down nor in bus-off."""
         return self.confinement.live
 
-    # What software does
+    # For the node's software
 
     def request(
         self, frame: Frame, mailbox: int = 0, *, not_before: int | None = None, not_after: int | None = None
     ) -> bool:
-        """Send this frame. False: this mailbox still holds one, or the controller is down or in bus-off.
+        """Send this frame. False: the mailbox still holds one, or the controller is down or in bus-off.
 
-        The two instants are those of this node's clock, in ns. `not_before`: software hands the frame over ahead of
-        it, by the nominal latency; so the start of frame is as exact as the latency. `not_after`: a frame that has not
-        started by then is aborted, and `on_late` is told.
+        The two instants are of this node's clock, in ns. `not_before`: the software hands the frame over earlier by the
+        nominal latency, so the start of frame is as exact as the jitter. `not_after`: a frame that has not started by
+        then is aborted, and `on_late` is called.
 
-        Raises IndexError for a mailbox that the controller does not have, and `MessageError` for what is no frame.
+        Raises IndexError for a mailbox that the controller does not have, and `MessageError` for an invalid frame.
         """
         if not 0 <= mailbox < self.node.mailboxes:
-            raise IndexError(f"{self.name} has {self.node.mailboxes} mailboxes: there is no mailbox {mailbox}")
+            raise IndexError(f"{self.name} has mailboxes 0 to {self.node.mailboxes - 1}, not {mailbox}")
         if mailbox in self.mailboxes.requests or not self.confinement.live:
             return False
         given, clock = self._source.elapsed, self.clock
@@ -119,79 +129,79 @@ class CanController:
         return True
 
     def abort(self, mailbox: int = 0) -> bool:
-        """Withdraw the frame of this mailbox. False: its start of frame has begun, or there is none."""
+        """Remove the frame of this mailbox. False: its start of frame has begun, or the mailbox is empty."""
         request = self.mailboxes.requests.get(mailbox)
         return request is not None and self._withdraw(request)
 
     def pending(self, mailbox: int = 0) -> Frame | None:
-        """The frame in this mailbox."""
+        """Return the frame in this mailbox."""
         request = self.mailboxes.requests.get(mailbox)
         return request.frame if request else None
 
     @property
     def filters(self) -> Sequence[tuple[int, int]]:
-        """(identifier, mask): only frames with `id & mask == identifier` of one are received; none: all are."""
+        """Pairs (identifier, mask): frames with `id & mask == identifier` for one of them are received; empty: all."""
         return self._filters
 
     @filters.setter
     def filters(self, filters: Sequence[tuple[int, int]]) -> None:
         self._filters = filters
-        self._bus.reconsider()
+        self._bus.filters_changed()
 
     def call_at(self, local: int, callback: Callable[..., object], *args: Any) -> TimelineTimer:
-        """Call it when this node's clock shows `local` ns: a timer interrupt, without latency."""
+        """Call `callback(*args)` when this node's clock shows `local` ns: a timer interrupt, without latency."""
         return self._timeline.timer(self.clock.true(local), callback, *args)
 
     def alarm(self, callback: Callable[[], object]) -> LocalAlarm:
-        """A timer of this node that can be moved, by its clock."""
+        """Return a movable timer on this node's clock."""
         return LocalAlarm(self._timeline, self.clock, callback)
 
     def restart(self) -> None:
-        """Leave bus-off, after 128 times 11 recessive bits: for `CanNode(recovery=False)`."""
+        """Leave bus-off after 128 times 11 recessive bits: for `CanNode(recovery=False)`."""
         if self.state is ControllerState.BUS_OFF:
             self._bus.recover(self)
 
-    # What happens to nodes
+    # Faults of the node
 
     def babble(self, frame: Frame | None) -> None:
-        """Go mad: send this frame over and over, whatever happens. None: be well again."""
-        self._mad = frame
-        self.mailboxes.requests.pop(BABBLE, None)
-        self._bus.withdrawn()
+        """Send this frame over and over, as a babbling idiot does. None: stop."""
+        self._babbled = frame
+        self.mailboxes.requests.pop(_BABBLE, None)
+        self._bus.request_withdrawn()
         self._babble()
 
     def lose_next(self, count: int = 1) -> None:
-        """The software loses the next frames that it should receive."""
+        """Let the software lose the next frames that it should receive."""
         self._lose_next += count
 
     def power_off(self) -> None:
-        """Die, in the middle of a frame if need be. Nothing is called back; the mailboxes are lost."""
+        """Cut the power, also in the middle of a frame. No callback is called; the mailboxes are lost."""
         if self.state is ControllerState.DOWN:
             return
         self.confinement.enter(ControllerState.DOWN)
-        self._mad = None
-        self._interrupts.forget()
+        self._babbled = None
+        self._interrupts.discard()
         self.mailboxes.clear()
-        self._bus.left(self)
+        self._bus.disconnected(self)
 
     def power_on(self) -> None:
-        """Come back, as new: sends nothing before it has seen 11 recessive bits."""
+        """Restore the power: it starts as new, and sends nothing before it has seen 11 recessive bits."""
         if self.state is ControllerState.DOWN:
-            self.mailboxes.not_before = self._timeline.now() + RECESSIVE * self._bus.bit
+            self.mailboxes.not_before = self._timeline.now() + RECESSIVE_BITS * self._bus.bit
             self.restarted()
 
-    # What the bus tells it
+    # For the bus
 
     def concerned(self, identifier: int) -> bool:
-        """Whether a good frame of another node matters here: it may be wanted, or make up for an error."""
-        return self.confinement.receive > 0 or self._wants(identifier)
+        """Return whether a good frame of another node matters: it passes the filters, or decrements the error count."""
+        return self.confinement.receive > 0 or self._is_wanted(identifier)
 
     def arrived(self, frame: Frame, end: int) -> None:
-        """A good frame of another node ended, which concerns this one."""
+        """Receive a good frame of another node that concerns this one."""
         if self.confinement.receive:
             self.confinement.received()
-            self._bus.reconsider()
-            if not self._wants(frame.id):
+            self._bus.filters_changed()
+            if not self._is_wanted(frame.id):
                 return
         if self._lose_next:
             self._lose_next -= 1
@@ -199,41 +209,42 @@ class CanController:
         elif self.node.loss and self.numbers.random() < self.node.loss:
             self.missed += 1
         else:
-            self._interrupts.tell(end, self.on_receive, frame)
+            self._interrupts.deliver(end, self.on_receive, frame)
 
     def sent(self, request: Request, end: int) -> None:
-        """This request's frame got through."""
+        """Complete this request: its frame was acknowledged."""
         if self.confinement.transmit:
             self.confinement.transmitted()
         if self.mailboxes.remove(request):
-            self._interrupts.tell(end, self.on_sent, request.frame)
+            self._interrupts.deliver(end, self.on_sent, request.frame)
 
-    def outdone(self, request: Request, at: int) -> None:
-        """This request's frame loses arbitration, at this instant."""
-        request.held = at
-        if self.node.one_shot and request.mailbox != BABBLE:
+    def lost_arbitration(self, request: Request, at: int) -> None:
+        """Note that the frame of this request loses arbitration, at this instant."""
+        request.busy_until = at
+        if self.node.one_shot and request.mailbox != _BABBLE:
             request.ready = NEVER
-            self._interrupts.tell(at, self._lost, request)
-        elif request.last < NEVER:
-            self._guard(request)
+            self._interrupts.deliver(at, self._lost, request)
+        elif request.last_start < NEVER:
+            self._watch(request)
 
     def failed(self, request: Request, kind: ErrorKind, at: int) -> None:
-        """This request's frame was destroyed: an error frame begins."""
+        """Note that the frame of this request was destroyed: an error frame begins."""
+        # The standard's exception: a node that is alone on the bus stays error passive, and never goes to bus-off.
         alone = kind is ErrorKind.ACK and self.confinement.passive
-        if not alone:  # or a lone node would go to bus-off
+        if not alone:
             self.confinement.failed(transmit=8)
         if self.node.one_shot and self.mailboxes.remove(request):
-            self._interrupts.tell(at, self.on_error, request.frame, kind)
+            self._interrupts.deliver(at, self.on_error, request.frame, kind)
 
     def disturbed(self, count: int) -> None:
-        """A frame that this node was receiving was destroyed."""
+        """Note that a frame that this node was receiving was destroyed."""
         self.confinement.failed(receive=count)
-        self._bus.reconsider()
+        self._bus.filters_changed()
 
     def restarted(self) -> None:
-        """It takes part again, with its error counters at 0."""
+        """Start again with the error counters at 0."""
         self.confinement.restart()
-        self._bus.joined(self)
+        self._bus.connected(self)
         self._babble()
 
     # Inside
@@ -241,91 +252,98 @@ class CanController:
     def _put(self, request: Request) -> None:
         frame = request.frame
         if frame.id >> 29 or len(frame.data) > FRAME_MAX:
-            raise MessageError(f"identifier {frame.id:#x} with {len(frame.data)} bytes: no frame has room")
+            raise MessageError(
+                f"a frame has an identifier of at most 29 bits and at most {FRAME_MAX} bytes, "
+                f"not {frame.id:#x} with {len(frame.data)} bytes"
+            )
         self.mailboxes.requests[request.mailbox] = request
-        if not self._bus.contend(request) and request.last < NEVER:
-            self._guard(request)
+        if not self._bus.contend(request) and request.last_start < NEVER:
+            self._watch(request)
 
-    def _wants(self, identifier: int) -> bool:
+    def _is_wanted(self, identifier: int) -> bool:
         return not self._filters or any(identifier & mask == value for value, mask in self._filters)
 
-    def _guard(self, request: Request) -> None:
-        """Abort it at its last instant, if it still waits by then: its software is told, and only then looks."""
-        if not request.guarded and request.ready < NEVER:
-            request.guarded = True
-            self._interrupts.look(max(request.last, request.held, self._timeline.now()), self._late, request)
+    def _watch(self, request: Request) -> None:
+        """Abort the frame after its last start, if it still waits then."""
+        # One event for each frame at most, and none for a frame that starts at once: most have a last start.
+        if not request.watched and request.ready < NEVER:
+            request.watched = True
+            self._interrupts.check_at(
+                max(request.last_start, request.busy_until, self._timeline.now()), self._late, request
+            )
 
     def _changed(self, state: ControllerState) -> None:
         if state is ControllerState.DOWN:
             return
         now = self._timeline.now()
-        given_up = self.mailboxes.clear() if state is ControllerState.BUS_OFF else ()
-        self._interrupts.tell(now, self.on_state, state)
-        for frame in given_up:
-            self._interrupts.tell(now, self.on_error, frame, ErrorKind.BUS_OFF)
+        lost = self.mailboxes.clear() if state is ControllerState.BUS_OFF else ()
+        self._interrupts.deliver(now, self.on_state, state)
+        for frame in lost:
+            self._interrupts.deliver(now, self.on_error, frame, ErrorKind.BUS_OFF)
         if state is ControllerState.BUS_OFF:
-            self._bus.left(self)
+            self._bus.disconnected(self)
             if self.node.recovery:
                 self._bus.recover(self)
 
     def _withdraw(self, request: Request) -> bool:
-        """Empty its mailbox, unless it is on the wire or about to be."""
-        if self._timeline.now() < request.held or self._bus.trying(request) or not self.mailboxes.remove(request):
+        """Empty the mailbox, unless the frame is on the wire or about to be."""
+        if (
+            self._timeline.now() < request.busy_until
+            or self._bus.is_starting(request)
+            or not self.mailboxes.remove(request)
+        ):
             return False
-        self._bus.withdrawn()
+        self._bus.request_withdrawn()
         return True
 
     def _lost(self, request: Request, stamp: int) -> None:
-        if self.mailboxes.remove(request):  # only now: one event less for each loss, and software can't know before
+        if self.mailboxes.remove(request):  # only now: one event less for each loss, and software can't tell
             self.on_lost(request.frame, stamp)
 
     def _late(self, request: Request, stamp: int) -> None:
-        request.guarded = False  # if it has started, and is not sent, this comes again
+        request.watched = False  # a frame that has started and is not sent in the end is watched again
         if self._withdraw(request):
             self.on_late(request.frame, stamp)
 
     def _babble(self) -> None:
-        if self._mad and self.live:
-            self._put(Request(self, self._mad, BABBLE, self._timeline.now(), NEVER))
-
-
-# What a controller has to send: its mailboxes, and which of their frames it tries.
-
-
-BABBLE: Final = -1
-"""The mailbox of a node that has gone mad."""
+        if self._babbled and self.live:
+            self._put(Request(self, self._babbled, _BABBLE, self._timeline.now(), NEVER))
 
 
 class Request(msgspec.Struct, eq=False):
     """A frame in a mailbox of the controller `owner`.
 
-    `ready`: from when on the controller tries it; `last`: until when it may start; `held`: until when it is on the
-    wire. `guarded`: it will be aborted at `last`, unless it is on the wire.
+    All instants are true time, in ns: the controller tries to send it from `ready` on; it starts by `last_start` or
+    not at all; it is on the wire until `busy_until`. `watched`: an event at `last_start` will abort it if it waits.
     """
 
     owner: CanController
     frame: Frame
     mailbox: int
     ready: int
-    last: int
-    held: int = 0
-    guarded: bool = False
+    last_start: int
+    busy_until: int = 0
+    watched: bool = False
 
 
 class ControllerMailboxes:
-    """One frame in each. `guard` is told of those that may have to be aborted at their last instant."""
+    """The mailboxes of a controller, one frame in each, and the choice which of them is sent.
 
-    def __init__(self, guard: Callable[[Request], None]) -> None:
+    `watch` is called with frames that may have to be aborted at their last start.
+    """
+
+    def __init__(self, watch: Callable[[Request], None]) -> None:
         self.requests: dict[int, Request] = {}
-        """By mailbox."""
+        """The frames, by mailbox."""
         self.not_before = 0
-        """No start of frame here earlier than this."""
-        self._guard = guard
+        """The controller starts no frame before this instant."""
+        self._watch = watch
 
     def choose(self, start: int, end: int) -> Request | None:
-        """The frame that this controller tries when a start of frame comes at `start`; `end` is one bit later.
+        """Return the frame that takes part in an arbitration from `start` on; `end` is one bit later.
 
-        Of those ready by then the one with the lowest identifier, else the first that gets ready before `end`.
+        Of the frames ready by then it is the one with the lowest identifier, otherwise the first to be ready by `end`:
+        a controller that is ready within the first bit still joins.
         """
         chosen = None
         if start < self.not_before:
@@ -334,14 +352,14 @@ class ControllerMailboxes:
             begins = request.ready
             if begins < start:
                 begins = start
-            if begins > request.last:
+            if begins > request.last_start:
                 continue
             if begins < end or (begins == end and chosen is not None and request.frame.id < chosen.frame.id):
                 chosen, end = request, begins
         return chosen
 
     def first(self, free: int) -> int:
-        """When this controller wants to start a frame, given when the bus is free. NEVER: not at all."""
+        """Return when this controller wants to start a frame, given when the bus is free. NEVER: not at all."""
         earliest = NEVER
         if free < self.not_before:
             free = self.not_before
@@ -349,175 +367,64 @@ class ControllerMailboxes:
             begins = request.ready
             if begins < free:
                 begins = free
-            if begins > request.last:
-                self._guard(request)
+            if begins > request.last_start:
+                self._watch(request)
             elif begins < earliest:
                 earliest = begins
         return earliest
 
-    def passed(self, chosen: Request | None) -> None:
-        """A frame has started, and of these at most this one takes part: watch the others' last instants."""
+    def frame_started(self, chosen: Request | None) -> None:
+        """Watch all frames but `chosen`: another frame has started, and they may become too late."""
         for request in self.requests.values():
-            if request.last < NEVER and request is not chosen:
-                self._guard(request)
+            if request.last_start < NEVER and request is not chosen:
+                self._watch(request)
 
     def clear(self) -> list[Frame]:
-        """Empty all; these were the frames."""
-        frames = [request.frame for mailbox, request in self.requests.items() if mailbox != BABBLE]
+        """Empty all mailboxes and return the frames."""
+        frames = [request.frame for mailbox, request in self.requests.items() if mailbox != _BABBLE]
         self.requests.clear()
         return frames
 
     def remove(self, request: Request) -> bool:
-        """Empty its mailbox. False if it is no longer there; a babbling node never ends."""
+        """Empty the mailbox of this request. False: it is no longer there, or the node babbles and sends it again."""
         mailbox = request.mailbox
-        if mailbox == BABBLE or self.requests.get(mailbox) is not request:
+        if mailbox == _BABBLE or self.requests.get(mailbox) is not request:
             return False
         del self.requests[mailbox]
         return True
 
 
-# Out of bus-off: a controller comes back once it has seen 128 times 11 recessive bits in a row.
-
-
-RECESSIVE: Final = 11
-_TIMES: Final = 128
-
-
-class Recovery:
-    """The controllers that wait for it."""
-
-    def __init__(self, timeline: Timeline, bit: int) -> None:
-        self._timeline = timeline
-        self._sequence = RECESSIVE * bit  # ns
-        self.left: dict[CanController, int] = {}  # how many times more; without any, `busy` and `free` need no call
-        self._since: dict[CanController, int] = {}  # from when on the bus was idle
-        self._idle = 0  # counts the times that the bus became free or busy: a timer of another time does nothing
-
-    def begin(self, controller: CanController, since: int) -> None:
-        """This one counts from now, or from `since`, when the bus becomes idle."""
-        if not self.left:
-            self._idle += 1  # `busy` and `free` were not called: timers from before mean nothing
-        self.left[controller] = _TIMES
-        self._since[controller] = since
-        self._wait(controller)
-
-    def forget(self, controller: CanController) -> None:
-        """This one has died."""
-        self.left.pop(controller, None)
-
-    def busy(self, start: int) -> None:
-        """A frame starts on the idle bus."""
-        self._idle += 1
-        for controller in self.left:
-            self.left[controller] -= max(0, start - self._since[controller]) // self._sequence
-
-    def free(self, since: int) -> None:
-        """A frame or an error frame is over, and so will its intermission be at `since`."""
-        self._idle += 1
-        for controller in self.left:
-            if self._since[controller] < since:
-                self.left[controller] -= 1
-            self._since[controller] = max(since, self._since[controller])
-            self._wait(controller)
-
-    def _wait(self, controller: CanController) -> None:
-        when = self._since[controller] + max(0, self.left[controller]) * self._sequence
-        self._timeline.at(when, self._check, controller, self._idle)
-
-    def _check(self, controller: CanController, idle: int) -> None:
-        if idle == self._idle and self.left.pop(controller, None) is not None:
-            controller.restarted()
-
-
-# Fault confinement: a controller counts errors, and with more of them takes less and less part.
-
-
-_PASSIVE: Final = 127
-_OFF: Final = 255
-_RECEIVED_WELL: Final = 119  # what the receive error counter goes back to from above 127
-
-
-class Confinement:
-    """The two error counters of a controller, and the state that follows from them; `changed` is told of a new one."""
-
-    def __init__(self, changed: Callable[[ControllerState], object]) -> None:
-        self.state = ControllerState.ACTIVE
-        self.live = True
-        """Whether the controller takes part: neither down nor in bus-off."""
-        self.passive = False
-        self.transmit = 0
-        self.receive = 0
-        self._changed = changed
-
-    def transmitted(self) -> None:
-        """A frame got through."""
-        self._count(self.transmit - 1, self.receive)
-
-    def received(self) -> None:
-        """A good frame came in."""
-        self._count(self.transmit, self.receive - 1 if self.receive <= _PASSIVE else _RECEIVED_WELL)
-
-    def failed(self, *, transmit: int = 0, receive: int = 0) -> None:
-        """A frame was destroyed, while it was sent or received: add this to the counters."""
-        self._count(self.transmit + transmit, self.receive + receive)
-
-    def restart(self) -> None:
-        """Begin anew, without errors."""
-        self.transmit = self.receive = 0
-        self.enter(ControllerState.ACTIVE)
-
-    def enter(self, state: ControllerState) -> None:
-        """Be in this state from now on."""
-        if state is not self.state:
-            self.state = state
-            self.live = state is ControllerState.ACTIVE or state is ControllerState.PASSIVE
-            self.passive = state is ControllerState.PASSIVE
-            self._changed(state)
-
-    def _count(self, transmit: int, receive: int) -> None:
-        self.transmit = max(0, transmit)
-        self.receive = max(0, receive)
-        if self.transmit > _OFF:
-            self.enter(ControllerState.BUS_OFF)
-        else:
-            self.enter(
-                ControllerState.PASSIVE if max(self.transmit, self.receive) > _PASSIVE else ControllerState.ACTIVE
-            )
-
-
-# How a node's software hears of things: a little late, in the order in which they happened, never after its death.
-
-
 class Interrupts:
-    """Calls the software's handlers, each with the instant that the node's clock shows as its last argument.
+    """Calls the callbacks of the node's software, each with the time of the node's clock as its last argument.
 
-    `delay()` gives ns from an instant to when its interrupt is served.
+    They come a little late, in the order of the events, and never after the node has lost power. `delay()` returns the
+    ns from an event to the moment when its interrupt is served.
     """
 
     def __init__(self, timeline: Timeline, clock: LocalClock, delay: Callable[[], int]) -> None:
         self._timeline = timeline
         self._clock = clock
         self._delay = delay
-        self._life = 0  # counts deaths: what it was about to hear is not heard any more
-        self._heard = 0  # when its software hears the last thing so far
+        self._life = 0  # counts power cuts: interrupts from before one are not served
+        self._latest = 0  # when the last interrupt so far is served: none overtakes another, whatever their delays
 
-    def tell(self, when: int, handler: Callable[..., object], *args: Any) -> None:
-        """Something happens at `when`, on the bus."""
+    def deliver(self, when: int, handler: Callable[..., object], *args: Any) -> None:
+        """Call the handler for an event on the bus at `when`."""
         if handler is ignore:
             return
-        heard = when + self._delay()
-        if heard < self._heard:
-            heard = self._heard
-        self._heard = heard
-        self._timeline.at(heard, self._serve, heard, self._life, handler, args)
+        at = when + self._delay()
+        if at < self._latest:
+            at = self._latest
+        self._latest = at
+        self._timeline.at(at, self._serve, at, self._life, handler, args)
 
-    def look(self, when: int, handler: Callable[..., object], *args: Any) -> None:
-        """Something may have to be done at `when`; it keeps nothing else waiting."""
+    def check_at(self, when: int, handler: Callable[..., object], *args: Any) -> None:
+        """Call the handler for a time-out at `when`, which does not hold up the events after it."""
         at = when + self._delay()
         self._timeline.at(at, self._serve, at, self._life, handler, args)
 
-    def forget(self) -> None:
-        """The node has died."""
+    def discard(self) -> None:
+        """Drop all interrupts that were not served: the node has lost power."""
         self._life += 1
 
     def _serve(self, at: int, life: int, handler: Callable[..., object], args: tuple[Any, ...]) -> None:
@@ -526,4 +433,4 @@ class Interrupts:
 
 
 def ignore(*_args: object) -> None:
-    """The handler of software that does not care."""
+    """Do nothing: the callback of software that has set none."""

@@ -1,4 +1,4 @@
-"""What the bus carried. It counts records, so it serves for any bus that somebody writes records of."""
+"""Counters of what a bus carried, by message and by node. They count `FrameRecord`s, so they fit any bus."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Count:
-    """`frames` that got through and their `bits` (stuffed ones included, without intermission), and what did not."""
+    """Frames that were sent, with their bits (stuff bits included, intermission not), and what was not sent."""
 
     __slots__ = ("bits", "error_bits", "errors", "frames", "lost")
 
@@ -24,21 +24,21 @@ class Count:
         self.lost = 0  # arbitrations lost
 
     def add(self, other: Count) -> None:
-        """Count what the other one has counted."""
+        """Add the numbers of another counter."""
         for name in self.__slots__:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     @property
     def occupied(self) -> int:
-        """Bit times that nobody else could use: everything, with the intermission that follows."""
+        """Bit times in which the bus was not free: all bits, with the intermission that follows."""
         return self.bits + self.error_bits + INTERMISSION * (self.frames + self.errors)
 
 
 class Statistics:
-    """Counts in all, by message id and by node. A frame that several nodes sent as one counts for each of them."""
+    """Totals, and counts by message id and by node. A frame that several nodes sent as one counts for each of them."""
 
     def __init__(self, bit: int, since: int) -> None:
-        """`bit` is the length of one, and `since` the instant from which the load counts, in ns."""
+        """`bit`: the length of a bit in ns. `since`: the instant from which the load counts, in ns."""
         self.since = since
         self._bit = bit
         self._counts: defaultdict[tuple[int, tuple[str, ...]], Count] = defaultdict(Count)  # by message id and senders
@@ -66,7 +66,7 @@ class Statistics:
         return dict(counts)
 
     def add(self, record: FrameRecord) -> None:
-        """Count one attempt."""
+        """Count a frame or a failed attempt."""
         count = self._counts[record.frame.id >> 7 & 0xFFFF, record.senders]
         if record.error is None:
             count.frames += 1
@@ -80,6 +80,6 @@ class Statistics:
         self._counts[identifier >> 7 & 0xFFFF, (name,)].lost += 1
 
     def load(self, now: int) -> float:
-        """The share of the time up to `now` in which the bus was occupied: 1.0 is saturated."""
+        """Return the share of the time up to `now` (ns) in which the bus was occupied: 1.0 is saturated."""
         elapsed = now - self.since
         return self.total.occupied * self._bit / elapsed if elapsed > 0 else 0.0

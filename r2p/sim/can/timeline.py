@@ -1,14 +1,15 @@
-"""The order of events on a bus, and of the timers of its nodes: a list of instants under one timer of the loop.
+"""The order of events on a bus in true time, and the clocks of its nodes.
 
-Turning asyncio's loop for each event would cost more than the event. So under virtual time the loop runs ahead through
-this list, for as long as nothing else is due: the same events at the same instants, only faster. On an ordinary loop
-what has become due is carried out; an event that the loop made late still has its own instant, `now()`.
+All events of a bus are in one sorted list under one timer of the loop. An iteration of asyncio's loop for each event
+would cost more than the event, so under virtual time the loop runs ahead through the list until something else is due:
+the same events at the same instants, only faster. On an ordinary loop the events that are due are run; an event that
+runs late still has its own instant, `now()`.
 """
 
 from __future__ import annotations
 
 from bisect import insort
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from r2p.clock import Alarm, clock_of
 from r2p.sim.loop import VirtualLoop
@@ -19,9 +20,14 @@ if TYPE_CHECKING:
 
     from r2p.sim.loop import Event
 
+NEVER: Final = 1 << 63
+"""An instant after all others, ns."""
+
+_SECOND: Final = 1_000_000_000
+
 
 class TimelineTimer:
-    """One call in the future, which can be cancelled."""
+    """A call in the future that can be cancelled."""
 
     __slots__ = ("_args", "_callback")
 
@@ -30,18 +36,18 @@ class TimelineTimer:
         self._args = args
 
     def cancel(self) -> None:
-        """Let it not happen, unless it has."""
+        """Cancel the call, unless it has been made."""
         self._callback = None
 
     def fire(self) -> None:
-        """Call it now, once."""
+        """Make the call now, once."""
         callback, self._callback = self._callback, None
         if callback is not None:
             callback(*self._args)
 
 
 class TimelineSource(Protocol):
-    """A clock that can be read."""
+    """A clock with the time as an attribute: the timeline itself, or the clock of a `VirtualLoop`."""
 
     @property
     def elapsed(self) -> int:
@@ -50,46 +56,46 @@ class TimelineSource(Protocol):
 
 
 class Timeline:
-    """Calls at instants of the loop's monotonic clock, in ns; those of one instant in the order they were made."""
+    """Makes calls at instants of the loop's monotonic clock, in ns; calls of one instant in the order of `at`."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.clock = clock_of(loop)
-        self._events: list[Event] = []  # sorted: there are a few for each node, so few that a heap takes longer
+        self._events: list[Event] = []  # sorted; a few for each node, and with so few a heap is slower
         self._number = 0
         self._alarm = Alarm(loop, self._run, background=True)
         self._virtual = loop if isinstance(loop, VirtualLoop) and loop.clock.virtual else None
         self._running = False
         self._now = 0
         self.source: TimelineSource = self if self._virtual is None else self._virtual.clock
-        """Where `now` comes from, for those who ask often: `elapsed` is the same without a call."""
+        """What `now` reads. For hot paths: `source.elapsed` is the same without a call."""
         self.now: Callable[[], int] = self.clock.monotonic if self._virtual else self._present
-        """The instant of the event that is being carried out; else what the clock says."""
+        """The instant of the event that is running; between events, the time."""
 
     @property
     def elapsed(self) -> int:
-        """As `now()`, on an ordinary loop."""
+        """Return the same as `now()`, on an ordinary loop."""
         return self._present()
 
     def at(self, when: int, callback: Callable[..., object], *args: Any) -> None:
-        """Call it at `when`; an instant that is over is now."""
+        """Call `callback(*args)` at `when`; as soon as possible if that is in the past."""
         self._number = number = self._number + 1
         insort(self._events, (when, number, callback, args))
         if not self._running and self._events[0][1] == number:
             self._alarm.set(when)
 
     def timer(self, when: int, callback: Callable[..., object], *args: Any) -> TimelineTimer:
-        """As `at`, and can be cancelled."""
+        """Do the same as `at`, with a timer that can be cancelled."""
         timer = TimelineTimer(callback, args)
         self.at(when, timer.fire)
         return timer
 
     def catch_up(self) -> None:
-        """On an ordinary loop, carry out what is due: for whoever is about to act in the present."""
+        """On an ordinary loop, run the events that are due, so that what follows is done in the present."""
         if self._virtual is None and not self._running:
             self._run()
 
     def close(self) -> None:
-        """Nothing happens any more, until the next `at`."""
+        """Drop all events; the next `at` starts anew."""
         self._events.clear()
         self._alarm.close()
 
@@ -100,7 +106,7 @@ class Timeline:
                 self._virtual.run_ahead(self._events)
             else:
                 self._run_due(self.clock.monotonic())
-        finally:  # an event that raises goes to the loop's exception handler; the next one comes all the same
+        finally:  # an exception goes to the loop's exception handler; the next event runs all the same
             self._running = False
             self._now = 0
             if self._events:
@@ -115,3 +121,82 @@ class Timeline:
             when, _, callback, args = events.pop(0)
             self._now = max(self._now, when)
             callback(*args)
+
+
+class LocalClock:
+    """The clock of a node: too fast by `drift_ppm`, and `offset` ns ahead at true time 0."""
+
+    def __init__(self, timeline: Timeline, offset: int, drift_ppm: float) -> None:
+        self.virtual = timeline.clock.virtual
+        self._timeline = timeline
+        self._source = timeline.source
+        self._offset = offset
+        self._drift = round(drift_ppm * 1000)  # ns per second
+        self._second = _SECOND + self._drift  # local ns in a true second
+        self._true = self._local = -1  # the latest conversion: at one instant it is needed again and again
+
+    def monotonic(self) -> int:
+        """Return the time of this clock, in ns."""
+        true = self._source.elapsed
+        return self._local if true == self._true else self.local(true)
+
+    def now(self) -> int:
+        """Return UTC in ns, as far as this node knows it."""
+        true = self._source.elapsed
+        ahead = self.local(true) - true
+        return self._timeline.clock.now() + ahead
+
+    def local(self, true: int) -> int:
+        """Return what this clock shows at a true instant."""
+        if true != self._true:
+            self._true = true
+            self._local = true + self._offset + true * self._drift // _SECOND
+        return self._local
+
+    def true(self, local: int) -> int:
+        """Return the first true instant at which this clock shows `local` or more."""
+        since = local - self._offset
+        return since - since * self._drift // self._second
+
+
+class LocalAlarm:
+    """A movable timer on a node's clock: calls `callback()` when the clock shows the deadline or more.
+
+    A later deadline costs nothing: the event that was scheduled stays, and schedules another one if it comes too early.
+    """
+
+    def __init__(self, timeline: Timeline, clock: LocalClock, callback: Callable[[], object]) -> None:
+        self._timeline = timeline
+        self._clock = clock
+        self._callback = callback
+        self._deadline: int | None = None
+        self._due = 0  # the true instant of the deadline
+        self._armed = NEVER  # the instant of the scheduled event; may be earlier
+
+    def set(self, deadline: int | None) -> None:
+        """Set the deadline, in local ns; one in the past is now. None: off."""
+        if deadline == self._deadline:
+            return
+        self._deadline = deadline
+        if deadline is not None:
+            self._due = due = self._clock.true(deadline)
+            if due < self._armed:
+                self._armed = due
+                self._timeline.at(due, self._expire, due)
+
+    def close(self) -> None:
+        """Switch the timer off."""
+        self._deadline = None
+
+    def _expire(self, armed: int) -> None:
+        if armed != self._armed:
+            return  # another event has been scheduled since, for an earlier instant
+        self._armed = NEVER
+        if self._deadline is None:
+            return
+        if self._due > armed:
+            self._armed = self._due
+            self._timeline.at(self._due, self._expire, self._due)
+            return
+        self._deadline = None
+        self._callback()
