@@ -20,7 +20,7 @@ from r2p.tools.bus import dump as bus_dump
 from r2p.tools.bus import load as bus_load
 from r2p.tools.bus import schedule as bus_schedule
 from r2p.tools.bus.load import listen
-from r2p.tools.session import Usage
+from r2p.tools.session import UsageError
 from r2p.transports.can.port import CanPort, CanPortListener
 
 pytestmark = pytest.mark.virtual_time
@@ -83,9 +83,7 @@ async def test_the_slots_show_their_owner_and_who_died() -> None:
         cells = bus_schedule.cells_of(listener)
         assert [cell.owner for cell in cells].count("encoder") == 1
         assert cells[0].owner == "sync"
-        assert [cell.owner for cell in cells].count(
-            "reserved, and not used: nobody subscribes, or the owner is gone"
-        ) == 1
+        assert [cell.owner for cell in cells].count("reserved but not used: no subscriber, or the owner is gone") == 1
         assert [row["used"] for row in bus_schedule.rows(listener) if row["owner"] == "encoder"] == [20]
         bus.power_off()
         assert not await listener.cycles(20, timeout=1.0)
@@ -177,7 +175,7 @@ def test_an_invalid_topic_is_a_usage_error() -> None:
 
 @pytest.mark.parametrize("via", [["memory:lab"], ["rtcan:can0", "rtcan:can1"]])
 async def test_the_commands_take_one_can_bus(via: list[str]) -> None:
-    with pytest.raises(Usage, match="give one CAN bus"):
+    with pytest.raises(UsageError, match="give one CAN bus"):
         async with listen(via):
             pass
 

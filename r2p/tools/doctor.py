@@ -1,7 +1,7 @@
-"""`r2p doctor`: what this machine has and lacks for r2p, and what to do about it. It sends nothing to anybody.
+"""`r2p doctor`: what this machine has and lacks for r2p, and what to do about it. It sends nothing.
 
-Each check is a function that looks at one thing and says what it found; those that read the system's files take the
-root folder, so that tests bring their own.
+Each check is a function that inspects one thing and returns what it found; checks that read system files have the root
+folder as an argument, for tests.
 """
 
 import asyncio
@@ -22,23 +22,24 @@ import msgspec
 import r2p
 from r2p.clock import Ticker
 from r2p.names import module_name_from
+from r2p.tools.options import Format, Quiet, Verbose
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Quiet, Usage, Verbose, execute, settings
+from r2p.tools.session import UsageError, execute, settings
 from r2p.transports.can.netlink import ARPHRD_CAN, Interface, has_socketcan, list_interfaces
 
 EXTRAS = {"can": "python-can", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
-"""The extras of r2p, and the package that each brings."""
+"""The extras of r2p, and the package of each."""
 
 _ROOT = Path("/")
 _UP = 1  # IFF_UP
 _PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttyS*", "rfcomm*", "cu.usb*")
 _TICK = 1_000_000  # ns
 _SAMPLE = 0.2  # seconds
-_LATE = 1_000_000  # ns; a 99th percentile above it spoils periods of some milliseconds
+_LATE = 1_000_000  # ns; a 99th percentile above this is too much for periods of a few milliseconds
 
 
 class Check(msgspec.Struct, frozen=True):
-    """One thing that was looked at: what was found, and what to do if it is not `ok`, or could be better."""
+    """The result of one check: what was found, and what to `do` if it is not `ok` or could be better."""
 
     what: str
     ok: bool
@@ -54,7 +55,7 @@ class Check(msgspec.Struct, frozen=True):
 
 
 def command(format: Format = None, verbose: Verbose = 0, quiet: Quiet = 0) -> None:
-    """Tell what this machine has and lacks for r2p, and what to do about it. Sends nothing to anybody."""
+    """Check what this machine has and lacks for r2p, and what to do about it. Sends nothing."""
 
     async def main() -> None:
         output = Output(format)
@@ -67,11 +68,11 @@ def command(format: Format = None, verbose: Verbose = 0, quiet: Quiet = 0) -> No
 
 
 def checks(root: Path = _ROOT) -> Iterator[Check]:
-    """All checks but the measurement; `root` is the folder that holds `sys` and `dev`."""
+    """Yield all checks but the measurement; `root` is the folder that contains `sys` and `dev`."""
     yield Check("python", True, f"{platform.python_implementation()} {platform.python_version()} on {_system()}")
-    yield Check("r2p", True, f"{r2p.__version__}, here a module is called {module_name_from(socket.gethostname())}")
+    yield Check("r2p", True, f"{r2p.__version__}, default module name {module_name_from(socket.gethostname())}")
     yield configured()
-    yield package("uvloop", "uvloop", "without it messages take about twice the time")
+    yield package("uvloop", "uvloop", "without it messages take about twice as long")
     yield timerfd()
     for extra, name in EXTRAS.items():
         yield package(name, f"r2p[{extra}]", f"the extra {extra}")
@@ -88,14 +89,14 @@ def _system() -> str:
 
 
 def configured() -> Check:
-    """How tools join the network."""
+    """Check how tools join the network."""
     try:
         via = settings().via
-    except Usage as error:
-        return Check("network", False, str(error), "mend that file")
+    except UsageError as error:
+        return Check("network", False, str(error), "correct this file")
     if via:
-        return Check("network", True, f"tools join by {' '.join(via)}")
-    return Check("network", False, "R2P_VIA and r2p.toml name none", "give --via tcp:HOST:PORT or serial:DEVICE")
+        return Check("network", True, f"tools join with {' '.join(via)}")
+    return Check("network", False, "not set in R2P_VIA or r2p.toml", "give --via tcp:HOST:PORT or serial:DEVICE")
 
 
 def package(name: str, requirement: str, why: str) -> Check:
@@ -106,10 +107,10 @@ def package(name: str, requirement: str, why: str) -> Check:
 
 
 def timerfd() -> Check:
-    """Whether periods come from the kernel's timers."""
+    """Check whether periods come from the kernel's timers."""
     if sys.platform == "linux" and (hasattr(os, "timerfd_create") or hasattr(ctypes.CDLL(None), "timerfd_create")):
         return Check("timerfd", True, "periods are exact to some ten microseconds")
-    return Check("timerfd", False, "periods are exact to a millisecond or two; Linux has it")
+    return Check("timerfd", False, "periods are exact to a millisecond or two; only Linux has it")
 
 
 # Wires
@@ -121,22 +122,22 @@ def serial_ports(root: Path = _ROOT) -> Iterator[Check]:
     for port in ports:
         yield _serial_port(port)
     if not ports:
-        yield Check("serial", False, "no port: only a cable to the robot needs one", "plug it in; ls /dev/tty*")
+        yield Check("serial", False, "no port: needed only for a cable to the robot", "plug it in; ls /dev/tty*")
 
 
 def _is_real(root: Path, port: Path) -> bool:
-    """Linux shows ports ttyS... that the machine may have, and knows those that it has by their type."""
+    """Return whether a port exists: Linux lists ttyS... that the machine lacks, with type 0."""
     return not port.name.startswith("ttyS") or _read(root / "sys/class/tty" / port.name / "type") not in ("", "0")
 
 
 def _serial_port(port: Path) -> Check:
     if os.access(port, os.R_OK | os.W_OK):
-        return Check("serial", True, f"{port}, yours to open: --via serial:{port}")
+        return Check("serial", True, f"{port}, you may open it: --via serial:{port}")
     group = _group(port)
     return Check(
         "serial",
         False,
-        f"{port} is there, but only for {group}",
+        f"{port}: only group {group} may open it",
         f"sudo usermod -aG {group} $USER\nthen log in again",
     )
 
@@ -155,55 +156,56 @@ def network(root: Path = _ROOT) -> Check:
     return Check("interfaces", False, "no network interface is up", "ip link")
 
 
-def can(root: Path = _ROOT, told: dict[str, Interface] | None = None) -> Iterator[Check]:
-    """CAN interfaces, what the kernel has told about them, and how to bring up those that are down."""
-    told = _told() if told is None else told
+def can(root: Path = _ROOT, from_kernel: dict[str, Interface] | None = None) -> Iterator[Check]:
+    """CAN interfaces, their settings as the kernel reports them, and how to bring up those that are down."""
+    from_kernel = _from_kernel() if from_kernel is None else from_kernel
     names = [each for each in _interfaces(root) if _is_can(each)]
     for each in names:
-        yield _can_interface(told.get(each.name) or _seen(each))
+        yield _can_interface(from_kernel.get(each.name) or _from_files(each))
     if not names:
         sockets = has_socketcan()
-        nor = "" if sockets else ", nor CAN sockets in the kernel"
+        nor = "" if sockets else ", and no CAN sockets in the kernel"
         first = "" if sockets else "sudo modprobe can_raw\n"
         do = f"{first}plug an adapter in; ip link\nor a virtual one: sudo ip link add dev vcan0 up type vcan"
-        yield Check("CAN", False, f"no interface{nor}: only RTCAN needs one", do)
+        yield Check("CAN", False, f"no interface{nor}: needed only for RTCAN", do)
 
 
-def _told() -> dict[str, Interface]:
+def _from_kernel() -> dict[str, Interface]:
     try:
         return {each.name: each for each in list_interfaces()}
     except (OSError, AttributeError):  # AttributeError: not Linux
         return {}
 
 
-def _seen(folder: Path) -> Interface:
-    """What the files tell of an interface."""
+def _from_files(folder: Path) -> Interface:
+    """Return what the files in /sys show of an interface."""
     return Interface(folder.name, "vcan" if "virtual" in folder.resolve().parts else "can", up=_is_up(folder))
 
 
-def _can_interface(there: Interface) -> Check:
-    if there.problem:
-        found, _, do = there.problem.partition(": ")
+def _can_interface(interface: Interface) -> Check:
+    if interface.problem:
+        found, _, do = interface.problem.partition(": ")
         return Check("CAN", False, found, do)
-    found = ", ".join([f"{there.name} is up", *_can_details(there)])
-    if there.kind != "can" or there.one_shot:
-        return Check("CAN", True, f"{found}: --via rtcan:{there.name}")
-    again = f"sudo ip link set {there.name} down\n{there.command_up()}"
-    return Check("CAN", True, f"{found}; in one-shot mode, if its driver has it, laxity is fresh at each try", again)
+    found = ", ".join([f"{interface.name} is up", *_can_details(interface)])
+    if interface.kind != "can" or interface.one_shot:
+        return Check("CAN", True, f"{found}: --via rtcan:{interface.name}")
+    again = f"sudo ip link set {interface.name} down\n{interface.command_up()}"
+    better = "in one-shot mode, if the driver supports it, the laxity is updated before each attempt"
+    return Check("CAN", True, f"{found}; {better}", again)
 
 
-def _can_details(there: Interface) -> Iterator[str]:
-    if there.bitrate:
-        yield f"{there.bitrate / 1000:g} kbit/s"
-    if there.state:
-        yield there.state
-    yield from sorted(there.modes)
-    if there.restart_ms:
-        yield f"restarts {there.restart_ms} ms after bus-off"
-    elif there.restart_ms == 0:
+def _can_details(interface: Interface) -> Iterator[str]:
+    if interface.bitrate:
+        yield f"{interface.bitrate / 1000:g} kbit/s"
+    if interface.state:
+        yield interface.state
+    yield from sorted(interface.modes)
+    if interface.restart_ms:
+        yield f"restarts {interface.restart_ms} ms after bus-off"
+    elif interface.restart_ms == 0:
         yield "stays in bus-off"
-    if there.errors and any(there.errors):
-        yield f"error counters {there.errors[0]} (transmit), {there.errors[1]} (receive)"
+    if interface.errors and any(interface.errors):
+        yield f"error counters {interface.errors[0]} (transmit), {interface.errors[1]} (receive)"
 
 
 def _interfaces(root: Path) -> list[Path]:
@@ -223,7 +225,7 @@ def _is_up(interface: Path) -> bool:
 
 
 def priority() -> Check:
-    """Whether programs may ask for real-time scheduling."""
+    """Check whether programs may use real-time scheduling."""
     try:
         import resource
     except ImportError:  # Windows
@@ -234,15 +236,15 @@ def priority() -> Check:
         return Check("real time", True, f"{allowed}: chrt -f 50 r2p run ...")
     user = os.environ.get("USER", "$USER")
     line = f'echo "{user} - rtprio 50" | sudo tee /etc/security/limits.d/r2p.conf'
-    return Check("real time", False, "you may not ask for real-time scheduling", f"{line}\nthen log in again")
+    return Check("real time", False, "you may not use real-time scheduling", f"{line}\nthen log in again")
 
 
 def governor(root: Path = _ROOT) -> Check:
-    """How the CPUs choose their speed."""
+    """Check how the CPUs choose their speed."""
     files = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governors = sorted({_read(file) for file in files} - {""})
     if governors in ([], ["performance"]):
-        return Check("CPU speed", True, "constant" if governors else "not up to this system")
+        return Check("CPU speed", True, "constant" if governors else "not controlled by this system")
     do = "sudo cpupower frequency-set -g performance"
     return Check("CPU speed", False, f"changes with the load ({', '.join(governors)}): wake-ups take longer", do)
 
@@ -254,7 +256,7 @@ def clock() -> Check:
 
 
 async def measure() -> list[int]:
-    """How late (ns) ticks of 1 kHz come on this event loop, in 0.2 s."""
+    """Measure how late (ns) ticks of 1 kHz are on this event loop, for 0.2 s."""
     late: list[int] = []
     ticker = Ticker(asyncio.get_running_loop(), _TICK, lambda _due, by, _skipped: late.append(by))
     ticker.start()
@@ -267,10 +269,10 @@ async def measure() -> list[int]:
 
 def lateness(late: list[int]) -> Check:
     if len(late) < 2:
-        return Check("timers", False, "not even two ticks of 1 kHz came in 0.2 s: this machine is busy")
+        return Check("timers", False, "fewer than two ticks of 1 kHz in 0.2 s: this machine is busy")
     p99 = statistics.quantiles(late, n=100)[98]
     found = f"at 1 kHz {statistics.median(late) / 1000:.0f} us late (median), {p99 / 1000:.0f} us (99 %)"
-    do = "" if p99 < _LATE else "end other programs, or give r2p a real-time priority (see above)"
+    do = "" if p99 < _LATE else "end other programs, or use a real-time priority (see above)"
     return Check("timers", p99 < _LATE, found, do)
 
 

@@ -1,7 +1,7 @@
-"""The `r2p` command: a table of names, each imported only when it is called, so that `r2p --help` answers at once.
+"""The `r2p` command: a table of commands, each imported only when it is called, so that `r2p --help` is fast.
 
-A group of commands is a module with `app`, a `session.group(...)`; a single command is a module with `command`, a
-function as Typer takes it. How they join the network, and end: see `r2p.tools.session`.
+A group of commands is a module with an `app`, made by `session.group(...)`; a single command is a module with a
+function `command` for Typer. `r2p.tools.session` has how they join the network, and how they end.
 """
 
 import errno
@@ -13,26 +13,25 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from r2p.tools.output import abandon_stdout
-from r2p.tools.terminal import say
+from r2p.tools.output import abandon_stdout, notify
 
 GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
-    "node": ("r2p.tools.node", "Nodes, and what they publish and subscribe."),
-    "module": ("r2p.tools.module", "Modules: list, stop, reboot, bootload."),
-    "bus": ("r2p.tools.bus", "An RTCAN bus: its load, its frames, its slots."),
+    "node": ("r2p.tools.node", "List and inspect nodes."),
+    "module": ("r2p.tools.module", "List, stop and restart modules."),
+    "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),
 }
 COMMANDS = {
     "run": ("r2p.tools.run", "Run functions as the nodes of a module."),
     "gateway": ("r2p.tools.gateway", "Join links to one network: a robot's bus, a debug line, zenoh."),
-    "sim": ("r2p.tools.simulator.command", "An emulated robot, without hardware."),
-    "doctor": ("r2p.tools.doctor", "Tell what this machine has and lacks for r2p."),
-    "demo": ("r2p.tools.demo.command", "Show r2p at work, without hardware."),
+    "sim": ("r2p.tools.simulator", "Run an emulated robot, without hardware."),
+    "doctor": ("r2p.tools.doctor", "Check what this machine has and lacks for r2p."),
+    "demo": ("r2p.tools.demo", "Show r2p at work, without hardware."),
 }
 
 
 class LazyGroup(TyperGroup):
-    """Knows its commands by name and help line; loads the one that is called."""
+    """A group that knows its commands by name and help line, and imports the one that is called."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, command, rest = super().resolve_command(ctx, args)
@@ -42,7 +41,7 @@ class LazyGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ")  # pydantic's words, by way of typer
+            error.message = error.message.removeprefix("Value error, ")  # added by pydantic, through Typer
             raise
 
 
@@ -57,15 +56,15 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """The entry point."""
+    """Run the command line: the entry point of the `r2p` script."""
     _open_missing_streams()
     try:
         app(prog_name="r2p")
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        _say_unwritable(error)
-    except KeyboardInterrupt:  # before a command has taken care of signals itself
+        _exit_unwritable(error)
+    except KeyboardInterrupt:  # before the command handles signals itself
         raise SystemExit(0) from None
     except SystemExit as error:
         if isinstance(error.__context__, BrokenPipeError):
@@ -77,7 +76,10 @@ def main() -> None:
 
 
 def _open_missing_streams() -> None:
-    """What the shell has closed (`<&-`, `>&-`) reads and writes nothing; else a socket would get its number."""
+    """Open /dev/null for the standard streams that the shell has closed (`<&-`, `>&-`).
+
+    Otherwise a socket would get their number, and messages for the user would be sent to the network.
+    """
     for fd, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(fd)
@@ -93,12 +95,12 @@ def _flush() -> None:
     except BrokenPipeError:
         abandon_stdout()
     except OSError as error:
-        _say_unwritable(error)
+        _exit_unwritable(error)
 
 
-def _say_unwritable(error: OSError) -> NoReturn:
+def _exit_unwritable(error: OSError) -> NoReturn:
     abandon_stdout()
-    say(f"can't write the output: {error.strerror}")
+    notify(f"can't write the output: {error.strerror}")
     raise SystemExit(1) from error
 
 
@@ -126,7 +128,7 @@ def _load(name: str) -> Any:
 
 
 def _unloaded() -> None:
-    """Stands for a command that has not been loaded."""
+    """Stand for a command that has not been imported."""
 
 
 for _name, (_path, _summary) in (GROUPS | COMMANDS).items():

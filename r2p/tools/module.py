@@ -1,6 +1,6 @@
-"""`r2p module`: who is on the network, and orders to them.
+"""`r2p module`: list modules, and send them commands.
 
-An order may be lost, so it is repeated until the module's ALIVE confirms it. None of them is an emergency stop.
+A command may get lost, so it is repeated until the module's ALIVE confirms it. None of them is an emergency stop.
 """
 
 import asyncio
@@ -15,85 +15,86 @@ import r2p
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.names import module_path
 from r2p.tools import session
+from r2p.tools.options import Format, Timeout, Wait
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Session, TimedOut, Timeout, Usage, Wait
+from r2p.tools.session import Session, TimedOut, UsageError
 
 TIMEOUT = 10.0
-"""Seconds that an order has to be confirmed in: firmware with many topics says ALIVE that rarely."""
+"""Seconds in which a command must be confirmed: firmware with many topics sends ALIVE that rarely."""
 
-_FIRST_LOOK = 1.0  # seconds to learn the module's state before it is ordered
-_ROUND = 5.0  # seconds of listening for ALIVE
-_LOOK = 0.02
-_REPEAT = 1.0
-_PROMPT = 0.2  # firmware says ALIVE 10 ms after an order to restart
+_FIRST_STATE = 1.0  # seconds to learn the module's state before the first command
+_ROUND = 5.0  # seconds in which firmware sends ALIVE at least once
+_POLL = 0.02  # seconds
+_REPEAT = 1.0  # seconds between two commands
+_PROMPT = 0.2  # seconds: firmware sends ALIVE 10 ms after a command to restart
 
-app = session.group("Modules: list, stop, reboot, bootload.")
+app = session.group("List, stop and restart modules.")
 
-TOOLS_THERE = "; there are tools, which --all shows"
+ALL_SHOWS_TOOLS = "; use --all to include tools"
 
 Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
-All = Annotated[bool, typer.Option("--all", "-a", help="Also tools, whose names begin with _.")]
+All = Annotated[bool, typer.Option("--all", "-a", help="Include tools, whose names begin with _.")]
 
 
 @session.command(app, "list")
 async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
-    """List the modules: state, kind (r2p or firmware), the link they are on, and seconds since they were heard."""
+    """List the modules: state, kind (r2p or firmware), link, and seconds since the last message from each."""
     output = Output(format)
     await session.settle(wait, of="modules")
     if wait is None:
-        await _hear_firmware(session)
+        await _wait_for_firmware(session)
     known = [view for view in session.module.network.modules() if view.link]
     views = [view for view in known if all or not view.name.startswith("_")]
     columns = ["module", "state", "rebooted", "kind", "link", "age"]
     await output.table([_row(view) for view in views], columns, units={"age": "s"})
     if not views:
-        session.say(f"no module has been heard on {session.where}{TOOLS_THERE if known else ''}")
+        session.notify(f"no modules found on {session.network_name}{ALL_SHOWS_TOOLS if known else ''}")
 
 
-async def _hear_firmware(session: Session) -> None:
-    """Firmware says its name once in a round of all its topics: give it time, if nobody else is at its link."""
+async def _wait_for_firmware(session: Session) -> None:
+    """Wait for the name of firmware, which it sends once in a round of all its topics, on links without a module."""
 
     def named() -> bool:
         known = {view.link for view in session.module.network.modules()}
         return all(link.name in known for link in session.module.links if link.up and link.passes_probes)
 
     with session.waiting("ALIVE of firmware"):
-        await _until(named, _ROUND)
+        await _wait_until(named, _ROUND)
 
 
-async def _until(condition: Callable[[], bool], patience: float) -> bool:
-    """Wait until it is so; False if it is not after `patience` seconds."""
+async def _wait_until(condition: Callable[[], bool], timeout: float) -> bool:
+    """Wait until the condition is true; False if it is not after `timeout` seconds."""
     loop = asyncio.get_running_loop()
-    end = loop.time() + patience
+    end = loop.time() + timeout
     while not condition():
         if loop.time() >= end:
             return False
-        await asyncio.sleep(_LOOK)
+        await asyncio.sleep(_POLL)
     return True
 
 
 @session.command(app, "stop")
 async def stop(session: Session, module: Name, *, timeout: Timeout = None) -> None:
-    """End a module's nodes; reboot starts them again. No emergency stop: it may take a second, or get lost."""
-    await _order(session, r2p.Command.STOP, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_STOPPED))
+    """Stop a module's nodes; reboot starts them again. Not an emergency stop: it may take a second, or get lost."""
+    await _send_command(session, r2p.Command.STOP, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_STOPPED))
 
 
 @session.command(app, "reboot")
 async def reboot(session: Session, module: Name, *, timeout: Timeout = None) -> None:
     """Restart a module's firmware, or the nodes of an r2p module."""
-    await _order(session, r2p.Command.REBOOT, module, timeout, _has_rebooted)
+    await _send_command(session, r2p.Command.REBOOT, module, timeout, _has_rebooted)
 
 
 @session.command(app, "bootload")
 async def bootload(session: Session, module: Name, *, timeout: Timeout = None) -> None:
-    """Restart a module into its boot loader; reboot leaves it. Programs on a PC have none, and refuse."""
-    await _order(session, r2p.Command.BOOTLOAD, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_BOOT))
+    """Restart a module into its boot loader; reboot leaves it. Programs on a PC have no boot loader, and refuse."""
+    await _send_command(session, r2p.Command.BOOTLOAD, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_BOOT))
 
 
 class _CommandWatch(msgspec.Struct):
-    """What was heard of a module: its flags one after the other, and how long (s) after the order firmware spoke.
+    """What is known of the module since the command: its flags in order, and the delay (s) until firmware answered.
 
-    `denied`: why a gateway does not let the order through, in words; `refused`: why it is not given at all.
+    `denied`: why a gateway does not forward the command; `refused`: why this module does not send it at all.
     """
 
     flags: list[int]
@@ -103,7 +104,7 @@ class _CommandWatch(msgspec.Struct):
 
 
 def _has_rebooted(watch: _CommandWatch) -> bool:
-    """A new start shows in the flags; those of firmware that was rebooted before in an ALIVE right after the order."""
+    """Return whether the flags show a restart; firmware that had been rebooted before shows it by a prompt ALIVE."""
     if not _restarted(watch.flags[-1]):
         return False
     changed = any(_restarted(after) and not _restarted(before) for before, after in pairwise(watch.flags))
@@ -117,12 +118,12 @@ def _restarted(flags: int) -> bool:
 _DONE = {r2p.Command.STOP: "stopped", r2p.Command.REBOOT: "rebooted", r2p.Command.BOOTLOAD: "in its boot loader"}
 
 
-async def _order(
+async def _send_command(
     session: Session, command: r2p.Command, name: str, timeout: float | None, done: Callable[[_CommandWatch], bool]
 ) -> None:
     module_path(name)
     if not session.settings.via:
-        raise Usage("there is nobody to order around: give --via tcp:HOST:PORT, or set R2P_VIA")
+        raise UsageError("no network to send a command on: give --via tcp:HOST:PORT or set R2P_VIA")
     await session.settle(wait=0)
     loop = asyncio.get_running_loop()
     started = loop.time()
@@ -131,20 +132,22 @@ async def _order(
         try:
             async with asyncio.timeout(timeout or TIMEOUT), asyncio.TaskGroup() as tasks:
                 watch.flags += [_flags(view) for view in [_find(session, name)] if view is not None]
-                follower = tasks.create_task(_follow(session.module.events(), name, f"{command.name} denied", watch))
-                await _confirmed(session, command, name, watch, done)
-                follower.cancel()
+                watcher = tasks.create_task(
+                    _watch_events(session.module.events(), name, f"{command.name} denied", watch)
+                )
+                await _repeat_until_done(session, command, name, watch, done)
+                watcher.cancel()
         except TimeoutError:
-            raise TimedOut(_what_was_seen(session, command, name, timeout or TIMEOUT)) from None
+            raise TimedOut(_timeout_text(session, command, name, timeout or TIMEOUT)) from None
     if watch.refused:
         raise watch.refused
     if watch.denied:
         raise TimedOut(watch.denied)
-    session.say(f"{name}: {_DONE[command]}, after {loop.time() - started:.1f} s")
+    session.notify(f"{name}: {_DONE[command]} after {loop.time() - started:.1f} s")
 
 
-async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str, watch: _CommandWatch) -> None:
-    """Note each change of the module's flags, and that a gateway denies the order."""
+async def _watch_events(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str, watch: _CommandWatch) -> None:
+    """Note each change of the module's flags, and whether a gateway denies the command."""
     async for event in events:
         match event:
             case r2p.ModuleChanged(info=info) if info.name == name:
@@ -153,17 +156,17 @@ async def _follow(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str
                 watch.denied = text
 
 
-async def _confirmed(
+async def _repeat_until_done(
     session: Session, command: r2p.Command, name: str, watch: _CommandWatch, done: Callable[[_CommandWatch], bool]
 ) -> None:
-    """Send the order, again and again, until the module confirms it."""
+    """Send the command, and repeat it until the module confirms it or a gateway denies it."""
     loop = asyncio.get_running_loop()
-    await _until(lambda: bool(watch.flags), _FIRST_LOOK)
-    ordered = loop.time()
+    await _wait_until(lambda: bool(watch.flags), _FIRST_STATE)
+    sent_at = loop.time()
 
     def is_done() -> bool:
         view = _find(session, name)
-        watch.delay = None if view is None or view.instance is not None else loop.time() - view.age - ordered
+        watch.delay = None if view is None or view.instance is not None else loop.time() - view.age - sent_at
         return bool(watch.denied) or (bool(watch.flags) and done(watch))
 
     while not watch.denied:
@@ -172,8 +175,8 @@ async def _confirmed(
         except r2p.Error as error:
             watch.refused = error
             return
-        ordered = loop.time()
-        if await _until(is_done, _REPEAT):
+        sent_at = loop.time()
+        if await _wait_until(is_done, _REPEAT):
             return
 
 
@@ -183,23 +186,23 @@ def _flags(view: r2p.ModuleView) -> int:
 
 
 def _find(session: Session, name: str) -> r2p.ModuleView | None:
-    """The module as it was heard last, on whichever link."""
+    """Return the module as it was last seen, on any link."""
     views = [view for view in session.module.network.modules() if view.name == name and view.link]
     return min(views, key=lambda view: view.age, default=None)
 
 
-def _what_was_seen(session: Session, command: r2p.Command, name: str, timeout: float) -> str:
+def _timeout_text(session: Session, command: r2p.Command, name: str, timeout: float) -> str:
     view = _find(session, name)
     if view is None:
-        heard = sorted({view.name for view in session.module.network.modules() if view.state != "observer"})
-        return f"nothing was heard of {name} in {timeout:g} s; heard of: {', '.join(heard) or 'nobody'}"
-    text = f"{name} did not confirm {command.name} in {timeout:g} s: it is {view.state}, heard {view.age:.1f} s ago"
+        found = sorted({view.name for view in session.module.network.modules() if view.state != "observer"})
+        return f"module {name} was not found in {timeout:g} s; modules found: {', '.join(found) or 'none'}"
+    text = f"{name} did not confirm {command.name} in {timeout:g} s: it is {view.state}, last seen {view.age:.1f} s ago"
     if command is r2p.Command.BOOTLOAD and view.instance is not None:
-        text += "; it is a program on a PC, those have no boot loader and refuse"
+        text += "; it is a program on a PC, which has no boot loader and refuses"
     elif command is r2p.Command.REBOOT and view.rebooted:
-        text += "; it had been rebooted before, so its ALIVE may not tell"
+        text += "; it had been rebooted before, so its ALIVE may not show it"
     elif view.link.partition(":")[0] in {"tcp", "zenoh"}:
-        text += "; if there is a gateway in between, does it have --allow-control?"
+        text += "; a gateway in between must have --allow-control"
     return text
 
 

@@ -1,6 +1,6 @@
-"""`r2p node`: the nodes, and what they publish and subscribe.
+"""`r2p node`: list nodes, and what they publish and subscribe.
 
-Firmware tells its topics, and not which of its nodes have them: they are listed under `MODULE/?`.
+Firmware announces its topics, but not which of its nodes have them: they are listed under `MODULE/?`.
 """
 
 from typing import Annotated, Any
@@ -9,13 +9,13 @@ import typer
 
 import r2p
 from r2p.tools import session
-from r2p.tools.module import TOOLS_THERE
+from r2p.tools.module import ALL_SHOWS_TOOLS
+from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Session, Wait
-from r2p.tools.topic.watching import CLASS_NAMES
+from r2p.tools.session import Session
 from r2p.tools.types import Types, type_name
 
-app = session.group("Nodes, and what they publish and subscribe.")
+app = session.group("List and inspect nodes.")
 
 Table = dict[tuple[str, str], tuple[list[str], list[str]]]
 
@@ -24,7 +24,7 @@ Table = dict[tuple[str, str], tuple[list[str], list[str]]]
 async def list_(
     session: Session,
     *,
-    all: Annotated[bool, typer.Option("--all", "-a", help="Also those of tools.")] = False,
+    all: Annotated[bool, typer.Option("--all", "-a", help="Include the nodes of tools.")] = False,
     wait: Wait = None,
     format: Format = None,
 ) -> None:
@@ -39,18 +39,18 @@ async def list_(
     ]
     await output.table(rows, ["node", "publishes", "subscribes"])
     if not rows:
-        session.say(f"no node is known on {session.where}{TOOLS_THERE if nodes else ''}")
+        session.notify(f"no nodes found on {session.network_name}{ALL_SHOWS_TOOLS if nodes else ''}")
 
 
 @session.command(app, "info")
 async def info(
     session: Session,
-    node: Annotated[str, typer.Argument(metavar="MODULE/NODE", help="NODE alone will do if only one has the name.")],
+    node: Annotated[str, typer.Argument(metavar="MODULE/NODE", help="NODE alone if the name is unique.")],
     *,
     wait: Wait = None,
     format: Format = None,
 ) -> None:
-    """Tell what a node publishes and subscribes: types, and the classes of its publishers."""
+    """Show what a node publishes and subscribes: types, and the classes of its publishers."""
     output = Output(format)
     await session.settle(wait)
     nodes = _nodes(session)
@@ -72,15 +72,15 @@ async def info(
 
 
 def _nodes(session: Session) -> Table:
-    """(module, node) -> topics published, topics subscribed; `?` for what nobody has told."""
+    """Return the topics published and subscribed by (module, node); `?` for what was not announced."""
     table = session.module.network.nodes()
     for view in session.module.network.topics().values():
         for index, (known, links) in enumerate(
             ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on))
         ):
-            told = {endpoint.link for endpoint in known}
+            covered = {endpoint.link for endpoint in known}
             for link in links:
-                if link not in told:
+                if link not in covered:
                     table.setdefault((session.only_module(link), "?"), ([], []))[index].append(view.name)
     return dict(sorted(table.items()))
 
@@ -92,8 +92,8 @@ def _find(wanted: str, nodes: Table) -> tuple[str, str]:
         return found[0]
     paths = ", ".join(f"{module}/{node}" for module, node in found or nodes)
     if found:
-        raise r2p.Error(f"there are several nodes {wanted}: say which of {paths}")
-    raise r2p.Error(f"there is no node {wanted}; known: {paths or 'none'}")
+        raise r2p.Error(f"there are several nodes {wanted}: choose one of {paths}")
+    raise r2p.Error(f"there is no node {wanted}; nodes found: {paths or 'none'}")
 
 
 def _topic(types: Types, view: r2p.TopicView) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def _topic(types: Types, view: r2p.TopicView) -> dict[str, Any]:
 
 
 def _class(view: r2p.TopicView, node: str) -> str | None:
-    """The class of its publisher, where the node has told it."""
+    """Return the class of the node's publisher, if it is known."""
     for endpoint in view.publishers:
         if endpoint.node == node.rpartition("/")[2] and endpoint.publisher_class is not None:
             return CLASS_NAMES[endpoint.publisher_class]

@@ -1,10 +1,10 @@
-"""What tools print: text for people at a terminal, JSON lines in a pipe, or the --format that was asked for.
+"""The output of commands: records on stdout, messages for the user and log records on stderr.
 
-Texts from other modules are escaped here, for each format in its way: what is printed never moves a terminal's cursor,
-and a record stays on its lines.
+stdout gets text at a terminal, JSON lines in a pipe, or what --format asks for. Texts from other modules are escaped
+here, for each format in its way: output never moves a terminal's cursor, and a record stays on its lines.
 
-Output never stops the event loop: a tool that did would not read its links, and so make a robot wait for somebody's
-pager. Where the reader of a pipe is slow, `put` waits, the tool's lossy queues overflow, and that is counted.
+Output never blocks the event loop: a command that did would not read its links, and the robot would wait for a pager.
+Where the reader of a pipe is slow, `put` waits, the command's lossy queues overflow, and the losses are counted.
 """
 
 import asyncio
@@ -14,6 +14,7 @@ import functools
 import io
 import itertools
 import json
+import logging
 import os
 import select
 import shutil
@@ -29,21 +30,21 @@ Record = Mapping[str, Any]
 
 _NONE: Mapping[str, str] = {}
 
-_ATOMIC = 4096  # bytes that a pipe takes without blocking once it says that it takes some (POSIX: at least 512)
+_ATOMIC = 4096  # bytes that a writable pipe accepts without blocking (POSIX: at least 512)
 
 
 class PipeClosed(Exception):
-    """Nobody reads our output any more: the end, exit code 0."""
+    """The reader of the output has closed the pipe: the command ends with exit code 0."""
 
 
 class Unwritable(Exception):
-    """The output can't be written, to a full disk for example: exit code 1."""
+    """The output can't be written, for example to a full disk: exit code 1."""
 
 
 class Output:
-    """Writes records to stdout, each as soon as it is there.
+    """Writes records to stdout, each as soon as it arrives.
 
-    `format` None: "text" at a terminal, else "json". Records hold numbers, texts, lists and nested records.
+    `format` None: "text" at a terminal, else "json". Records contain numbers, texts, lists and nested records.
     """
 
     def __init__(self, format: Literal["yaml", "json", "csv"] | None = None, stream: TextIO | None = None) -> None:
@@ -55,25 +56,25 @@ class Output:
 
     @contextlib.asynccontextmanager
     async def while_read(self) -> AsyncIterator[None]:
-        """End the block with PipeClosed as soon as nobody reads the pipe any more, also while there is no output."""
+        """Raise PipeClosed in the block as soon as the reader closes the pipe, also while there is no output."""
         fd = waitable(self._stream)
         if fd is None or not stat.S_ISFIFO(os.fstat(fd).st_mode):
             yield
             return
-        loop, task, gone = asyncio.get_running_loop(), asyncio.current_task(), False
+        loop, task, closed = asyncio.get_running_loop(), asyncio.current_task(), False
 
-        def hang_up() -> None:  # a pipe's writing end has nothing to read but this
-            nonlocal gone
-            gone = True
+        def close() -> None:  # the writing end of a pipe becomes readable only when the reader is gone
+            nonlocal closed
+            closed = True
             loop.remove_reader(fd)
             if task is not None:
                 task.cancel()
 
-        loop.add_reader(fd, hang_up)
+        loop.add_reader(fd, close)
         try:
             yield
         except asyncio.CancelledError:
-            if not gone or task is None:
+            if not closed or task is None:
                 raise
             task.uncancel()
             raise PipeClosed from None
@@ -81,15 +82,12 @@ class Output:
             loop.remove_reader(fd)
 
     async def put(self, record: Record, text: str | None = None) -> None:
-        """Write one record of a stream; `text` is its form for people, default: YAML. Raises PipeClosed."""
+        """Write one record of a stream; at a terminal as `text`, by default as YAML. Raises PipeClosed."""
         async with self._lock:
             await self._write(self._record(record, text))
 
     async def table(self, rows: Iterable[Record], columns: list[str], *, units: Mapping[str, str] = _NONE) -> None:
-        """Write a list of records with the same keys; for people in aligned columns, numbers with the unit of theirs.
-
-        Raises PipeClosed.
-        """
+        """Write records with the same keys; at a terminal in aligned columns, with `units`. Raises PipeClosed."""
         rows = list(rows)
         match self.format:
             case "text":
@@ -103,7 +101,7 @@ class Output:
             await self._write(text)
 
     async def remark(self, text: str, *, over: int = 0) -> None:
-        """Write a line for people, over the last `over` lines; other formats are without. Raises PipeClosed."""
+        """Write a line of text over the last `over` lines, in text format only. Raises PipeClosed."""
         if self.format == "text":
             up = f"\x1b[{over}F\x1b[J" if over else ""
             async with self._lock:
@@ -136,7 +134,7 @@ class Output:
                 return
             data = memoryview(text.encode())
             while data:
-                await _room(fd)
+                await _wait_writable(fd)
                 data = data[os.write(fd, data[:_ATOMIC]) :]
         except BrokenPipeError as error:
             raise PipeClosed from error
@@ -145,30 +143,30 @@ class Output:
 
 
 def waitable(stream: TextIO) -> int | None:
-    """The file descriptor, if it can be waited for; files never make anybody wait."""
+    """Return the file descriptor if it can be waited for; regular files never block."""
     try:
         fd = stream.fileno()
-    except (OSError, ValueError):  # none: a test's stream
+    except (OSError, ValueError):  # a stream of a test has none
         return None
     regular = stat.S_ISREG(os.fstat(fd).st_mode) or sys.platform == "win32"
     return None if regular else fd
 
 
-async def _room(fd: int) -> None:
-    """Wait until something can be written without blocking."""
+async def _wait_writable(fd: int) -> None:
+    """Wait until a write does not block."""
     if select.select([], [fd], [], 0)[1]:
         return
     loop = asyncio.get_running_loop()
-    room = asyncio.Event()
-    loop.add_writer(fd, room.set)
+    writable = asyncio.Event()
+    loop.add_writer(fd, writable.set)
     try:
-        await room.wait()
+        await writable.wait()
     finally:
         loop.remove_writer(fd)
 
 
 def flatten(record: Record) -> dict[str, Any]:
-    """The leaves of a record by path: "stamp.sec", "value[0]"."""
+    """Return the leaves of a record by path: "stamp.sec", "value[0]"."""
     leaves: dict[str, Any] = {}
 
     def visit(path: str, value: Any) -> None:
@@ -186,7 +184,7 @@ def flatten(record: Record) -> dict[str, Any]:
 
 
 def to_yaml(record: Any) -> str:
-    """A record as YAML: one line a field, and for a list of plain values. Only what is printable is not escaped."""
+    """Return a record as YAML, with lists of plain values on one line, and with unprintable characters escaped."""
     text = _yaml_dumper()(record, True)
     return text if printable(text, "\n") == text else _yaml_dumper()(record, False)
 
@@ -197,7 +195,7 @@ def _yaml_dumper() -> Callable[[Any, bool], str]:
 
     base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
-    dumper: Any = type("Dumper", (base,), {})  # of our own: what is added to it stays with us
+    dumper: Any = type("Dumper", (base,), {})  # our own class: representers would be added to all users of PyYAML's
 
     def represent(to: Any, items: Iterable[Any]) -> Any:
         """Lists of plain values on one line."""
@@ -212,9 +210,9 @@ def _yaml_dumper() -> Callable[[Any, bool], str]:
 
 
 def aligned(rows: Iterable[Record], columns: list[str], width: int | None = None) -> str:
-    """A table for people: columns aligned, lists joined by blanks, nothing for None, each cell printable.
+    """Return a table with aligned columns: lists joined by blanks, None as an empty cell, all cells printable.
 
-    Where it is wider than `width` characters, lists are folded between their items, onto lines of their own.
+    Where it is wider than `width` characters, lists are folded between their items.
     """
     rows = list(rows)
     lines = [[printable(name.upper()) for name in columns], *([_cell(row[name]) for name in columns] for row in rows)]
@@ -230,7 +228,7 @@ def aligned(rows: Iterable[Record], columns: list[str], width: int | None = None
 
 
 def _narrowed(widths: list[int], lists: list[int], room: int) -> list[int]:
-    """These widths, with what the others leave of `room` shared by the columns of lists, the narrowest served first."""
+    """Return widths such that the columns of lists share what the others leave, the narrowest served first."""
     left = room - sum(width for i, width in enumerate(widths) if i not in lists)
     narrowed = list(widths)
     for served, i in enumerate(sorted(lists, key=widths.__getitem__)):
@@ -240,7 +238,7 @@ def _narrowed(widths: list[int], lists: list[int], room: int) -> list[int]:
 
 
 def _folded(line: list[str], lists: list[int], widths: list[int]) -> Iterator[list[str]]:
-    """A line of a table as the lines that it takes; an item that is wider than its column is left whole."""
+    """Yield the lines of a folded row; an item that is wider than its column stays whole."""
     cells = [_wrapped(cell, widths[i]) if i in lists else [cell] for i, cell in enumerate(line)]
     for each in itertools.zip_longest(*cells, fillvalue=""):
         yield list(each)
@@ -263,8 +261,63 @@ def _csv(cells: Iterable[Any]) -> str:
 
 
 def abandon_stdout() -> None:
-    """Nobody reads standard output any more: let the interpreter flush what is left to nowhere."""
+    """Redirect standard output to /dev/null, so that the interpreter can flush what is left without an error."""
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):  # no real file, or closed
         return
+
+
+def notify(text: str) -> None:
+    """Print a message for the user on stderr."""
+    with contextlib.suppress(OSError):  # stderr is closed
+        print(printable(f"r2p: {text}", "\n\t"), file=sys.stderr, flush=True)  # noqa: T201 - the one place
+
+
+class _LineFormatter(logging.Formatter):
+    """Formats a log record as a short line; records of nodes begin with `module/node`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        _, _, rest = record.name.partition(".")
+        module, _, node = rest.partition(".")
+        where = f"{module}/{node}: " if node else "r2p: "
+        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        text = where + level + record.getMessage()
+        if record.exc_info:
+            text += "\n" + self.formatException(record.exc_info)
+        return printable(text, "\n\t")
+
+
+class _StderrHandler(logging.StreamHandler[Any]):
+    """Writes to the `sys.stderr` of the moment, and is silent if that is closed."""
+
+    def __init__(self) -> None:
+        super().__init__(sys.stderr)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.stream = sys.stderr
+        super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        if not isinstance(sys.exc_info()[1], OSError | ValueError):
+            super().handleError(record)
+
+
+_HANDLER = _StderrHandler()
+_HANDLER.setFormatter(_LineFormatter())
+
+
+@contextlib.contextmanager
+def log_to_stderr(level: int) -> Iterator[None]:
+    """Log to stderr in the block: INFO and up, and each -v or -q moves that by one level."""
+    logger = logging.getLogger("r2p")
+    propagate, before = logger.propagate, logger.level
+    logger.addHandler(_HANDLER)
+    logger.propagate = False
+    logger.setLevel(max(logging.DEBUG, min(logging.INFO - 10 * level, logging.CRITICAL)))
+    try:
+        yield
+    finally:
+        logger.removeHandler(_HANDLER)
+        logger.propagate = propagate
+        logger.setLevel(before)

@@ -1,4 +1,8 @@
-"""`r2p run`: functions out of files and packages as the nodes of one module."""
+"""`r2p run`: run functions from files and packages as the nodes of one module.
+
+`load` finds the functions; `load_module` imports the user's files and packages, with errors that say what to do and
+tracebacks without the frames of r2p.
+"""
 
 import contextlib
 import difflib
@@ -18,7 +22,8 @@ import typer
 
 import r2p
 from r2p.names import NODE_MAX, node_name, topic_name
-from r2p.tools.session import Quiet, Usage, Verbose, Via, check_urls, execute, settings
+from r2p.tools.options import Quiet, Verbose, Via
+from r2p.tools.session import UsageError, check_urls, execute, settings
 
 logger = logging.getLogger("r2p.runner")
 
@@ -35,38 +40,38 @@ def command(
         list[str],
         typer.Argument(
             metavar="FILE:FUNCTION[=NAME]",
-            help="blink.py:blink, blink.py:blink=left, package.module:function.",
+            help="blink.py:blink, blink.py:blink=left, or package.module:function.",
             show_default=False,
         ),
     ],
     module: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The module's name; else from r2p.toml or the host name.")
+        str | None, typer.Option(metavar="NAME", help="The module's name; default: from r2p.toml or the host name.")
     ] = None,
     remap: Annotated[
-        list[str] | None, typer.Option(metavar="OLD:=NEW", help="Rename a topic for all its nodes (may repeat).")
+        list[str] | None, typer.Option(metavar="OLD:=NEW", help="Rename a topic for all its nodes (repeatable).")
     ] = None,
     priority: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NODE=N", help="Nodes of higher priority get their messages first; default 0 (may repeat)."
+            metavar="NODE=N", help="Nodes of higher priority get their messages first; default 0 (repeatable)."
         ),
     ] = None,
-    restart: Annotated[bool, typer.Option("--restart", help="Start a node that crashed again, after a pause.")] = False,
+    restart: Annotated[bool, typer.Option("--restart", help="Restart a crashed node, after a pause.")] = False,
     via: Via = None,
     verbose: Verbose = 0,
     quiet: Quiet = 0,
 ) -> None:
-    """Run functions as the nodes of one module, until all have ended or Ctrl-C ends them.
+    """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
 
-    A node that crashes ends alone, the others run on; the command then exits with 1.
+    A crash ends only that node; the command then exits with 1.
     """
 
     async def main() -> None:
         chosen = settings(via)
         check_urls(chosen.via)
         programs = load(functions)
-        priorities = _priorities(priority or (), programs)
-        names = chosen.remap | _renamed(remap or ())
+        priorities = _parse_priorities(priority or (), programs)
+        names = chosen.remap | _parse_remap(remap or ())
         async with r2p.Module(module or chosen.module, via=chosen.via, remap=names) as host:
             for program in programs:
                 host.start(
@@ -81,15 +86,15 @@ def command(
 
 
 def load(targets: Iterable[str]) -> list[Program]:
-    """The functions that these name, as `FILE:FUNCTION[=NAME]` or `package.module:FUNCTION[=NAME]`.
+    """Return the functions of targets: `FILE:FUNCTION[=NAME]` or `package.module:FUNCTION[=NAME]`.
 
-    Raises Usage, which says what to do, and r2p.Error with its traceback when a file can't be executed.
+    Raises UsageError, which says what to do, and r2p.Error with a traceback if a file can't be executed.
     """
     programs: list[Program] = []
     for target in targets:
         program = _program(target)
         if program.name in (other.name for other in programs):
-            raise Usage(f"{target}: there is a node {program.name} already; {_name_it(target)}")
+            raise UsageError(f"{target}: there is already a node {program.name}; {_rename_hint(target)}")
         programs.append(program)
     return programs
 
@@ -100,45 +105,45 @@ def _program(target: str) -> Program:
     try:
         return Program(function, node_name(name) if name else r2p.name_of(function))
     except r2p.NameTooLong as error:
-        raise Usage(f"{target}: a node's name has at most {NODE_MAX} characters; {_name_it(target)}") from error
+        raise UsageError(f"{target}: a node name has at most {NODE_MAX} characters; {_rename_hint(target)}") from error
 
 
 def _split(target: str) -> tuple[str, str, str]:
-    """Path, function (may be empty) and name (may be empty)."""
+    """Return path, function (may be empty) and name (may be empty)."""
     where, _, name = target.partition("=")
     path, colon, function = where.rpartition(":")
     return (path, function, name) if colon else (where, "", name)
 
 
-def _name_it(target: str) -> str:
-    return f"give it another: {target.partition('=')[0]}=NAME"
+def _rename_hint(target: str) -> str:
+    return f"use another name: {target.partition('=')[0]}=NAME"
 
 
 def _function(path: str, attribute: str, module: ModuleType) -> r2p.NodeFunction:
     if not attribute:
-        raise Usage(f"{path}: which function? {_choice(path, module)}")
+        raise UsageError(f"{path}: which function? {_choice(path, module)}")
     function: r2p.NodeFunction | None = getattr(module, attribute, None)
     if function is None:
         close = difflib.get_close_matches(attribute, _functions(module), n=1)
         hint = f"did you mean {close[0]}?" if close else _choice(path, module)
-        raise Usage(f"{path} has no function {attribute}; {hint}")
+        raise UsageError(f"{path} has no function {attribute}; {hint}")
     try:
-        with contextlib.suppress(r2p.InvalidName):  # it may be given another one
+        with contextlib.suppress(r2p.InvalidName):  # the target may give it another name
             r2p.name_of(function)
     except r2p.Error as error:
-        raise Usage(f"{path}:{attribute} is no node: write `async def {attribute}(node: r2p.Node)`") from error
+        raise UsageError(f"{path}:{attribute} is not a node: write `async def {attribute}(node: r2p.Node)`") from error
     return function
 
 
 def _choice(path: str, module: ModuleType) -> str:
     names = _functions(module)
     if not names:
-        return "it has no node; write `async def blink(node: r2p.Node) -> None`"
+        return "it defines no node; write `async def blink(node: r2p.Node) -> None`"
     return f"it has {', '.join(names)}: r2p run {path}:{names[0]}"
 
 
 def _functions(module: ModuleType) -> list[str]:
-    """The coroutine functions that a module defines itself."""
+    """Return the names of the coroutine functions that a module defines itself."""
     return [
         name
         for name, value in vars(module).items()
@@ -146,71 +151,67 @@ def _functions(module: ModuleType) -> list[str]:
     ]
 
 
-def _renamed(remap: Iterable[str]) -> dict[str, str]:
+def _parse_remap(remap: Iterable[str]) -> dict[str, str]:
     names: dict[str, str] = {}
     for each in remap:
         old, found, new = each.partition(":=")
         if not found:
-            raise Usage(f"--remap {each}: write it as OLD:=NEW, for example encoder:=encoder1")
+            raise UsageError(f"--remap {each}: write it as OLD:=NEW, for example encoder:=encoder1")
         names[topic_name(old)] = topic_name(new)
     return names
 
 
-def _priorities(priority: Iterable[str], programs: list[Program]) -> dict[str, int]:
+def _parse_priorities(priority: Iterable[str], programs: list[Program]) -> dict[str, int]:
     names = [program.name for program in programs]
     priorities: dict[str, int] = {}
     for each in priority:
         name, _, number = each.partition("=")
         if name not in names:
-            raise Usage(f"--priority {each}: there is no node {name}; the nodes are {', '.join(names)}")
+            raise UsageError(f"--priority {each}: there is no node {name}; the nodes are {', '.join(names)}")
         try:
             priorities[name] = int(number)
         except ValueError as error:
-            raise Usage(f"--priority {each}: write it as NODE=N, for example {name}=10") from error
+            raise UsageError(f"--priority {each}: write it as NODE=N, for example {name}=10") from error
     return priorities
 
 
-# Importing the user's files and packages, with errors that tell what to do and tracebacks without our own frames.
-
-
 def load_module(where: str) -> ModuleType:
-    """The module that `FILE.py` or `package.module` names; imported once, however often it is named.
+    """Import `FILE.py` or `package.module`, once.
 
-    A file finds what lies beside it, a package what lies in the working directory, as with `python` itself. Raises
-    Usage if there is no such thing, and r2p.Error with the traceback if it can't be executed.
+    A file can import its neighbours, a package what is in the working directory, as with `python` itself. Raises
+    UsageError if it does not exist, and r2p.Error with the traceback if it can't be executed.
     """
     if where.endswith(".py") or "/" in where:
         return _load_file(where)
     try:
-        _look_in(Path.cwd())
+        _add_to_path(Path.cwd())
     except FileNotFoundError as error:
-        raise Usage("the working directory does not exist any more: go to another one") from error
+        raise UsageError("the working directory does not exist any more: change to another one") from error
     try:
         return importlib.import_module(where)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{where}.".startswith(f"{error.name}."):
             raise _broken(where, error) from error
-        hint = f"did you mean {where}.py?" if Path(f"{where}.py").exists() else "a file's name ends with .py"
-        raise Usage(f"there is no module {error.name} here; {hint}") from error
+        hint = f"did you mean {where}.py?" if Path(f"{where}.py").exists() else "the name of a file must end with .py"
+        raise UsageError(f"there is no module {error.name} here; {hint}") from error
     except Exception as error:
         raise _broken(where, error) from error
 
 
 def _load_file(where: str) -> ModuleType:
     path = Path(where)
-    if path.is_file():
-        path = path.resolve()
-    else:
-        raise Usage(f"there is no file {where}")
+    if not path.is_file():
+        raise UsageError(f"there is no file {where}")
+    path = path.resolve()
     for known in list(sys.modules.values()):
         if getattr(known, "__file__", None) == str(path):
             return known
     name = path.stem if path.stem not in sys.modules else f"_r2p_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise Usage(f"{where} is no Python file: its name has to end with .py")
+        raise UsageError(f"{where} is not a Python file: its name must end with .py")
     module = importlib.util.module_from_spec(spec)
-    _look_in(path.parent)
+    _add_to_path(path.parent)
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
@@ -220,7 +221,7 @@ def _load_file(where: str) -> ModuleType:
     return module
 
 
-def _look_in(directory: Path) -> None:
+def _add_to_path(directory: Path) -> None:
     if str(directory) not in sys.path:
         sys.path.insert(0, str(directory))
 

@@ -1,6 +1,6 @@
-"""How every tool joins the network, talks to people, and ends.
+"""The session of a command: how it joins the network, waits for discovery, and ends with an exit code.
 
-A tool is a coroutine function whose first parameter is a `Session`; `tool()` makes a command of it:
+A command is a coroutine function whose first parameter is a `Session`:
 
     app = session.group("List and watch things.")
 
@@ -8,11 +8,11 @@ A tool is a coroutine function whose first parameter is a `Session`; `tool()` ma
     async def list_(session: Session, ..., format: Format = None) -> None:
         "One line of help."
 
-That adds --via, -v and -q, joins as an observer, and maps how it ends to an exit code: 0 fine (also Ctrl-C, SIGTERM
-and a closed pipe), 1 an error of r2p, 2 `Usage`, 3 `TimedOut`. The coroutine function stays what it is, so tests call
-it under virtual time, inside of `async with join(Settings(via=["memory:lab"])) as session`. A command outside of a
-group is `command = session.tool(body)`; one that joins by itself (as `run` does) takes `settings()` and `execute()`,
-with the options `Via`, `Verbose`, `Quiet`.
+`command` adds --via, -v and -q, joins as an observer, and maps the end to an exit code: 0 for success (also Ctrl-C,
+SIGTERM and a closed pipe), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`. The function itself is
+unchanged, so tests call it under virtual time, inside `async with join(Settings(via=["memory:lab"])) as session`.
+Commands that make a module of their own, such as `run`, use `settings()` and `execute()` with the options `Via`,
+`Verbose` and `Quiet`.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ import string
 import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import typer
@@ -34,72 +34,37 @@ import typer
 import r2p
 from r2p.clock import random_of
 from r2p.log_lines import printable
-from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout
-from r2p.tools.terminal import log_to_stderr, say
-from r2p.transports.url import duration, open_transport
+from r2p.tools.options import Quiet, Verbose, Via
+from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout, log_to_stderr, notify
+from r2p.transports.url import open_transport
 
 B = TypeVar("B", bound=Callable[..., Awaitable[None]])
 
 CONFIG = "r2p.toml"
-PATIENCE = 1.0
-"""Seconds that a tool waits before it says what for."""
+REPORT_WAITING_AFTER = 1.0
+"""Seconds that a command waits before it reports what it waits for."""
 
-_DESCRIPTORS = 12  # that are free: an event loop, its wake-ups, and a link
-_SETTLED = 0.3  # seconds without news, after which an r2p peer has told everything
-_FIRMWARE = 1.5  # seconds in which a module that repeats itself each half second should have said something
-_SETTLED_ON_BUS = 0.6  # ... on a bus, where all speak in turn
-_MOST = 8.0  # seconds that a tool listens while there is news: a bus of 1 Mbit/s bears 100 messages a second
+_DESCRIPTORS = 12  # free file descriptors that are needed: an event loop, its wake-ups, and a link
+_SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer has announced everything
+_SETTLED_ON_BUS = 0.6  # ... on a bus, where modules announce in turn
+_FIRMWARE = 1.5  # seconds in which firmware, which announces one item each half second, is heard at least once
+_SETTLE_MAX = 8.0  # seconds to listen while announcements arrive: a bus of 1 Mbit/s carries 100 of them a second
 _BUSES = ("rtcan", "sim")
-_LOOK = 0.05  # seconds between two looks for news
+_POLL = 0.05  # seconds
 _LOOPBACK = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
-_LINK_UP = 5.0  # seconds that a look at the network waits for the first link
+_LINK_UP = 5.0  # seconds to wait for the first link
 
 
-class Usage(Exception):
-    """The user asked for something that can't be: exit code 2."""
+class UsageError(Exception):
+    """The command line asks for something impossible: exit code 2."""
 
 
 class TimedOut(Exception):
-    """What was waited for did not come: exit code 3."""
-
-
-def seconds(text: str) -> float:
-    """A duration of more than 0 s from "10ms", "20us" or seconds, for an option's `parser`."""
-    try:
-        value = duration(text)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from error
-    if value <= 0:
-        raise typer.BadParameter(f"{text!r}: a time of more than 0 is needed")
-    return value
-
-
-Via = Annotated[
-    list[str] | None,
-    typer.Option("--via", metavar="URL", help="How to join: tcp:HOST:PORT, serial:DEVICE, ... (may repeat)."),
-]
-Verbose = Annotated[int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Tell more.")]
-Quiet = Annotated[int, typer.Option("--quiet", "-q", count=True, show_default=False, help="Tell less on stderr.")]
-Format = Annotated[
-    Literal["yaml", "json", "csv"] | None,
-    typer.Option("--format", help="Default: for people at a terminal, JSON lines in a pipe."),
-]
-Timeout = Annotated[
-    float | None,
-    typer.Option(
-        "--timeout", parser=seconds, metavar="TIME", help="Give up (exit 3) when nothing comes for so long: 2, 500ms."
-    ),
-]
-Wait = Annotated[
-    float | None,
-    typer.Option(
-        "--wait", parser=seconds, metavar="TIME", help="Listen for so long; firmware tells one topic each 0.5 s."
-    ),
-]
+    """Something did not happen in time: exit code 3."""
 
 
 class Settings(msgspec.Struct):
-    """What the command line, R2P_VIA and r2p.toml say. `types` are "package.module:Class" by topic."""
+    """The settings from the command line, R2P_VIA and r2p.toml. `types` are "package.module:Class" by topic."""
 
     via: list[str] = []
     types: dict[str, str] = {}
@@ -117,35 +82,35 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def settings(via: list[str] | None = None, directory: Path | None = None, *, tool: bool = False) -> Settings:
-    """The settings; precedence for `via`: argument, R2P_VIA, r2p.toml in the directory (default: working directory).
+    """Return the settings. `via` is the argument, else R2P_VIA, else of r2p.toml in `directory` (default: the current).
 
-    The last two tell how the robot's program joins. Where that listens, a `tool` beside it connects to it.
-    Raises Usage for an r2p.toml that can't be read, or that other users may write.
+    R2P_VIA and r2p.toml are shared with the robot's program: where that listens, a `tool` on this machine connects.
+    Raises UsageError for an r2p.toml that can't be read, or that other users can write.
     """
     file = _read(directory)
     from_file = [file.via] if isinstance(file.via, str) else file.via
     shared = os.environ.get("R2P_VIA", "").split() or from_file
-    return Settings(via or [_beside(url) if tool else url for url in shared], file.types, file.remap, file.module)
+    return Settings(via or [_local_peer(url) if tool else url for url in shared], file.types, file.remap, file.module)
 
 
 def check_urls(via: list[str]) -> None:
-    """Raises Usage for a URL that names no transport, or not as that takes it; it opens nothing."""
+    """Raise UsageError for a URL of an unknown transport or with invalid options; open nothing."""
     for url in via:
         try:
             open_transport(url)
         except r2p.TransportError as error:
-            if isinstance(error.__cause__, ImportError):  # the URL is right, and this installation lacks something
+            if isinstance(error.__cause__, ImportError):  # the URL is valid, but this installation lacks a package
                 raise
-            raise Usage(str(error)) from error
+            raise UsageError(str(error)) from error
 
 
-def _beside(url: str) -> str:
-    """The URL by which a tool on the same machine reaches a program with this one."""
+def _local_peer(url: str) -> str:
+    """Return the URL by which a tool on the same machine reaches a program that has opened this one."""
     scheme, _, address = url.partition(":")
     if scheme != "tcp-listen":
         return url
     host, colon, port = address.rpartition(":")
-    if not colon or not port.isdecimal():  # no port: the usual one, or nothing but a port
+    if not colon or not port.isdecimal():  # only a host (and the usual port), or only a port
         return f"tcp:127.0.0.1:{address}" if address.isdecimal() else f"tcp:{_LOOPBACK.get(address, address)}"
     return f"tcp:{_LOOPBACK.get(host, host)}:{port}"
 
@@ -162,28 +127,28 @@ def _read(directory: Path | None) -> _File:
     except FileNotFoundError:
         return _File()
     except RecursionError as error:
-        raise Usage(f"{path}: it is nested too deeply") from error
+        raise UsageError(f"{path} is nested too deeply") from error
     except msgspec.ValidationError as error:
-        raise Usage(f"{path}: {error}; it knows {', '.join(_File.__struct_fields__)}") from error
-    except (OSError, ValueError) as error:  # unreadable, or no TOML
-        raise Usage(f"{path}: {error}") from error
+        raise UsageError(f"{path}: {error}; the keys are {', '.join(_File.__struct_fields__)}") from error
+    except (OSError, ValueError) as error:  # unreadable, or not TOML
+        raise UsageError(f"{path}: {error}") from error
 
 
 def check_owned(path: Path, status: os.stat_result) -> None:
-    """Raises Usage for a configuration that another user, who is not root, may write: it can name code to run."""
+    """Raise UsageError for a configuration that a user other than root can write: it can name code to run."""
     if os.name != "posix":
         return
     owners = {0, os.geteuid()}
-    if os.geteuid() == 0:  # by way of sudo, whoever has called that
+    if os.geteuid() == 0:  # with sudo, the file may belong to the user who called it
         owners.add(int(os.environ.get("SUDO_UID", "0")))
     if status.st_uid not in owners:
-        raise Usage(f"{path} belongs to another user, and it can name code to run: chown it, or work elsewhere")
+        raise UsageError(f"{path} belongs to another user and can name code to run: chown it, or use another directory")
     if status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and not _is_private(status)):
-        raise Usage(f"{path} can be written by other users, and it can name code to run: chmod go-w {path}")
+        raise UsageError(f"{path} is writable by other users and can name code to run: chmod go-w {path}")
 
 
 def _is_private(status: os.stat_result) -> bool:
-    """Whether the group of a file is its owner's own, of the same name and without other members."""
+    """Return whether the group of a file is its owner's own: it has the same name and no other members."""
     import grp
     import pwd
 
@@ -195,21 +160,21 @@ def _is_private(status: os.stat_result) -> bool:
 
 
 def _check_descriptors() -> None:
-    """Raises r2p.Error where so few files may be open that not even an event loop can run."""
+    """Raise r2p.Error if too few files may be open for an event loop: asyncio's own error would be obscure."""
     opened: list[int] = []
     try:
         for _ in range(_DESCRIPTORS):
-            opened.append(os.open(os.devnull, os.O_RDONLY))  # noqa: PERF401 - what was opened is closed
+            opened.append(os.open(os.devnull, os.O_RDONLY))  # noqa: PERF401 - what was opened must be closed
     except OSError as error:
-        raise r2p.Error(f"{error.strerror}: r2p needs {_DESCRIPTORS} more at least (ulimit -n 1024)") from error
+        raise r2p.Error(f"{error.strerror}: r2p needs at least {_DESCRIPTORS} more (ulimit -n 1024)") from error
     finally:
         for each in opened:
             os.close(each)
 
 
 @contextlib.contextmanager
-def later(seconds: float, call: Callable[[], object]) -> Iterator[None]:
-    """Call it if the block takes so long."""
+def call_after(seconds: float, call: Callable[[], object]) -> Iterator[None]:
+    """Call `call` if the block takes longer than this."""
     timer = asyncio.get_running_loop().call_later(seconds, call)
     try:
         yield
@@ -217,8 +182,27 @@ def later(seconds: float, call: Callable[[], object]) -> Iterator[None]:
         timer.cancel()
 
 
+@contextlib.asynccontextmanager
+async def patience(what: str, timeout: float | None) -> AsyncIterator[Callable[[], None]]:
+    """Raise TimedOut in the block if nothing is received on `what` for `timeout` seconds.
+
+    The block gets a function to call for each message.
+    """
+    loop = asyncio.get_running_loop()
+    try:
+        async with asyncio.timeout(timeout) as limit:
+
+            def received() -> None:
+                if timeout is not None and not limit.expired():
+                    limit.reschedule(loop.time() + timeout)
+
+            yield received
+    except TimeoutError:
+        raise TimedOut(f"nothing received on {what} for {timeout:g} s") from None
+
+
 class Session:
-    """A tool on the network: its module, and its voice (stderr; stdout is for output alone)."""
+    """A command on the network: its module, and its messages to the user (on stderr; stdout is for output only)."""
 
     def __init__(self, module: r2p.Module, settings: Settings, *, name: str = "tool", verbose: int = 0) -> None:
         self.module = module
@@ -228,39 +212,39 @@ class Session:
 
     @functools.cached_property
     def node(self) -> r2p.Node:
-        """A node to publish and subscribe with; it lives as long as the session."""
-        return self.module.start(_live, name=self._name)
+        """A node to publish and subscribe with; it exists as long as the session."""
+        return self.module.start(_idle, name=self._name)
 
     @property
-    def where(self) -> str:
-        """The network that it is on, in words."""
+    def network_name(self) -> str:
+        """The network that the command is on, for messages."""
         return ", ".join(self.settings.via) or "this tool alone"
 
-    def say(self, text: str) -> None:
-        """Tell the user."""
-        say(text)
+    def notify(self, text: str) -> None:
+        """Print a message for the user on stderr."""
+        notify(text)
 
     @contextlib.contextmanager
     def waiting(self, what: str | Callable[[], str]) -> Iterator[None]:
-        """While the block waits: after a second, say what for (a function is asked then)."""
+        """Report what the block waits for if it takes more than a second; a function is called for the text then."""
 
-        def tell() -> None:
-            self.say(f"waiting for {what if isinstance(what, str) else what()} on {self.where}")
+        def report() -> None:
+            self.notify(f"waiting for {what if isinstance(what, str) else what()} on {self.network_name}")
 
-        with later(PATIENCE, tell):
+        with call_after(REPORT_WAITING_AFTER, report):
             yield
 
     def only_module(self, link: str) -> str:
-        """The name of the module at the other end of a link; "?" if there is not just one."""
+        """Return the name of the module at the other end of a link; "?" unless there is exactly one."""
         views = self.module.network.modules()
         names = {view.name for view in views if view.link == link and view.state != "observer"}
         return names.pop() if len(names) == 1 else "?"
 
     async def settle(self, wait: float | None = None, *, of: str = "topics") -> None:
-        """Listen to the network until the others have told what they have, or for `wait` seconds.
+        """Listen until the other modules have announced what they have, or for `wait` seconds.
 
-        `of` is what it listens for, in words. r2p modules are asked and answer at once, gateways for those behind
-        them; firmware repeats itself step by step. Where there may be more to come, that is said. Raises
+        r2p modules are queried and answer at once, gateways for the modules behind them; firmware repeats one
+        announcement at a time. Where more may come, the user is told; `of` is the plural for that message. Raises
         r2p.TransportError if no link comes up.
         """
         if not self.settings.via:
@@ -270,25 +254,27 @@ class Session:
             await asyncio.sleep(wait)
             return
         self.module.query()
-        told = await self._told()
-        if self._hears_firmware() and (not told or self._expects_more()):
-            self.say(f"firmware tells one thing each half second: there may be more {of}, listen longer with --wait 5")
-        elif not told:
-            self.say(f"there was news to the end: there may be more {of}, listen longer with --wait 20")
+        settled = await self._settled()
+        if self._has_firmware() and (not settled or self._expects_more()):
+            self.notify(
+                f"firmware announces one item every 0.5 s, so there may be more {of}: listen longer with --wait 5"
+            )
+        elif not settled:
+            self.notify(f"announcements kept arriving, so there may be more {of}: listen longer with --wait 20")
 
-    async def _told(self) -> bool:
-        """Wait until nobody has news any more; False if that was given up."""
+    async def _settled(self) -> bool:
+        """Wait until no new announcements arrive; False if they still did after the longest time."""
         on_bus = any(url.partition(":")[0] in _BUSES for url in self.settings.via)
         quiet = _SETTLED_ON_BUS if on_bus else _SETTLED
         loop = asyncio.get_running_loop()
-        start = news_at = loop.time()
+        start = changed_at = loop.time()
         known = 0
-        while (now := loop.time()) - start < _MOST:
-            if now - news_at > quiet and (now - start > _FIRMWARE or not self._expects_more()):
+        while (now := loop.time()) - start < _SETTLE_MAX:
+            if now - changed_at > quiet and (now - start > _FIRMWARE or not self._expects_more()):
                 return True
-            await asyncio.sleep(_LOOK)
+            await asyncio.sleep(_POLL)
             if (count := self._known()) != known:
-                known, news_at = count, loop.time()
+                known, changed_at = count, loop.time()
         return False
 
     async def _link_up(self) -> None:
@@ -297,8 +283,8 @@ class Session:
         with self.waiting("a link"):
             while not any(link.up for link in self.module.links):
                 if loop.time() > end:
-                    raise r2p.TransportError(f"no connection on {self.where}")
-                await asyncio.sleep(_LOOK)
+                    raise r2p.TransportError(f"no connection on {self.network_name}")
+                await asyncio.sleep(_POLL)
 
     def _known(self) -> int:
         topics = self.module.network.topics().values()
@@ -306,43 +292,44 @@ class Session:
         return len(topics) + endpoints + len(self.module.network.modules())
 
     def _expects_more(self) -> bool:
-        """Whether there is a link on which no r2p module is heard that would answer at once, or nothing but modules.
+        """Return whether a link lacks r2p modules, which would answer at once, or has modules without topics.
 
-        A module has topics; a gateway passes those of others on only after it has looked for other gateways.
+        Modules have topics, but a gateway announces those of others only after it has looked for other gateways.
         """
-        told = self._answering() & self._heard()
-        return any(link.up and link.name not in told for link in self.module.links)
+        complete = self._links_with_r2p() & self._links_with_topics()
+        return any(link.up and link.name not in complete for link in self.module.links)
 
-    def _answering(self) -> set[str]:
-        return {view.link for view in self.module.network.modules() if view.instance is not None}
-
-    def _hears_firmware(self) -> bool:
-        """Whether somebody is heard who does not answer."""
+    def _has_firmware(self) -> bool:
+        """Return whether there are announcements of modules that do not answer queries."""
         modules = self.module.network.modules()
-        return any(view.instance is None for view in modules) or bool(self._heard() - self._answering())
+        return any(view.instance is None for view in modules) or bool(
+            self._links_with_topics() - self._links_with_r2p()
+        )
 
     def may_have_firmware(self) -> bool:
-        """Whether firmware was heard, or may be at the other end of a link on which no r2p module is."""
-        there = {view.link for view in self.module.network.modules() if view.instance is None}
-        silent = {link.name for link in self.module.links if link.up and link.passes_probes} - self._answering()
-        return bool(there | silent)
+        """Return whether firmware has announced something, or may be silent on a link without r2p modules."""
+        firmware = {view.link for view in self.module.network.modules() if view.instance is None}
+        silent = {link.name for link in self.module.links if link.up and link.passes_probes} - self._links_with_r2p()
+        return bool(firmware | silent)
 
-    def _heard(self) -> set[str]:
-        """Links on which there are topics."""
+    def _links_with_r2p(self) -> set[str]:
+        return {view.link for view in self.module.network.modules() if view.instance is not None}
+
+    def _links_with_topics(self) -> set[str]:
         views = self.module.network.topics().values()
         return {link for view in views for link in view.published_on + view.subscribed_on if link}
 
 
-async def _live(node: r2p.Node) -> None:
-    """The node of a tool: what it opens is used elsewhere."""
+async def _idle(node: r2p.Node) -> None:
+    """Run until cancelled: the command itself publishes and subscribes with this node."""
     await asyncio.get_running_loop().create_future()
 
 
 @contextlib.asynccontextmanager
 async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> AsyncIterator[Session]:
-    """Join the network as an observer, a module named `_` and six random characters; `name` is its node's."""
+    """Join the network as an observer, a module named `_` and six random characters; `name` is that of its node."""
     if not settings.via:
-        say("local only: this tool sees nothing but itself; give --via tcp:HOST:PORT, or set R2P_VIA")
+        notify("no network: this tool sees only itself; give --via tcp:HOST:PORT or set R2P_VIA")
     alphabet = string.ascii_lowercase + string.digits
     check_urls(settings.via)
     module_name = "_" + "".join(random_of(asyncio.get_running_loop()).choices(alphabet, k=6))
@@ -351,8 +338,9 @@ async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> A
 
 
 def command(app: typer.Typer, name: str) -> Callable[[B], B]:
-    """Decorate a coroutine function that takes a Session first, then its own arguments and options: it stays as it is,
-    and `app` gets the command made of it.
+    """Make a command of `app` from the coroutine function that this decorates, and return the function unchanged.
+
+    The function takes a Session first, then its own arguments and options.
     """
 
     def register(body: B) -> B:
@@ -363,7 +351,7 @@ def command(app: typer.Typer, name: str) -> Callable[[B], B]:
 
 
 def tool(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
-    """The command made of such a coroutine function."""
+    """Return the command of such a coroutine function, as Typer expects it."""
     name = body.__name__.strip("_")
 
     def run(**given: Any) -> None:
@@ -392,7 +380,7 @@ _COMMON = {
 
 
 def group(help: str) -> typer.Typer:
-    """A group of commands for `main.GROUPS`."""
+    """Return a group of commands for `main.GROUPS`."""
     app = typer.Typer(
         help=help, no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False
     )
@@ -411,7 +399,7 @@ def execute(
     quiet: int = 0,
     run: Callable[[Callable[[], Awaitable[object]]], object] | None = None,
 ) -> None:
-    """Run a command until it ends or a signal ends it; errors become exit codes. `run`: how, else `r2p.run_main`."""
+    """Run a command until it ends or a signal ends it, and exit with its code. `run` replaces `r2p.run_main`."""
     with log_to_stderr(verbose - quiet):
         try:
             _check_descriptors()
@@ -421,31 +409,31 @@ def execute(
 
 
 def _explain(error: BaseException) -> None:
-    """Tell what ended a command, and exit as it deserves; a bug is raised again."""
+    """Print the errors that ended a command, and exit with their code; a bug is raised again."""
     leaves = list(_leaves(error))
     for leaf in leaves:
         if isinstance(leaf, PipeClosed):
             abandon_stdout()
             return
-        if isinstance(leaf, Usage | r2p.InvalidName):  # names that did not come from a person raise nothing
+        if isinstance(leaf, UsageError | r2p.InvalidName):  # invalid names always come from the command line
             raise typer.BadParameter(printable(str(leaf), "\n")) from leaf
         if isinstance(leaf, TimedOut):
-            say(str(leaf))
+            notify(str(leaf))
             raise typer.Exit(3) from leaf
     if not all(isinstance(leaf, r2p.Error | Unwritable) or _is_exhausted(leaf) for leaf in leaves):
         raise error
     for leaf in leaves:
-        say(leaf.message if isinstance(leaf, r2p.NodeCrashed) else str(leaf))
+        notify(leaf.message if isinstance(leaf, r2p.NodeCrashed) else str(leaf))
     raise typer.Exit(1) from error
 
 
 def _is_exhausted(error: BaseException) -> bool:
-    """Whether there were too many open files, in this process or on this computer."""
+    """Return whether too many files were open, in this process or on this computer."""
     return isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE)
 
 
 def _leaves(error: BaseException) -> Iterator[BaseException]:
-    """The errors in nested groups; what nodes raised is one error, its details have been logged."""
+    """Yield the errors in nested groups. Errors of nodes count as one, because their details have been logged."""
     if isinstance(error, BaseExceptionGroup) and not isinstance(error, r2p.NodeCrashed):
         for each in error.exceptions:
             yield from _leaves(each)

@@ -42,7 +42,7 @@ async def test_a_delay_is_that_from_the_first_frame_to_the_tool() -> None:
             assert network_time is not None
             await times.publish(r2p.Timestamp.from_ns(network_time))
             sample = await anext(subscriber.samples())
-            meter.note(sample, laptop.now())
+            meter.add(sample, laptop.now())
             (frame,) = made.sent(lambda found: rtcan.SRT_MIN <= found.laxity <= rtcan.SRT_MAX, "SENSOR")
             assert sample.stamp == frame.start + laptop.now() - clock_of().monotonic()
             way.append((frame.end - frame.start) / 1e9 + DELAY)

@@ -145,7 +145,7 @@ def test_the_slots_as_text_and_as_a_drawing(
 
 def test_a_silent_bus(vcan: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert command("dump", "--timeout", "50ms", "--via", f"rtcan:{vcan}") == 3
-    assert "nothing on the bus for 0.05 s" in capsys.readouterr().err
+    assert "nothing received on the bus for 0.05 s" in capsys.readouterr().err
 
 
 @pytest.mark.anyio

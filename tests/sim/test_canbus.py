@@ -183,7 +183,7 @@ async def test_a_mailbox_holds_one_frame() -> None:
     await asyncio.sleep(0.001)
     assert a.pending() is None
     assert [record.frame for record in watch.records] == [LOW, MIDDLE]
-    with pytest.raises(IndexError, match="no mailbox 3"):
+    with pytest.raises(IndexError, match="mailboxes 0 to 2, not 3"):
         a.request(LOW, 3)
 
 
@@ -368,7 +368,7 @@ async def test_jitter_is_spread_over_its_range() -> None:
 
 
 def test_a_delay_is_never_negative() -> None:
-    with pytest.raises(ValueError, match="never negative"):
+    with pytest.raises(ValueError, match="the jitter"):
         Latency(1_000, 2_000)
 
 

@@ -18,7 +18,7 @@ from tests.tools.rig import process
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-RETRIES = "in one-shot mode, if its driver has it, laxity is fresh at each try"
+RETRIES = "in one-shot mode, if the driver supports it, the laxity is updated before each attempt"
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="looks into Linux's files")
 
@@ -100,7 +100,7 @@ def test_serial_ports_that_are_there(tmp_path: Path) -> None:
         if kind is not None:
             write(tmp_path, f"sys/class/tty/{name}/type", f"{kind}\n")
     assert findings(doctor.serial_ports(tmp_path)) == [
-        (True, f"{tmp_path}/dev/{name}, yours to open: --via serial:{tmp_path}/dev/{name}", "")
+        (True, f"{tmp_path}/dev/{name}, you may open it: --via serial:{tmp_path}/dev/{name}", "")
         for name in ("ttyUSB0", "ttyS0")
     ]
 
@@ -113,7 +113,7 @@ def test_a_serial_port_of_others_gets_its_command(tmp_path: Path, monkeypatch: p
     assert check == Check(
         "serial",
         False,
-        f"{port} is there, but only for dialout",
+        f"{port}: only group dialout may open it",
         "sudo usermod -aG dialout $USER\nthen log in again",
     )
 
@@ -126,7 +126,7 @@ def test_no_serial_port(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("governors", "ok", "found"),
     [
-        ([], True, "not up to this system"),
+        ([], True, "not controlled by this system"),
         (["performance", "performance"], True, "constant"),
         (["powersave", "performance"], False, "changes with the load (performance, powersave): wake-ups take longer"),
     ],
@@ -164,9 +164,9 @@ def test_how_tools_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.delenv("R2P_VIA", raising=False)
     assert not doctor.configured().ok
     write(tmp_path, "r2p.toml", 'via = ["tcp:10.0.0.1:23", "serial:/dev/ttyUSB0"]')
-    assert doctor.configured().found == "tools join by tcp:10.0.0.1:23 serial:/dev/ttyUSB0"
+    assert doctor.configured().found == "tools join with tcp:10.0.0.1:23 serial:/dev/ttyUSB0"
     write(tmp_path, "r2p.toml", "via = 3")
-    assert doctor.configured().do == "mend that file"
+    assert doctor.configured().do == "correct this file"
 
 
 def test_lateness() -> None:

@@ -18,9 +18,9 @@ from r2p.msg import GatewayStatus, Led
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.testing.network import node_in
 from r2p.tools import gateway
-from r2p.tools.gateway import GatewayScreen, Rates, fitted, serve, table
+from r2p.tools.gateway import LiveTable, RateCounter, crop, serve, table
 from r2p.tools.output import Output
-from r2p.tools.session import Usage
+from r2p.tools.session import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -40,7 +40,7 @@ def ways(forwarded: int) -> list[WayStatistics]:
 
 
 def test_the_table() -> None:
-    rates = Rates()
+    rates = RateCounter()
     rates.rows(GatewayStatistics(PORTS, ways(100)), 1 * SECOND)
     rows = rates.rows(GatewayStatistics(PORTS, ways(300)), 3 * SECOND)
     assert table(rows).splitlines() == [
@@ -60,13 +60,13 @@ def test_two_links_of_a_kind_have_their_names_in_the_table() -> None:
         WayStatistics("leds", "zenoh:tcp/c:7447", "tcp:b:23", 5, {}),
         WayStatistics("leds", "zenoh:tcp/c:7447", "tcp:gone:23", 5, {}),
     ]
-    text = table(Rates().rows(GatewayStatistics(ports, there), SECOND))
+    text = table(RateCounter().rows(GatewayStatistics(ports, there), SECOND))
     ways = [line.split()[:3] for line in text.partition("TOPIC")[2].splitlines()[1:]]
     assert ways == [["encoder", "tcp:a:23", "zenoh"], ["leds", "zenoh", "tcp:b:23"], ["leds", "zenoh", "tcp:gone:23"]]
 
 
 def test_a_way_that_is_made_anew_counts_anew() -> None:
-    rates = Rates()
+    rates = RateCounter()
     rates.rows(GatewayStatistics(PORTS, ways(100)), 1 * SECOND)
     rows = rates.rows(GatewayStatistics(PORTS, ways(20)), 2 * SECOND)
     assert [row.rate for row in rows if row.topic] == [20.0]
@@ -74,9 +74,9 @@ def test_a_way_that_is_made_anew_counts_anew() -> None:
 
 def test_the_table_fits_on_the_terminal() -> None:
     text = "".join(f"{number} {'x' * 20}\n" for number in range(10))
-    assert fitted(text, 80, 12) == text
-    assert fitted(text, 10, 11).splitlines() == [*(f"{n} xxxxxxxx" for n in range(8)), "... and 2 "]
-    assert fitted(text, 80, 1) == "... and 10 more lines\n"
+    assert crop(text, 80, 12) == text
+    assert crop(text, 10, 11).splitlines() == [*(f"{n} xxxxxxxx" for n in range(8)), "... and 2 "]
+    assert crop(text, 80, 1) == "... and 10 more lines\n"
 
 
 @pytest.mark.virtual_time
@@ -84,8 +84,8 @@ async def test_the_table_stays_in_its_place_until_something_is_logged() -> None:
     stream = io.StringIO()
     output = Output("yaml", stream)
     output.format = "text"
-    screen = GatewayScreen(output)
-    rows = Rates().rows(GatewayStatistics(PORTS, []), SECOND)
+    screen = LiveTable(output)
+    rows = RateCounter().rows(GatewayStatistics(PORTS, []), SECOND)
     await screen.draw(rows)
     await screen.draw(rows)
     assert stream.getvalue().count("\x1b[4F\x1b[J") == 1
@@ -162,18 +162,20 @@ VIA = ["rtcan:can0,priority=1", "zenoh:?network=lab", "tcp:robot", "tcp-listen:0
 
 
 def test_mistakes_are_told() -> None:
-    with pytest.raises(Usage, match="--deny 'leds@': write TOPIC"):
+    with pytest.raises(UsageError, match="--deny 'leds@': write TOPIC"):
         gateway._rules(["leds@"], "--deny", VIA)
-    with pytest.raises(Usage, match="--allow: 'can0' is none of the links rtcan:can0, zenoh:, tcp:robot, tcp-listen:0"):
+    with pytest.raises(
+        UsageError, match="--allow: 'can0' matches none of the links rtcan:can0, zenoh:, tcp:robot, tcp-listen:0"
+    ):
         gateway._rules(["leds@can0"], "--allow", VIA)
-    with pytest.raises(Usage, match="--read-only: 'serial' is none"):
+    with pytest.raises(UsageError, match="--read-only: 'serial' matches none"):
         gateway._links(["zenoh", "serial"], "--read-only", VIA)
     for prefix in ("robot1", "rob ot/", "a/b/", "a_name_that_is_too_long/"):
-        with pytest.raises(Usage, match=r"--prefix: .* robot1/"):
+        with pytest.raises(UsageError, match=r"--prefix: .* robot1/"):
             gateway._prefix(prefix)
         with pytest.raises(r2p.Error, match="is not a valid prefix"):
             Policy(BridgeOptions(prefix=prefix))
-    with pytest.raises(Usage, match="--rate-limit leds: write it as TOPIC=HZ"):
+    with pytest.raises(UsageError, match="--rate-limit leds: write it as TOPIC=HZ"):
         list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
     with pytest.raises(typer.BadParameter, match="periodic:10ms"):
         gateway._class("often")

@@ -39,11 +39,11 @@ def test_a_signal_ends_it_well(gateway: subprocess.Popen[str], number: signal.Si
 
 def test_mistakes() -> None:
     for arguments, code, words in (
-        (("--via", "tcp:127.0.0.1:1"), 2, "a gateway joins two links"),
+        (("--via", "tcp:127.0.0.1:1"), 2, "a gateway needs at least two links"),
         (("--via", "memory:a", "--via", "memory:b", "--allow", "@x"), 2, "write TOPIC, TOPIC@FROM or TOPIC@FROM>TO"),
         (("--via", "memory:a", "--via", "memory:b", "--rate-limit", "leds"), 2, "write it as TOPIC=HZ"),
         (("--via", "memory:a", "--via", "nonsense:b"), 2, "unknown transport"),
-        (("--via", "memory:a", "--via", "memory:a"), 2, "a link is given twice"),
+        (("--via", "memory:a", "--via", "memory:a"), 2, "the same link is given twice"),
     ):
         with process("gateway", *arguments) as child:
             _, err = child.communicate()

@@ -52,7 +52,7 @@ async def test_what_firmware_has_is_listed_under_a_question_mark(capsys: pytest.
         await list_(session)
         captured = capsys.readouterr()
         assert captured.out == '{"node": "IMU1/?", "publishes": ["tilt"], "subscribes": []}\n'
-        assert "firmware tells one thing each half second: there may be more topics" in captured.err
+        assert "firmware announces one item every 0.5 s, so there may be more topics" in captured.err
 
 
 async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,9 +75,9 @@ async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
 
 async def test_names_that_are_not_one_node() -> None:
     async with robot(drive), robot(drive, name="ARM"), tool() as session:
-        with pytest.raises(r2p.Error, match="several nodes drive: say which of ARM/drive, BOT/drive"):
+        with pytest.raises(r2p.Error, match="several nodes drive: choose one of ARM/drive, BOT/drive"):
             await info(session, "drive")
-        with pytest.raises(r2p.Error, match="no node ARM/show; known: ARM/drive, ARM/log, BOT/drive, BOT/log"):
+        with pytest.raises(r2p.Error, match="no node ARM/show; nodes found: ARM/drive, ARM/log, BOT/drive, BOT/log"):
             await info(session, "ARM/show")
 
 
@@ -87,13 +87,13 @@ async def test_nobody_but_tools(capsys: pytest.CaptureFixture[str]) -> None:
         await list_(session)
         await modules(session)
     no_node, *_, no_module = capsys.readouterr().err.splitlines()
-    assert no_node == "r2p: no node is known on memory:lab; there are tools, which --all shows"
-    assert no_module == "r2p: no module has been heard on memory:lab; there are tools, which --all shows"
+    assert no_node == "r2p: no nodes found on memory:lab; use --all to include tools"
+    assert no_module == "r2p: no modules found on memory:lab; use --all to include tools"
 
 
 async def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
     async with tool() as session:
         await list_(session)
-        with pytest.raises(r2p.Error, match="known: none"):
+        with pytest.raises(r2p.Error, match="nodes found: none"):
             await info(session, "drive")
-    assert "no node is known on memory:lab" in capsys.readouterr().err
+    assert "no nodes found on memory:lab" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import pytest
 
 import r2p
 from r2p.tools.run import load
-from r2p.tools.session import Usage
+from r2p.tools.session import UsageError
 from tests.tools.rig import listening, process
 
 if TYPE_CHECKING:
@@ -110,25 +110,25 @@ def test_a_file_may_be_named_like_a_module_that_is_there(tmp_path: Path) -> None
         ("nodes.py", "which function? it has blink, watch, once, crash, motor, stubborn, blocks, a_long_name: r2p run"),
         ("nodes.py:blnk", "nodes.py has no function blnk; did you mean blink?"),
         ("nodes.py:xyz", "nodes.py has no function xyz; it has blink, "),
-        ("nodes.py:plain", "nodes.py:plain is no node: write `async def plain"),
-        ("nodes.py:Led", "nodes.py:Led is no node"),
-        ("nodes.py:a_long_name", "at most 8 characters; give it another: nodes.py:a_long_name=NAME"),
-        ("nodes.py:blink=much_too_long", "at most 8 characters; give it another: nodes.py:blink=NAME"),
+        ("nodes.py:plain", "nodes.py:plain is not a node: write `async def plain"),
+        ("nodes.py:Led", "nodes.py:Led is not a node"),
+        ("nodes.py:a_long_name", "at most 8 characters; use another name: nodes.py:a_long_name=NAME"),
+        ("nodes.py:blink=much_too_long", "at most 8 characters; use another name: nodes.py:blink=NAME"),
         ("other.py:blink", "there is no file other.py"),
         ("dir/nodes:blink", "there is no file dir/nodes"),
-        ("other:blink", "there is no module other here; a file's name ends with .py"),
+        ("other:blink", "there is no module other here; the name of a file must end with .py"),
         ("nodes.blink", "there is no module nodes.blink"),
-        ("empty.py", "which function? it has no node; write `async def"),
+        ("empty.py", "which function? it defines no node; write `async def"),
     ],
 )
 def test_usage_says_what_to_do(tmp_path: Path, target: str, what_to_do: str) -> None:
     (tmp_path / "empty.py").touch()
-    with pytest.raises(Usage, match=re.escape(what_to_do)):
+    with pytest.raises(UsageError, match=re.escape(what_to_do)):
         load([target])
 
 
 def test_two_nodes_of_one_name() -> None:
-    with pytest.raises(Usage, match=r"there is a node blink already; give it another: nodes.py:blink=NAME"):
+    with pytest.raises(UsageError, match=r"there is already a node blink; use another name: nodes.py:blink=NAME"):
         load(["nodes.py:blink", "nodes.py:watch", "nodes.py:blink"])
 
 

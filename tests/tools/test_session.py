@@ -21,10 +21,10 @@ from typer.testing import CliRunner
 
 import r2p
 from r2p.msg import Led
-from r2p.tools import session
+from r2p.tools import options, session
 from r2p.tools.output import PipeClosed
 from r2p.tools.run import load_module
-from r2p.tools.session import Session, Settings, TimedOut, Usage, check_owned, execute, join, settings
+from r2p.tools.session import Session, Settings, TimedOut, UsageError, check_owned, execute, join, settings
 from tests.tools.rig import Firmware, robot, tool
 
 if TYPE_CHECKING:
@@ -87,13 +87,13 @@ def test_what_the_file_holds(tmp_path: Path) -> None:
 )
 def test_a_bad_file_is_told_with_its_name(text: str, tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text(text)
-    with pytest.raises(Usage, match=re.escape(str(tmp_path / "r2p.toml"))):
+    with pytest.raises(UsageError, match=re.escape(str(tmp_path / "r2p.toml"))):
         settings()
 
 
 def test_a_key_that_is_unknown_is_told_with_those_that_are_known(tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text('vai = "tcp:there"')
-    with pytest.raises(Usage, match="unknown field `vai`; it knows via, module, types, remap"):
+    with pytest.raises(UsageError, match="unknown field `vai`; the keys are via, module, types, remap"):
         settings()
 
 
@@ -103,9 +103,9 @@ def test_a_working_directory_that_is_gone_has_no_file(tmp_path: Path) -> None:
     gone.rmdir()
     try:
         assert settings() == Settings()
-        with pytest.raises(Usage, match="the working directory does not exist any more"):
+        with pytest.raises(UsageError, match="the working directory does not exist any more"):
             load_module("robot")
-        with pytest.raises(Usage, match=re.escape("there is no file robot.py")):
+        with pytest.raises(UsageError, match=re.escape("there is no file robot.py")):
             load_module("robot.py")
     finally:
         os.chdir(tmp_path)
@@ -120,13 +120,13 @@ def status(mode: int = 0o644, user: int | None = None, group: int = 4711) -> os.
     [
         (status(), ""),
         (status(user=0), ""),
-        (status(user=4711), "belongs to another user, and it can name code to run: chown it"),
-        (status(0o646), "can be written by other users, and it can name code to run: chmod go-w"),
-        (status(0o664), "can be written by other users"),
+        (status(user=4711), "belongs to another user and can name code to run: chown it"),
+        (status(0o646), "is writable by other users and can name code to run: chmod go-w"),
+        (status(0o664), "is writable by other users"),
     ],
 )
 def test_a_file_that_others_may_write_is_refused(file: os.stat_result, refused: str) -> None:
-    with pytest.raises(Usage, match=refused) if refused else contextlib.nullcontext():
+    with pytest.raises(UsageError, match=refused) if refused else contextlib.nullcontext():
         check_owned(Path("r2p.toml"), file)
 
 
@@ -134,7 +134,7 @@ def test_the_group_of_its_owner_alone_may_write_it() -> None:
     owner = pwd.getpwuid(os.geteuid())
     group = grp.getgrgid(owner.pw_gid)
     alone = group.gr_name == owner.pw_name and set(group.gr_mem) <= {owner.pw_name}
-    with contextlib.nullcontext() if alone else pytest.raises(Usage):
+    with contextlib.nullcontext() if alone else pytest.raises(UsageError):
         check_owned(Path("r2p.toml"), status(0o664, group=owner.pw_gid))
 
 
@@ -142,14 +142,14 @@ def test_root_by_way_of_sudo_reads_the_file_of_the_caller(monkeypatch: pytest.Mo
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     monkeypatch.setenv("SUDO_UID", "4711")
     check_owned(Path("r2p.toml"), status(user=4711))
-    with pytest.raises(Usage):
+    with pytest.raises(UsageError):
         check_owned(Path("r2p.toml"), status(user=4712))
 
 
 def test_the_file_itself_is_looked_at(tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text('via = "tcp:there"')
     (tmp_path / "r2p.toml").chmod(0o666)
-    with pytest.raises(Usage, match="can be written by other users"):
+    with pytest.raises(UsageError, match="is writable by other users"):
         settings()
 
 
@@ -171,7 +171,7 @@ def test_too_few_files_may_be_open(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert ended.value.exit_code == 1
     first, second = capsys.readouterr().err.splitlines()
     assert first == "r2p: [Errno 24] Too many open files"
-    assert second == "r2p: Too many open files: r2p needs 12 more at least (ulimit -n 1024)"
+    assert second == "r2p: Too many open files: r2p needs at least 12 more (ulimit -n 1024)"
 
 
 # On the network
@@ -191,7 +191,7 @@ async def test_without_a_network_it_says_so(capsys: pytest.CaptureFixture[str]) 
     async with join(Settings()) as alone:
         await alone.settle()
     captured = capsys.readouterr()
-    assert "local only" in captured.err
+    assert "no network" in captured.err
     assert "--via" in captured.err
     assert captured.out == ""
 
@@ -295,7 +295,7 @@ async def test_no_link_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
         (PipeClosed(), 0, ""),
         (r2p.TypeMismatch("two layouts"), 1, "r2p: two layouts\n"),
         (r2p.NodeCrashed("1 node(s) crashed", [ValueError("x")]), 1, "r2p: 1 node(s) crashed\n"),
-        (Usage("not like this"), 2, "not like this"),
+        (UsageError("not like this"), 2, "not like this"),
         (r2p.NameTooLong("too long"), 2, "too long"),
         (TimedOut("nothing came"), 3, "r2p: nothing came\n"),
     ],
@@ -331,7 +331,7 @@ def test_what_a_coroutine_function_asks_for_becomes_options() -> None:
     @session.command(app, "try")
     async def try_(session: Session, topic: str, *, count: Annotated[int, typer.Option("--count", "-n")] = 1) -> None:
         """Try it."""
-        seen.append((topic, count, session.where, session.verbose, session.node.name))
+        seen.append((topic, count, session.network_name, session.verbose, session.node.name))
 
     runner = CliRunner()
     result = runner.invoke(app, ["try", "leds", "-n", "3", "--via", "memory:a", "--via", "memory:b", "-v"])
@@ -371,4 +371,4 @@ def test_log_records_go_to_stderr(verbose: int, quiet: int, shown: str, capsys: 
 @pytest.mark.parametrize("text", ["0", "-1s", "5x", "", "nan"])
 def test_a_time_is_more_than_nothing(text: str) -> None:
     with pytest.raises(typer.BadParameter):
-        session.seconds(text)
+        options.seconds(text)

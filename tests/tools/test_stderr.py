@@ -4,14 +4,14 @@ import logging
 
 import pytest
 
-from r2p.tools.session import Usage, execute
-from r2p.tools.terminal import log_to_stderr, say
+from r2p.tools.output import log_to_stderr, notify
+from r2p.tools.session import UsageError, execute
 
 HOSTILE = "EV\x1b[2J\x9b\x07\rIL"
 
 
 def test_what_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    say(f"two lines\n\tof {HOSTILE}")
+    notify(f"two lines\n\tof {HOSTILE}")
     assert capsys.readouterr().err == "r2p: two lines\n\tof EV\\x1b[2J\\x9b\\x07\\rIL\n"
 
 
@@ -25,7 +25,7 @@ def test_what_is_logged(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_an_error_of_usage() -> None:
     async def main() -> None:
-        raise Usage(HOSTILE)
+        raise UsageError(HOSTILE)
 
     with pytest.raises(Exception, match=r"EV\\x1b\[2J") as caught:
         execute(main)

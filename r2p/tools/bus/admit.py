@@ -1,4 +1,4 @@
-"""`r2p bus admit`: would these periodic messages get slots of their own? The master's calendar answers, offline."""
+"""`r2p bus admit`: check offline, with the master's calendar, whether periodic messages get slots of their own."""
 
 import re
 from pathlib import Path
@@ -12,30 +12,30 @@ from r2p.bus import Calendar, Refusal, Reservation, Timing, occupied, timing
 from r2p.codecs import rtcan
 from r2p.tools.bus import picture
 from r2p.tools.bus.picture import Cell
+from r2p.tools.options import Format, hertz, seconds
 from r2p.tools.output import Output, Record
-from r2p.tools.session import Format, execute, seconds
-from r2p.tools.topic.watching import hertz
+from r2p.tools.session import execute
 
 _MESSAGE = re.compile(r"(?P<name>[^:@]+):(?P<size>\d+)@(?P<rate>.+)")
 _SECOND = 1_000_000_000
 _CYCLE = 0.010  # s, as in the thesis
-_SHORTEST, _LONGEST = 1e-9, 1e9  # s; what is counted in ns, and is no slip of the finger
+_SHORTEST, _LONGEST = 1e-9, 1e9  # s; representable in ns, and above it surely a typing error
 
 Messages = Annotated[
     list[str],
-    typer.Argument(metavar="NAME:BYTES@RATE...", show_default=False, help="imu:18@200Hz, or imu:18@5ms; in order."),
+    typer.Argument(metavar="NAME:BYTES@RATE...", show_default=False, help="imu:18@200Hz or imu:18@5ms, in this order."),
 ]
-Slots = Annotated[int, typer.Option("--slots", min=2, max=rtcan.SLOTS_MAX, metavar="N", help="Slots in a cycle.")]
+Slots = Annotated[int, typer.Option("--slots", min=2, max=rtcan.SLOTS_MAX, metavar="N", help="Slots per cycle.")]
 CycleTime = Annotated[
     float | None,
-    typer.Option("--cycle", parser=seconds, metavar="TIME", help="Nominal length of a cycle; default: 10ms."),
+    typer.Option("--cycle", parser=seconds, metavar="TIME", help="Nominal length of the cycle; default: 10ms."),
 ]
-BitRate = Annotated[int, typer.Option("--bitrate", min=10_000, metavar="BIT/S")]
-Svg = Annotated[Path | None, typer.Option("--svg", metavar="FILE", help="Draw the cycle into a file.")]
+BitRate = Annotated[int, typer.Option("--bitrate", min=10_000, metavar="BIT/S", help="Bit rate of the bus.")]
+Svg = Annotated[Path | None, typer.Option("--svg", metavar="FILE", help="Also draw the cycle into this file.")]
 
 
 class Wanted(msgspec.Struct, frozen=True):
-    """A periodic message that somebody plans: bytes, period in ns."""
+    """A planned periodic message: size in bytes, period in ns."""
 
     name: str
     size: int
@@ -51,21 +51,20 @@ def admit(
     svg: Svg = None,
     format: Format = None,
 ) -> None:
-    """Tell whether periodic messages fit on a bus, in which slots, and what is left. Nothing is opened or sent.
+    """Check whether periodic messages fit on a bus, in which slots, and what is left. Opens and sends nothing.
 
-    Messages are admitted in the order given, as the master would; a period is rounded down to one that goes with the
-    others. Exits 1 when one is refused.
+    Messages are admitted in this order, as the master does it; a period is rounded down to one compatible with the
+    others. The exit code is 1 if one is refused.
     """
-
     wanted = [parse(each) for each in messages]
     timing = grid(slots, cycle, bitrate)
-    execute(lambda: _tell(wanted, timing, svg, Output(format)))
+    execute(lambda: _print(wanted, timing, svg, Output(format)))
 
 
 def grid(slots: int, cycle: float | None, bitrate: int) -> Timing:
-    """The slots of a cycle (s). Raises BadParameter when no frame fits in."""
+    """Return the slots of a cycle (s). Raises BadParameter if a frame does not fit into a slot."""
     if cycle is not None and cycle > _LONGEST:
-        raise typer.BadParameter(f"a cycle of {cycle:g} s")
+        raise typer.BadParameter(f"a cycle of {cycle:g} s is too long")
     try:
         return timing(slots, round((cycle or _CYCLE) * _SECOND), bitrate)
     except ValueError as error:
@@ -73,21 +72,21 @@ def grid(slots: int, cycle: float | None, bitrate: int) -> Timing:
 
 
 def parse(text: str) -> Wanted:
-    """`NAME:BYTES@RATE`; the rate is `200Hz` or a period: `5ms`."""
+    """Parse `NAME:BYTES@RATE`; the rate is `200Hz`, or a period such as `5ms`."""
     match = _MESSAGE.fullmatch(text)
     if match is None:
         raise typer.BadParameter(f"{text!r}: write NAME:BYTES@RATE, as in imu:18@200Hz or imu:18@5ms")
     size = int(match["size"])
     if not 1 <= size <= rtcan.PAYLOAD_MAX:
-        raise typer.BadParameter(f"{text!r}: RTCAN carries 1 to {rtcan.PAYLOAD_MAX} bytes in a message")
+        raise typer.BadParameter(f"{text!r}: an RTCAN message has 1 to {rtcan.PAYLOAD_MAX} bytes")
     period = _period(match["rate"])
     if not _SHORTEST <= period <= _LONGEST:
-        raise typer.BadParameter(f"{text!r}: a period of {period:g} s")
+        raise typer.BadParameter(f"{text!r}: a period of {period:g} s is out of range")
     return Wanted(match["name"], size, round(period * _SECOND))
 
 
 def _period(text: str) -> float:
-    """Seconds, of a rate or a period. A number alone could be either."""
+    """Return the period in seconds of a rate or a period; a number without a unit is ambiguous."""
     lower = text.lower()
     if lower.endswith("khz"):
         return 1e-3 / hertz(lower.removesuffix("khz"))
@@ -98,7 +97,7 @@ def _period(text: str) -> float:
     return seconds(text)
 
 
-async def _tell(wanted: list[Wanted], grid: Timing, drawing: Path | None, output: Output) -> None:
+async def _print(wanted: list[Wanted], grid: Timing, drawing: Path | None, output: Output) -> None:
     calendar = Calendar(grid.slots)
     results = admit_all(calendar, wanted, grid)
     rows = [_row(each, result, grid) for each, result in zip(wanted, results, strict=True)]
@@ -109,11 +108,11 @@ async def _tell(wanted: list[Wanted], grid: Timing, drawing: Path | None, output
     if drawing is not None:
         picture.save(drawing, cells, f"{grid.slots} slots of {grid.slot / 1000:g} us", {})
     if refused:
-        raise r2p.Error(f"{refused} of {len(wanted)} messages get no slots{_hint(wanted, grid)}")
+        raise r2p.Error(f"{refused} of {len(wanted)} messages do not fit{_hint(wanted, grid)}")
 
 
 def admit_all(calendar: Calendar, wanted: list[Wanted], grid: Timing) -> list[Reservation | Refusal]:
-    """Admit them in order; message ids are their places."""
+    """Admit the messages in order; message ids are their indices."""
     return [
         calendar.admit(i, each.interval // grid.slot, rtcan.fragment_count(each.size), round_down=True)
         for i, each in enumerate(wanted)
@@ -121,12 +120,12 @@ def admit_all(calendar: Calendar, wanted: list[Wanted], grid: Timing) -> list[Re
 
 
 def _hint(wanted: list[Wanted], grid: Timing) -> str:
-    """Another order may do: the shortest periods first."""
+    """Suggest another order if all messages fit with the shortest periods first."""
     ordered = sorted(wanted, key=lambda each: each.interval)
     results = admit_all(Calendar(grid.slots), ordered, grid)
     if any(isinstance(result, Refusal) for result in results):
         return ""
-    return "; all of them do in this order: " + " ".join(each.name for each in ordered)
+    return "; all of them fit in this order: " + " ".join(each.name for each in ordered)
 
 
 def _row(wanted: Wanted, result: Reservation | Refusal, grid: Timing) -> Record:
@@ -152,7 +151,7 @@ def _row(wanted: Wanted, result: Reservation | Refusal, grid: Timing) -> Record:
 
 
 def cells_of(calendar: Calendar, wanted: list[Wanted], grid: Timing) -> list[Cell]:
-    """The slots of a cycle; one that is used in some cycles only says so."""
+    """Return the slots of a cycle; a slot that is used only in some cycles has a note."""
     cells = [Cell("sync")] + [Cell()] * (grid.slots - 1)
     for each in calendar:
         start = each.phase - each.phase % grid.slots
@@ -166,11 +165,11 @@ def cells_of(calendar: Calendar, wanted: list[Wanted], grid: Timing) -> list[Cel
 
 
 def summary(calendar: Calendar, grid: Timing) -> str:
-    """What is reserved and what is left, on average over all cycles."""
-    taken = 1 + sum(each.fragments * grid.slots / each.period for each in calendar)
-    left = grid.slots - taken
+    """Return a line about what is reserved and what is left, on average over all cycles."""
+    reserved = 1 + sum(each.fragments * grid.slots / each.period for each in calendar)
+    left = grid.slots - reserved
     frames = left / grid.cycle * _SECOND
     return (
-        f"{taken:g} of {grid.slots} slots reserved (the sync's included), {left:g} left for events and the rest: "
+        f"{reserved:g} of {grid.slots} slots reserved (including the sync), {left:g} left for other traffic: "
         f"{frames:.0f} frames/s, {frames * 64 / 1000:.1f} kbit/s of data"
     )

@@ -1,4 +1,4 @@
-"""`r2p bus dump`: every frame of a bus in words."""
+"""`r2p bus dump`: print every frame of a bus, decoded."""
 
 from typing import Annotated
 
@@ -7,15 +7,15 @@ import typer
 from r2p.bus import FrameKind, SeenFrame
 from r2p.names import topic_name
 from r2p.tools.bus.load import SECOND, listen
+from r2p.tools.options import Count, Format, Quiet, Timeout, Verbose, Via
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Quiet, Timeout, Verbose, Via, execute
-from r2p.tools.topic.watching import Count, patience
+from r2p.tools.session import execute, patience
 
 Kinds = Annotated[
-    list[FrameKind] | None, typer.Option("--kind", help="Only frames of this kind (may repeat).", show_default=False)
+    list[FrameKind] | None, typer.Option("--kind", help="Only frames of this kind (repeatable).", show_default=False)
 ]
 OnlyTopic = Annotated[
-    list[str] | None, typer.Option("--topic", metavar="TOPIC", help="Only frames of this topic (may repeat).")
+    list[str] | None, typer.Option("--topic", metavar="TOPIC", help="Only frames of this topic (repeatable).")
 ]
 
 
@@ -29,9 +29,9 @@ def dump(
     verbose: Verbose = 0,
     quiet: Quiet = 0,
 ) -> None:
-    """Print the frames on a CAN bus: when, slot, kind, topic, module, laxity, fragment, data. Sends nothing.
+    """Print the frames on a CAN bus: time, slot, kind, topic, module, laxity, fragment, data. Sends nothing.
 
-    Topics and modules go by number until they have told their names.
+    Topics and modules appear as numbers until they have announced their names.
     """
     kinds = set(kind or FrameKind)
 
@@ -39,10 +39,10 @@ def dump(
         topics = {topic_name(name) for name in topic or ()}
         output = Output(format)
         printed = 0
-        async with output.while_read(), listen(via) as bus, patience("the bus", timeout) as heard:
+        async with output.while_read(), listen(via) as bus, patience("the bus", timeout) as received:
             async for seen in bus:
                 if seen.kind in kinds and (not topics or seen.topic in topics):
-                    heard()
+                    received()
                     await output.put(record(seen, bus.since), line(seen, bus.since))
                     printed += 1
                     if printed == count:
@@ -52,7 +52,7 @@ def dump(
 
 
 def record(seen: SeenFrame, since: int) -> dict[str, object]:
-    """A frame for programs; `time` is the end of the frame, in s since the first look."""
+    """Return a frame as a record; `time` is the end of the frame, in s since the command started to listen."""
     return {
         "time": round((seen.stamp - since) / SECOND, 9),
         "id": f"0x{seen.frame.id:08X}",
@@ -71,7 +71,7 @@ def record(seen: SeenFrame, since: int) -> dict[str, object]:
 
 
 def line(seen: SeenFrame, since: int) -> str:
-    """A frame for people."""
+    """Return a frame as a line of text."""
     slot = "" if seen.slot is None else f"{seen.slot:2}"
     if seen.fragments is not None:
         part = f"{seen.fragments - seen.left}/{seen.fragments}"

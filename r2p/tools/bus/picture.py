@@ -1,6 +1,6 @@
 """The slots of a cycle as a picture: as text for a terminal, and as SVG.
 
-Each owner gets a letter; a cell is the letter and a mark: `!` some cycles missed, `+` free, and used by events.
+Each owner gets a letter. A cell is the letter and a mark: `!` missed in some cycles, `+` free and used by events.
 """
 
 import string
@@ -20,7 +20,7 @@ _SYNC, _FREE, _EVENTS, _MISSED = "#444444", "#f4f4f4", "#cfe3f5", "#d62728"
 
 
 class Cell(msgspec.Struct, frozen=True):
-    """One slot. `owner` "" is nobody, "sync" the master; `missed` and `shared` count cycles; `note` says more."""
+    """One slot. `owner` is "" for a free one, "sync" for the master's; `missed` and `shared` count cycles."""
 
     owner: str = ""
     missed: int = 0
@@ -29,13 +29,13 @@ class Cell(msgspec.Struct, frozen=True):
 
 
 def letters(cells: Iterable[Cell]) -> dict[str, str]:
-    """Owner -> letter, in order of appearance; the last letter stands for all that are too many."""
+    """Return the letter of each owner, in order of appearance; all beyond the last letter share that."""
     owners = dict.fromkeys(cell.owner for cell in cells if cell.owner not in {"", "sync"})
     return {owner: _LETTERS[min(i, len(_LETTERS) - 1)] for i, owner in enumerate(owners)}
 
 
 def text(cells: list[Cell]) -> str:
-    """Lines of 20 slots each, with the number of the first one."""
+    """Return lines of 20 slots, each with the number of its first slot."""
     names = letters(cells)
     rows = []
     for start in range(0, len(cells), _ROW):
@@ -45,21 +45,21 @@ def text(cells: list[Cell]) -> str:
 
 
 def legend(cells: Iterable[Cell], more: dict[str, str]) -> list[str]:
-    """Lines that tell the letters; `more` says more of an owner."""
+    """Return lines that explain the letters; `more` has longer names of owners."""
     lines = [f"     {letter}  {more.get(owner, owner)}" for owner, letter in letters(cells).items()]
     return [*lines, "     S  sync    .  free    +  free, used by events    !  missed in some cycles"]
 
 
 def save(file: Path, cells: list[Cell], title: str, legend: dict[str, str]) -> None:
-    """Write the drawing. Raises Error when it can't be written."""
+    """Write the drawing into a file. Raises Error if that fails."""
     try:
         file.write_text(svg(cells, title, legend), encoding="utf-8")
     except OSError as error:
-        raise Error(f"{file} can't be written: {error.strerror}") from error
+        raise Error(f"can't write {file}: {error.strerror}") from error
 
 
 def svg(cells: list[Cell], title: str, legend: dict[str, str]) -> str:
-    """The same as a drawing of its own; `legend` says more of each owner."""
+    """Return the picture as an SVG document; `legend` has longer names of owners."""
     names = letters(cells)
     top, width = 40, _ROW * _SIDE + 40
     rows = -(-len(cells) // _ROW)

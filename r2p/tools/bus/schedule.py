@@ -1,4 +1,4 @@
-"""`r2p bus schedule`: the slots of the cycle, and who really uses them."""
+"""`r2p bus schedule`: the slots of the cycle, and which nodes use them."""
 
 from typing import Annotated
 
@@ -9,13 +9,14 @@ from r2p.tools.bus import picture
 from r2p.tools.bus.admit import Svg
 from r2p.tools.bus.load import listen
 from r2p.tools.bus.picture import Cell
+from r2p.tools.options import Format, Quiet, Verbose, Via
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Quiet, TimedOut, Verbose, Via, execute
+from r2p.tools.session import TimedOut, execute
 
-_UNUSED = "reserved, and not used: nobody subscribes, or the owner is gone"
-_PATIENCE = 3.0  # s without a sync
+_UNUSED = "reserved but not used: no subscriber, or the owner is gone"
+_SYNC_TIMEOUT = 3.0  # s
 
-Cycles = Annotated[int, typer.Option("--cycles", "-n", min=1, metavar="N", help="Watch so many cycles.")]
+Cycles = Annotated[int, typer.Option("--cycles", "-n", min=1, metavar="N", help="Watch N cycles.")]
 
 
 def schedule(
@@ -26,15 +27,15 @@ def schedule(
     verbose: Verbose = 0,
     quiet: Quiet = 0,
 ) -> None:
-    """Draw the slots of a CAN bus: who owns which, what is free, and what was reserved and not used. Sends nothing."""
+    """Draw the slots of a CAN bus: owners, free slots, and slots that were reserved but not used. Sends nothing."""
 
     async def main() -> None:
         output = Output(format)
         async with listen(via) as bus:
-            if not await bus.cycles(cycles, timeout=_PATIENCE):
+            if not await bus.cycles(cycles, timeout=_SYNC_TIMEOUT):
                 raise TimedOut(
-                    f"no sync frames for {_PATIENCE:g} s: no RTCAN master on this bus, so it has no slots "
-                    "(firmware of 2014 works without them)"
+                    f"no sync frames for {_SYNC_TIMEOUT:g} s: no RTCAN master on this bus, so it has no slots "
+                    "(the firmware of 2014 has none)"
                 )
             cells = cells_of(bus)
             grid = bus.timing
@@ -51,7 +52,7 @@ def schedule(
 
 
 def cells_of(bus: BusMonitor) -> list[Cell]:
-    """The slot map as a picture's cells."""
+    """Return the slots as cells of a picture."""
     return [
         Cell(
             _owner(slot) or (_UNUSED if slot.reserved else ""),
@@ -64,7 +65,7 @@ def cells_of(bus: BusMonitor) -> list[Cell]:
 
 
 def rows(bus: BusMonitor) -> list[dict[str, object]]:
-    """The slot map for programs; numbers of cycles."""
+    """Return the slots as records; the numbers count cycles."""
     return [
         {
             "slot": index,
@@ -79,5 +80,5 @@ def rows(bus: BusMonitor) -> list[dict[str, object]]:
 
 
 def _owner(slot: BusSlot) -> str:
-    """Who used it most: in longer periods than a cycle several may share one."""
+    """Return the owner that used a slot most: with periods longer than a cycle, several can share one."""
     return max(slot.owners, key=lambda owner: slot.owners[owner], default="")

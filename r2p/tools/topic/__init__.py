@@ -1,4 +1,8 @@
-"""`r2p topic`: the group; its commands lie beside it, by what they do."""
+"""`r2p topic`: the group of commands.
+
+`list` (with `info` and `find`), `echo`, `pub` and `rates` (`hz`, `bw`, `delay`) are the commands; `watching` is what
+they share.
+"""
 
 from r2p.tools import session
 from r2p.tools.topic import echo as topic_echo

@@ -1,4 +1,4 @@
-"""`r2p topic list`, `info` and `find`: what is known of topics."""
+"""`r2p topic list`, `info` and `find`: what is known about topics."""
 
 import re
 from typing import Annotated, Any
@@ -7,9 +7,10 @@ import typer
 
 import r2p
 from r2p.names import topic_name
+from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Session, Wait
-from r2p.tools.topic.watching import CLASS_NAMES, Topic, meant
+from r2p.tools.session import Session
+from r2p.tools.topic.watching import Topic, suggest_topics
 from r2p.tools.types import Types, load_type, of_size, type_name
 
 _COLUMNS = ["topic", "type", "size", "publishers", "subscribers"]
@@ -24,25 +25,25 @@ async def list_(session: Session, *, wait: Wait = None, format: Format = None) -
     rows = [_row(session, view, types) for view in views]
     await output.table(rows, _COLUMNS)
     if not rows:
-        session.say(f"no topic is known on {session.where}")
+        session.notify(f"no topics found on {session.network_name}")
 
 
 async def info(session: Session, topic: Topic, *, wait: Wait = None, format: Format = None) -> None:
-    """Tell all about a topic.
+    """Show everything about a topic.
 
     Its type, its publishers and subscribers by node, and what the links guarantee;
-    with -v also the fields of the type, and how long ago the topic was heard of.
+    with -v also the fields of the type, and the time since it was last announced.
     """
     output = Output(format)
     await session.settle(wait)
     views = session.module.network.topics()
     view = views.get(topic_name(topic))
     if view is None:
-        question = meant(session, topic_name(topic), lambda view: True)
+        question = suggest_topics(session, topic_name(topic), lambda view: True)
         known = question or f"; known topics: {', '.join(views) or 'none'}"
-        raise r2p.Error(f"nobody publishes or subscribes {topic}{known}")
+        raise r2p.Error(f"{topic} has no publisher and no subscriber{known}")
     if view.mismatch:
-        session.say(f"{topic} has different types: some of those below can't hear each other")
+        session.notify(f"{topic} has different types: some of these nodes can't exchange messages")
     details = await _details(session, view)
     if session.verbose:
         age = None if view.age is None else round(view.age, 3)
@@ -59,7 +60,7 @@ async def find(
 ) -> None:
     """Find the topics of a type.
 
-    Of a topic whose fingerprint nobody tells (firmware does not) only the size is compared; its match is "size".
+    Firmware does not announce the fingerprint of a type: then only the size is compared, and the match is "size".
     """
     output = Output(format)
     size, fingerprint = _wanted(what)
@@ -71,11 +72,11 @@ async def find(
     rows = [_row(session, view, types) | {"match": match} for view, match in found]
     await output.table(rows, [*_COLUMNS, "match"])
     if not rows:
-        raise r2p.Error(f"no topic of type {what} is known on {session.where}")
+        raise r2p.Error(f"no topics of type {what} found on {session.network_name}")
 
 
 def _wanted(what: str) -> tuple[int, bytes | None]:
-    """Size (0: any) and fingerprint (None: any) to look for."""
+    """Return the size (0: any) and the fingerprint (None: any) to find."""
     if re.fullmatch(r"[0-9a-fA-F]{16}", what):
         return 0, bytes.fromhex(what)
     if what.isdecimal():
@@ -102,13 +103,13 @@ def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
 
 
 def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) -> list[dict[str, Any]]:
-    """Those known by node; for the other links somebody: the only module there, or `?`."""
-    told = {each.link for each in known}
+    """Return the known endpoints, and for each other link the only module there, or `?`."""
+    covered = {each.link for each in known}
     found = [
         {"node": f"{each.module or '?'}/{each.node}", "class": _class_name(each), "link": each.link} for each in known
     ]
     return found + [
-        {"node": f"{session.only_module(link)}/?", "class": None, "link": link} for link in links if link not in told
+        {"node": f"{session.only_module(link)}/?", "class": None, "link": link} for link in links if link not in covered
     ]
 
 
@@ -135,7 +136,7 @@ async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
 
 
 def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> dict[str, Any]:
-    """The kind of each field by its path; of an unknown type the names of the types that have its size."""
+    """Return the kind of each field by its path; for an unknown type, the names of the types of its size."""
     if cls is not None:
         pairs = (field.rpartition(":") for field in r2p.layout(cls).schema.split())
         return {"fields": {path: kind for path, _, kind in pairs}}
@@ -143,7 +144,7 @@ def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> dict[str, Any
 
 
 def _guarantees(session: Session, view: r2p.TopicView) -> dict[str, str]:
-    """What each link gives to the classes that are published, as far as they are known."""
+    """Return what each link guarantees to the classes of the publishers, as far as they are known."""
     classes = {each.publisher_class for each in view.publishers if each.publisher_class is not None}
     guarantees = {}
     for link in session.module.links:

@@ -1,31 +1,27 @@
 """`r2p topic pub`: publish from the shell."""
 
 import asyncio
-from typing import Annotated, Any
+import os
+import select
+import sys
+from collections.abc import AsyncIterator
+from typing import Annotated, Any, TextIO
 
 import typer
 
 import r2p
-from r2p.tools.session import PATIENCE, Session, TimedOut, Timeout, Usage
-from r2p.tools.terminal import lines
-from r2p.tools.topic.watching import (
-    ClassChoice,
-    Count,
-    Once,
-    Rate,
-    Topic,
-    TypeName,
-    class_choice,
-    hint,
-    meant,
-    passed_on,
-    subscribed,
-)
+from r2p.tools.options import ClassChoice, Count, Once, Rate, Timeout, class_choice
+from r2p.tools.output import waitable
+from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError
+from r2p.tools.topic.watching import Topic, TypeName, hint, is_subscribed, suggest_topics, wait_until_passed_on
 from r2p.tools.types import find
 from r2p.tools.values import parse, parse_line
 
 STDIN = "-"
 DEFAULT_RATE = 1.0
+
+_CHUNK = 65536  # bytes
+_LINE_MAX = 1 << 20  # bytes
 
 _AnyPublisher = r2p.Publisher[Any] | r2p.SporadicPublisher[Any] | r2p.PeriodicPublisher[Any]
 
@@ -35,7 +31,7 @@ async def pub(
     topic: Topic,
     message: Annotated[
         list[str] | None,
-        typer.Argument(metavar="MESSAGE...", help="'{x: 1.5}', x=1.5 w=0.25, or - for JSON lines on stdin."),
+        typer.Argument(metavar="MESSAGE...", help="'{x: 1.5}', x=1.5 w=0.25, or - for JSON lines from stdin."),
     ] = None,
     *,
     type: TypeName = None,
@@ -48,21 +44,21 @@ async def pub(
             "--class",
             parser=class_choice,
             metavar="CLASS",
-            help="nrt (non real-time, the default: waits for room), periodic:10ms or sporadic:20ms.",
+            help="nrt (non real-time, the default), periodic:10ms or sporadic:20ms.",
         ),
     ] = None,
     timeout: Timeout = None,
 ) -> None:
-    """Publish a message.
+    """Publish a message, by default once a second.
 
-    Once a second unless told otherwise; fields that are left out are zero. With --once, -n or stdin it waits for a
-    subscriber first, at most --timeout. Ctrl-C ends it.
+    Fields that are left out are zero. With --once, -n or stdin it first waits for a subscriber, at most --timeout.
+    Ctrl-C ends it.
     """
     klass = klass or ClassChoice(r2p.PublisherClass.NON_REAL_TIME)
     periodic = klass.publisher_class is r2p.PublisherClass.PERIODIC
     from_stdin = message == [STDIN]
     if periodic and (from_stdin or rate is not None):
-        raise Usage("--class periodic:TIME says when to publish: it takes neither --rate nor stdin")
+        raise UsageError("--class periodic:TIME sets when to publish: leave out --rate, and don't read from stdin")
     cls = await find(session, topic, type)
     job = _Job(session, topic, cls, klass, 1 if once else count, timeout)
     if from_stdin:
@@ -71,7 +67,7 @@ async def pub(
     try:
         value = parse(cls, message or [])
     except r2p.MessageError as error:
-        raise Usage(str(error)) from error
+        raise UsageError(str(error)) from error
     if periodic:
         await job.publish_periodically(value)
     else:
@@ -79,7 +75,7 @@ async def pub(
 
 
 class _Job:
-    """Publishes on one topic."""
+    """Publishes messages of one topic."""
 
     def __init__(
         self,
@@ -98,17 +94,17 @@ class _Job:
         self._timeout = timeout
 
     async def publish(self, message: r2p.Message, rate: float) -> None:
-        """The same message again and again."""
+        """Publish the same message over and over."""
         publisher = self._advertise()
         ticks = self._session.node.every(1 / rate)
-        await self._found_subscriber(publisher, needed=self._count is not None)
+        await self._wait_subscriber(publisher, needed=self._count is not None)
         await publisher.publish(message)
         while publisher.sent != self._count:
             await anext(ticks)
             await publisher.publish(message)
 
     async def publish_periodically(self, message: r2p.Message) -> None:
-        """The same message, timed by its publisher."""
+        """Publish the same message over and over, timed by a periodic publisher."""
         done = asyncio.Event()
         ready = self._count is None
 
@@ -120,17 +116,17 @@ class _Job:
 
         klass = r2p.Periodic(self._klass.time, fill)
         publisher = self._session.node.advertise(self._topic, self._cls, klass)
-        await self._found_subscriber(publisher, needed=not ready)
+        await self._wait_subscriber(publisher, needed=not ready)
         ready = True
         await done.wait()
 
     async def publish_lines(self, rate: float | None) -> None:
-        """One message for each line on stdin."""
+        """Publish one message for each line of stdin."""
         publisher = self._advertise()
-        await self._found_subscriber(publisher, needed=True)
+        await self._wait_subscriber(publisher, needed=True)
         ticks = None if rate is None else self._session.node.every(1 / rate)
         number = 0
-        async for line in lines():
+        async for line in read_lines():
             number += 1
             if not line.strip():
                 continue
@@ -149,22 +145,56 @@ class _Job:
             return self._session.node.advertise(self._topic, self._cls, r2p.Sporadic(self._klass.time))
         return self._session.node.advertise(self._topic, self._cls)
 
-    async def _found_subscriber(self, publisher: _AnyPublisher, *, needed: bool) -> None:
-        """Wait for a subscriber if one is needed; else only say that there is none, if so after a second."""
+    async def _wait_subscriber(self, publisher: _AnyPublisher, *, needed: bool) -> None:
+        """Wait for a subscriber if one is needed; otherwise only report after a second that there is none."""
         if not needed:
-            asyncio.get_running_loop().call_later(PATIENCE, self._note_subscribers, publisher)
+            asyncio.get_running_loop().call_later(REPORT_WAITING_AFTER, self._report_no_subscriber, publisher)
             return
-        nobody = f"nobody subscribes {self._topic}"
+        missing = f"{self._topic} has no subscriber"
         waiting = self._session.waiting(f"a subscriber of {self._topic}")
-        with waiting, hint(self._session, nobody, self._topic, subscribed):
+        with waiting, hint(self._session, missing, self._topic, is_subscribed):
             try:
                 async with asyncio.timeout(self._timeout):
                     await publisher.wait_subscriber()
-                    await passed_on(self._session, publisher.topic)
+                    await wait_until_passed_on(self._session, publisher.topic)
             except TimeoutError:
-                raise TimedOut(f"nobody subscribed {self._topic} for {self._timeout:g} s") from None
+                raise TimedOut(f"{self._topic} had no subscriber for {self._timeout:g} s") from None
 
-    def _note_subscribers(self, publisher: _AnyPublisher) -> None:
+    def _report_no_subscriber(self, publisher: _AnyPublisher) -> None:
         if not publisher.subscribers:
-            question = meant(self._session, self._topic, subscribed)
-            self._session.say(f"nobody subscribes {self._topic} yet; publishing all the same{question}")
+            question = suggest_topics(self._session, self._topic, is_subscribed)
+            self._session.notify(f"{self._topic} has no subscriber yet, publishing anyway{question}")
+
+
+async def read_lines(stream: TextIO | None = None) -> AsyncIterator[str]:
+    """Yield the lines of stdin (or of `stream`) without blocking the event loop.
+
+    Raises MessageError for a line longer than 1 MB.
+    """
+    stream = stream or sys.stdin
+    fd = waitable(stream)
+    if fd is None:
+        for line in stream:
+            yield line
+        return
+    rest = b""
+    while data := await _read(fd):
+        *complete, rest = (rest + data).split(b"\n")
+        for each in complete:
+            yield each.decode(errors="replace")
+        if len(rest) > _LINE_MAX:
+            raise r2p.MessageError("a line on stdin is longer than 1 MB")
+    if rest:
+        yield rest.decode(errors="replace")
+
+
+async def _read(fd: int) -> bytes:
+    if not select.select([fd], [], [], 0)[0]:
+        loop = asyncio.get_running_loop()
+        readable = asyncio.Event()
+        loop.add_reader(fd, readable.set)
+        try:
+            await readable.wait()
+        finally:
+            loop.remove_reader(fd)
+    return os.read(fd, _CHUNK)

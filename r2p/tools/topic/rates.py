@@ -1,7 +1,7 @@
-"""`r2p topic hz`, `bw` and `delay`: measure a topic, without decoding it unless its type is stated.
+"""`r2p topic hz`, `bw` and `delay`: measure a topic, without decoding it unless its type is given.
 
-Each reports once a second on the last `--window` messages. What is measured, and where, is kept apart: the publisher
-stamps and counts its messages where the link carries that (the debug line does not), the tool counts what its own queue
+Each reports once a second on the last `--window` messages. Reports say where a number comes from: the publisher stamps
+and numbers its messages if the link carries that (the debug line does not), and this tool counts what its own queue
 lost.
 """
 
@@ -15,23 +15,22 @@ import typer
 
 import r2p
 from r2p.names import topic_name
+from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output
-from r2p.tools.session import Format, Session, Timeout
-from r2p.tools.topic.watching import Count, Once, Topic, TypeName, patience, watched
+from r2p.tools.session import Session, patience
+from r2p.tools.topic.watching import Topic, TypeName, received_samples
 from r2p.tools.types import Types
 
 QUEUE = 4096
-"""Messages that wait for the tool before the oldest are lost, counted."""
+"""Messages that wait for this tool; beyond that the oldest are lost, and counted."""
 
 _SECOND = 1_000_000_000
-_GAP = 2.0  # times the usual period: a publisher that pauses
-_MEMORY = 1 / 16  # weight of a new period in the usual one
-_MISSING = 65536  # sequence numbers that are remembered, in case that they still come
-
-_STARTS = 4  # publishers that a report names
-_PRECISE = 9  # decimals of seconds: ns
-
-Window = Annotated[int, typer.Option("--window", "-w", min=2, metavar="N", help="Messages that are averaged.")]
+_GAP = 2.0  # times the usual period: the publisher has paused
+_SMOOTHING = 1 / 16  # weight of a new period in the usual one
+_MISSING_MAX = 65536  # missing sequence numbers that are remembered: they may still arrive
+_ORIGINS = 4  # publishers that a report names
+_DIGITS = 9  # decimals of seconds: ns
+Window = Annotated[int, typer.Option("--window", "-w", min=2, metavar="N", help="Messages to average over.")]
 Report = dict[str, Any]
 
 
@@ -46,10 +45,10 @@ async def hz(
     timeout: Timeout = None,
     format: Format = None,
 ) -> None:
-    """Measure a topic's rate, and what is lost.
+    """Measure the rate of a topic, and losses.
 
-    Reports once a second. Periods (s) are the publisher's where it stamps its messages, else those of reception; `gaps`
-    are pauses of the publisher; `lost_on_way` is known where messages are numbered. -n and --once count reports.
+    Reports once a second. Periods (s) are the publisher's if it stamps its messages, otherwise those of reception;
+    `gaps` are pauses of the publisher; `lost_on_way` needs numbered messages. -n and --once count reports.
     """
     await _measure(session, topic, type, _Rate(window), 1 if once else count, timeout, Output(format))
 
@@ -65,9 +64,9 @@ async def bw(
     timeout: Timeout = None,
     format: Format = None,
 ) -> None:
-    """Measure a topic's bandwidth.
+    """Measure the bandwidth of a topic.
 
-    Reports bytes of payload, once a second. -n and --once count reports.
+    Reports payload bytes once a second. -n and --once count reports.
     """
     await _measure(session, topic, type, _Bandwidth(window), 1 if once else count, timeout, Output(format))
 
@@ -85,23 +84,23 @@ async def delay(
 ) -> None:
     """Measure how long messages take.
 
-    Reports the time from publish() to this tool, once a second. Needs a link that carries stamps, and clocks that
-    agree. -n and --once count reports.
+    Reports the time from publish() to this tool once a second. Needs a link that carries stamps, and synchronized
+    clocks. -n and --once count reports.
     """
     await _measure(session, topic, type, _Delay(window), 1 if once else count, timeout, Output(format))
 
 
 class _Meter(Protocol):
-    """What is measured."""
+    """One kind of measurement."""
 
-    def note(self, sample: r2p.Sample, now: int) -> None:
-        """A message was read at `now` (UTC ns). Raises r2p.Error if it can't be measured."""
+    def add(self, sample: r2p.Sample, now: int) -> None:
+        """Measure a message that was received at `now` (UTC ns). Raises r2p.Error if it can't be measured."""
 
     def report(self, lost: int) -> tuple[Report, str] | None:
-        """The record, and its form for people; None: too little is known. `lost` counts what the tool itself lost."""
+        """Return the record and its text; None: too little is known. `lost`: messages that this tool lost itself."""
 
-    def begin_again(self) -> None:
-        """After a silence: what is averaged begins with the next message; what is counted goes on."""
+    def restart(self) -> None:
+        """Start new averages with the next message, after a silence; counters go on."""
 
 
 async def _measure(
@@ -119,12 +118,12 @@ async def _measure(
 
     async def read() -> None:
         nonlocal fresh
-        async for sample in watched(session, subscriber, typed=cls is not None):
-            heard()
+        async for sample in received_samples(session, subscriber, typed=cls is not None):
+            received()
             fresh += 1
-            meter.note(sample, session.node.now())
+            meter.add(sample, session.node.now())
 
-    async with output.while_read(), patience(topic, timeout) as heard, asyncio.TaskGroup() as tasks:
+    async with output.while_read(), patience(topic, timeout) as received, asyncio.TaskGroup() as tasks:
         reading = tasks.create_task(read())
         measured = False
         async for _ in session.node.every(1.0):
@@ -136,14 +135,14 @@ async def _measure(
                 if reports == 0:
                     break
             elif measured and not fresh:
-                session.say(f"no new messages of {topic}")
-                meter.begin_again()
+                session.notify(f"no new messages of {topic}")
+                meter.restart()
             measured, fresh = report is not None, 0
         reading.cancel()
 
 
 class _Sequences:
-    """Finds what one publisher's sequence numbers leave out. A number that comes late is not missing any more."""
+    """Counts the gaps in the sequence numbers of one publisher. A number that arrives late is not missing any more."""
 
     def __init__(self) -> None:
         self.last = 0
@@ -154,16 +153,16 @@ class _Sequences:
     def missing(self) -> int:
         return self._forgotten + len(self._missing)
 
-    def note(self, number: int) -> bool:
-        """Whether it follows the last one."""
+    def add(self, number: int) -> bool:
+        """Note a sequence number; return whether it follows the last one."""
         last, self.last = self.last, max(self.last, number)
         if number <= last:
             self._missing.discard(number)
-            if number == 1:  # the publisher started again
+            if number == 1:  # the publisher was restarted
                 self.last = 1
             return False
         gap = number - last - 1 if last else 0
-        if gap + len(self._missing) > _MISSING:
+        if gap + len(self._missing) > _MISSING_MAX:
             self._forgotten += gap
         else:
             self._missing.update(range(number - gap, number))
@@ -178,36 +177,36 @@ class _Rate:
         self._periods: deque[float] = deque(maxlen=window)
         self._sequences: dict[r2p.Source, _Sequences] = {}
         self._stamps: dict[r2p.Source, int] = {}
-        self._silent: set[r2p.Source] = set()
+        self._silent: set[r2p.Source] = set()  # their next period spans a silence, and does not count
         self._numbered = False
         self._stamped = False
         self._gaps = 0
         self._usual = 0.0
 
-    def note(self, sample: r2p.Sample, now: int) -> None:
+    def add(self, sample: r2p.Sample, now: int) -> None:
         source = sample.source
         self._arrivals.append(now if sample.stamped else sample.stamp)
         self._stamped = sample.stamped
         follows = source in self._stamps
         if sample.sequence:
             self._numbered = True
-            follows = self._sequences.setdefault(source, _Sequences()).note(sample.sequence)
+            follows = self._sequences.setdefault(source, _Sequences()).add(sample.sequence)
         if follows:
-            self._note_period((sample.stamp - self._stamps[source]) / _SECOND, source)
+            self._add_period((sample.stamp - self._stamps[source]) / _SECOND, source)
         self._stamps[source] = sample.stamp
 
-    def begin_again(self) -> None:
+    def restart(self) -> None:
         self._arrivals.clear()
         self._periods.clear()
         self._silent.update(self._stamps)
 
-    def _note_period(self, period: float, source: r2p.Source) -> None:
+    def _add_period(self, period: float, source: r2p.Source) -> None:
         if self._stamped and self._usual and period > _GAP * self._usual:
             self._gaps += 1
         if source in self._silent:
             self._silent.remove(source)
             return
-        self._usual += (period - self._usual) * (_MEMORY if self._periods else 1.0)
+        self._usual += (period - self._usual) * (_SMOOTHING if self._periods else 1.0)
         self._periods.append(period)
 
     def report(self, lost: int) -> tuple[Report, str] | None:
@@ -238,11 +237,11 @@ class _Bandwidth:
         self._arrivals: deque[int] = deque(maxlen=window)
         self._sizes: deque[int] = deque(maxlen=window)
 
-    def note(self, sample: r2p.Sample, now: int) -> None:
+    def add(self, sample: r2p.Sample, now: int) -> None:
         self._arrivals.append(now if sample.stamped else sample.stamp)
         self._sizes.append(len(sample.data))
 
-    def begin_again(self) -> None:
+    def restart(self) -> None:
         self._arrivals.clear()
         self._sizes.clear()
 
@@ -267,28 +266,28 @@ class _Bandwidth:
 
 
 class _Delay:
-    """Time from publish() to the tool."""
+    """Time from publish() to this tool."""
 
     def __init__(self, window: int) -> None:
         self._delays: deque[float] = deque(maxlen=window)
         self._link = ""
-        self._starts: dict[str, None] = {}
+        self._origins: dict[str, None] = {}
         self._error: int | None = None
 
-    def note(self, sample: r2p.Sample, now: int) -> None:
+    def add(self, sample: r2p.Sample, now: int) -> None:
         if not sample.stamped and not sample.hops:
             raise r2p.Error(
-                f"no stamps: link {sample.source.link} does not carry when a message was published, only its reception "
-                "is known here"
+                f"no stamps: link {sample.source.link} does not carry when a message was published, so its delay is "
+                "unknown"
             )
         self._link = sample.source.link
-        start = _start(sample)
-        if start in self._starts or len(self._starts) < _STARTS:
-            self._starts[start] = None
+        origin = _origin(sample)
+        if origin in self._origins or len(self._origins) < _ORIGINS:
+            self._origins[origin] = None
         self._error = None if sample.clock is None else sample.clock.error
         self._delays.append((now - sample.stamp) / _SECOND)
 
-    def begin_again(self) -> None:
+    def restart(self) -> None:
         self._delays.clear()
 
     def report(self, lost: int) -> tuple[Report, str] | None:
@@ -297,10 +296,10 @@ class _Delay:
         here = self._link.partition(":")[0] in {"", "memory"}
         clocks = "one clock" if here else "clocks not compared"
         record = {
-            "mean": round(statistics.fmean(self._delays), _PRECISE),
+            "mean": round(statistics.fmean(self._delays), _DIGITS),
             **_spread(self._delays),
             "window": len(self._delays),
-            "from": " or ".join(self._starts),
+            "from": " or ".join(self._origins),
             "to": "this tool",
             "clocks": clocks,
             "lost_here": lost,
@@ -312,8 +311,8 @@ class _Delay:
         return record, text
 
 
-def _start(sample: r2p.Sample) -> str:
-    """The instant that a sample's stamp tells."""
+def _origin(sample: r2p.Sample) -> str:
+    """Describe the instant of a sample's stamp."""
     if sample.stamped:
         return f"publish() in {sample.source}"
     where = "arrival at the first gateway" if sample.clock is None else "first frame on the bus"
@@ -321,16 +320,16 @@ def _start(sample: r2p.Sample) -> str:
 
 
 def _per_second(arrivals: Sequence[int], amount: int) -> float | None:
-    """Amount by time between first and last; None if no time has passed."""
+    """Return the amount per second between the first and the last arrival; None if no time has passed."""
     span = (arrivals[-1] - arrivals[0]) / _SECOND if arrivals else 0.0
     return amount / span if span > 0 else None
 
 
 def _spread(values: Sequence[float]) -> Report:
     return {
-        "min": round(min(values), _PRECISE),
-        "max": round(max(values), _PRECISE),
-        "std": round(statistics.pstdev(values), _PRECISE),
+        "min": round(min(values), _DIGITS),
+        "max": round(max(values), _DIGITS),
+        "std": round(statistics.pstdev(values), _DIGITS),
     }
 
 

@@ -73,7 +73,7 @@ def test_the_networks_of_the_thesis_fill_39_of_59_slots() -> None:
     wanted, timing = [parse(each) for each in plan], grid(60, None, 1_000_000)
     calendar = Calendar(timing.slots)
     admit_all(calendar, wanted, timing)
-    assert summary(calendar, timing).startswith("40 of 60 slots reserved (the sync's included), 20 left")
+    assert summary(calendar, timing).startswith("40 of 60 slots reserved (including the sync), 20 left")
 
 
 def test_a_refusal_has_its_reason_and_another_order_is_told() -> None:
@@ -81,9 +81,9 @@ def test_a_refusal_has_its_reason_and_another_order_is_told() -> None:
     code, rows, err = admit(*plan)
     assert code == 1
     assert "no 1 slots in a row are free every 6 slots" in str(rows[-1]["refused"])
-    assert "2 of 5 messages get no slots" in err
+    assert "2 of 5 messages do not fit" in err
     _, _, err = admit("b:8@5ms", "c:8@5ms", "d:8@5ms", "e:8@5ms", "f:8@5ms", "a:8@996us")
-    assert "all of them do in this order: a b c d e f" in err
+    assert "all of them fit in this order: a b c d e f" in err
 
 
 def test_slots_that_are_too_short_are_a_wrong_usage() -> None:
@@ -102,7 +102,7 @@ def test_the_drawing_shows_every_slot(tmp_path: Path) -> None:
     assert titles[4:6] == [f"slot {i}: slow, every 4 cycles" for i in (4, 5)]
     code, _, err = admit("a:8@1Hz", "--svg", str(tmp_path / "none" / "x.svg"))
     assert code == 1
-    assert "can't be written" in err
+    assert "can't write" in err
 
 
 def test_the_picture_marks_what_was_missed_and_what_events_use() -> None:

@@ -24,10 +24,9 @@ from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.robots.figures import BusFigures, Figures, Gauge, TopicFigures, WheelFigures
 from r2p.sim.robots.square import square
 from r2p.tools.main import app
-from r2p.tools.simulator import screen
-from r2p.tools.simulator.command import outside
-from r2p.tools.simulator.play import Play, play, program
+from r2p.tools.simulator import outside, screen
 from r2p.tools.simulator.screen import Chart
+from r2p.tools.simulator.simulation import Play, play, program
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
@@ -92,7 +91,7 @@ def test_what_its_gateway_takes_from_outside(monkeypatch: pytest.MonkeyPatch, al
     def robot(_via: str, *, options: BridgeOptions, **_others: object) -> Triskar2:
         raise r2p.Error(f"control: {options.allow_control}")
 
-    monkeypatch.setattr("r2p.tools.simulator.play.Triskar2", robot)
+    monkeypatch.setattr("r2p.tools.simulator.simulation.Triskar2", robot)
     result = CliRunner().invoke(app, ["sim", "--via", "memory:lab", *(["--allow-control"] if allowed else [])])
     assert (result.exit_code, result.stderr) == (1, f"r2p: control: {allowed}\n")
 

@@ -8,7 +8,7 @@ import pytest
 
 import r2p
 from r2p.msg import Led, StampedPose3, Velocity3
-from r2p.tools.session import TimedOut, Usage
+from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.echo import QUEUE, echo
 from tests.tools.rig import Firmware, printed, robot, tool
 
@@ -86,13 +86,13 @@ async def test_an_unknown_field_is_a_mistake() -> None:
     async with robot(poses), tool() as session:
         with pytest.raises(ExceptionGroup) as caught:
             await echo(session, ["poses"], field=["z"])
-    assert caught.group_contains(Usage, match="no field z: there are timestamp.sec, timestamp.nsec, x, y, w")
+    assert caught.group_contains(UsageError, match="no field z: there are timestamp.sec, timestamp.nsec, x, y, w")
 
 
 @pytest.mark.virtual_time
 async def test_csv_takes_one_topic() -> None:
     async with tool() as session:
-        with pytest.raises(Usage):
+        with pytest.raises(UsageError):
             await echo(session, ["a", "b"], format="csv")
 
 
@@ -159,8 +159,8 @@ async def test_it_waits_for_a_topic_that_nobody_knows_and_says_so(capsys: pytest
 @pytest.mark.parametrize(
     ("topic", "hint"),
     [
-        ("ledz", "r2p: nobody publishes ledz: is it one of leds?\n"),
-        ("/robot1/leds", "r2p: nobody publishes robot1/leds: is it one of leds?\n"),
+        ("ledz", "r2p: ledz has no publisher; did you mean leds?\n"),
+        ("/robot1/leds", "r2p: robot1/leds has no publisher; did you mean leds?\n"),
         ("odometry", ""),
     ],
 )
@@ -185,7 +185,7 @@ async def test_silence_is_a_time_out(capsys: pytest.CaptureFixture[str]) -> None
 
     async with robot(three), tool() as session:
         start = asyncio.get_running_loop().time()
-        with pytest.raises(TimedOut, match="nothing on leds for 1 s"):
+        with pytest.raises(TimedOut, match="nothing received on leds for 1 s"):
             await echo(session, ["leds"], timeout=1)
         assert asyncio.get_running_loop().time() - start == pytest.approx(3.7, abs=0.1)
     assert len(printed(capsys)) == 3

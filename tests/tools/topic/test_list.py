@@ -10,7 +10,7 @@ import pytest
 
 import r2p
 from r2p.msg import Led, Velocity3
-from r2p.tools.session import Usage
+from r2p.tools.session import UsageError
 from r2p.tools.topic.list import find, info, list_
 from tests.tools.rig import VIA, Firmware, printed, robot, tool
 
@@ -70,7 +70,7 @@ async def test_list_of_nothing(capsys: pytest.CaptureFixture[str]) -> None:
         await list_(session)
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err == f"r2p: no topic is known on {VIA}\n"
+    assert captured.err == f"r2p: no topics found on {VIA}\n"
 
 
 @pytest.mark.virtual_time
@@ -118,9 +118,9 @@ async def test_info_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: 
 @pytest.mark.virtual_time
 async def test_info_of_a_topic_that_nobody_knows() -> None:
     async with robot(blink), tool() as session:
-        with pytest.raises(r2p.Error, match="nobody publishes or subscribes power; known topics: leds, log, speed"):
+        with pytest.raises(r2p.Error, match="power has no publisher and no subscriber; known topics: leds, log, speed"):
             await info(session, "power")
-        with pytest.raises(r2p.Error, match=r"nobody publishes or subscribes led: is it one of leds\?"):
+        with pytest.raises(r2p.Error, match=r"led has no publisher and no subscriber; did you mean leds\?"):
             await info(session, "led")
 
 
@@ -157,12 +157,12 @@ async def test_find(what: str, found: dict[str, str], capsys: pytest.CaptureFixt
 @pytest.mark.virtual_time
 async def test_find_nothing() -> None:
     async with robot(blink), tool() as session:
-        with pytest.raises(r2p.Error, match="no topic of type StampedPose3 is known"):
+        with pytest.raises(r2p.Error, match="no topics of type StampedPose3 found"):
             await find(session, "StampedPose3")
 
 
 @pytest.mark.virtual_time
 async def test_find_a_type_that_does_not_exist() -> None:
     async with tool() as session:
-        with pytest.raises(Usage, match=r"did you mean r2p\.msg:Led\?"):
+        with pytest.raises(UsageError, match=r"did you mean r2p\.msg:Led\?"):
             await find(session, "Ledd")

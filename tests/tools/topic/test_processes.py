@@ -98,8 +98,8 @@ def test_time_out() -> None:
     with process("topic", "echo", "leds", "--timeout", "10ms") as child:
         out, err = child.communicate()
     assert (child.returncode, out) == (3, "")
-    assert "local only" in err
-    assert "nothing on leds for 0.01 s" in err
+    assert "no network" in err
+    assert "nothing received on leds for 0.01 s" in err
 
 
 def test_an_address_in_use(publisher: subprocess.Popen[str]) -> None:

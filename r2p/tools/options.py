@@ -1,0 +1,89 @@
+"""Options that several commands share, and the parsers of their values.
+
+Each is a type for a parameter of a command, as Typer reads it: `async def echo(session, *, timeout: Timeout = None)`.
+"""
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+import typer
+
+import r2p
+from r2p.transports.url import duration
+
+CLASS_NAMES = {
+    r2p.PublisherClass.NON_REAL_TIME: "nrt",
+    r2p.PublisherClass.SPORADIC: "sporadic",
+    r2p.PublisherClass.PERIODIC: "periodic",
+}
+"""The publisher classes as --class names them."""
+
+
+def seconds(text: str) -> float:
+    """Parse a duration greater than 0: "10ms", "20us", or seconds."""
+    try:
+        value = duration(text)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    if value <= 0:
+        raise typer.BadParameter(f"{text!r}: the time must be greater than 0")
+    return value
+
+
+class ClassChoice(msgspec.Struct, frozen=True):
+    """A publisher class, and its period or deadline in seconds."""
+
+    publisher_class: r2p.PublisherClass
+    time: float = 0.0
+
+
+def class_choice(text: str) -> ClassChoice:
+    """Parse `nrt`, `periodic:10ms` or `sporadic:20ms`."""
+    name, _, time = text.partition(":")
+    by_name = {name: publisher_class for publisher_class, name in CLASS_NAMES.items()}
+    if name not in by_name or (name == "nrt") == bool(time):
+        raise typer.BadParameter(f"{text!r}: write nrt, periodic:10ms or sporadic:20ms")
+    return ClassChoice(by_name[name], seconds(time) if time else 0.0)
+
+
+def hertz(text: str) -> float:
+    """Parse a rate greater than 0 Hz."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise typer.BadParameter(f"{text!r}: the rate must be a number greater than 0 (Hz)")
+    return value
+
+
+Via = Annotated[
+    list[str] | None,
+    typer.Option("--via", metavar="URL", help="How to join: tcp:HOST:PORT, serial:DEVICE, ... (repeatable)."),
+]
+Verbose = Annotated[int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Print more.")]
+Quiet = Annotated[int, typer.Option("--quiet", "-q", count=True, show_default=False, help="Print less on stderr.")]
+Format = Annotated[
+    Literal["yaml", "json", "csv"] | None,
+    typer.Option("--format", help="Output format; default: text at a terminal, JSON lines in a pipe."),
+]
+Timeout = Annotated[
+    float | None,
+    typer.Option(
+        "--timeout",
+        parser=seconds,
+        metavar="TIME",
+        help="Give up (exit code 3) when nothing arrives for this long: 2, 500ms.",
+    ),
+]
+Wait = Annotated[
+    float | None,
+    typer.Option(
+        "--wait", parser=seconds, metavar="TIME", help="Listen for this long; firmware announces one topic every 0.5 s."
+    ),
+]
+Count = Annotated[int | None, typer.Option("--count", "-n", min=1, metavar="N", help="End after N.")]
+Once = Annotated[bool, typer.Option("--once", help="End after one.")]
+Rate: Any = Annotated[
+    float | None, typer.Option("--rate", "-r", parser=hertz, metavar="HZ", help="Messages per second; default: 1.")
+]
