@@ -9,8 +9,6 @@ from typing import Self
 
 import msgspec
 
-UP = "up"
-DOWN = "down"
 BUS_OFF = "bus-off"
 STATES = ("error-active", "error-warning", "error-passive", BUS_OFF, "stopped", "sleeping")
 """States of a controller, by the kernel's number."""
@@ -48,7 +46,6 @@ class Interface(msgspec.Struct, frozen=True):
     up: bool
     state: str = ""  # of STATES
     bitrate: int | None = None  # bit/s
-    sample_point: float | None = None
     modes: frozenset[str] = frozenset()  # of CTRLMODES
     restart_ms: int | None = None  # after bus-off; 0: it does not restart by itself
     errors: tuple[int, int] | None = None  # the controller's counters of transmit and receive errors
@@ -120,19 +117,17 @@ def parse(body: bytes) -> Interface | None:
     link = _attributes(body[_LINK.size :])
     info = _attributes(link.get(_LINKINFO, b""))
     can = _attributes(info.get(_DATA, b""))
-    bitrate, sample_point = _u32s(can.get(_BITTIMING), 2)
-    _, modes = _u32s(can.get(_CTRLMODE), 2)
+    bitrate, state = _u32(can.get(_BITTIMING)), _u32(can.get(_STATE))
+    modes = _u32(can.get(_CTRLMODE), index=1) or 0  # struct can_ctrlmode: a mask, then the flags
     errors = can.get(_BERR_COUNTER, b"")
-    (state,) = _u32s(can.get(_STATE), 1)
     return Interface(
         name=_text(link.get(_IFNAME, b"")),
         kind=_text(info.get(_KIND, b"")),
         up=bool(flags & _IFF_UP),
         state=STATES[state] if state is not None and state < len(STATES) else "",
-        bitrate=bitrate if bitrate and bitrate != 0xFFFF_FFFF else None,  # slcan's marks an unknown one so
-        sample_point=sample_point / 1000 if bitrate and sample_point else None,
-        modes=frozenset(name for bit, name in CTRLMODES.items() if (modes or 0) & bit),
-        restart_ms=_u32s(can.get(_RESTART_MS), 1)[0],
+        bitrate=bitrate if bitrate and bitrate != 0xFFFF_FFFF else None,  # slcan's driver reports an unknown one so
+        modes=frozenset(name for bit, name in CTRLMODES.items() if modes & bit),
+        restart_ms=_u32(can.get(_RESTART_MS)),
         errors=struct.unpack("=HH", errors) if len(errors) == 4 else None,
     )
 
@@ -152,11 +147,12 @@ def _aligned(length: int) -> int:
     return length + 3 & ~3
 
 
-def _u32s(data: bytes | None, count: int) -> tuple[int | None, ...]:
-    """The first `count` 32-bit numbers of an attribute; each is None if the attribute is missing or too short."""
-    if data is None or len(data) < 4 * count:
-        return (None,) * count
-    return struct.unpack_from(f"={count}I", data)
+def _u32(data: bytes | None, index: int = 0) -> int | None:
+    """The 32-bit number at this index of an attribute. None if the attribute is missing or too short."""
+    if data is None or len(data) < 4 * (index + 1):
+        return None
+    number: int = struct.unpack_from("=I", data, 4 * index)[0]
+    return number
 
 
 def _text(data: bytes) -> str:

@@ -50,7 +50,6 @@ def test_a_controller() -> None:
         up=True,
         state="error-warning",
         bitrate=500_000,
-        sample_point=0.875,
         modes=frozenset({"one-shot", "berr-reporting"}),
         restart_ms=100,
         errors=(96, 3),
