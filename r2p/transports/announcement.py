@@ -67,7 +67,7 @@ def announce(
         events += discovery.unsubscribe(now, topic)
     for (node, role), publisher_class in desired.endpoints.items():
         if known.endpoints.get((node, role)) != publisher_class:
-            events += discovery.endpoint(now, node, topic, role, publisher_class)
+            events += discovery.add_endpoint(now, node, topic, role, publisher_class)
     for node, role in known.endpoints.keys() - desired.endpoints.keys():
-        events += discovery.endpoint_gone(now, node, topic, role)
+        events += discovery.remove_endpoint(now, node, topic, role)
     return events

@@ -323,7 +323,7 @@ class Link(abc.ABC):
 
     def report_conflict(self, module: str, instance_a: int, instance_b: int) -> None:
         """Tell two modules that they have the same name."""
-        self._apply(self.discovery.conflict(self._clock.monotonic(), module, instance_a, instance_b))
+        self._apply(self.discovery.report_conflict(self._clock.monotonic(), module, instance_a, instance_b))
 
     def relay(self, message: Relayed) -> None:
         """Pass on what a module on another link has announced."""

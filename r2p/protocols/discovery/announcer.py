@@ -78,14 +78,14 @@ class Announcer:
             self.announce_once(ItemKind.UNSUBSCRIBE, topic)
         return was_there
 
-    def endpoint(self, node: str, topic: str, role: int, publisher_class: int) -> None:
+    def add_endpoint(self, node: str, topic: str, role: int, publisher_class: int) -> None:
         key = (node, topic, role)
         if self._endpoints.get(key) != publisher_class:
             self._endpoints[key] = publisher_class
             if self.r2p:
                 self._add(ItemKind.ENDPOINT, *key)
 
-    def endpoint_gone(self, node: str, topic: str, role: int) -> None:
+    def remove_endpoint(self, node: str, topic: str, role: int) -> None:
         if self._endpoints.pop((node, topic, role), None) is not None:
             self._drop(ItemKind.ENDPOINT, node, topic, role)
             if self.r2p:

@@ -90,11 +90,11 @@ class DiscoveryProtocol(ABC):
         """End the subscription of a topic: its remote publishers are gone."""
 
     @abstractmethod
-    def endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
+    def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
         """Announce that a node publishes or subscribes (ROLE_...) a topic, as CLASS_..."""
 
     @abstractmethod
-    def endpoint_gone(self, now: int, node: str, topic: str, role: int) -> list[Event]:
+    def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
         """Announce that a node's publisher or subscriber has ended."""
 
     # What users and gateways ask for
@@ -108,7 +108,7 @@ class DiscoveryProtocol(ABC):
         """Ask all modules to repeat what they publish and subscribe."""
 
     @abstractmethod
-    def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
+    def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
         """Report that two modules, which don't hear each other, have one name."""
 
     @abstractmethod

@@ -127,7 +127,9 @@ class Directory:
         """Whether no other module than this one is known directly at an address."""
         return all(info.instance == instance for info in self._direct.get(source, {}).values())
 
-    def alive(self, now: int, message: management.Alive, source: PeerAddress) -> tuple[ModuleInfo | None, ModuleInfo]:
+    def read_alive(
+        self, now: int, message: management.Alive, source: PeerAddress
+    ) -> tuple[ModuleInfo | None, ModuleInfo]:
         """Read a module's state; returns what was known before (it is not entered yet), and what is known now."""
         before = self.modules.get(message.module)
         if before is None:
@@ -136,7 +138,9 @@ class Directory:
             info = msgspec.structs.replace(before, flags=message.flags, last_heard=now)
         return before, info
 
-    def hello(self, now: int, message: management.Hello, source: PeerAddress) -> tuple[ModuleInfo | None, ModuleInfo]:
+    def read_hello(
+        self, now: int, message: management.Hello, source: PeerAddress
+    ) -> tuple[ModuleInfo | None, ModuleInfo]:
         """Read an r2p module's HELLO; returns what was known before (it is not entered yet), and what is known now."""
         before = self.modules.get(message.module)
         return before, ModuleInfo(
@@ -201,15 +205,15 @@ class Directory:
         info = self.topics.get(topic)
         return 0 if info is None else info.size
 
-    def topic(self, name: str) -> TopicInfo:
+    def touch_topic(self, name: str) -> TopicInfo:
         """The entry of a topic that a message has just named."""
         info = self.topics.get(name) or TopicInfo(name)
         self._put(self.topics, name, info, "topics forgotten")
         return info
 
-    def typed(self, now: int, topic: str, role: int, said: TopicType) -> TopicInfo:
+    def add_type(self, now: int, topic: str, role: int, said: TopicType) -> TopicInfo:
         """Enter the type that a peer says. Of several that differ the first one stays, as long as it is repeated."""
-        info = self.topic(topic)
+        info = self.touch_topic(topic)
         for each, at in list(info.typed_at.items()):
             if now > at + LEASE:
                 del info.typed_at[each]
@@ -221,7 +225,7 @@ class Directory:
             info.set_type(role, known.merged(said))
         return info
 
-    def endpoint(self, now: int, message: management.Endpoint) -> None:
+    def enter_endpoint(self, now: int, message: management.Endpoint) -> None:
         """Enter a publisher or subscriber of a remote node, or forget it if it is gone."""
         role = message.role & ~management.ROLE_GONE
         key = (message.instance, message.node, message.topic, role)

@@ -81,7 +81,7 @@ class PeerLiveness:
             return  # a gateway's probe for loops: only tools have such names, and they send no ALIVE
         if message.module == self._module and not self._is_namesake(now):
             return
-        before, info = self._directory.alive(now, message, source)
+        before, info = self._directory.read_alive(now, message, source)
         if before is not None and _restarted(before.flags, info.flags):
             self._negotiation.restarted(source)
         self._enter(now, before, info)
@@ -104,7 +104,7 @@ class PeerLiveness:
     def endpoint(self, now: int, message: management.Endpoint, source: PeerAddress) -> None:
         """ENDPOINT: a publisher or subscriber of a remote node."""
         if message.instance != self._instance:
-            self._directory.endpoint(now, message)
+            self._directory.enter_endpoint(now, message)
 
     def conflict(self, now: int, message: management.Conflict, source: PeerAddress) -> None:
         """CONFLICT: a peer, which hears more modules than this one does, found another one of this module's name."""
@@ -168,7 +168,7 @@ class PeerLiveness:
     def _present(self, now: int, message: management.Hello, source: PeerAddress) -> None:
         """An r2p module introduces itself, for the first time or again."""
         known_start = self._directory.was_before(message.module, message.instance)
-        before, info = self._directory.hello(now, message, source)
+        before, info = self._directory.read_hello(now, message, source)
         self._look_for_namesakes(now, before, message)
         is_new = not known_start and (before is None or before.instance != info.instance)
         if before is not None and (before.source, before.hops) != (info.source, info.hops):

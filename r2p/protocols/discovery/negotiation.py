@@ -63,7 +63,7 @@ class SubscriptionNegotiation:
     def advertised(self, now: int, message: management.Advertise, source: PeerAddress) -> None:
         """ADVERTISE, of a publisher: request its messages if this module subscribes the topic."""
         topic = message.topic
-        self._directory.typed(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
+        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
         own = self._own.subscribers.get(topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -78,7 +78,7 @@ class SubscriptionNegotiation:
     def requested(self, now: int, message: management.SubscribeRequest, source: PeerAddress) -> None:
         """SUBSCRIBE_REQUEST, of a subscriber: respond, and attach it if it is new. The size in it decides nothing."""
         topic = message.topic
-        self._directory.typed(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
+        self._directory.add_type(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
         own = self._own.publishers.get(topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -93,7 +93,7 @@ class SubscriptionNegotiation:
         peer = self._peers.get_or_create(source) if topic in self._own.subscribers else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, message)):
             return
-        self._directory.typed(now, topic, ROLE_PUBLISHES, TopicType(message.size))
+        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size))
         # Every response to a repeated request comes here; only new params, as after a restart, are an event.
         if peer.publishers.get(topic) != (message.params, message.size):
             peer.publishers[topic] = (message.params, message.size)
@@ -102,7 +102,7 @@ class SubscriptionNegotiation:
 
     def typed(self, now: int, message: management.TypeInfo, source: PeerAddress) -> None:
         """TYPE: compare a peer's type of a topic with this module's, if it has the topic."""
-        self._directory.typed(now, message.topic, message.role, TopicType(message.size, message.fingerprint))
+        self._directory.add_type(now, message.topic, message.role, TopicType(message.size, message.fingerprint))
         own = self._counterpart(message.role).get(message.topic)
         peer = self._peers.get_or_create(source) if own is not None else None
         if peer is not None:
@@ -287,7 +287,7 @@ class SubscriptionNegotiation:
         """Whether a peer's type fits this module's. If not, nothing flows, and it is reported once."""
         ours = self._counterpart(role)[topic].type
         fits = ours.fits(theirs)  # what is unknown fits, so firmware, which has no fingerprints, is judged by size only
-        self._directory.topic(topic).mismatch = not fits
+        self._directory.touch_topic(topic).mismatch = not fits
         if fits:
             peer.mismatched.pop((topic, role), None)
             return True

@@ -167,12 +167,12 @@ class Discovery(DiscoveryProtocol):
             self._negotiation.subscription_ended(topic)
         return self._flush(now)
 
-    def endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
-        self._announcer.endpoint(node, topic, role, publisher_class)
+    def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
+        self._announcer.add_endpoint(node, topic, role, publisher_class)
         return self._flush(now)
 
-    def endpoint_gone(self, now: int, node: str, topic: str, role: int) -> list[Event]:
-        self._announcer.endpoint_gone(node, topic, role)
+    def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
+        self._announcer.remove_endpoint(node, topic, role)
         return self._flush(now)
 
     # What users and gateways ask for
@@ -185,7 +185,7 @@ class Discovery(DiscoveryProtocol):
         self._announcer.announce_once(ItemKind.QUERY)
         return self._flush(now)
 
-    def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
+    def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
         self._announcer.announce_once(ItemKind.CONFLICT, module_alias(module), instance_a, instance_b)
         return self._flush(now)
 

@@ -136,12 +136,12 @@ class LivelinessDiscovery(DiscoveryProtocol):
         """The module does not subscribe this topic any more: its publishers are gone."""
         return self._remove_topic(topic, ROLE_SUBSCRIBES)
 
-    def endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
+    def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
         """A node publishes or subscribes (ROLE_...) the topic, as CLASS_..."""
         self._own.add_node(topic, role, node, publisher_class)
         return self._pop_events()
 
-    def endpoint_gone(self, now: int, node: str, topic: str, role: int) -> list[Event]:
+    def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
         """It does not any more."""
         self._own.remove_node(topic, role, node)
         return self._pop_events()
@@ -199,7 +199,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         """Do nothing: what r2p modules have is known."""
         return self._pop_events()
 
-    def conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
+    def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
         """Tell two modules, which don't see each other, that they have the same name."""
         self._send(management.Conflict(module_alias(module), instance_a, instance_b))
         return self._pop_events()

@@ -114,18 +114,18 @@ class TestModules:
 
     def test_only_r2p_modules_get_endpoints(self) -> None:
         discovery = started()
-        discovery.endpoint(S, "blink", "leds", m.ROLE_PUBLISHES, m.CLASS_SRT)
+        discovery.add_endpoint(S, "blink", "leds", m.ROLE_PUBLISHES, m.CLASS_SRT)
         assert not any(
             isinstance(message, m.Endpoint) for _, event in run(discovery, S, 9 * S) for message in sent([event])
         )
         hear(discovery, 9 * S, PC2)
         assert m.Endpoint(1, ME, "blink", "leds", m.CLASS_SRT) in sent(discovery.poll(9 * S))
-        assert sent(discovery.endpoint(9 * S, "blink", "leds", 1, m.CLASS_HRT)) == [
+        assert sent(discovery.add_endpoint(9 * S, "blink", "leds", 1, m.CLASS_HRT)) == [
             m.Endpoint(1, ME, "blink", "leds", m.CLASS_HRT)
         ]
-        assert sent(discovery.endpoint_gone(9 * S, "blink", "leds", 1)) == [m.Endpoint(129, ME, "blink", "leds")]
+        assert sent(discovery.remove_endpoint(9 * S, "blink", "leds", 1)) == [m.Endpoint(129, ME, "blink", "leds")]
         hear(discovery, 9 * S, m.Hello("PC2", PEER, m.HELLO_LEAVING))
-        assert sent(discovery.endpoint(9 * S, "blink", "leds", 1)) == []
+        assert sent(discovery.add_endpoint(9 * S, "blink", "leds", 1)) == []
 
     def test_endpoints_are_learnt_and_forgotten(self) -> None:
         discovery = started()
@@ -205,7 +205,7 @@ class TestNames:
     def test_a_hub_that_hears_both_reports_them(self) -> None:
         hub = started()
         message = m.Conflict("IMU1", 1, 2)
-        assert sent(hub.conflict(SOON, "IMU1", 1, 2)) == [message]
+        assert sent(hub.report_conflict(SOON, "IMU1", 1, 2)) == [message]
         one, other = Discovery("IMU1", 2), Discovery("IMU1", 3)
         one.link_up(0)
         other.link_up(0)

@@ -145,7 +145,7 @@ class TestSchedule:
         discovery = Discovery("PC1", 1, rate=1, burst=2)
         discovery.link_up(0)
         for n in range(1000):
-            discovery.conflict(n, "IMU1", 1, 2)
+            discovery.report_conflict(n, "IMU1", 1, 2)
             discovery.set_flags(n, n % 2)
         kinds = [type(message) for _, event in run(discovery, 1000, 100 * S) for message in sent([event])]
         assert kinds.count(m.Conflict) == 1

@@ -165,7 +165,7 @@ def test_a_late_joiner_learns_everything(world: World) -> None:
     world.add("A", 1)
     advertise(world, 1, "leds")
     for node in ("blink", "glow"):
-        world.act(1, world.members[1].endpoint(world.now, node, "leds", ROLE_PUBLISHES, 1 | CLASS_LATCHES))
+        world.act(1, world.members[1].add_endpoint(world.now, node, "leds", ROLE_PUBLISHES, 1 | CLASS_LATCHES))
     world.settle()
     late = world.add("B", 2)
     subscribe(world, 2, "leds")
@@ -182,7 +182,7 @@ def test_one_token_for_a_publisher_and_its_node(world: World) -> None:
     a = world.add("A", 1)
     events = [
         *a.advertise(0, "leds", 5, PRINT),
-        *a.endpoint(0, "blink", "leds", ROLE_PUBLISHES, 1),
+        *a.add_endpoint(0, "blink", "leds", ROLE_PUBLISHES, 1),
         *a.poll(0),
     ]
     assert events == [Declare("1/1/pub/leds/1/blink/1/5/6161616161616161/0/0")]
@@ -248,7 +248,7 @@ def test_nothing_is_kept_of_modules_that_left(world: World) -> None:
     for instance in (2, 3):
         world.add(f"M{instance}", instance)
         advertise(world, instance, "leds", instance)
-        world.members[instance].endpoint(0, "node", "leds", ROLE_PUBLISHES, 1)
+        world.members[instance].add_endpoint(0, "node", "leds", ROLE_PUBLISHES, 1)
     subscribe(world, 1, "leds", 2)
     world.settle()
     assert {each.module for each in watcher.endpoints.values()} <= {"M2", "M3"}
@@ -319,7 +319,7 @@ def test_a_module_that_comes_back_is_no_namesake(world: World) -> None:
 
 def test_somebody_else_tells_namesakes(world: World) -> None:
     world.add("X", 1), world.add("C", 3)
-    world.act(3, world.members[3].conflict(world.now, "X", 1, 77))
+    world.act(3, world.members[3].report_conflict(world.now, "X", 1, 77))
     assert world.news(1, NameConflict) == [NameConflict("X", 1, 77)]
 
 
