@@ -12,10 +12,8 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics, PortStatistics, WayStatistics
-from r2p.bridge.options import ClassOf, Policy, is_link, rule
-from r2p.bridge.shaping import Shaper
+from r2p.bridge.options import Policy
 from r2p.msg import GatewayStatus, Led
-from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.testing.network import node_in
 from r2p.tools import gateway
 from r2p.tools.gateway import LiveTable, RateCounter, crop, serve, table
@@ -127,17 +125,6 @@ async def drained(status: r2p.Subscriber[GatewayStatus]) -> AsyncIterator[Gatewa
         yield await status.fetch()
 
 
-@pytest.mark.parametrize("text", ["", "@", "leds@", "leds@a>", "@a"])
-def test_rules_without_sense(text: str) -> None:
-    with pytest.raises(r2p.Error, match="write TOPIC, TOPIC@FROM"):
-        rule(text)
-
-
-def test_links_are_meant_by_name_kind_or_pattern() -> None:
-    assert all(is_link("tcp:10.0.0.5:23", each) for each in ("tcp", "tcp:10.0.0.5:23", "tcp:10.*", "*"))
-    assert not any(is_link("tcp:10.0.0.5:23", each) for each in ("tcp-listen", "tcp:", "zenoh", ""))
-
-
 def test_links_that_are_meant_by_rules_and_options() -> None:
     links = ["rtcan", "rtcan:can0", "rtcan:*", "zenoh", "zenoh:", "tcp:robot", "tcp:robot:2323", "tcp", "tcp:10.*", "*"]
     assert gateway._links(links, "--read-only", VIA) == tuple(links)
@@ -145,17 +132,6 @@ def test_links_that_are_meant_by_rules_and_options() -> None:
     assert gateway._rules(["cmd_*@zenoh>rtcan", "log"], "--allow", VIA)
     assert gateway._prefix("robot1/") == "robot1/"
     assert gateway._prefix("") == ""
-
-
-def test_loader_topics_come_in_from_ip_links_only_with_permission() -> None:
-    strict, open_ = Policy(BridgeOptions()), Policy(BridgeOptions(allow_control=True))
-    for link in ("tcp:10.0.0.5:23", "zenoh:"):
-        assert not strict.allows("BOOT_IMU1", link, "rtcan:can0")
-        assert strict.allows("BOOT_IMU1", "rtcan:can0", link)
-        assert open_.allows("BOOT_IMU1", link, "rtcan:can0")
-        assert not strict.order_denied(link, "rtcan:can0", harmless=True)
-        assert strict.order_denied(link, "rtcan:can0", harmless=False)
-    assert strict.allows("BOOT_IMU1", "serial:/dev/ttyUSB0", "rtcan:can0")
 
 
 VIA = ["rtcan:can0,priority=1", "zenoh:?network=lab", "tcp:robot", "tcp-listen:0"]
@@ -179,39 +155,3 @@ def test_mistakes_are_told() -> None:
         list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
     with pytest.raises(typer.BadParameter, match="periodic:10ms"):
         gateway._class("often")
-
-
-# Classes on the way
-
-
-def sample(stamp: int = SECOND, publisher_class: PublisherClass = PublisherClass.NON_REAL_TIME) -> Sample:
-    return Sample(b"12345", Source("A", "n", "tcp:x"), stamp, publisher_class=publisher_class)
-
-
-def test_what_a_debug_line_brings_gets_the_class_that_it_can_not_say() -> None:
-    klass = ClassOf(PublisherClass.SPORADIC, 0.02)
-    policy = Policy(BridgeOptions(classes={"enc*": klass}))
-    assert policy.class_of("encoder", "tcp:10.0.0.5:23") == klass
-    assert policy.class_of("leds", "tcp:10.0.0.5:23") is None
-    assert policy.class_of("encoder", "zenoh:") is None
-    shaper = Shaper.of(rate=None, klass=klass, soften=False)
-    assert shaper is not None
-    shaped = shaper.shape(sample(), 0, 0)
-    assert shaped is not None
-    assert (shaped.publisher_class, shaped.deadline) == (PublisherClass.SPORADIC, SECOND + SECOND // 50)
-    assert not shaped.drop_late  # nobody who published it has said so
-
-
-def test_periodic_messages_are_due_within_their_period() -> None:
-    shaper = Shaper.of(rate=None, klass=None, soften=True)
-    assert shaper is not None
-    periodic = [sample(n * SECOND // 100, PublisherClass.PERIODIC) for n in range(1, 5)]
-    last = [shaper.shape(each, 0, 0) for each in periodic][-1]
-    assert last is not None
-    assert (last.publisher_class, last.deadline - last.stamp) == (PublisherClass.SPORADIC, SECOND // 100)
-    plain = sample()
-    assert shaper.shape(plain, 0, 0) is plain
-
-
-def test_nothing_to_change() -> None:
-    assert Shaper.of(rate=None, klass=None, soften=False) is None

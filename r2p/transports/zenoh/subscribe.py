@@ -312,7 +312,10 @@ class RxStream:
         elif not self._advance(publisher, serial):
             self._stats.lost["repeated"] += 1
             return False
-        if not publisher.last_received.accept(sequence, stamp):
+        last = publisher.last_received
+        if sequence > last.sequence:  # as `accept`, inlined: while a reader is slow, each message comes here
+            last.sequence, last.stamp = sequence, stamp
+        elif not last.accept(sequence, stamp):
             self._drop_duplicate(publisher, serial, sequence)
             return False
         publisher.sequence = sequence
