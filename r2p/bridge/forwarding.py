@@ -38,6 +38,7 @@ class HeldMessages:
 
     def hold(self, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
         """Hold a message; False if it expires or there are too many. `go_on` gives back the sinks without room."""
+        # Events and periods are of no use later.
         if sample.publisher_class != PublisherClass.NON_REAL_TIME or len(self._held) >= MOST_HELD:
             return False
         self._held.append((sample, go_on))
@@ -138,7 +139,7 @@ class BridgedTopic(Topic):
             if routes is None:
                 routes = [] if self.relayed is None else self.relayed.active_from(link)
                 self.active_routes[link] = routes
-            if not routes and not self.queues:  # not yet, or not any more, as its publisher will soon know
+            if not routes and not self.queues:  # not yet, or not any more, as its publisher will soon know: no loss
                 port.dropped["not subscribed"] += 1
                 return None
         blocked = super().deliver(sample) if self.queues else None
@@ -316,7 +317,7 @@ def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sin
     if not subscriber.wait_queue().line_of(sample) and subscriber.offer(sample):
         return blocked
     if not subscriber.waits and sample.publisher_class == PublisherClass.NON_REAL_TIME:
-        subscriber.force(sample)
+        subscriber.force(sample)  # it had no room for long: one slow link must not hold up all the others
         return blocked
     return [subscriber] if blocked is None else [*blocked, subscriber]
 

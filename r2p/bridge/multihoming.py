@@ -78,7 +78,7 @@ class MultihomedModule:
         else:
             self.selection.close(self._now(), port.number)
             link.stands_by = ""
-        self._act()
+        self._act()  # which announces topics on links whose use has changed
         if link.up and port.number not in self._used[_ALL]:
             self._announce(list(self._space.topics.values()), [link])
 

@@ -96,7 +96,7 @@ class RoutingTable:
     def _review_all(self, topics: Iterable[str]) -> None:
         """Look at these anew, at once: what comes in next may need a new route."""
         self._to_review.update(dict.fromkeys(sorted(topics)))
-        if self._reviewing:
+        if self._reviewing:  # what a review announces may change demand: that is reviewed after it
             return
         self._reviewing = True
         try:
@@ -208,7 +208,7 @@ class RoutingTable:
         relayed.topics[here.name] = here
 
     def _end(self, topic: str) -> None:
-        relayed = self.by_name.pop(topic, None)
+        relayed = self.by_name.pop(topic, None)  # first: links ask `desired_state`, which looks there
         if relayed is None:
             return
         for here in relayed.topics.values():

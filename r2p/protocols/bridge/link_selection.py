@@ -117,14 +117,14 @@ class LinkChoice:
         candidates, barred = self._candidates(now, links)
         contested = [link for link in candidates if link.is_contested(now)]
         self.consent_until = min(link.consent_until for link in contested) if len(contested) > 1 else FOREVER
-        if now >= self.consent_until:
+        if now >= self.consent_until:  # one contested link needs no consent: keep the one that is in use
             self.consent_until = FOREVER
             first = next((link for link in contested if link.number in self.used), contested[0])
             barred += [link for link in contested if link is not first]
             candidates = [link for link in candidates if link not in barred]
         self._bar(now, {link.number for link in barred})
         used = frozenset(link.number for link in candidates if self._may_begin(now, link))
-        if (self.used - used) & self._contested:
+        if (self.used - used) & self._contested:  # what it sent may still be on its way: others begin after SETTLE
             self._closed_at = now
         self.used = used
         self._contested = used & {link.number for link in links if link.is_contested(now)}
@@ -285,7 +285,7 @@ class LinkSelection:
                 dues += [at + TWIN_MEMORY for at in (*link.twins.values(), *link.loops.values())]
                 dues += [link.known_at] if now < link.known_at else []
         due = min(dues, default=FOREVER)
-        return due if due < FOREVER // 2 else None
+        return due if due < FOREVER // 2 else None  # half: some dues are a little less or more than FOREVER
 
     # What comes in
 
@@ -310,7 +310,7 @@ class LinkSelection:
         link = self.by_number.get(number)
         if link is None:
             return
-        link.echoes = message.port == number & 0xFF
+        link.echoes = message.port == number & 0xFF  # the number has one byte on the wire
         for other in self.by_number:
             if other != number and other & 0xFF == message.port:
                 link.twins = link.twins | {other: now}
@@ -336,7 +336,7 @@ class LinkSelection:
             link.suspected_at = FOREVER
         else:
             link.suspected_at = min(link.suspected_at, now)
-        for each in self.by_number.values():
+        for each in self.by_number.values():  # any of them may have sent it: what they send now shows which
             each.asks = True
         self._update(now)
         return now < link.suspected_at + _SUSPICION
@@ -347,7 +347,7 @@ class LinkSelection:
         """
         link = self.by_number.get(number)
         if instance is not None and instance < self._instance:
-            instance = None
+            instance = None  # the other end chooses; if both did, each might give up the link that the other one keeps
         if link is None or link.remote == instance:
             return
         stood_alone = self._stands_alone(link)

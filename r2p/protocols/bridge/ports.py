@@ -221,6 +221,7 @@ class TreePort(msgspec.Struct, eq=False):
         leaf = self.leaves.get(leaf_id)
         if leaf is None:
             self.hurry(now)
+            # Without a current acknowledgement it may be an old message; it counts once it has heard our answer.
             if not acked_at or acked_at < rooted_at or len(self.leaves) >= MOST_LEAVES:
                 return False
             self.leaves = self.leaves | {leaf_id: Neighbour(now, message.count, acked_at)}
@@ -286,7 +287,7 @@ class ClientPorts:
     def open(self, now: int, number: int) -> TreePort:
         """A client has connected; `number` is FIRST_CLIENT or more."""
         port = TreePort(number, now, private=True)
-        if not self.ports:
+        if not self.ports:  # nothing was due while there were no clients
             self._send_at = now + TICK_ALONE
         self.ports[port.number] = port
         self._listening.append(port)
@@ -339,7 +340,7 @@ class ClientPorts:
             self._update(now, port)
             if port.send_at <= now:
                 self._send_bridge(now, port)
-            if not port.leaves and port.state is PortState.ALONE:
+            if not port.leaves and port.state is PortState.ALONE:  # nothing there depends on the time any more
                 del self._with_leaves[port.number]
         if self.ports and self._send_at <= now:
             self._send_at = now + TICK_ALONE

@@ -134,11 +134,12 @@ class SpanningTree:
         if sender == (self.gateway, number):
             port.echoes = True
             return
-        neighbour = port.neighbours.get(sender)
+        neighbour = port.neighbours.get(sender)  # may be another port of ours on the same network
         if neighbour is None:
             if not self._admits_neighbour(now, port):
                 return
             neighbour = Neighbour(now, message.count, agreement=message.agreement)
+            # It is on this network itself: its probes came straight, not through a loop of firmware.
             port.probes = {each: at for each, at in port.probes.items() if each[0] != message.gateway}
             port.neighbours = port.neighbours | {sender: neighbour}
         elif is_late(message.count, neighbour.count):
@@ -214,7 +215,7 @@ class SpanningTree:
             self._start_over(now)
         self._updated_at = now
         mesh = self._mesh.fingerprint
-        if changed is None:
+        if changed is None:  # not for each message: with many neighbours it would cost most, and `poll` comes soon
             self._expire(now)
         heard = frozenset((port.number, *neighbour) for port in self.ports.values() for neighbour in port.neighbours)
         if self._mesh.set_heard(heard):
@@ -230,7 +231,7 @@ class SpanningTree:
         """This program stood still for so long that others may have given this gateway up."""
         for port in self.ports.values():
             port.send_at = now
-            if port.private and not port.neighbours:
+            if port.private and not port.neighbours:  # no gateway can have come meanwhile
                 port.extend_leaves(now)
                 continue
             port.resumes = port.resumes or port.state is PortState.ALONE
@@ -290,14 +291,14 @@ class SpanningTree:
 
     def _is_agreed(self, now: int, port: TreePort) -> bool:
         """Whether all gateways there have acknowledged the very same mesh within a lease."""
-        return all(
+        return all(  # other ports of this gateway agree anyway
             each.agreement == port.agreement and now < each.acked_at + LEASE
             for (gateway, _), each in port.neighbours.items()
             if gateway != self.gateway
         )
 
     def _state(self, now: int, port: TreePort) -> PortState:
-        if self._loops(now, port):
+        if self._loops(now, port):  # first of all: agreement says nothing about gateways that do not take part
             return PortState.LOOP
         if now < port.opened_at + LISTEN:
             return PortState.LISTENING
@@ -323,6 +324,7 @@ class SpanningTree:
 
     def _forwards_until(self, port: TreePort, state: PortState) -> int:
         if state is PortState.ALONE:
+            # Another gateway that comes listens for longer than a lease: by then it has heard us, or we are stuck.
             return FOREVER if port.private else port.sent_at + LEASE
         if state is not PortState.FORWARDING:
             return 0
@@ -352,7 +354,7 @@ class SpanningTree:
         for packed in pack_acks(port.neighbours | port.leaves, BRIDGE_ACKS):
             bridge = Bridge(self.gateway, port.number, count, port.agreement, self.root, packed)
             self._actions.append(SendToPort(port.number, bridge))
-        if port.neighbours and not self._is_agreed(now, port):
+        if port.neighbours and not self._is_agreed(now, port):  # MESH is not acknowledged: some may have been lost
             for gateway in [self.gateway, *self._mesh.others(count, _RECORDS_A_TICK)]:
                 self._send_mesh(port, gateway)
         port.sent_at = now
@@ -369,6 +371,6 @@ class SpanningTree:
 
     def _send_probe(self, now: int, port: TreePort) -> None:
         listening = port.state is PortState.LISTENING
-        port.probe_at = now + (LISTEN // 2 if listening else PROBE)
+        port.probe_at = now + (LISTEN // 2 if listening else PROBE)  # a loop has to show before the port forwards
         if listening or port.in_tree:
             self._actions.append(SendProbe(port.number))
