@@ -1,1 +1,1 @@
-"""What needs SocketCAN: runs in one user-mode Linux kernel, beside programs that know nothing of r2p."""
+"""Tests that need SocketCAN: they run in one user-mode Linux kernel, beside programs that know nothing of r2p."""

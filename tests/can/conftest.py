@@ -16,7 +16,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """One worker of pytest-xdist gets all of them, for there is one kernel."""
+    """Give all of them to one worker of pytest-xdist, as there is one kernel."""
     for item in items:
         if item.get_closest_marker(replay.MARK) and not replay.inside():
             item.add_marker(pytest.mark.xdist_group(replay.MARK))

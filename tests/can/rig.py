@@ -27,7 +27,7 @@ _numbers = itertools.count()
 
 
 def ip(*arguments: str) -> None:
-    """`ip link` with these arguments."""
+    """Run `ip link` with these arguments."""
     subprocess.run(("ip", "link", *arguments), check=True)
 
 
@@ -40,12 +40,12 @@ def new_name() -> str:
 
 
 def cansend(name: str, frame: str) -> None:
-    """A frame as candump prints it in logs, such as "1FFFFFFF#0102"."""
+    """Send a frame, as candump prints it in logs: "1FFFFFFF#0102"."""
     subprocess.run(("cansend", name, frame), check=True)
 
 
 def cangen(name: str, count: int) -> None:
-    """Frames as fast as can be, while the loop stands still: numbered, and 8 bytes of which the first counts."""
+    """Send frames as fast as possible while the loop stands still, numbered in identifier and first byte."""
     subprocess.run(("cangen", name, "-e", "-g", "0", "-I", "i", "-L", "8", "-D", "i", "-n", str(count)), check=True)
 
 
@@ -64,7 +64,7 @@ def listeners(name: str) -> int:
 
 
 class Candump:
-    """candump, as an async context manager inside which it listens."""
+    """Runs candump, which listens inside of the `async with` block."""
 
     def __init__(self, name: str, *options: str) -> None:
         self._command = ("candump", *options, name)
@@ -84,7 +84,7 @@ class Candump:
         await self._process.communicate()
 
     async def line(self) -> str:
-        """What it prints next, with single spaces."""
+        """The next line that it prints, with single spaces."""
         assert self._process is not None
         assert self._process.stdout is not None
         async with asyncio.timeout(GUARD):
@@ -92,7 +92,7 @@ class Candump:
 
 
 async def run_program(*command: str) -> str:
-    """What a program prints, once it has ended well."""
+    """Run a program that has to succeed. Returns what it prints."""
     process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
     async with asyncio.timeout(GUARD):
         output, _ = await process.communicate()

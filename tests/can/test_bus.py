@@ -1,4 +1,4 @@
-"""`r2p bus` beside a robot of 2 modules that is a recording: canplayer plays it, so all that is seen is known."""
+"""`r2p bus` beside a recorded robot of 2 modules: canplayer plays it, so all frames are known."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.can
 
 SLOTS, SLOT = 4, 0.1
-"""In s: so long that a frame that the slow kernel sends late is still in its slot."""
+"""Seconds, so long that a frame that the slow kernel sends late is still in its slot."""
 CYCLES = 100
 MASTER, MOTOR = 1, 7
 ENCODER = rtcan.message_id(5, MOTOR)
@@ -66,7 +66,7 @@ def played(vcan: str, tmp_path: Path) -> Iterator[str]:
 
 
 def command(*arguments: str) -> int:
-    """`r2p bus` with these arguments; its exit code."""
+    """Run `r2p bus` with these arguments. Returns its exit code."""
     with pytest.raises(SystemExit) as ended:
         app(["bus", *arguments], prog_name="r2p")
     code = ended.value.code
@@ -108,7 +108,7 @@ def test_the_load(played: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_frames_of_others_are_in_the_load(vcan: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """As `canbusload` has it: 11-bit identifiers and remote frames take their time on the bus, too."""
+    """As in `canbusload`: frames with 11-bit identifiers and remote frames occupy the bus, too."""
     players = [
         subprocess.Popen(("cangen", vcan, *kind, "-g", "20", "-L", "8"))
         for kind in (("-I", "123"), ("-I", "124", "-R"), ("-e", "-R"), ("-e",))

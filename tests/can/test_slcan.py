@@ -1,4 +1,4 @@
-"""A CAN adapter on a serial line: slcand makes a kernel interface of one end of it; a program has the other."""
+"""A CAN adapter on a serial line: slcand makes an interface of one end, and a program has the other."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ async def program(*command: str) -> AsyncIterator[None]:
 
 @contextlib.asynccontextmanager
 async def adapter(device: str) -> AsyncIterator[str]:
-    """A CAN interface that is up, of a serial device."""
+    """Make a CAN interface of a serial device, and set it up."""
     async with program("slcand", "-F", "-o", "-s8", device, "slcan0"):
         await until(lambda: netlink.find_interface("slcan0"))
         ip("set", "slcan0", "up")

@@ -42,7 +42,7 @@ def queue(name: str, *arguments: str) -> None:
 
 
 CLOCKS = 100 * MS
-"""Stamps are by another clock than the port's: what may come between reading one and the other."""
+"""Ns that may pass between reading the clock of the stamps and reading the port's."""
 
 
 async def test_candump_prints_what_is_sent(vcan: str) -> None:
@@ -350,7 +350,7 @@ async def deaf_port(
 async def test_one_try_that_failed(
     kind: int, data: str, outcome: Outcome, vcan: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The next frame is handed over only then: nobody else can be meant."""
+    """The next frame is handed over only afterwards, so the error frame must be about this one."""
     monkeypatch.setattr(socketcan, "CONFIRM_TIMEOUT_ONE_SHOT_NS", 3600_000 * MS)
     async with Candump(vcan) as candump, deaf_port(vcan, one_shot=True, monkeypatch=monkeypatch) as (port, listener):
         port.transmit(order(SRT))

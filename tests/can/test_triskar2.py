@@ -25,7 +25,7 @@ from r2p.transports.can import rawsocket
 pytestmark = [pytest.mark.can, pytest.mark.virtual_time]
 
 SLOTS = "slots=20,cycle=20ms"
-"""Slots that a port of SocketCAN trusts itself to hold."""
+"""Slots that a port of SocketCAN holds."""
 SIDE, SPEED = 0.6, 0.5  # m, m/s
 LEG = SIDE / SPEED + REST  # seconds
 SLOTTED = {"encoder1", "encoder2", "encoder3", "speed"}
@@ -33,7 +33,7 @@ SLOTTED = {"encoder1", "encoder2", "encoder3", "speed"}
 
 @pytest.fixture
 def _virtual_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kernel stamps frames with the computer's time, which is not the robot's: take when they were read instead."""
+    """The kernel stamps frames with the computer's time, not the robot's: use the time when they were read."""
 
     def now() -> int:
         return clock_of().monotonic()
@@ -42,7 +42,7 @@ def _virtual_stamps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def counted(interface: str, what: str) -> int:
-    """A counter of the kernel's."""
+    """A counter of the kernel."""
     return int(Path(f"/sys/class/net/{interface}/statistics/{what}").read_text(encoding="ascii"))
 
 

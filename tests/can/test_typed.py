@@ -1,4 +1,4 @@
-"""Typed topics on SocketCAN, with a firmware module made of python-can alone, cansend's frames, and candump's eyes."""
+"""Typed topics on SocketCAN, with a firmware module made of python-can alone, cansend and candump."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Long(r2p.Message):
 
 
 class Firmware:
-    """A module with one topic, on a socket of python-can's."""
+    """A module with one topic, on a socket of python-can."""
 
     def __init__(self, name: str) -> None:
         self._bus = can.Bus(interface="socketcan", channel=name)
@@ -53,7 +53,7 @@ class Firmware:
         self.send(MANAGEMENT, management.encode(said))
 
     async def message(self) -> tuple[int, bytes]:
-        """The next one on the bus: its id, and its bytes."""
+        """The next message on the bus: its id and its bytes."""
         while True:
             frame = await self._reader.get_message()
             message, left = frame.arbitration_id >> 7 & 0xFFFF, frame.arbitration_id & 0x7F
@@ -78,7 +78,7 @@ class Firmware:
 
 @contextlib.asynccontextmanager
 async def network(name: str) -> AsyncIterator[tuple[r2p.Node, Firmware]]:
-    """A node of ours, and the other module."""
+    """A node of r2p, and the firmware module."""
     firmware = Firmware(name)
     try:
         async with r2p.Module("PC", via=f"rtcan:{name},profile=firmware-2014", watchdog=False) as module:
@@ -89,7 +89,7 @@ async def network(name: str) -> AsyncIterator[tuple[r2p.Node, Firmware]]:
 
 
 def filters(name: str) -> dict[tuple[int, int], int]:
-    """What the kernel passes to programs with filters: (identifier, mask), and how many frames it was so far."""
+    """The kernel's filters, as (identifier, mask), and how many frames each has passed so far."""
     lines = [line.split() for line in Path("/proc/net/can/rcvlist_fil").read_text(encoding="ascii").splitlines()]
     return {
         (int(line[1], 16) & 0x1FFFFFFF, int(line[2], 16) & 0x1FFFFFFF): int(line[5])
@@ -99,7 +99,7 @@ def filters(name: str) -> dict[tuple[int, int], int]:
 
 
 async def publishes(firmware: Firmware, topic: str, size: int) -> None:
-    """The firmware has a topic, and somebody subscribes it."""
+    """The firmware publishes a topic, and a node subscribes it."""
     await firmware.heard(management.Alive)
     firmware.manage(management.Advertise(topic, size))
     await firmware.heard(management.SubscribeRequest, topic)
@@ -107,7 +107,7 @@ async def publishes(firmware: Firmware, topic: str, size: int) -> None:
 
 
 async def subscribes(firmware: Firmware, topic: str, size: int) -> management.SubscribeResponse:
-    """The firmware hears of a topic, and subscribes it."""
+    """The firmware receives an ADVERTISE, and subscribes the topic."""
     await firmware.heard(management.Advertise, topic)
     firmware.manage(management.SubscribeRequest(topic, size, 5))
     return await firmware.heard(management.SubscribeResponse, topic)

@@ -1,4 +1,4 @@
-"""The port to python-can's interfaces: its virtual one, and made ones that fail."""
+"""The port to python-can's interfaces: the virtual one, and broken ones."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ async def test_it_is_opened_again_when_it_failed(method: str, channel: str, monk
 
 
 async def test_a_frame_that_was_not_sent_in_time(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Perhaps it was."""
+    """It may have been sent all the same."""
     monkeypatch.setattr(can, "Bus", Broken(("send", can.CanTimeoutError("full"))))
     port = port_on(channel)
     async with using(port) as listener:

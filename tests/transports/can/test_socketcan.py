@@ -1,4 +1,4 @@
-"""The port to SocketCAN on a socket that is made up; tests/can has real ones."""
+"""The port to SocketCAN on a fake socket; tests/can has real ones."""
 
 from types import SimpleNamespace
 from typing import Any

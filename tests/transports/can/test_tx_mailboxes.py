@@ -12,12 +12,12 @@ CONFIRM_TIMEOUT = 1_000_000
 
 
 class Bus:
-    """A driver's queue, and what the mailboxes say."""
+    """A driver's queue, and the confirmations of the mailboxes."""
 
     def __init__(self, *, one_at_a_time: bool = False) -> None:
         self.queue: list[int] = []
         self.room = True
-        self.said: list[tuple[Mailbox, Outcome, int]] = []
+        self.confirmed: list[tuple[Mailbox, Outcome, int]] = []
         self.boxes = TxMailboxes(
             self._send, self._confirm, latency=LATENCY, confirm_timeout=CONFIRM_TIMEOUT, one_at_a_time=one_at_a_time
         )
@@ -34,7 +34,7 @@ class Bus:
         return self.room
 
     def _confirm(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        self.said.append((mailbox, outcome, at))
+        self.confirmed.append((mailbox, outcome, at))
 
 
 def test_from_the_mailbox_to_the_bus() -> None:
@@ -42,7 +42,7 @@ def test_from_the_mailbox_to_the_bus() -> None:
     bus.put(1000, 7)
     assert (bus.queue, bus.boxes.handed_over) == ([7], [SRT])
     assert bus.seen(7, 2000)
-    assert (bus.said, bus.boxes.next_deadline()) == ([(SRT, Outcome.SENT, 1995)], None)
+    assert (bus.confirmed, bus.boxes.next_deadline()) == ([(SRT, Outcome.SENT, 1995)], None)
     assert not bus.seen(7, 2000)
 
 
@@ -51,7 +51,7 @@ def test_only_the_frame_itself_confirms_it() -> None:
     bus.put(1000, 7)
     assert not bus.seen(8, 2000)
     assert not bus.boxes.seen(7, b"y", 2000, 2000)
-    assert bus.said == []
+    assert bus.confirmed == []
 
 
 def test_it_waits_for_its_instant_less_the_latency() -> None:
@@ -64,19 +64,19 @@ def test_it_waits_for_its_instant_less_the_latency() -> None:
     assert bus.queue == [7]
     bus.boxes.withdraw(5000, SRT)  # too late
     bus.boxes.poll(6001)  # nor does its last instant count any more
-    assert bus.said == []
+    assert bus.confirmed == []
 
 
 def test_too_late() -> None:
     bus = Bus()
     bus.put(1000, 7, last=1099)
     bus.put(1000, 8, HRT, last=1100)
-    assert (bus.queue, bus.said) == ([8], [])  # confirmed at once, the engine would try again at once, without end
+    assert (bus.queue, bus.confirmed) == ([8], [])  # confirmed at once, the engine would try again at once, without end
     due = bus.boxes.next_deadline()
     assert due is not None
     assert due <= 1000
     bus.boxes.poll(1001)
-    assert bus.said == [(SRT, Outcome.LATE, 1001)]
+    assert bus.confirmed == [(SRT, Outcome.LATE, 1001)]
 
 
 def test_withdrawn() -> None:
@@ -85,7 +85,7 @@ def test_withdrawn() -> None:
     bus.boxes.withdraw(2000, HRT)
     bus.boxes.withdraw(2000, SRT)
     bus.boxes.poll(9000)
-    assert (bus.queue, bus.said) == ([], [(SRT, Outcome.LATE, 2000)])
+    assert (bus.queue, bus.confirmed) == ([], [(SRT, Outcome.LATE, 2000)])
 
 
 def test_no_room_is_tried_again_until_it_is_too_late() -> None:
@@ -97,7 +97,7 @@ def test_no_room_is_tried_again_until_it_is_too_late() -> None:
     bus.boxes.poll(RETRY_INTERVAL)
     assert bus.boxes.next_deadline() == 2 * RETRY_INTERVAL - LATENCY + 1
     bus.boxes.poll(2 * RETRY_INTERVAL - LATENCY + 1)
-    assert bus.said == [(NRT, Outcome.LATE, 2 * RETRY_INTERVAL - LATENCY + 1)]
+    assert bus.confirmed == [(NRT, Outcome.LATE, 2 * RETRY_INTERVAL - LATENCY + 1)]
     bus.room = True
     bus.boxes.poll(2 * RETRY_INTERVAL)
     assert bus.queue == [7]
@@ -108,9 +108,9 @@ def test_a_confirmation_that_stays_away_is_no_reason_to_send_again() -> None:
     bus.put(1000, 7)
     assert bus.boxes.next_deadline() == 1000 + CONFIRM_TIMEOUT
     bus.boxes.poll(999 + CONFIRM_TIMEOUT)
-    assert bus.said == []
+    assert bus.confirmed == []
     bus.boxes.poll(1000 + CONFIRM_TIMEOUT)
-    assert (bus.queue, bus.said) == ([7], [(SRT, Outcome.UNKNOWN, 1000 + CONFIRM_TIMEOUT)])
+    assert (bus.queue, bus.confirmed) == ([7], [(SRT, Outcome.UNKNOWN, 1000 + CONFIRM_TIMEOUT)])
     assert not bus.seen(7, 3 * CONFIRM_TIMEOUT)
 
 
@@ -133,7 +133,7 @@ def test_one_at_a_time_the_most_urgent_goes_next() -> None:
     bus.boxes.poll(1000)
     bus.boxes.failed(HRT, Outcome.LOST, 1200)
     bus.boxes.failed(HRT, Outcome.LOST, 1200)
-    assert bus.said[1:] == [(SRT, Outcome.LATE, 1000), (HRT, Outcome.LOST, 1200)]
+    assert bus.confirmed[1:] == [(SRT, Outcome.LATE, 1000), (HRT, Outcome.LOST, 1200)]
     assert bus.boxes.next_deadline() is None
 
 
@@ -143,7 +143,7 @@ def test_when_the_bus_is_gone_so_are_the_frames() -> None:
     bus.boxes.clear()
     assert not bus.seen(1, 10)
     bus.put(20, 2)
-    assert (bus.queue, bus.said) == ([1, 2], [])
+    assert (bus.queue, bus.confirmed) == ([1, 2], [])
 
 
 def test_the_next_frame_may_be_put_while_one_is_confirmed() -> None:
@@ -151,7 +151,7 @@ def test_the_next_frame_may_be_put_while_one_is_confirmed() -> None:
     numbers = iter(range(2, 5))
 
     def confirm(mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        bus.said.append((mailbox, outcome, at))
+        bus.confirmed.append((mailbox, outcome, at))
         number = next(numbers, None)
         if number is not None:
             boxes.put(at, Transmit(Frame(number, b""), mailbox, 0, 500))
@@ -163,4 +163,4 @@ def test_the_next_frame_may_be_put_while_one_is_confirmed() -> None:
     boxes.poll(900)
     boxes.poll(900)
     assert bus.queue == [1, 2]
-    assert [outcome for _, outcome, _ in bus.said] == [Outcome.SENT, Outcome.SENT, Outcome.LATE, Outcome.LATE]
+    assert [outcome for _, outcome, _ in bus.confirmed] == [Outcome.SENT, Outcome.SENT, Outcome.LATE, Outcome.LATE]

@@ -1,4 +1,4 @@
-"""Modules on a simulated CAN bus, and a look at what really went over it."""
+"""Modules on a simulated CAN bus, and all frames that were on it."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -56,7 +56,7 @@ class Lab:
         return self._modules[module]
 
     def sent(self, accept: Callable[[rtcan.Identifier], bool], module: str = "") -> list[FrameRecord]:
-        """Frames of one sender (of all) that got through."""
+        """Frames that were sent without an error, by one module or by all."""
         return [
             each
             for each in self.frames

@@ -1,4 +1,4 @@
-"""The loop around an engine, on a port that answers at once."""
+"""The loop that drives an engine, on a port that confirms at once."""
 
 import asyncio
 import operator
@@ -114,7 +114,7 @@ async def test_it_polls_when_the_engine_wants() -> None:
 
 
 async def test_a_port_that_confirms_at_once_and_an_owner_that_publishes_at_once() -> None:
-    """Each waits for its turn: a message of many frames goes out whole, and in order."""
+    """What they bring about waits for its turn: a message of many frames goes out whole, and in order."""
     driver, port, owner = make()
     payload = bytes(range(100))
     owner.on_ready = lambda: driver.carry_out(driver.engine.publish(port.now(), 0x42, payload, handle="bulk"))

@@ -1,4 +1,4 @@
-"""What a program publishes in its last moments, a `finally` that stops the motor, reaches its subscribers."""
+"""The last messages of a program, such as those of a `finally` that stops the motor, reach their subscribers."""
 
 import asyncio
 

@@ -286,7 +286,7 @@ async def test_publishers_of_a_topic_share_a_high_byte() -> None:
 
 
 async def test_stop_is_urgent() -> None:
-    """It gets through while others send as much as they can."""
+    """It arrives while others send as much as they can."""
 
     async def flood(node: r2p.Node) -> None:
         publisher = node.advertise("flood", Led, r2p.NonRealTime(stall=10.0))

@@ -1,4 +1,4 @@
-"""All modules of a robot are switched on at once, and have much to say."""
+"""All modules of a robot are switched on at once, and have much to announce."""
 
 import asyncio
 import logging
