@@ -131,7 +131,7 @@ class BusMonitor:
     @property
     def timing(self) -> Timing:
         """The slots of the cycle: those that the master announces, else those of the URL."""
-        return self._monitor.census.timing
+        return self._monitor.directory.timing
 
     @property
     def slots(self) -> list[BusSlot]:
@@ -174,10 +174,10 @@ class BusMonitor:
         if (left := end - self._now()) > 0:
             await self._sleep(left)
         quiet = 0
-        while self._monitor.heard < end and quiet < _QUIET_CHECKS:
-            heard, before = self._monitor.heard, self._now()
+        while self._monitor.last_frame < end and quiet < _QUIET_CHECKS:
+            last, before = self._monitor.last_frame, self._now()
             late = await self._sleep(_CHECK_INTERVAL)
-            quiet = quiet + 1 if self._monitor.heard == heard and before >= end and late < _STALLED else 0
+            quiet = quiet + 1 if self._monitor.last_frame == last and before >= end and late < _STALLED else 0
 
     async def _sleep(self, duration: int) -> int:
         """Sleep for so many ns. Returns by how many ns it woke up late."""

@@ -16,7 +16,7 @@ from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Granted, Ready
+from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Ready, SlotsGranted
 from r2p.sim import run
 from r2p.sim.can import CanBus, CanNode, FrameRecord, Latency
 from r2p.sim.transport import SimCan, SimPort
@@ -154,7 +154,7 @@ class Node:
         latency = Latency(_LATENCY, scenario.jitter)
         offset, drift = numbers.randrange(SECOND), numbers.uniform(-scenario.ppm, scenario.ppm)
         self.name = name
-        self.grants: dict[int, Granted] = {}
+        self.grants: dict[int, SlotsGranted] = {}
         node = CanNode(name, one_shot=True, offset=offset, drift_ppm=drift, transmit=latency, receive=latency)
         self.port = SimPort(shared, node)
         self.engine = Engine(
@@ -190,7 +190,7 @@ class Node:
         if isinstance(action, Due):
             data = self._data(self._sizes[action.high])
             self.driver.carry_out(self.engine.fill(self.driver.now(), action.high, data))
-        elif isinstance(action, Granted):
+        elif isinstance(action, SlotsGranted):
             self.grants[action.high] = action
         elif isinstance(action, Ready):
             self.driver.update_filters()

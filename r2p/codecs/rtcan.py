@@ -1,10 +1,13 @@
 """RTCAN on the wire: identifiers, fragments, the sync frame, and how many bits a frame takes (PROTOCOL.md 6).
 
-    bits 28..23 laxity | 22..7 message id: high byte the topic, low byte the module's id8 | 6..0 fragments left
+    bits 28..23 laxity | 22..15 high byte: the topic | 14..7 id8: the module | 6..0 fragments left
+                       | 22..7 message id                                    |
 
-A frame's length in bits depends on its content: after five equal bits the controller stuffs in a sixth, other one, and
-the CRC is stuffed, too. Counting is done a byte at a time: a table says for each state of the stuffing (which bit came
-last, how often) and each byte which state is next and how many bits were stuffed in.
+This module alone knows the layout of an identifier: hot paths elsewhere shift and mask with the constants below.
+
+A frame's length in bits depends on its content: after five equal bits the controller stuffs in a sixth, opposite one,
+also in the CRC. Bits are counted a byte at a time: a table has for each state of the stuffing (which bit came last, how
+often) and each byte the next state and how many bits were stuffed in.
 """
 
 from functools import lru_cache
@@ -27,9 +30,19 @@ SYNC = 0x00  # high bytes of message ids that are not topics
 MANAGEMENT = 0x01
 FIRST_TOPIC = 0x02
 FIRMWARE_MANAGEMENT = 0x0000  # the message id of management of every module of 2014
-MESSAGE_MASK = 0xFFFF << 7  # a filter for one message id looks at these bits of the identifier
 
-LEFT_MASK = 0x7F  # the bits of the identifier that say how many fragments come after this one
+IDENTIFIER_BITS = 29
+LAXITY_SHIFT = 23
+HIGH_SHIFT = 15
+MESSAGE_SHIFT = 7  # also of the id8, the low byte of the message id
+HIGH_MAX = ID8_MAX = 0xFF  # all ones: also the masks of these fields after shifting
+MESSAGE_MAX = 0xFFFF
+LEFT_MASK = 0x7F
+HIGH_MASK = HIGH_MAX << HIGH_SHIFT  # filters look at these bits of the identifier
+ID8_MASK = ID8_MAX << MESSAGE_SHIFT
+MESSAGE_MASK = MESSAGE_MAX << MESSAGE_SHIFT
+NOT_SYNC = ~ID8_MASK  # a sync frame has none of these bits: it has the cycle counter in place of an id8
+CYCLE_MASK = 0xFF  # a sync frame carries these bits of the cycle counter
 
 INTERMISSION = 3  # bits between two frames
 TAIL = 10  # bits after the CRC, never stuffed: CRC delimiter, ACK slot, ACK delimiter, end of frame
@@ -46,7 +59,7 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
 
 
 class Identifier(msgspec.Struct, frozen=True, gc=False):
-    """What the 29 bits say: laxity 0..63, message id 0..0xFFFF, fragments that come after this one 0..127."""
+    """The parts of an identifier: laxity 0..63, message id 0..0xFFFF, fragments that come after this one 0..127."""
 
     laxity: int
     message: int
@@ -54,7 +67,7 @@ class Identifier(msgspec.Struct, frozen=True, gc=False):
 
 
 class OtherFrame(msgspec.Struct, frozen=True):
-    """A frame that RTCAN does not use: with an 11-bit identifier, or `remote`, which asks for so many bytes."""
+    """A frame that RTCAN does not use: with an 11-bit identifier, or a remote frame, which asks for `remote` bytes."""
 
     id: int
     data: bytes = b""
@@ -63,41 +76,66 @@ class OtherFrame(msgspec.Struct, frozen=True):
 
 
 class Sync(msgspec.Struct, frozen=True, gc=False):
-    """What starts a cycle: its counter mod 256, and a mask in which bit i says that slot i is reserved."""
+    """The frame that starts a cycle: its counter mod 256, and a mask in which bit i says that slot i is reserved."""
 
     cycle: int
     mask: int
 
 
 def encode_identifier(laxity: int, message: int, left: int = 0) -> int:
-    """The 29 bits. Raises `MessageError` when a part does not fit its field."""
-    if not (0 <= laxity <= NRT and 0 <= message <= 0xFFFF and 0 <= left <= 0x7F):
+    """The identifier of a frame. Raises `MessageError` when a part does not fit its field."""
+    if not (0 <= laxity <= NRT and 0 <= message <= MESSAGE_MAX and 0 <= left <= LEFT_MASK):
         raise MessageError(f"laxity {laxity}, message id {message:#x}, {left} fragments left: no identifier has room")
-    return laxity << 23 | message << 7 | left
+    return laxity << LAXITY_SHIFT | message << MESSAGE_SHIFT | left
 
 
 def decode_identifier(identifier: int) -> Identifier:
-    """The parts of 29 bits. Raises `DecodeError` for more."""
-    if identifier >> 29:
+    """The parts of an identifier. Raises `DecodeError` for more than 29 bits."""
+    if identifier >> IDENTIFIER_BITS:
         raise DecodeError(f"{identifier:#x} has more than 29 bits")
-    return Identifier(identifier >> 23, identifier >> 7 & 0xFFFF, identifier & 0x7F)
+    return Identifier(laxity_of(identifier), message_of(identifier), identifier & LEFT_MASK)
+
+
+def laxity_of(identifier: int) -> int:
+    """The laxity in an identifier."""
+    return identifier >> LAXITY_SHIFT
+
+
+def message_of(identifier: int) -> int:
+    """The message id in an identifier."""
+    return identifier >> MESSAGE_SHIFT & MESSAGE_MAX
+
+
+def high_filter(high: int) -> tuple[int, int]:
+    """The identifier and the mask of a filter for all messages with this high byte."""
+    return high << HIGH_SHIFT, HIGH_MASK
+
+
+def id8_filter(id8: int) -> tuple[int, int]:
+    """The identifier and the mask of a filter for all messages of the module `id8`."""
+    return id8 << MESSAGE_SHIFT, ID8_MASK
+
+
+def message_filter(message: int) -> tuple[int, int]:
+    """The identifier and the mask of a filter for one message id."""
+    return message << MESSAGE_SHIFT, MESSAGE_MASK
 
 
 def message_id(high: int, id8: int) -> int:
     """The id of a topic (or SYNC, MANAGEMENT) at the module `id8`. Raises `MessageError` beyond a byte each."""
-    if not (0 <= high <= 0xFF and 0 <= id8 <= 0xFF):
+    if not (0 <= high <= HIGH_MAX and 0 <= id8 <= ID8_MAX):
         raise MessageError(f"high byte {high}, id8 {id8}: each is a byte")
     return high << 8 | id8
 
 
 def high_byte(message: int) -> int:
-    """Which topic of its module a message id names."""
+    """The high byte of a message id: the topic."""
     return message >> 8
 
 
 def id8_of(message: int) -> int:
-    """Which module a message id names."""
-    return message & 0xFF
+    """The low byte of a message id: the module."""
+    return message & ID8_MAX
 
 
 def srt_laxity(remaining: int) -> int:
@@ -126,39 +164,39 @@ def fragments(payload: bytes) -> list[tuple[int, bytes]]:
 
 
 def encode_sync(cycle: int, mask: int) -> Frame:
-    """The frame that starts a cycle; of the counter 8 bits are left. Raises `MessageError` for a slot beyond 63."""
+    """The sync frame, with the lowest 8 bits of the counter. Raises `MessageError` for a slot beyond 63."""
     if mask & ~_ALL_SLOTS:
         raise MessageError(f"reservation mask {mask:#x}: a cycle has at most {SLOTS_MAX} slots")
-    return Frame((cycle & 0xFF) << 7, mask.to_bytes(8, "little"))
+    return Frame((cycle & CYCLE_MASK) << MESSAGE_SHIFT, mask.to_bytes(FRAME_MAX, "little"))
 
 
 def decode_sync(frame: Frame) -> Sync:
-    """What the master says. Raises `DecodeError` when this is no sync frame."""
+    """What the master says. Raises `DecodeError` when this is not a sync frame."""
     if not is_sync(frame.id) or len(frame.data) != FRAME_MAX:
-        raise DecodeError(f"{frame.id:#010x} with {len(frame.data)} bytes is no sync frame")
-    return Sync(frame.id >> 7, int.from_bytes(frame.data, "little"))
+        raise DecodeError(f"{frame.id:#010x} with {len(frame.data)} bytes is not a sync frame")
+    return Sync(message_of(frame.id), int.from_bytes(frame.data, "little"))
 
 
 def is_sync(identifier: int) -> bool:
-    """Laxity 0, high byte 0, no fragments left. With another laxity it is management of firmware without HRT."""
-    return not identifier & ~(0xFF << 7)
+    """Whether it is of a sync: laxity 0, high byte 0, no fragments left. Firmware may send management like that."""
+    return not identifier & NOT_SYNC
 
 
 def frame_bits_min(size: int) -> int:
-    """No frame with `size` bytes of data is shorter: nothing stuffed in. Without intermission."""
+    """The bits of the shortest frame with `size` bytes of data: nothing stuffed in. Without intermission."""
     return _HEADER + 8 * size + _CRC + TAIL
 
 
 def frame_bits_max(size: int) -> int:
-    """No frame with `size` bytes of data is longer: after the first bit, every fourth has one stuffed in."""
+    """The bits of the longest frame with `size` bytes of data: after the first bit, every fourth has one stuffed in."""
     return frame_bits_min(size) + (_HEADER + 8 * size + _CRC - 1) // 4
 
 
-@lru_cache(maxsize=64)  # whoever deals with one frame asks at about the same time
+@lru_cache(maxsize=64)  # all that deal with one frame ask at about the same time
 def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
-    """How many bits a data frame takes from its start to its end, those stuffed in included, without intermission.
+    """The bits of a data frame from its start to its end, those stuffed in included, without intermission.
 
-    `extended=False` is for frames with 11-bit identifiers, which only others send. Raises `MessageError` when the
+    `extended=False` is for frames with 11-bit identifiers, which RTCAN does not send. Raises `MessageError` when the
     identifier or the data are too long.
     """
     row, crc, bits = _header(identifier, len(data), extended)
@@ -184,10 +222,10 @@ def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
 
 
 def other_frame_bits(frame: OtherFrame) -> int:
-    """How many bits a frame takes that RTCAN does not use, as `frame_bits`. Raises `MessageError` as that does."""
+    """The bits of a frame that RTCAN does not use, and errors, as for `frame_bits`."""
     if frame.remote is None:
         return frame_bits(frame.id, frame.data, extended=frame.extended)
-    if frame.id >> (29 if frame.extended else 11) or not 0 <= frame.remote <= 0xF:
+    if frame.id >> (IDENTIFIER_BITS if frame.extended else 11) or not 0 <= frame.remote <= 0xF:
         raise MessageError(f"identifier {frame.id:#x}, {frame.remote} bytes asked for: no frame has room")
     bits = (_arbitration(frame.id) if frame.extended else frame.id) << 7 | _REMOTE | frame.remote
     count = (_HEADER if frame.extended else _STANDARD_HEADER) + _CRC
@@ -200,7 +238,9 @@ def bits_until_lost(winner: int, loser: int) -> int:
     Both are 29-bit identifiers, `winner` the lower one.
     """
     bit = (winner ^ loser).bit_length() - 1
-    before = 29 - bit if bit > 17 else 31 - bit  # SRR and IDE are sent between bits 18 and 17
+    before = IDENTIFIER_BITS - bit
+    if bit <= 17:
+        before += 2  # SRR and IDE are sent between bits 18 and 17
     return before + _stuffed(_arbitration(winner) >> 32 - before, before) + 1
 
 
@@ -243,7 +283,7 @@ def _stuffed(bits: int, count: int) -> int:
 @lru_cache(maxsize=4096)
 def _header(identifier: int, size: int, extended: bool) -> tuple[_Row, int, int]:
     """What the bits before the data leave: state of the stuffing, CRC as if all data were 0, bits so far."""
-    if identifier >> (29 if extended else 11) or size > FRAME_MAX:
+    if identifier >> (IDENTIFIER_BITS if extended else 11) or size > FRAME_MAX:
         raise MessageError(f"identifier {identifier:#x} with {size} bytes: no frame has room")
     bits = _arbitration(identifier) << 7 | size if extended else identifier << 7 | size
     count = _HEADER if extended else _STANDARD_HEADER

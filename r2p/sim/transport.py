@@ -171,19 +171,19 @@ class SimPort(CanPort):
 
     def _sent(self, frame: Frame, stamp: int) -> None:
         if self._user is not None and self._up:
-            self._user.confirmed(_MAILBOXES[frame.id >> 23], _SENT, stamp - self.receive_latency)
+            self._user.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _SENT, stamp - self.receive_latency)
 
     def _lost(self, frame: Frame, stamp: int) -> None:
         if self._user is not None and self._up:
-            self._user.confirmed(_MAILBOXES[frame.id >> 23], _LOST, stamp)
+            self._user.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _LOST, stamp)
 
     def _late(self, frame: Frame, stamp: int) -> None:
-        self._confirm(_MAILBOXES[frame.id >> 23], _LATE, stamp)
+        self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], _LATE, stamp)
 
     def _failed(self, frame: Frame, kind: ErrorKind, stamp: int) -> None:
         if self._user is not None and self._up:
             self._user.fault(kind.value)
-        self._confirm(_MAILBOXES[frame.id >> 23], Outcome.ERROR, stamp)
+        self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], Outcome.ERROR, stamp)
 
     def _confirm(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         if self._user is not None and self._up:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import r2p
 from r2p.codecs.rtcan import (
     FIRMWARE_MANAGEMENT,
     HRT,
@@ -29,9 +33,14 @@ from r2p.codecs.rtcan import (
     frame_bits_max,
     frame_bits_min,
     high_byte,
+    high_filter,
+    id8_filter,
     id8_of,
     is_sync,
+    laxity_of,
+    message_filter,
     message_id,
+    message_of,
     other_frame_bits,
     srt_laxity,
     wire_bits,
@@ -367,3 +376,23 @@ def test_arbitration_is_lost_in_the_first_bit_that_differs(first: int, second: i
     bits = zip(on_the_bus(winner, b""), on_the_bus(loser, b""), strict=False)
     differ = next(i for i, (a, b) in enumerate(bits) if (a, b) == ("0", "1"))
     assert bits_until_lost(winner, loser) == differ + 1
+
+
+def test_the_parts_of_an_identifier() -> None:
+    identifier = encode_identifier(40, 0x1828, 3)
+    assert (laxity_of(identifier), message_of(identifier)) == (40, 0x1828)
+    for value, mask in (high_filter(0x18), id8_filter(0x28), message_filter(0x1828)):
+        assert identifier & mask == value
+        assert encode_identifier(40, 0x1929, 3) & mask != value
+
+
+def test_no_other_module_knows_the_layout_of_an_identifier() -> None:
+    """By its numbers: shifts are named constants of the codec."""
+    numbers = {7, 15, 18, 23, 29}
+    for path in sorted(Path(r2p.__file__).parent.rglob("*.py")):
+        if path.parts[-2:] == ("codecs", "rtcan.py"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.LShift | ast.RShift):
+                amount = node.right.value if isinstance(node.right, ast.Constant) else None
+                assert amount not in numbers, f"{path}:{node.lineno} shifts by {amount}: use r2p.codecs.rtcan"

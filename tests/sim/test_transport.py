@@ -110,9 +110,9 @@ async def test_a_module_that_closes_gives_its_slots_back_and_says_good_bye() -> 
             await publisher.ready(5.0)
             link = b.links[0]
             await asyncio.sleep(0.1)
-            assert link.engine.mask != 1  # type: ignore[attr-defined]
+            assert link.engine.cycle.mask != 1  # type: ignore[attr-defined]
         await asyncio.sleep(0.05)
-        assert link.engine.mask == 1  # type: ignore[attr-defined]
+        assert link.engine.cycle.mask == 1  # type: ignore[attr-defined]
         assert [view.name for view in b.network.modules()] == ["B"]
 
 

@@ -1,17 +1,19 @@
 """RTCAN: real-time publish/subscribe on a CAN bus, as state machines (thesis chapter 4, PROTOCOL.md 6 to 9).
 
-`engine.Engine` is the door; its module says how to drive it. Behind it, each rule has its own file:
+Begin with `engine`: `Engine` is one node, its docstring says how to drive it, and `Engine._update_mode` decides whether
+and how the node may send. Then, in this order:
 
-    laxity       which soft or non real-time message is tried next
-    calendar     which slots belong to whom, at the master
-    leases       asking for slots, granting them, losing them
-    periodic     the node's own calendar: what to do in which slot
-    cycle        slots and cycles by the sync frames, network time
-    sending      the mailboxes, in slots or without
-    reassembly   frames to messages, and what was lost
-    identity     claiming an id8
-    election     who becomes the master
-    network      finding, following and being the master
-    profile      RTCAN or firmware of 2014
-    topics       high bytes for topics
+    events      the values that go in and out of an engine: settings, actions
+    context     what its parts share: timers, counters, actions
+    node_id     claiming an id8
+    network     finding and following a network; master: the election, and being the master
+    management  the management messages of the bus
+    cycle       slots and cycles by the sync frames, network time
+    leases      asking for slots and granting them; calendar: which slots, at the master; plan: the node's own, by slot
+    transmitter which frame leaves when; queue: soft and non real-time messages by laxity
+    reassembly  frames to messages, and what was lost
+    topic_ids   high bytes for topics
+    monitor     watching a bus without sending, for tools
+
+The layout of identifiers is in `r2p.codecs.rtcan`.
 """

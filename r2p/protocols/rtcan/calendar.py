@@ -1,17 +1,14 @@
-"""The calendar of reserved slots at the master: admission and phases of periodic messages.
-
-PROTOCOL.md 6, thesis 4.3.4.
+"""The calendar of reserved slots at the master: which message gets which (PROTOCOL.md 6, thesis 4.3.4).
 
 Slots are counted through: slot s of cycle c is number c * slots + s. A reservation of period p, phase f and k fragments
 owns the numbers f .. f + k - 1 and all that differ from them by a multiple of p. Of every two reservations, the sync's
-included (period: the cycle, phase 0, one slot), one period divides the other: so they meet nowhere if they don't meet
-within the shorter of the two periods. That makes the slots one period has left a number of that many bits.
+included (period: the cycle, phase 0, one slot), one period divides the other: so they share no slot if they share none
+within the shorter of the two periods. So the slots that are free for a period are an integer of that many bits.
 
 Since slot 0 of every cycle is the sync's, the slots of one occurrence never span two cycles.
 """
 
 import enum
-import math
 from collections.abc import Iterator
 
 import msgspec
@@ -20,7 +17,7 @@ from r2p.codecs.rtcan import SLOTS_MAX
 
 LONGEST_PERIOD = 1 << 16
 """In slots: about 11 s in slots of 166 us."""
-_MOST = 1024
+_MOST = 1024  # reservations: each one makes an admission slower
 
 
 class Reservation(msgspec.Struct, frozen=True):
@@ -100,7 +97,7 @@ class Calendar:
     def admit(
         self, message: int, period: int, fragments: int = 1, *, round_down: bool = False
     ) -> Reservation | Refusal:
-        """Reserve slots, from the least possible phase on; `round_down` takes the longest possible period up to this.
+        """Reserve slots, with the least possible phase; `round_down`: with the longest possible period up to this one.
 
         A message that has slots of another period or size gives those back first.
         """
@@ -119,7 +116,7 @@ class Calendar:
         return self._enter(Reservation(message, wanted, phase, fragments))
 
     def readmit(self, reservation: Reservation) -> Reservation | Refusal:
-        """Enter what another master granted, with its phase."""
+        """Enter a reservation that another master granted, with its phase."""
         message, period, phase, fragments = msgspec.structs.astuple(reservation)
         before = self._entries.get(message)
         if before == reservation:
@@ -158,7 +155,7 @@ class Calendar:
         return reservation
 
     def _wanted(self, message: int, period: int, round_down: bool) -> int:
-        """The period, or the longest up to it that goes with all others; the period itself where there is none."""
+        """The period, or the longest up to it that is harmonic with all others; the period itself if there is none."""
         if not round_down or not 1 < period <= LONGEST_PERIOD:
             return period
         others = {each.period for each in self._entries.values() if each.message != message} | {self.slots}
@@ -179,7 +176,7 @@ class Calendar:
 
 
 def occupied(reservation: Reservation, start: int, slots: int) -> int:
-    """The slots of a cycle that begins with number `start` and belong to the reservation, as a mask."""
+    """The slots of the reservation in a cycle that begins with number `start`, as a mask."""
     period, train = reservation.period, (1 << reservation.fragments) - 1
     offset = (reservation.phase - start) % period
     if period >= slots:
@@ -187,19 +184,12 @@ def occupied(reservation: Reservation, start: int, slots: int) -> int:
     return _comb(period, offset, reservation.fragments, slots)
 
 
-def meet(a: Reservation, b: Reservation) -> bool:
-    """Whether two reservations ever own the same slot, whatever their periods are."""
-    step = math.gcd(a.period, b.period)
-    distance = (b.phase - a.phase) % step
-    return distance < a.fragments or step - distance < b.fragments
-
-
 def _harmonic(a: int, b: int) -> bool:
     return a % b == 0 or b % a == 0
 
 
 def _candidates(period: int, slots: int) -> Iterator[int]:
-    """Periods up to this one that go with the cycle, the longest first."""
+    """Periods up to this one that are harmonic with the cycle, the longest first."""
     yield from range(period - period % slots, 0, -slots)
     yield from (divisor for divisor in range(min(period, slots - 1), 1, -1) if slots % divisor == 0)
 
@@ -212,13 +202,14 @@ def _comb(period: int, phase: int, fragments: int, length: int) -> int:
     if period >= length:
         bits = train << phase % length
         return (bits | bits >> length) & (1 << length) - 1
+    # A bit for each occurrence: 1 + 2**p + 2**2p + ... is a geometric series. The product repeats the train there.
     teeth = ((1 << -(-length // period) * period) - 1) // ((1 << period) - 1)
     return (train << phase % period) * teeth & (1 << length) - 1
 
 
 def _first_run(free: int, length: int) -> int | None:
-    """Where the first `length` set bits in a row begin."""
+    """The index of the first `length` set bits in a row."""
     starts = free
     for shift in range(1, length):
-        starts &= free >> shift
+        starts &= free >> shift  # bit i stays set while bits i .. i + shift are free
     return (starts & -starts).bit_length() - 1 if starts else None

@@ -1,9 +1,9 @@
 """Slots and cycles: where this node is in which cycle, by its own clock (PROTOCOL.md 6, thesis 4.3.3).
 
 The reference is the start of frame of the sync in slot 0. The master plans it on a grid of its own clock; if the
-confirmation of its own frame shows that it left later than latencies vary, it takes that. A slave takes it from each
-sync it hears: the reception's stamp, less the exact length of the frame with its stuff bits, less its own calibrated
-latency. A sync that does not come is made up for by the slave's own clock, for at most three cycles.
+confirmation of its own frame shows that it left later than latencies vary, that start counts. A slave has it from each
+sync that it receives: the reception's stamp, less the exact length of the frame with its stuff bits, less its own
+calibrated latency. The slave's own clock bridges syncs that do not come, for at most three cycles.
 
 The first sync of a master that goes on with a network may leave late: then its grid begins where that sync did, and
 moves back from cycle to cycle, so that network time catches up.
@@ -16,16 +16,16 @@ from functools import lru_cache
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import CYCLE_MASK, Frame
 
 HOLDOVER = 3
 """Cycles without a sync that a slave bridges."""
 NO_SLOT = 1 << 16
-"""Behind every slot of a cycle."""
+"""After every slot of a cycle."""
 _CATCH_UP = 64  # part of a slot by which a cycle is shortened while network time catches up
 _IN_TIME = 8_000  # ns between plan and stamp of a sync: two calibrated latencies that vary by +-3 us, and a bit more
-_AMBIGUOUS = 128  # cycles: half of what 8 bits tell
-_DELAYED = 16  # cycles that NETWORK may be ahead of a sync
+_AMBIGUOUS = 128  # cycles: half of what the 8 bits of a sync tell apart
+_DELAYED = 16  # cycles that a sync may be ahead of NETWORK, which waits for a free slot
 _MICROSECOND = 1000
 _SECOND = 1_000_000_000
 
@@ -57,7 +57,7 @@ class CycleState(enum.Enum):
     """How the node knows where in the cycle it is."""
 
     NONE = "no cycle"
-    FOLLOWING = "following"  # the last sync was heard
+    FOLLOWING = "following"  # the last sync was received
     HOLDING = "holding"  # one to three syncs were missed
     LEADING = "leading"  # the node is the master
 
@@ -66,21 +66,21 @@ _NONE = CycleState.NONE  # Python 3.11 takes its time to find a member of an enu
 
 
 class Alignment(enum.Enum):
-    """What a sync frame was good for."""
+    """What a sync frame was to the cycle."""
 
     STARTED = "started"  # there was no cycle before
     RESUMED = "resumed"  # ... but one that was lost goes on, where it should be by now
     ALIGNED = "aligned"
     LATE = "late"  # this cycle has already begun without it
-    REPEATED = "repeated"  # this cycle's sync was already heard
+    REPEATED = "repeated"  # this cycle has its sync already
     FOREIGN = "foreign"  # off the grid, or of another count: another master's
 
 
 class Cycle:
     """The cycle of one node. `mask` None: it is not known which slots of this cycle are free.
 
-    `free` are those of which it is; `next_free` has for each slot the first of them behind it. `counter` is the whole
-    cycle counter once `anchored`; before, only its low 8 bits mean something.
+    `free` are the slots that surely are; `next_free` has for each slot the first of them after it. `counter` is the
+    whole cycle counter once `anchored`; before, only its low 8 bits mean something.
     """
 
     def __init__(self, timing: Timing, receive_latency: int = 0) -> None:
@@ -99,7 +99,7 @@ class Cycle:
         self._first = 0
         self._first_at = 0
         self._length = 0
-        self._widest = 0  # how far a sync was from where the one before it let expect it
+        self._widest = 0  # how far a sync was from where it was expected by the one before it (ns)
 
     @property
     def running(self) -> bool:
@@ -123,31 +123,32 @@ class Cycle:
             return None
         return self.counter * self.timing.cycle + now - self.reference
 
-    # At a slave
+    # Slave
 
-    def heard(self, frame: Frame, stamp: int) -> Alignment:
+    def on_sync(self, frame: Frame, stamp: int) -> Alignment:
         """A sync frame was received; `stamp` is the instant of the reception interrupt."""
         sync = rtcan.decode_sync(frame)
         start = stamp - self._latency - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
         if self.state is _NONE:
             return self._start(start, sync.cycle, sync.mask)
         cycles, off = self._distance(start)
-        if abs(off) > self.timing.slot or cycles < 0 or (self.counter + cycles) & 0xFF != sync.cycle:
+        if abs(off) > self.timing.slot or cycles < 0 or (self.counter + cycles) & CYCLE_MASK != sync.cycle:
             return Alignment.FOREIGN
         if cycles == 0 and self.mask is not None:
             return Alignment.REPEATED
         self.counter += cycles
+        # Over all cycles since the start: the jitter of two stamps, spread over many cycles, does not matter.
         self._length = (start - self._first_at) // max(1, self.counter - self._first)
         self._widest = max(self._widest, abs(off))
         self._follow(start, sync.mask)
         return Alignment.ALIGNED if cycles else Alignment.LATE
 
     def doubt(self) -> None:
-        """The mask of this cycle can't be true: it is not known which slots are free, unless another sync tells."""
-        self._reserve(None)
+        """Distrust the mask of this cycle: which slots are free is not known, unless another sync tells."""
+        self._set_mask(None)
 
     def measured(self) -> tuple[int, int] | None:
-        """The length of a cycle by the syncs heard since it started, and how far off that may be as they jitter (ns).
+        """The length of a cycle by the syncs since it started, and how far off that may be as they jitter (ns).
 
         None before there are two.
         """
@@ -155,21 +156,21 @@ class Cycle:
             return None
         return self._length, 2 * self._widest // max(1, self.counter - self._first)
 
-    def roll(self) -> bool:
-        """The next cycle began without a sync. False: that is one too many, the cycle is lost."""
+    def bridge(self) -> bool:
+        """Begin the next cycle without a sync. False: that is one too many, the cycle is lost."""
         self.missed += 1
         if self.missed > HOLDOVER:
             self.stop()
             return False
-        self.state = CycleState.HOLDING
+        self.state = CycleState.HOLDING  # own slots go on; no slot is free, as its mask is not known
         self.counter += 1
         self.reference += self.timing.cycle
         self._grid = self.reference
-        self._reserve(None)
+        self._set_mask(None)
         return True
 
     def anchor(self, counter: int) -> bool:
-        """NETWORK told a whole counter, of this cycle or a bit earlier. Says whether ours was another one."""
+        """Use the whole counter in a NETWORK, of this cycle or a bit earlier. Says whether ours was another one."""
         whole = _nearest(counter, self.counter, _DELAYED)
         changed = self.anchored and whole != self.counter
         self._first += whole - self.counter
@@ -180,10 +181,10 @@ class Cycle:
     def stop(self) -> None:
         """There is no cycle any more."""
         self.state = CycleState.NONE
-        self._reserve(None)
+        self._set_mask(None)
         self._length = 0
 
-    # At the master
+    # Master
 
     def upcoming(self, now: int) -> tuple[int, int]:
         """Start and count of the next cycle: the grid and the counter of before go on, if there were any."""
@@ -192,32 +193,32 @@ class Cycle:
         cycles = -(-(now - self._grid) // self.timing.cycle)
         return self._grid + cycles * self.timing.cycle, self.counter + cycles
 
-    def late(self, by: int) -> bool:
+    def delay(self, by: int) -> bool:
         """The first sync of a network that goes on has left `by` ns late. False: too late for its count.
 
-        Then network time can't catch up any more.
+        Then network time can't catch up any more, and a new network begins.
         """
         self._behind += by
         return 2 * self._behind < self.timing.cycle
 
     def lead(self, start: int, counter: int, mask: int | None, *, anew: bool = False) -> None:
-        """Be the master, from the cycle on that began there; `anew`: of a network that was not there before."""
+        """Be the master, from the cycle on that began at `start`; `anew`: of a network that was not there before."""
         self.state = CycleState.LEADING
         self.reference = self._grid = start
         if anew:
             self._behind = 0
         self.counter = counter
-        self._reserve(mask)
+        self._set_mask(mask)
         self.anchored = True
         self.missed = 0
 
     def advance(self, mask: int) -> Frame:
-        """The next cycle begins: its sync frame."""
+        """Begin the next cycle; its sync frame comes back."""
         self.counter += 1
         self.reference = self.end
         self._behind -= self._grid + self.timing.cycle - self.reference
         self._grid = self.reference
-        self._reserve(mask)
+        self._set_mask(mask)
         return rtcan.encode_sync(self.counter, mask)
 
     @property
@@ -225,20 +226,21 @@ class Cycle:
         """When the master's next cycle begins."""
         return self._grid + self.timing.cycle - min(self._behind, self._slot // _CATCH_UP)
 
-    def left(self, frame: Frame, at: int) -> None:
-        """The master's sync was on the bus until `at`. If it left late, all are late with it, and so is the master.
+    def on_sync_sent(self, frame: Frame, at: int) -> None:
+        """The master's sync was on the bus until `at`. If it left late, its slaves are late with it, and so is it.
 
-        What the jitter of latencies explains moves nothing: the plan is as good a guess as the stamp, and, unlike that,
-        the slots of the next cycle are just one cycle later.
+        What the jitter of latencies explains moves nothing: the plan is as good a guess as the stamp, and keeps the
+        slots of the next cycle exactly one cycle later.
         """
         start = at - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
-        if _IN_TIME < start - self._grid <= self._slot and frame.id >> 7 == self.counter & 0xFF:
+        ours = rtcan.message_of(frame.id) == self.counter & CYCLE_MASK  # it may be confirmed in the next cycle
+        if ours and _IN_TIME < start - self._grid <= self._slot:
             self.reference = start
 
     def _start(self, start: int, low: int, mask: int) -> Alignment:
         cycles, off = self._distance(start)
         counter = self.counter + cycles
-        resumed = self.anchored and counter & 0xFF == low and abs(off) <= self.timing.slot
+        resumed = self.anchored and counter & CYCLE_MASK == low and abs(off) <= self.timing.slot
         self.counter = _nearest(counter, low, _AMBIGUOUS) if self.anchored else low
         self._follow(start, mask)
         self._first, self._first_at, self._widest = self.counter, start, 0
@@ -248,10 +250,10 @@ class Cycle:
         self.state = CycleState.FOLLOWING
         self.reference = self._grid = start
         self._behind = 0
-        self._reserve(mask)
+        self._set_mask(mask)
         self.missed = 0
 
-    def _reserve(self, mask: int | None) -> None:
+    def _set_mask(self, mask: int | None) -> None:
         if mask != self.mask:
             self.mask = mask
             self.free, self.next_free = _free(mask, self.timing.slots)
@@ -263,21 +265,21 @@ class Cycle:
 
 
 def following(chosen: Container[int], slots: int) -> list[int]:
-    """For each slot from 0 to `slots`: the first one behind it that is chosen, up to `slots`; else NO_SLOT."""
-    behind = [NO_SLOT]
+    """For each slot from 0 to `slots`: the first one after it that is chosen, up to `slots`; else NO_SLOT."""
+    after = [NO_SLOT]
     for slot in range(slots, 0, -1):
-        behind.append(slot if slot in chosen else behind[-1])
-    return behind[::-1]
+        after.append(slot if slot in chosen else after[-1])
+    return after[::-1]
 
 
 @lru_cache(maxsize=64)  # few masks come, again and again
 def _free(mask: int | None, slots: int) -> tuple[frozenset[int], list[int]]:
-    """The slots that this mask leaves free, and which one is next behind each slot."""
+    """The slots that this mask leaves free, and which one is next after each slot."""
     free = frozenset() if mask is None else frozenset(slot for slot in range(1, slots) if not mask >> slot & 1)
     return free, following(free, slots)
 
 
 def _nearest(counter: int, low: int, before: int) -> int:
     """The counter with the low 8 bits of `low` that is next to this one: up to `before` it, or else after it."""
-    nearest = counter + ((low - counter + before) & 0xFF) - before
-    return nearest if nearest >= 0 else nearest + 256
+    nearest = counter + ((low - counter + before) & CYCLE_MASK) - before
+    return nearest if nearest >= 0 else nearest + CYCLE_MASK + 1

@@ -1,23 +1,23 @@
-"""RTCAN as one state machine (PROTOCOL.md 6 to 9): frames and time go in, frames, messages and news come out.
+"""RTCAN as one state machine (PROTOCOL.md 6 to 9): frames and time go in; frames, messages and events come out.
 
-It does no I/O and reads no clock; the same code runs on the simulated bus, on SocketCAN and in a unit test. What a
-transport has to do to drive it:
+It does no I/O and reads no clock; the same code runs on the simulated bus, on SocketCAN and in unit tests. To drive it,
+a transport does this:
 
 1. Make it from `EngineSettings`; `number` must be 64 random bits. Call `start` when the bus works, `stop` when not.
-2. Every call takes `now`, the node's monotonic clock in ns, and gives back what to do, in order. After every call, set
-   one timer to `next_deadline()` and call `poll` then. In slots, "then" is the start of a slot less
-   `transmit_latency`: whoever comes late enough misses it.
+2. Every call takes `now`, the node's monotonic clock in ns, and returns the actions to carry out, in order. After every
+   call, set one timer to `next_deadline()` and call `poll` then. In slots, "then" is the start of a slot less
+   `transmit_latency`: a call that is late enough misses the slot.
 3. `Transmit`: put the frame into that mailbox, so that its start of frame is not before `not_before`, and not after
    `not_after`: by then a frame that has not started is aborted. Mailboxes hold one frame and never get a second one.
    `Withdraw`: abort it if it has not started. For each `Transmit` call `confirm` exactly once, with what became of
    the frame and when it was over: SENT when its own frame was seen on the bus; LOST in arbitration, on a one-shot
    controller only; LATE when aborted, or not handed over in time; ERROR when given up after a bus error; UNKNOWN when
-   no news came, and it may have been sent. One-shot controllers give every try a fresh laxity. On others the laxity is
-   that of the hand-over, until the frame is sent or aborted: say so in `guarantees`.
+   there was no confirmation, and it may have been sent. One-shot controllers give every try a fresh laxity. On others
+   the laxity is that of the hand-over, until the frame is sent or aborted: say so in `guarantees`.
 4. `receive` every frame of others, never the own ones, with the instant (by the same clock) of the reception interrupt,
    that is the end of the frame plus `receive_latency`. Sync frames must not wait behind a long queue. `filters` says
    which frames are needed; it changes with `Ready`, `IdConflict`, and subscriptions.
-5. After `Ready`, and not before, `publish`, `manage`, `reserve` and let discovery speak. `topics.HighBytes` picks the
+5. After `Ready`, and not before, `publish`, `manage`, `reserve`, and start discovery. `TopicIdAllocator` picks the
    high byte of a topic; its message id is `message_id(high, engine.id8)` and goes into the SUBSCRIBE_RESPONSE.
    `IdConflict` with `yielded` takes all that back until the next `Ready`, possibly with another id8.
 6. Answer each `Due` with `fill`, before the slot.
@@ -25,23 +25,39 @@ transport has to do to drive it:
 Without a master, or while it refuses slots, periodic messages go as soft real-time ones with their period as deadline.
 """
 
-from collections import Counter
 from collections.abc import Hashable, Sequence
 
 from r2p.codecs import management, rtcan
-from r2p.codecs.rtcan import Frame
-from r2p.errors import MessageError
-from r2p.protocols.rtcan.core import Core
-from r2p.protocols.rtcan.cycle import Timing
-from r2p.protocols.rtcan.events import NEVER, Action, Done, EngineSettings, Fate, Mailbox, Outcome, Profile
+from r2p.codecs.rtcan import HIGH_MAX, HIGH_SHIFT, ID8_MAX, MANAGEMENT, MESSAGE_SHIFT, NOT_SYNC, Frame
+from r2p.errors import DecodeError, MessageError
+from r2p.protocols.rtcan.context import EngineContext
+from r2p.protocols.rtcan.events import (
+    NEVER,
+    Action,
+    Done,
+    Due,
+    EngineSettings,
+    Fate,
+    Mailbox,
+    Outcome,
+    Profile,
+    Ready,
+    Received,
+)
+from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
+from r2p.protocols.rtcan.management import ManagementHandlers, ManagementSender
 from r2p.protocols.rtcan.master import Role
-from r2p.protocols.rtcan.node_id import Stage
+from r2p.protocols.rtcan.network import Detector, NetworkMembership
+from r2p.protocols.rtcan.node_id import NodeId, Stage
 from r2p.protocols.rtcan.plan import PeriodicMessage
 from r2p.protocols.rtcan.queue import QueuedMessage
+from r2p.protocols.rtcan.reassembly import Reassembly
+from r2p.protocols.rtcan.transmitter import Mode, SlotTransmitter
 
 _NOTHING: tuple[Action, ...] = ()
-_LISTENING = Stage.LISTENING  # Python 3.11 takes its time to find a member of an enum
-_NOT_SYNC = ~(0xFF << 7)
+# Python 3.11 takes its time to find a member of an enum.
+_FIRMWARE, _ELECTING, _LISTENING = Profile.FIRMWARE, Role.ELECTING, Stage.LISTENING
+_SILENT, _FREE, _SLOTTED = Mode
 
 
 class Engine:
@@ -51,188 +67,160 @@ class Engine:
     """
 
     def __init__(self, settings: EngineSettings) -> None:
-        self._core = Core(settings)
-        self._out = self._core.out
-        self._sender = self._core.sender
-        self._reassembly = self._core.reassembly
-        self._identity = self._core.identity
-        self._timers = self._core.timers
-        self._pacer = self._core.pacer
+        if settings.id8 is not None and not 0 < settings.id8 <= ID8_MAX:
+            raise ValueError(f"id8 {settings.id8}: it is a byte, and not 0")
+        self.settings = settings
+        context = EngineContext(settings)
+        self.timing = context.timing
+        self.cycle = context.cycle
+        self.counts = context.counts
+        """What went wrong here, by kind."""
+        self.reassembly = Reassembly()
+        self.detector = Detector(settings.profile)
+        self.node_id = NodeId(context, self._send_claim, self._on_stage)
+        self.transmitter = SlotTransmitter(context, self._next_cycle)
+        self.periodics = self.transmitter.plan.periodics
+        """The periodic messages of this node by high byte."""
+        self.management = ManagementSender(context, self.node_id, self.detector, self.transmitter)
+        self.grants = SlotGrants(context)
+        self.requests = SlotRequests(context, self.transmitter.plan, self._ask, self.transmitter.abandon)
+        self.network = NetworkMembership(
+            context, self.transmitter, self.node_id, self.grants, self.requests, self.management.send
+        )
+        self.election = self.network.election
+        self._handlers = ManagementHandlers(
+            self.network, self.grants, self.requests, self.management.send, self._start_ticking
+        )
+        self._context = context
+        self._actions = context.actions
+        self._timers = context.timers
+        self._limiter = self.management.limiter
         self._latency = settings.receive_latency
         self._running = False
+        self._joined = False  # the node has an id8, and knows how the network works: messages may be sent
+        self._management_ends = False  # the next frame of firmware's management is the last one of a message
 
-    # What is known
+    # State
 
     @property
     def id8(self) -> int | None:
         """Our id8; None: not yet, or not any more."""
-        return self._identity.id8 if self.ready else None
+        return self.node_id.id8 if self.ready else None
 
     @property
     def ready(self) -> bool:
         """Whether messages can be sent."""
-        return self._running and self._core.joined
+        return self._running and self._joined
 
     @property
     def profile(self) -> Profile:
-        return self._core.profile
-
-    @property
-    def role(self) -> Role:
-        return self._core.election.role
-
-    @property
-    def master(self) -> int | None:
-        """The master's id8."""
-        return self._core.network.master
-
-    @property
-    def epoch(self) -> int | None:
-        """Which run of the network this is; cycles are counted through it."""
-        return self._core.network.epoch
-
-    @property
-    def timing(self) -> Timing:
-        return self._core.timing
-
-    @property
-    def counts(self) -> Counter[str]:
-        """What went wrong here, by kind."""
-        return self._core.counts
-
-    @property
-    def losses(self) -> dict[int, Counter[str]]:
-        """What was lost on the way here, by id8 of the source and reason."""
-        return self._reassembly.losses
-
-    @property
-    def silenced(self) -> str | None:
-        """Why the node sends nothing: the network has other parameters."""
-        return self._core.network.silenced
-
-    @property
-    def cycle(self) -> int | None:
-        """The counter of the current cycle; without NETWORK only its low 8 bits mean something."""
-        return self._core.cycle.counter if self._core.cycle.running else None
-
-    @property
-    def mask(self) -> int | None:
-        """The reserved slots of the current cycle."""
-        return self._core.cycle.mask
+        """Whose network it is, as far as it is known."""
+        return self.detector.profile
 
     @property
     def waiting(self) -> int:
         """Messages that wait to be sent, and management that waits for silence."""
-        return len(self._core.queue) + len(self._pacer)
-
-    @property
-    def full(self) -> bool:
-        """Whether `publish` would refuse."""
-        return self._core.queue.full
+        return self.transmitter.queue.size + len(self._limiter.waiting)
 
     def network_time(self, now: int) -> int | None:
         """The time that all nodes of the network share (ns). None: not known."""
-        return self._core.cycle.network_time(now)
+        return self.cycle.network_time(now)
 
     def utc(self, now: int) -> tuple[int, int] | None:
         """UTC by the master, and how far off it may be (both ns). None: not known."""
-        time, network = self.network_time(now), self._core.network
+        time, network = self.network_time(now), self.network
         if time is None or network.utc_error == management.NO_UTC:
             return None
         return time + network.utc_offset, network.utc_error * 1000
 
     def set_utc(self, now: int, utc: int, error: int) -> None:
-        """This node knows UTC (ns, and its error in ns): as the master it tells the others."""
+        """This node knows UTC (ns, and its error in ns): as the master it sends it to the others."""
         time = self.network_time(now)
-        if time is not None and self.role is Role.MASTER:
-            self._core.network.utc_offset = utc - time
-            self._core.network.utc_error = min(-(-error // 1000), management.NO_UTC - 1)
+        if time is not None and self.election.role is Role.MASTER:
+            self.network.utc_offset = utc - time
+            self.network.utc_error = min(-(-error // 1000), management.NO_UTC - 1)
 
     def filters(self) -> list[tuple[int, int]]:
         """Which frames are needed: those with `id & mask == identifier` of one of these (identifier, mask)."""
         if not self.ready:
             return [(0, 0)]
-        high, low = 0xFF << 15, 0xFF << 7
-        fixed = [(0, high), (rtcan.MANAGEMENT << 15, high), (self._identity.id8 << 7, low)]
-        topics = [message for message in self._reassembly.messages if message >> 8 > rtcan.MANAGEMENT]
-        return fixed + [(message << 7, rtcan.MESSAGE_MASK) for message in topics]
+        fixed = [rtcan.high_filter(rtcan.SYNC), rtcan.high_filter(MANAGEMENT), rtcan.id8_filter(self.node_id.id8)]
+        topics = [each for each in self.reassembly.messages if rtcan.high_byte(each) > MANAGEMENT]
+        return fixed + [rtcan.message_filter(each) for each in topics]
 
-    # The bus
+    # The bus and time
 
     def start(self, now: int) -> Sequence[Action]:
         """The bus can be used: listen, then join."""
         self._running = True
-        self._identity.start(now)
-        return self._take()
+        self.node_id.start(now)
+        return self._drain()
 
     def stop(self, now: int) -> Sequence[Action]:
         """The bus can't be used any more, or the node leaves: everything that waits is discarded."""
         self._running = False
-        self._identity.stop(now)
-        self._core.network.stop(now)
-        self._sender.reset()
-        self._reassembly.reset()
-        return self._take()
+        self.node_id.stop(now)  # first: messages are discarded, and a master steps down, before the cycle stops
+        self.network.stop(now)
+        self.transmitter.reset()
+        self.reassembly.reset()
+        return self._drain()
 
     def receive(self, now: int, frame: Frame, stamp: int) -> Sequence[Action]:
         """A frame of another node came in; `stamp` is the instant of its reception interrupt."""
-        core, identifier = self._core, frame.id
-        if not identifier & _NOT_SYNC and core.is_sync(identifier):
-            if len(frame.data) != rtcan.FRAME_MAX:
-                self.counts["undecodable"] += 1
-            elif self._running and core.profile is not Profile.FIRMWARE:
-                core.network.sync(now, frame, stamp)
-                core.settle(now)
-            return self._take()
-        if identifier >> 7 & 0xFF == self._identity.id8:
-            core.duplicate_id_seen(now, identifier)
-        if self._identity.stage is _LISTENING:
-            core.listen(identifier)
-        high = identifier >> 15 & 0xFF
-        if high > rtcan.MANAGEMENT:
-            received = self._reassembly.receive(frame, stamp - self._latency)
-            if not self._out:
+        identifier = frame.id
+        # The codec's functions are inlined: most frames of a busy bus are for others, and only need these lines.
+        if not identifier & NOT_SYNC and self._is_sync(identifier):
+            self._on_sync(now, frame, stamp)
+            return self._drain()
+        if identifier >> MESSAGE_SHIFT & ID8_MAX == self.node_id.id8:
+            self._on_own_id8(now, identifier)
+        if self.node_id.stage is _LISTENING:
+            self._learn(identifier)
+        if identifier >> HIGH_SHIFT & HIGH_MAX > MANAGEMENT:
+            received = self.reassembly.receive(frame, stamp - self._latency)
+            if not self._actions:
                 return _NOTHING if received is None else (received,)
             if received is not None:
-                self._out.append(received)
+                self._actions.append(received)
         elif self._running:
-            core.low(now, frame, stamp - self._latency)
-        return self._take() if self._out else _NOTHING
+            self._on_low(now, frame, stamp - self._latency)
+        return self._drain() if self._actions else _NOTHING
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> Sequence[Action]:
         """What became of a frame that was to be transmitted, and when it was over (for SENT: its end)."""
-        self._sender.confirm(now, mailbox, outcome, at)
-        return self._take() if self._out else _NOTHING
+        self.transmitter.confirm(now, mailbox, outcome, at)
+        return self._drain() if self._actions else _NOTHING
 
     def next_deadline(self) -> int | None:
         """When to call `poll`; an instant in the past means at once."""
         if not self._running:
             return None
-        due = self._sender.due
+        # No `min` over all parts: this is called after each frame.
+        due = self.transmitter.due
         if self._timers.due < due:
             due = self._timers.due
-        if self._reassembly.open and (given_up := self._reassembly.due) < due:
+        if self.reassembly.open and (given_up := self.reassembly.due) < due:
             due = given_up
-        if self._pacer.waiting and (quiet := self._pacer.due) < due:
+        if self._limiter.waiting and (quiet := self._limiter.due) < due:
             due = quiet
         return due if due < NEVER else None
 
     def poll(self, now: int) -> Sequence[Action]:
-        """What the time brings."""
-        core = self._core
+        """Do what is due."""
         if not self._running:
             return _NOTHING
+        # Timers go first: a lease that is over must not send in the slot that begins now.
         if self._timers.due <= now:
             for key in self._timers.pop(now):
-                core.expired(now, key)
-                core.settle(now)
-        if self._sender.due <= now:
-            self._sender.poll(now)
-        if self._reassembly.open:
-            self._reassembly.poll(now)
-        if self._pacer.waiting:
-            core.pace(now)
-        return self._take()
+                self._expired(now, key)
+                self._update_mode(now)
+        if self.transmitter.due <= now:
+            self.transmitter.poll(now)
+        if self.reassembly.open:
+            self.reassembly.poll(now)
+        if self._limiter.waiting:
+            self.management.poll(now)
+        return self._drain()
 
     # Messages
 
@@ -241,34 +229,34 @@ class Engine:
     ) -> Sequence[Action]:
         """Send a message: soft real-time with the instant `deadline`, non real-time without.
 
-        When it is overdue it is dropped, or (not `drop`) sent with laxity 1. `Done` tells what became of it, if there
+        When it is overdue it is dropped, or (not `drop`) sent with laxity 1. `Done` says what became of it, if there
         is a `handle`. Raises `MessageError` beyond 1..1024 bytes, and for high bytes that are not a topic's.
         """
-        _check(high)
-        message = QueuedMessage(self._core.message_id(high), payload, deadline, drop and deadline != NEVER, handle)
+        _check_topic(high)
+        message = QueuedMessage(self._message_id(high), payload, deadline, drop and deadline != NEVER, handle)
         if not self.ready:
-            rtcan.fragment_count(len(payload))
-            self._refuse(now, message, Fate.DISCARDED)
+            rtcan.fragment_count(len(payload))  # raises for what could never be sent
+            self._reject(now, message, Fate.DISCARDED)
         else:
-            self._send(now, message)
-        return self._take()
+            self._enqueue(now, message)
+        return self._drain()
 
     def manage(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Sequence[Action]:
         """Send a management message of 32 bytes, within 50 ms, or 1 ms and before all others if `urgent`.
 
-        `Done` tells what became of it, if there is a `handle` and the node may send.
+        `Done` says what became of it, if there is a `handle` and the node may send.
         """
         if self.ready:
-            self._core.manage(now, data, urgent=urgent, handle=handle)
-        return self._take()
+            self.management.send_bytes(now, data, urgent=urgent, handle=handle)
+        return self._drain()
 
     def subscribe(self, message: int, size: int) -> None:
-        """Take the messages with this id, of `size` bytes each. Raises `MessageError` beyond 1..1024."""
-        self._reassembly.subscribe(message, size)
+        """Receive the messages with this id, of `size` bytes each. Raises `MessageError` beyond 1..1024."""
+        self.reassembly.subscribe(message, size)
 
     def unsubscribe(self, message: int) -> None:
-        """Take no more of them."""
-        self._reassembly.unsubscribe(message)
+        """Receive no more of them."""
+        self.reassembly.unsubscribe(message)
 
     # Periodic messages
 
@@ -279,75 +267,251 @@ class Engine:
 
         `Due` asks for the data, `lead` ns before the slot. Raises `MessageError` for a size that RTCAN can't carry.
         """
-        core = self._core
-        _check(high)
+        _check_topic(high)
         fragments = rtcan.fragment_count(size)
-        self._end(now, high)
-        message = core.message_id(high) if self.ready else 0
-        periodic = core.periodics[high] = PeriodicMessage(high, message, size, fragments, interval, lead, handle)
-        self._sender.add(periodic)
+        self._end_periodic(now, high)
+        message = self._message_id(high) if self.ready else 0
+        periodic = self.periodics[high] = PeriodicMessage(high, message, size, fragments, interval, lead, handle)
         if self.ready:
-            core.wishes.want(now, periodic)
-            core.tick(now, periodic)
-        return self._take()
+            self._start_periodic(now, periodic)
+        return self._drain()
 
     def fill(self, now: int, high: int, payload: bytes | None) -> Sequence[Action]:
         """The data that `Due` asked for; None: nothing this time. Raises `ValueError` when the size is another one."""
-        periodic = self._core.periodics.get(high)
+        periodic = self.periodics.get(high)
         if periodic is None or not self.ready:
-            return self._take()
+            return self._drain()
         if payload is not None and len(payload) != periodic.size:
             raise ValueError(f"{len(payload)} bytes for a periodic message of {periodic.size}")
         if not periodic.ticked:
-            self._sender.fill(now, periodic, payload)
+            self.transmitter.fill(now, periodic, payload)
         elif payload is not None:
             deadline = now + periodic.interval
-            self._send(now, QueuedMessage(periodic.message, payload, deadline, handle=periodic.handle))
+            self._enqueue(now, QueuedMessage(periodic.message, payload, deadline, handle=periodic.handle))
         periodic.ticked = False
-        return self._take()
+        return self._drain()
 
     def release(self, now: int, high: int) -> Sequence[Action]:
         """End a periodic message; its slots come free."""
-        self._end(now, high)
-        return self._take()
+        self._end_periodic(now, high)
+        return self._drain()
 
-    # Inside
+    # May the node send?
 
-    def _take(self) -> Sequence[Action]:
-        if not self._out:
-            return _NOTHING
-        actions = self._out[:]
-        self._out.clear()
-        return actions
+    def _update_mode(self, now: int) -> None:
+        """Decide whether and how the node may send, by its id8, its network and the cycle.
 
-    def _send(self, now: int, message: QueuedMessage) -> None:
-        if self._core.queue.put(message):
-            self._sender.reschedule(now)
+        Called after each sync, timer, change of the id8, and management message of the bus: whatever may change one.
+        """
+        # While a master is elected only management may go: so its first sync meets a quiet bus.
+        electing, held = self.election.role is _ELECTING, self.transmitter.queue.only is not None
+        self.transmitter.queue.only = self._message_id(MANAGEMENT) if electing else None
+        if self.node_id.stage is _LISTENING or self.network.mismatch is not None:
+            mode = _SILENT
+        elif not self.cycle.running:
+            mode = _FREE
         else:
-            self._refuse(now, message, Fate.FULL)
+            mode = _SLOTTED if self.network.verified else _SILENT
+        self.transmitter.set_mode(now, mode)
+        if not self._joined and self.node_id.stage is Stage.OWNING and self.network.decided:
+            self._join(now)
+        if held and not electing:
+            self.transmitter.reschedule(now)  # the mode may be the same, and other messages may go now
 
-    def _refuse(self, now: int, message: QueuedMessage, fate: Fate) -> None:
-        missed = message.deadline != NEVER
-        self.counts[fate.value] += 1
-        if message.handle is not None:
-            self._out.append(Done(message.handle, fate, missed, now))
+    def _join(self, now: int) -> None:
+        self._joined = True
+        self._actions.append(Ready(self.node_id.id8, self.profile))
+        for periodic in self.periodics.values():
+            self._start_periodic(now, periodic)
 
-    def _end(self, now: int, high: int) -> None:
-        core = self._core
-        periodic = core.periodics.pop(high, None)
+    def _on_stage(self, now: int) -> None:
+        """The node lost its id8, claims one or owns it."""
+        stage = self.node_id.stage
+        if stage is _LISTENING:
+            self._joined = False
+            self.detector.start()
+            self._discard(now)
+            self.network.on_id_lost(now)
+        elif stage is Stage.OWNING:
+            for periodic in self.periodics.values():
+                periodic.message = self._message_id(periodic.high)
+            if self.profile is not _FIRMWARE:  # which has neither master nor slots
+                self.network.on_id_owned(now)
+        self._update_mode(now)
+
+    def _discard(self, now: int) -> None:
+        """Give up everything that waits to be sent."""
+        handles = self._limiter.clear() + [message.handle for message in self.transmitter.mailboxes.discard()]
+        self._actions += [Done(each, Fate.DISCARDED, missed=True, at=now) for each in handles if each is not None]
+        for periodic in self.periodics.values():
+            self.requests.revoke(now, periodic, "the node may not send")
+            self._timers.clear(("tick", periodic.high))
+
+    def _send_claim(self, now: int) -> None:
+        electing = management.CLAIM_ELECTING if self.network.master is None else 0
+        node = self.node_id
+        self.management.send(
+            now, management.Claim(node.id8, node.number, self.settings.priority, node.flags | electing)
+        )
+
+    # Frames
+
+    def _is_sync(self, identifier: int) -> bool:
+        """Whether a frame with the identifier of a sync is one.
+
+        When firmware has no time left it sends laxity 0: then the last frame of its management has the identifier of
+        the sync of cycle 0, and in a network of firmware a topic may have that of another one.
+        """
+        message = rtcan.message_of(identifier)
+        if self.profile is _FIRMWARE:
+            return message != rtcan.FIRMWARE_MANAGEMENT and not self.reassembly.subscribed(message)
+        return not (self._management_ends and message == rtcan.FIRMWARE_MANAGEMENT)
+
+    def _on_sync(self, now: int, frame: Frame, stamp: int) -> None:
+        if len(frame.data) != rtcan.FRAME_MAX:
+            self.counts["undecodable"] += 1
+        elif self._running and self.profile is not _FIRMWARE:
+            self.network.on_sync(now, frame, stamp)
+            self._update_mode(now)
+
+    def _on_own_id8(self, now: int, identifier: int) -> None:
+        """A frame of another node with our id8."""
+        if rtcan.message_of(identifier) != rtcan.FIRMWARE_MANAGEMENT:
+            self.node_id.duplicate_id_seen(now)
+            self._update_mode(now)
+
+    def _learn(self, identifier: int) -> None:
+        """While the node listens: learn from any frame which id8 is taken, and whether there is firmware."""
+        message = rtcan.message_of(identifier)
+        if rtcan.high_byte(message) == rtcan.SYNC:
+            self.detector.firmware_seen()
+        if message != rtcan.FIRMWARE_MANAGEMENT:
+            self.node_id.mark_taken(rtcan.id8_of(message))
+
+    def _on_low(self, now: int, frame: Frame, stamp: int) -> None:
+        """A frame of management, or in a network of firmware one of a topic whose high byte is as low as that."""
+        message = rtcan.message_of(frame.id)
+        high = rtcan.high_byte(message)
+        firmware = self.profile is _FIRMWARE
+        self._limiter.on_traffic(now)
+        if high == rtcan.SYNC and not firmware:
+            self.counts["management of firmware"] += 1
+            # The last frame, of which 0 are left, will look like a sync if its laxity is 0 as well.
+            self._management_ends = message == rtcan.FIRMWARE_MANAGEMENT and frame.id & rtcan.LEFT_MASK == 1
+        ours = message == rtcan.FIRMWARE_MANAGEMENT if firmware else high == MANAGEMENT
+        if ours:  # of each sender by itself: they interleave, and none is known before
+            self.reassembly.subscribe(message, management.SIZE)
+        received = self.reassembly.receive(frame, stamp)
+        if received is not None and ours:
+            self._on_management(now, received)
+        elif received is not None:
+            self._actions.append(received)
+
+    def _on_management(self, now: int, received: Received) -> None:
+        """A management message: of the RTCAN bus itself, or of discovery."""
+        if management.type_of(received.payload) not in management.RTCAN_TYPES:
+            self._actions.append(received)
+            return
+        try:
+            message = management.decode(received.payload)
+        except DecodeError:
+            self.counts["undecodable"] += 1
+            return
+        if self._handlers.handle(now, message, received.source):
+            self._update_mode(now)
+
+    # Timers and periodic messages
+
+    def _expired(self, now: int, key: Hashable) -> None:
+        """A timer ran out."""
+        match key:
+            case "listened":
+                self.detector.decide(synced=self.cycle.running)
+                self.node_id.on_listened(now)
+            case "claim":
+                self.node_id.on_claim_timer(now)
+            case "election":
+                self.network.decide_election(now)
+            case "network":
+                self.network.send_network(now)
+            case "renew":
+                self.requests.renew(now)
+            case "silence":
+                self.network.forget_mismatch(now)
+            case ("granted", int(message)):
+                self.grants.remove(message)
+            case (str(kind), int(high)) if high in self.periodics:
+                self._periodic_timer(now, kind, self.periodics[high])
+
+    def _periodic_timer(self, now: int, kind: str, periodic: PeriodicMessage) -> None:
+        if kind == "ask":
+            self.requests.request(now, periodic)
+        elif kind == "lease":
+            self.requests.suspend(now, periodic, "the master does not answer")
+            self._start_periodic(now, periodic)
+        elif not periodic.active or self.cycle.counter < periodic.from_cycle:
+            # In phase with the ticks before, however late this one is.
+            at = now if periodic.tick is None else now - (now - periodic.tick) % periodic.interval
+            periodic.tick = at + periodic.interval
+            periodic.ticked = True
+            self._timers.set(("tick", periodic.high), periodic.tick)
+            self._actions.append(Due(periodic.high, at, False))
+
+    def _start_periodic(self, now: int, periodic: PeriodicMessage) -> None:
+        """Ask for slots, and send without until they are granted."""
+        self.requests.schedule(now, periodic)
+        self._start_ticking(now, periodic)
+
+    def _start_ticking(self, now: int, periodic: PeriodicMessage) -> None:
+        """Without slots the node's own clock says when a periodic message is due."""
+        if not periodic.active and self._joined and ("tick", periodic.high) not in self._timers:
+            self._timers.set(("tick", periodic.high), now)
+
+    def _end_periodic(self, now: int, high: int) -> None:
+        periodic = self.periodics.pop(high, None)
         if periodic is None:
             return
         if periodic.payload is not None:
-            self._sender.abandon(now, periodic, "slots given back")
-        self._sender.remove(periodic)
-        core.timers.clear(("tick", high))
-        if core.wishes.forget(periodic) and self.ready:
-            if self.role is Role.MASTER:
-                core.grants.remove(periodic.message)
+            self.transmitter.abandon(now, periodic, "slots given back")
+        self.transmitter.forget(periodic)
+        self._timers.clear(("tick", high))
+        if self.requests.forget(periodic) and self.ready:
+            if self.election.role is Role.MASTER:
+                self.grants.remove(periodic.message)
             else:
-                core.say(now, management.Release(periodic.message))
+                self.management.send(now, management.Release(periodic.message))
+
+    def _ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
+        self._handlers.ask(now, wanted)
+
+    def _next_cycle(self, now: int) -> None:
+        self.network.next_cycle(now)
+        self._update_mode(now)
+
+    # Messages out, actions out
+
+    def _message_id(self, high: int) -> int:
+        return rtcan.message_id(high, self.node_id.id8)
+
+    def _enqueue(self, now: int, message: QueuedMessage) -> None:
+        if self.transmitter.queue.put(message):
+            self.transmitter.reschedule(now)
+        else:
+            self._reject(now, message, Fate.FULL)
+
+    def _reject(self, now: int, message: QueuedMessage, fate: Fate) -> None:
+        self.counts[fate.value] += 1
+        if message.handle is not None:  # not `report`: a message that was never queued does not count as missed
+            self._actions.append(Done(message.handle, fate, message.deadline != NEVER, now))
+
+    def _drain(self) -> Sequence[Action]:
+        if not self._actions:
+            return _NOTHING
+        actions = self._actions[:]
+        self._actions.clear()
+        return actions
 
 
-def _check(high: int) -> None:
-    if not rtcan.FIRST_TOPIC <= high <= 0xFF:
-        raise MessageError(f"high byte {high}: those of topics are {rtcan.FIRST_TOPIC} to 255")
+def _check_topic(high: int) -> None:
+    if not rtcan.FIRST_TOPIC <= high <= HIGH_MAX:
+        raise MessageError(f"high byte {high}: those of topics are {rtcan.FIRST_TOPIC} to {HIGH_MAX}")

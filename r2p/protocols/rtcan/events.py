@@ -1,5 +1,6 @@
-"""What goes in and out of the RTCAN engine besides frames: orders to the port, messages, news. All values are frozen.
+"""The values that pass between an RTCAN engine and its owner, besides frames: settings in, actions out. All are frozen.
 
+An action is an order to the CAN port (`Transmit`, `Withdraw`), a message, or an event of the node and its network.
 Instants are ns of the node's own monotonic clock. A message id is 16 bits: high byte the topic, low byte the id8.
 """
 
@@ -9,43 +10,12 @@ from collections.abc import Hashable
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.rtcan import MESSAGE_MAX, MESSAGE_SHIFT, Frame
 
 NEVER = 1 << 62
 """An instant that does not come."""
 LONG_AGO = -NEVER
 """An instant before all others."""
-
-
-class Mailbox(enum.IntEnum):
-    """Where a frame waits in the controller. Each holds one frame; HRT goes before SRT before NRT."""
-
-    HRT = 0  # sync and hard real-time
-    SRT = 1  # soft real-time and management
-    NRT = 2
-
-
-class Outcome(enum.Enum):
-    """What became of a frame that the port was told to transmit."""
-
-    SENT = "sent"
-    LOST = "arbitration lost"  # one-shot controllers only
-    ERROR = "bus error"  # destroyed, not acknowledged, or given up in bus-off
-    LATE = "not started"  # withdrawn, or not started by `not_after`: nobody has seen it
-    UNKNOWN = "unknown"  # nothing was heard of it: never sent again
-
-
-class Fate(enum.Enum):
-    """What became of a message."""
-
-    SENT = "sent"
-    UNKNOWN = "unknown"  # sent, but not every frame was confirmed
-    OVERDUE = "overdue"  # dropped: its deadline passed before its first frame
-    FULL = "no room"  # refused: too many wait
-    FAILED = "bus errors"  # given up
-    DISCARDED = "discarded"  # the node may not send, or stopped
-    REPLACED = "newer data in a slot"  # its topic got slots while it waited
-    ABANDONED = "slot missed"  # a frame of a hard real-time message missed its slot
 
 
 class Profile(enum.Enum):
@@ -56,176 +26,15 @@ class Profile(enum.Enum):
     FIRMWARE = "firmware-2014"  # no sync; management of all modules on one message id
 
 
-# Orders to the port
-
-
-class Transmit(msgspec.Struct, frozen=True, gc=False):
-    """Put this frame into the mailbox, which is empty. Its start of frame must lie between the two instants; answer
-    every one with `Engine.confirm`.
-    """
-
-    frame: Frame
-    mailbox: Mailbox
-    not_before: int
-    not_after: int = NEVER
-
-
-class Withdraw(msgspec.Struct, frozen=True, gc=False):
-    """Take the frame back if it has not started; what comes of it is confirmed as for every frame."""
-
-    mailbox: Mailbox
-
-
-# Messages
-
-
-class Received(msgspec.Struct, frozen=True, gc=False):
-    """A whole message. `identifier` is its first frame's, `stamp` the instant when that frame ended."""
-
-    identifier: int
-    payload: bytes
-    stamp: int
-
-    @property
-    def message(self) -> int:
-        return self.identifier >> 7 & 0xFFFF
-
-    @property
-    def high(self) -> int:
-        """The topic, at that module."""
-        return self.identifier >> 15 & 0xFF
-
-    @property
-    def source(self) -> int:
-        """The sender's id8; 0 for management of firmware of 2014, which does not say."""
-        return self.identifier >> 7 & 0xFF
-
-    @property
-    def laxity(self) -> int:
-        return self.identifier >> 23
-
-    @property
-    def mailbox(self) -> Mailbox:
-        """Its class."""
-        laxity = self.identifier >> 23
-        return Mailbox.HRT if laxity == rtcan.HRT else Mailbox.NRT if laxity == rtcan.NRT else Mailbox.SRT
-
-    def started(self, bit: int) -> int:
-        """The start of the first frame, exact to the stuff bits; `bit` is the bit time in ns. Not cheap: about 5 us."""
-        return self.stamp - rtcan.frame_bits(self.identifier, self.payload[: rtcan.FRAME_MAX]) * bit
-
-
-class Done(msgspec.Struct, frozen=True, gc=False):
-    """A published message is through, or given up. `missed`: not (surely) on the bus by its deadline."""
-
-    handle: Hashable
-    fate: Fate
-    missed: bool
-    at: int
-
-
-class Due(msgspec.Struct, frozen=True, gc=False):
-    """Time for the data of a periodic message: call `Engine.fill`. `at` is its slot's start, or the tick's instant."""
-
-    high: int
-    at: int
-    slotted: bool
-
-
-# News
-
-
-class Ready(msgspec.Struct, frozen=True):
-    """The node has an id8 and may send; the former one's topics are void."""
-
-    id8: int
-    profile: Profile
-
-
-class NewMaster(msgspec.Struct, frozen=True):
-    """Somebody keeps the cycle from now on. `id8` None: firmware, or nobody knows yet."""
-
-    id8: int | None
-    epoch: int
-    own: bool
-
-
-class LostSync(msgspec.Struct, frozen=True):
-    """There is no cycle any more: periodic messages go as soft real-time ones."""
-
-    reason: str
-
-
-class Granted(msgspec.Struct, frozen=True):
-    """A periodic message owns slots. `period`, `phase` in slots; `interval` is the true period in ns."""
-
-    high: int
-    period: int
-    phase: int
-    interval: int
-
-
-class Refused(msgspec.Struct, frozen=True):
-    """The master has no slots for a periodic message; it goes as a soft real-time one. The request is repeated."""
-
-    high: int
-    reason: str
-
-
-class Degraded(msgspec.Struct, frozen=True):
-    """A periodic message lost its slots, and goes as a soft real-time one."""
-
-    high: int
-    reason: str
-
-
-class IdConflict(msgspec.Struct, frozen=True):
-    """Another node uses our id8. `yielded`: it keeps it, and we send nothing until the next `Ready`."""
-
-    id8: int
-    yielded: bool
-
-
-class ParameterMismatch(msgspec.Struct, frozen=True):
-    """The network's parameters are not ours: nothing is sent."""
-
-    reason: str
-
-
-class ParametersMatch(msgspec.Struct, frozen=True):
-    """The network's parameters are ours after all."""
-
-
-Action = (
-    Transmit
-    | Withdraw
-    | Received
-    | Done
-    | Due
-    | Ready
-    | NewMaster
-    | LostSync
-    | Granted
-    | Refused
-    | Degraded
-    | IdConflict
-    | ParameterMismatch
-    | ParametersMatch
-)
-
-
-# What the owner of a node decides about its RTCAN.
-
-
 class EngineSettings(msgspec.Struct, frozen=True, kw_only=True):
     """One node on one bus. Times in ns.
 
-    - `number`: 64 random bits. `id8`: 1..255, None: claim a free one. `priority`: to be the master, 0: never.
+    - `number`: 64 random bits. `id8`: 1..255, None: claim a free one. `priority`: in the election, 0: never the master.
     - `slots`, `cycle` (nominal), `bit_rate` must be the same in the whole network.
     - `listen`: how long before anything is sent. `receive_latency`: from the end of a frame to its stamp.
       `transmit_latency`: from the hand-over of a frame to its start. `coarse`: the port can't hit a slot; so a frame
       may start anywhere in a run of free slots.
-    - `reserves`: ask for slots for periodic messages. `capacity`: messages that wait.
+    - `reserves`: ask for slots for periodic messages. `capacity`: messages in the queue.
     """
 
     number: int
@@ -241,3 +50,192 @@ class EngineSettings(msgspec.Struct, frozen=True, kw_only=True):
     coarse: bool = False
     reserves: bool = True
     capacity: int = 256
+
+
+# Frames to and from the port
+
+
+class Mailbox(enum.IntEnum):
+    """Where a frame waits in the controller. Each holds one frame; HRT goes before SRT before NRT."""
+
+    HRT = 0  # sync and hard real-time
+    SRT = 1  # soft real-time and management
+    NRT = 2
+
+
+class Outcome(enum.Enum):
+    """What became of a frame that the port had to transmit."""
+
+    SENT = "sent"
+    LOST = "arbitration lost"  # one-shot controllers only
+    ERROR = "bus error"  # destroyed, not acknowledged, or given up in bus-off
+    LATE = "not started"  # withdrawn, or not started by `not_after`: it was never on the bus
+    UNKNOWN = "unknown"  # the port can't say; never sent again, as a second copy would look like a new message
+
+
+class Transmit(msgspec.Struct, frozen=True, gc=False):
+    """Put this frame into the mailbox, which is empty. Its start of frame must lie between the two instants; answer
+    every one with `Engine.confirm`.
+    """
+
+    frame: Frame
+    mailbox: Mailbox
+    not_before: int
+    not_after: int = NEVER
+
+
+class Withdraw(msgspec.Struct, frozen=True, gc=False):
+    """Take the frame back if it has not started; it is confirmed as every frame."""
+
+    mailbox: Mailbox
+
+
+# Messages
+
+
+class Fate(enum.Enum):
+    """What became of a message."""
+
+    SENT = "sent"
+    UNKNOWN = "unknown"  # sent, but not every frame was confirmed
+    OVERDUE = "overdue"  # dropped: its deadline passed before its first frame
+    FULL = "no room"  # rejected: the queue is full
+    FAILED = "bus errors"  # given up
+    DISCARDED = "discarded"  # the node may not send, or stopped
+    REPLACED = "newer data in a slot"  # its topic got slots while it waited
+    ABANDONED = "slot missed"  # a frame of a hard real-time message missed its slot
+
+
+class Received(msgspec.Struct, frozen=True, gc=False):
+    """A whole message. `identifier` is its first frame's, `stamp` the instant when that frame ended."""
+
+    identifier: int
+    payload: bytes
+    stamp: int
+
+    @property
+    def message(self) -> int:
+        return self.identifier >> MESSAGE_SHIFT & MESSAGE_MAX  # inlined: it is asked for each message
+
+    @property
+    def high(self) -> int:
+        """The topic, at that module."""
+        return rtcan.high_byte(self.message)
+
+    @property
+    def source(self) -> int:
+        """The sender's id8; 0 for management of firmware of 2014, which does not say."""
+        return rtcan.id8_of(self.message)
+
+    @property
+    def laxity(self) -> int:
+        return rtcan.laxity_of(self.identifier)
+
+    @property
+    def mailbox(self) -> Mailbox:
+        """The mailbox that it left from, which is its class."""
+        laxity = self.laxity
+        return Mailbox.HRT if laxity == rtcan.HRT else Mailbox.NRT if laxity == rtcan.NRT else Mailbox.SRT
+
+    def started(self, bit: int) -> int:
+        """The start of the first frame, exact to the stuff bits; `bit` is the bit time in ns. Not cheap: about 5 us."""
+        return self.stamp - rtcan.frame_bits(self.identifier, self.payload[: rtcan.FRAME_MAX]) * bit
+
+
+class Done(msgspec.Struct, frozen=True, gc=False):
+    """A published message was sent, or given up. `missed`: not (surely) on the bus by its deadline."""
+
+    handle: Hashable
+    fate: Fate
+    missed: bool
+    at: int
+
+
+class Due(msgspec.Struct, frozen=True, gc=False):
+    """Time for the data of a periodic message: call `Engine.fill`. `at` is its slot's start, or the tick's instant."""
+
+    high: int
+    at: int
+    slotted: bool
+
+
+# Events of the node and its network
+
+
+class Ready(msgspec.Struct, frozen=True):
+    """The node has an id8 and may send; message ids with a former id8 are void."""
+
+    id8: int
+    profile: Profile
+
+
+class IdConflict(msgspec.Struct, frozen=True):
+    """Another node uses our id8. `yielded`: this node gives it up, and sends nothing until the next `Ready`."""
+
+    id8: int
+    yielded: bool
+
+
+class NewMaster(msgspec.Struct, frozen=True):
+    """A node keeps the cycle from now on. `id8` None: it is firmware, or has not said yet."""
+
+    id8: int | None
+    epoch: int
+    own: bool
+
+
+class LostSync(msgspec.Struct, frozen=True):
+    """There is no cycle any more: periodic messages go as soft real-time ones."""
+
+    reason: str
+
+
+class ParameterMismatch(msgspec.Struct, frozen=True):
+    """The network's parameters differ from this node's: nothing is sent."""
+
+    reason: str
+
+
+class ParametersMatch(msgspec.Struct, frozen=True):
+    """The network's parameters are this node's after all."""
+
+
+class SlotsGranted(msgspec.Struct, frozen=True):
+    """A periodic message owns slots. `period`, `phase` in slots; `interval` is the true period in ns."""
+
+    high: int
+    period: int
+    phase: int
+    interval: int
+
+
+class SlotsRefused(msgspec.Struct, frozen=True):
+    """The master has no slots for a periodic message; it goes as a soft real-time one. The request is repeated."""
+
+    high: int
+    reason: str
+
+
+class SlotsLost(msgspec.Struct, frozen=True):
+    """A periodic message lost its slots, and goes as a soft real-time one."""
+
+    high: int
+    reason: str
+
+
+Action = (
+    Transmit
+    | Withdraw
+    | Received
+    | Done
+    | Due
+    | Ready
+    | IdConflict
+    | NewMaster
+    | LostSync
+    | ParameterMismatch
+    | ParametersMatch
+    | SlotsGranted
+    | SlotsRefused
+    | SlotsLost
+)

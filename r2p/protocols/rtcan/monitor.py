@@ -1,8 +1,8 @@
-"""Watching an RTCAN bus without a word: what each frame is, what the bus carries, and who uses which slots.
+"""Watching an RTCAN bus without sending: what each frame is, what the bus carries, and which slots are used.
 
 Lengths are counted with the bits stuffed in, so loads are true for the bit rate that is given. The cycle is the
-master's, by its sync frames (PROTOCOL.md 6): a slot is what lies that far behind the start of one. A frame counts for
-the time at which it was on the bus, however late it is read.
+master's, by its sync frames (PROTOCOL.md 6): slots are counted from the start of the last one. A frame counts for the
+time at which it was on the bus, however late it is read. `BusDirectory` keeps the names, `Monitor` the numbers.
 """
 
 import enum
@@ -14,11 +14,11 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame, Identifier, OtherFrame
 from r2p.errors import DecodeError
 from r2p.protocols.rtcan.cycle import Timing
+from r2p.protocols.rtcan.events import NEVER
 from r2p.protocols.rtcan.reassembly import Reassembly
 
 _SYNC = -1  # in place of a message id
 _OTHER = -2
-_NEVER = 1 << 63
 _EARLY = 8  # a frame that starts less than this part of a slot early belongs to the slot
 
 
@@ -31,14 +31,14 @@ class FrameKind(enum.Enum):
     NRT = "nrt"
     MANAGEMENT = "management"
     OTHER = "other"
-    """None of RTCAN: with an 11-bit identifier, or a remote frame."""
+    """Not of RTCAN: with an 11-bit identifier, or a remote frame."""
 
 
 class SeenFrame(msgspec.Struct, frozen=True):
     """One frame. `stamp` is its end (ns), `bits` its length with the intermission, `left` how many fragments follow.
 
-    `cycle` (mod 256) and `slot` are None while no sync has been heard. `text` tells a whole management message, or what
-    a frame of another kind is: of that, `frame` has the identifier and the data.
+    `cycle` (mod 256) and `slot` are None while there is no sync. `text` describes a whole management message, or a
+    frame that is not of RTCAN: of that, `frame` has the identifier and the data.
     """
 
     stamp: int
@@ -63,7 +63,7 @@ class TrafficCount(msgspec.Struct):
 
 
 class BusSlot(msgspec.Struct):
-    """One slot over all cycles watched: in how many it was reserved, held an HRT frame, held another one; by whom."""
+    """One slot over all cycles watched: in how many it was reserved, had an HRT frame, had another one; by topic."""
 
     reserved: int = 0
     used: int = 0
@@ -79,7 +79,7 @@ class BusSlot(msgspec.Struct):
 class BusLoad(msgspec.Struct, frozen=True):
     """What the bus carried in `elapsed` ns; shares are of the time: 1.0 is all of it.
 
-    `free` is the share that nobody reserved, `free_frames` how many frames of full length fit in there. `nrt_gap` is
+    `free` is the share without reservation, `free_frames` how many frames of full length fit in there. `nrt_gap` is
     the longest time without a non real-time frame (ns); None where none was seen at all.
     """
 
@@ -105,252 +105,33 @@ class BusLoad(msgspec.Struct, frozen=True):
 
     @property
     def free_used(self) -> float:
-        """How much of what nobody reserved was taken: by time, or by frames, of which a slot holds so many."""
+        """How much of the share without reservation was used: by time, or by frames, of which a slot has so many."""
         events = [tally for (_, _, kind), tally in self.tallies.items() if kind not in {FrameKind.SYNC, FrameKind.HRT}]
         by_time = self.share(sum(tally.bits for tally in events)) / self.free if self.free else 0.0
         by_frames = sum(tally.frames for tally in events) / self.free_frames if self.free_frames else 0.0
         return min(1.0, max(by_time, by_frames))
 
 
-class Monitor:
-    """What a silent listener makes of the frames of a bus. Instants are ns of one clock, `bit` is the bit time."""
-
-    def __init__(self, timing: Timing) -> None:
-        self.census = BusDirectory(timing)
-        self.cycles = 0
-        """Whole cycles watched since the last `reset`."""
-        self.heard = 0
-        """When the last frame was on the bus."""
-        self._period = 0
-        self._end = _NEVER  # of the current period
-        self._loads: deque[BusLoad] = deque()  # of those that are over
-        self._reassembly = Reassembly()
-        self._sync: int | None = None  # start of the current cycle
-        self._cycle = 0
-        self._mask = 0
-        self._filled: set[int] = set()
-        self.reset(0)
-
-    def reset(self, now: int) -> None:
-        """Count from now on, until the next `reset`."""
-        self._end = _NEVER
-        self._loads.clear()
-        self._begin_at(now)
-
-    def begin(self, now: int, period: int) -> None:
-        """Count from now on, in periods of so many ns, each of which `next_load` gives once."""
-        self.reset(now)
-        self._period = period
-        self._end = now + period
-
-    def next_load(self) -> BusLoad:
-        """What was carried in the next period that is over; call it when all frames of that are here."""
-        if not self._loads:
-            self._end_period()
-        return self._loads.popleft()
-
-    def _end_period(self) -> None:
-        end = self._end
-        self._loads.append(self.load(end))
-        self._begin_at(end)
-        self._end = end + self._period
-
-    def _begin_at(self, now: int) -> None:
-        self._since = now
-        self._tallies: dict[tuple[int, FrameKind], TrafficCount] = {}
-        self._faults: Counter[str] = Counter()
-        self._reserved = 0
-        self._nrt: int | None = None
-        self._nrt_gap: int | None = None
-        self._forget_slots()
-
-    def _forget_slots(self) -> None:
-        self._slots: list[BusSlot] = []
-        self._owners: list[Counter[int]] = []  # by message id; names may be learnt later
-        self.cycles = 0
-        self._whole = False
-
-    def fault(self, kind: str) -> None:
-        """An error frame, or another trouble that the interface tells."""
-        self._faults[kind] += 1
-
-    def frame(self, frame: Frame, stamp: int) -> SeenFrame:
-        """A frame was on the bus until `stamp`."""
-        self._on_bus(stamp)
-        identifier = rtcan.decode_identifier(frame.id)
-        message = identifier.message
-        kind = self._kind(frame, identifier)
-        bits = rtcan.frame_bits(frame.id, frame.data)
-        start = stamp - bits * self.census.timing.bit
-        if kind is FrameKind.SYNC:
-            self._begin(start, frame)
-        slot = self._slot(start, message, kind)
-        self._tally(message, kind, bits)
-        if kind is FrameKind.NRT:
-            self._note_nrt(stamp)
-        text = self._hear(frame, message, stamp) if kind is FrameKind.MANAGEMENT else ""
-        size = self.census.sizes.get(message)
-        return SeenFrame(
-            stamp,
-            frame,
-            kind,
-            "" if kind is FrameKind.SYNC else self.census.topic(message),
-            "" if kind is FrameKind.SYNC else self.census.module(message),
-            identifier.laxity,
-            identifier.left,
-            bits + rtcan.INTERMISSION,
-            rtcan.fragment_count(size) if size and size <= rtcan.PAYLOAD_MAX else None,
-            self._cycle if self._sync is not None else None,
-            slot,
-            text,
-        )
-
-    def other(self, frame: OtherFrame, stamp: int) -> SeenFrame:
-        """A frame that RTCAN does not use was on the bus until `stamp`."""
-        self._on_bus(stamp)
-        bits = rtcan.other_frame_bits(frame)
-        slot = self._slot(stamp - bits * self.census.timing.bit, _OTHER, FrameKind.OTHER)
-        self._tally(_OTHER, FrameKind.OTHER, bits)
-        text = f"{'29-bit' if frame.extended else '11-bit'} identifier {frame.id:X}"
-        if frame.remote is not None:
-            text += f", asks for {frame.remote} bytes"
-        cycle = self._cycle if self._sync is not None else None
-        seen = Frame(frame.id, frame.data)
-        bits += rtcan.INTERMISSION
-        return SeenFrame(stamp, seen, FrameKind.OTHER, "", "", 0, 0, bits, None, cycle, slot, text)
-
-    def _on_bus(self, stamp: int) -> None:
-        self.heard = max(self.heard, stamp)
-        while stamp >= self._end:
-            self._end_period()
-
-    def _tally(self, message: int, kind: FrameKind, bits: int) -> None:
-        tally = self._tallies.setdefault((message, kind), TrafficCount())
-        tally.frames += 1
-        tally.bits += bits + rtcan.INTERMISSION
-
-    @property
-    def slots(self) -> list[BusSlot]:
-        """The use of each slot since the last `reset`, with the names that are known by now."""
-        for slot, owners in zip(self._slots, self._owners, strict=True):
-            slot.owners = Counter()
-            for message, count in owners.items():
-                slot.owners["sync" if message == _SYNC else self.census.topic(message)] += count
-        return self._slots
-
-    def load(self, now: int) -> BusLoad:
-        """What was carried since the last `reset`."""
-        gap = self._nrt_gap
-        if self._nrt is not None:
-            gap = max(gap or 0, now - self._nrt)
-        elapsed = now - self._since
-        tallies: dict[tuple[str, str, FrameKind], TrafficCount] = {}
-        for (message, kind), tally in self._tallies.items():
-            nameless = kind is FrameKind.SYNC or kind is FrameKind.OTHER
-            names = ("", "") if nameless else (self.census.topic(message), self.census.module(message))
-            total = tallies.setdefault((*names, kind), TrafficCount())
-            total.frames += tally.frames
-            total.bits += tally.bits
-        timing = self.census.timing
-        reserved = min(1.0, self._reserved * timing.slot / elapsed) if elapsed else 0.0
-        longest = (rtcan.frame_bits_max(rtcan.FRAME_MAX) + rtcan.INTERMISSION) * timing.bit
-        free = (1.0 - reserved) * elapsed / timing.slot * (timing.slot // longest) if self._reserved else 0.0
-        return BusLoad(elapsed, timing.bit, tallies, dict(self._faults), reserved, free, gap)
-
-    def _begin(self, start: int, frame: Frame) -> None:
-        sync = rtcan.decode_sync(frame)
-        timing = self.census.timing
-        if self._whole and self._sync is not None and abs(start - self._sync - timing.cycle) < timing.slot:
-            self._close()
-        self._whole = True
-        self._sync, self._cycle, self._mask = start, sync.cycle, sync.mask | 1
-        self._filled = set()
-        self._reserved += self._mask.bit_count()
-
-    def _close(self) -> None:
-        """The cycle that ends was watched from its beginning."""
-        self.cycles += 1
-        self._grow(self._mask.bit_length() - 1)
-        for index, slot in enumerate(self._slots):
-            if self._mask >> index & 1:
-                slot.reserved += 1
-                slot.used += index in self._filled
-
-    def _slot(self, start: int, message: int, kind: FrameKind) -> int | None:
-        """The slot in which a frame started; what it is, is noted there."""
-        timing = self.census.timing
-        if self._sync is None:
-            return None
-        index = (start - self._sync + timing.slot // _EARLY) // timing.slot
-        if not 0 <= index < timing.slots:
-            self._sync = self._sync if index < 0 else None  # no sync came
-            return None
-        if self._whole:
-            self._note_slot(index, message, kind)
-        return index
-
-    def _note_slot(self, index: int, message: int, kind: FrameKind) -> None:
-        self._grow(index)
-        if kind in {FrameKind.SYNC, FrameKind.HRT}:
-            self._filled.add(index)
-            self._owners[index][_SYNC if kind is FrameKind.SYNC else message] += 1
-        else:
-            self._slots[index].shared += 1
-
-    def _grow(self, index: int) -> None:
-        while len(self._slots) <= max(index, self.census.timing.slots - 1):
-            self._slots.append(BusSlot())
-            self._owners.append(Counter())
-
-    def _note_nrt(self, stamp: int) -> None:
-        since = self._since if self._nrt is None else self._nrt
-        self._nrt_gap = max(self._nrt_gap or 0, stamp - since)
-        self._nrt = stamp
-
-    def _hear(self, frame: Frame, message: int, stamp: int) -> str:
-        self._reassembly.subscribe(message, management.SIZE)
-        received = self._reassembly.receive(frame, stamp)
-        if received is None:
-            return ""
-        before = self.census.timing
-        text = self.census.learn(received.payload, rtcan.id8_of(message))
-        if self.census.timing != before:
-            self._forget_slots()
-        return text
-
-    def _kind(self, frame: Frame, identifier: Identifier) -> FrameKind:
-        message, laxity = identifier.message, identifier.laxity
-        if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX and not self._ends_management(message):
-            return FrameKind.SYNC
-        if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.census.topics:
-            return FrameKind.MANAGEMENT  # firmware of 2014 may have topics there
-        return FrameKind.HRT if laxity == rtcan.HRT else FrameKind.NRT if laxity == rtcan.NRT else FrameKind.SRT
-
-    def _ends_management(self, message: int) -> bool:
-        """Firmware without any time left ends its management with the identifier of the sync of cycle 0."""
-        return message == rtcan.FIRMWARE_MANAGEMENT and self._reassembly.ends_with_next(message)
-
-
-# Who is who on an RTCAN bus, from what the modules tell each other again and again.
-
-
 class BusDirectory:
-    """What is known by now; all tables are bounded by the 16 bits of a message id."""
+    """Names of modules and topics, and the timing of the network, from what modules announce again and again.
+
+    All tables are bounded by the 16 bits of a message id.
+    """
 
     def __init__(self, timing: Timing) -> None:
         self.timing = timing
-        self.told = False
-        """Whether the master has told the timing; else it is what the user said."""
+        self.timing_known = False
+        """Whether the timing is the master's, by its NETWORK; else it is the user's."""
         self.modules: dict[int, str] = {}
         """Names by id8."""
         self.topics: dict[int, str] = {}
         """Names by message id."""
         self.sizes: dict[int, int] = {}
         """Bytes of a message, by message id."""
-        self._greeted: set[int] = set()
+        self._greeted: set[int] = set()  # id8 with a name from a HELLO: a gateway also passes ALIVE on
 
     def learn(self, data: bytes, source: int) -> str:
-        """A management message of this id8 (0: firmware, which does not say). Comes back in words."""
+        """Learn from a management message of this id8 (0: firmware, which does not say). Its description comes back."""
         try:
             message = management.decode(data)
         except DecodeError:
@@ -365,7 +146,7 @@ class BusDirectory:
                 number = management.rtcan_message_id(params)
                 self.topics[number], self.sizes[number] = topic, size
             case management.Network(slots=slots, slot=slot) if 2 <= slots <= rtcan.SLOTS_MAX and slot:
-                self.told = True
+                self.timing_known = True
                 self.timing = Timing(slots, slot, self.timing.bit)
         return describe(message)
 
@@ -381,8 +162,227 @@ class BusDirectory:
         return self.modules.get(id8, f"id {id8}") if id8 else "?"
 
 
+class Monitor:
+    """Counts the frames of a bus. Instants are ns of one clock."""
+
+    def __init__(self, timing: Timing) -> None:
+        self.directory = BusDirectory(timing)
+        self.cycles = 0
+        """Whole cycles watched since the last `reset`."""
+        self.last_frame = 0
+        """When the last frame was on the bus."""
+        self._period = 0
+        self._end = NEVER  # of the current period
+        self._loads: deque[BusLoad] = deque()  # of those that are over
+        self._reassembly = Reassembly()
+        self._sync: int | None = None  # start of the current cycle
+        self._cycle = 0
+        self._mask = 0
+        self._filled: set[int] = set()
+        self.reset(0)
+
+    def reset(self, now: int) -> None:
+        """Count from now on, until the next `reset`."""
+        self._end = NEVER
+        self._loads.clear()
+        self._begin_period(now)
+
+    def begin(self, now: int, period: int) -> None:
+        """Count from now on, in periods of so many ns, each of which `next_load` gives once."""
+        self.reset(now)
+        self._period = period
+        self._end = now + period
+
+    def next_load(self) -> BusLoad:
+        """The load of the next period that is over; call it when all frames of that are here."""
+        if not self._loads:
+            self._end_period()
+        return self._loads.popleft()
+
+    def _end_period(self) -> None:
+        end = self._end
+        self._loads.append(self.load(end))
+        self._begin_period(end)
+        self._end = end + self._period
+
+    def _begin_period(self, now: int) -> None:
+        self._since = now
+        self._tallies: dict[tuple[int, FrameKind], TrafficCount] = {}
+        self._faults: Counter[str] = Counter()
+        self._reserved = 0
+        self._nrt: int | None = None
+        self._nrt_gap: int | None = None
+        self._forget_slots()
+
+    def _forget_slots(self) -> None:
+        self._slots: list[BusSlot] = []
+        self._owners: list[Counter[int]] = []  # by slot, of message ids: names may be learnt later
+        self.cycles = 0
+        self._whole = False
+
+    def fault(self, kind: str) -> None:
+        """An error frame, or another fault that the interface reports."""
+        self._faults[kind] += 1
+
+    def frame(self, frame: Frame, stamp: int) -> SeenFrame:
+        """A frame was on the bus until `stamp`."""
+        self._on_bus(stamp)
+        identifier = rtcan.decode_identifier(frame.id)
+        message = identifier.message
+        kind = self._kind_of(frame, identifier)
+        bits = rtcan.frame_bits(frame.id, frame.data)
+        start = stamp - bits * self.directory.timing.bit
+        if kind is FrameKind.SYNC:
+            self._begin_cycle(start, frame)
+        slot = self._slot_of(start, message, kind)
+        self._count(message, kind, bits)
+        if kind is FrameKind.NRT:
+            self._note_nrt(stamp)
+        text = self._management_text(frame, message, stamp) if kind is FrameKind.MANAGEMENT else ""
+        size = self.directory.sizes.get(message)
+        return SeenFrame(
+            stamp,
+            frame,
+            kind,
+            "" if kind is FrameKind.SYNC else self.directory.topic(message),
+            "" if kind is FrameKind.SYNC else self.directory.module(message),
+            identifier.laxity,
+            identifier.left,
+            bits + rtcan.INTERMISSION,
+            rtcan.fragment_count(size) if size and size <= rtcan.PAYLOAD_MAX else None,
+            self._cycle if self._sync is not None else None,
+            slot,
+            text,
+        )
+
+    def other(self, frame: OtherFrame, stamp: int) -> SeenFrame:
+        """A frame that RTCAN does not use was on the bus until `stamp`."""
+        self._on_bus(stamp)
+        bits = rtcan.other_frame_bits(frame)
+        slot = self._slot_of(stamp - bits * self.directory.timing.bit, _OTHER, FrameKind.OTHER)
+        self._count(_OTHER, FrameKind.OTHER, bits)
+        text = f"{'29-bit' if frame.extended else '11-bit'} identifier {frame.id:X}"
+        if frame.remote is not None:
+            text += f", asks for {frame.remote} bytes"
+        cycle = self._cycle if self._sync is not None else None
+        seen = Frame(frame.id, frame.data)
+        bits += rtcan.INTERMISSION
+        return SeenFrame(stamp, seen, FrameKind.OTHER, "", "", 0, 0, bits, None, cycle, slot, text)
+
+    def _on_bus(self, stamp: int) -> None:
+        self.last_frame = max(self.last_frame, stamp)
+        while stamp >= self._end:
+            self._end_period()
+
+    def _count(self, message: int, kind: FrameKind, bits: int) -> None:
+        tally = self._tallies.setdefault((message, kind), TrafficCount())
+        tally.frames += 1
+        tally.bits += bits + rtcan.INTERMISSION
+
+    @property
+    def slots(self) -> list[BusSlot]:
+        """The use of each slot since the last `reset`, with the names that are known by now."""
+        for slot, owners in zip(self._slots, self._owners, strict=True):
+            slot.owners = Counter()
+            for message, count in owners.items():
+                slot.owners["sync" if message == _SYNC else self.directory.topic(message)] += count
+        return self._slots
+
+    def load(self, now: int) -> BusLoad:
+        """The load since the last `reset`."""
+        gap = self._nrt_gap
+        if self._nrt is not None:
+            gap = max(gap or 0, now - self._nrt)
+        elapsed = now - self._since
+        tallies: dict[tuple[str, str, FrameKind], TrafficCount] = {}
+        for (message, kind), tally in self._tallies.items():
+            nameless = kind is FrameKind.SYNC or kind is FrameKind.OTHER
+            names = ("", "") if nameless else (self.directory.topic(message), self.directory.module(message))
+            total = tallies.setdefault((*names, kind), TrafficCount())
+            total.frames += tally.frames
+            total.bits += tally.bits
+        timing = self.directory.timing
+        reserved = min(1.0, self._reserved * timing.slot / elapsed) if elapsed else 0.0
+        longest = (rtcan.frame_bits_max(rtcan.FRAME_MAX) + rtcan.INTERMISSION) * timing.bit
+        free = (1.0 - reserved) * elapsed / timing.slot * (timing.slot // longest) if self._reserved else 0.0
+        return BusLoad(elapsed, timing.bit, tallies, dict(self._faults), reserved, free, gap)
+
+    def _begin_cycle(self, start: int, frame: Frame) -> None:
+        sync = rtcan.decode_sync(frame)
+        timing = self.directory.timing
+        if self._whole and self._sync is not None and abs(start - self._sync - timing.cycle) < timing.slot:
+            self._end_cycle()
+        self._whole = True
+        self._sync, self._cycle, self._mask = start, sync.cycle, sync.mask | 1
+        self._filled = set()
+        self._reserved += self._mask.bit_count()
+
+    def _end_cycle(self) -> None:
+        """The cycle that ends was watched from its beginning."""
+        self.cycles += 1
+        self._grow(self._mask.bit_length() - 1)
+        for index, slot in enumerate(self._slots):
+            if self._mask >> index & 1:
+                slot.reserved += 1
+                slot.used += index in self._filled
+
+    def _slot_of(self, start: int, message: int, kind: FrameKind) -> int | None:
+        """The slot in which a frame started; the frame is counted there."""
+        timing = self.directory.timing
+        if self._sync is None:
+            return None
+        index = (start - self._sync + timing.slot // _EARLY) // timing.slot
+        if not 0 <= index < timing.slots:
+            self._sync = self._sync if index < 0 else None  # too late: no sync came
+            return None
+        if self._whole:
+            self._note_slot(index, message, kind)
+        return index
+
+    def _note_slot(self, index: int, message: int, kind: FrameKind) -> None:
+        self._grow(index)
+        if kind in {FrameKind.SYNC, FrameKind.HRT}:
+            self._filled.add(index)
+            self._owners[index][_SYNC if kind is FrameKind.SYNC else message] += 1
+        else:
+            self._slots[index].shared += 1
+
+    def _grow(self, index: int) -> None:
+        while len(self._slots) <= max(index, self.directory.timing.slots - 1):
+            self._slots.append(BusSlot())
+            self._owners.append(Counter())
+
+    def _note_nrt(self, stamp: int) -> None:
+        since = self._since if self._nrt is None else self._nrt
+        self._nrt_gap = max(self._nrt_gap or 0, stamp - since)
+        self._nrt = stamp
+
+    def _management_text(self, frame: Frame, message: int, stamp: int) -> str:
+        self._reassembly.subscribe(message, management.SIZE)
+        received = self._reassembly.receive(frame, stamp)
+        if received is None:
+            return ""
+        before = self.directory.timing
+        text = self.directory.learn(received.payload, rtcan.id8_of(message))
+        if self.directory.timing != before:
+            self._forget_slots()
+        return text
+
+    def _kind_of(self, frame: Frame, identifier: Identifier) -> FrameKind:
+        message, laxity = identifier.message, identifier.laxity
+        if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX and not self._ends_management(message):
+            return FrameKind.SYNC
+        if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.directory.topics:
+            return FrameKind.MANAGEMENT  # firmware of 2014 may have topics there
+        return FrameKind.HRT if laxity == rtcan.HRT else FrameKind.NRT if laxity == rtcan.NRT else FrameKind.SRT
+
+    def _ends_management(self, message: int) -> bool:
+        """Firmware that has no time left ends its management with the identifier of the sync of cycle 0."""
+        return message == rtcan.FIRMWARE_MANAGEMENT and self._reassembly.ends_with_next(message)
+
+
 def describe(message: management.Management) -> str:
-    """A management message in words."""
+    """A management message as text."""
     fields = {
         name: getattr(message, name)
         for name in message.__struct_fields__

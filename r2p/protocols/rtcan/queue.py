@@ -1,10 +1,10 @@
 """The queue of outgoing soft and non real-time messages: the least laxity goes first (PROTOCOL.md 6, thesis 4.3.5).
 
-Messages of one topic wait in one lane, in order, and only the first one of a lane competes: so no two messages of a
-topic ever interleave. A lane is as urgent as the most urgent message in it. The lanes are sorted by deadline; those
-that have the same laxity at this moment (whole ms) are next to each other, and among them the first come is served.
+Messages of one topic wait in a FIFO of their own, and only the first one of each FIFO competes: so no two messages of
+a topic ever interleave. A FIFO is as urgent as the most urgent message in it. The FIFOs are sorted by deadline; those
+that have the same laxity at this moment (whole ms) are next to each other, and the oldest of them goes first.
 
-Laxity is computed anew at every try: `take` moves nothing, only `sent` does.
+Laxity is computed anew at every try: `next_frame` changes no order, only `frame_sent` does.
 """
 
 from bisect import bisect_left, insort
@@ -14,18 +14,18 @@ from collections.abc import Callable, Hashable, Iterator
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import FRAME_MAX, NRT, SRT_MAX, Frame
+from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, MESSAGE_SHIFT, NRT, SRT_MAX, Frame
 from r2p.protocols.rtcan.events import LONG_AGO, NEVER
 
 _MILLISECOND = 1_000_000
-_FIRST = 1 << 62  # more than any count
+_FIRST = 1 << 62  # more than any count of messages: taken off the order of management, which goes before the others
 
 
 class QueuedMessage(msgspec.Struct, eq=False):
-    """A message on its way. `deadline` NEVER: non real-time. `drop`: given up when overdue, unless it has started.
+    """A message that waits. `deadline` NEVER: non real-time. `drop`: given up when overdue, unless it has started.
 
-    Once its first frame is out it is always finished: a receiver of 2014 loses the next message as well when the end of
-    one is missing. `recalled`: its frame was asked back from the port, as the bus is used in another way from now on.
+    Once its first frame is sent it is always finished: firmware of 2014 loses the next message as well when the end of
+    one is missing. `recalled`: its frame was withdrawn, as the node uses the bus in another way from now on.
     """
 
     message: int
@@ -47,7 +47,10 @@ class QueuedMessage(msgspec.Struct, eq=False):
 
 
 class _MessageFifo(msgspec.Struct, eq=False):
-    """The messages of one topic. `busy`: a frame of the first one is with the port; `held`: no try before then."""
+    """The messages of one topic. `busy`: a frame of the first one is with the port; `held`: no try before this instant.
+
+    `deadline`, `order` and `expiry` are the first of those of its messages.
+    """
 
     waiting: deque[QueuedMessage]
     deadline: int = NEVER
@@ -65,58 +68,51 @@ class LaxityQueue:
         """While this is set, only the topic with this message id may send."""
         self._capacity = capacity
         self._depth = depth
-        self._lanes: dict[int, _MessageFifo] = {}
-        self._sorted: list[tuple[int, int, _MessageFifo]] = []
+        self._fifos: dict[int, _MessageFifo] = {}  # by message id
+        self._sorted: list[tuple[int, int, _MessageFifo]] = []  # by deadline and order
         self.size = 0
         """Messages that wait."""
         self._count = 0
-        self._expiry = NEVER
-
-    def __len__(self) -> int:
-        return self.size
-
-    @property
-    def full(self) -> bool:
-        return self.size >= self._capacity
+        self._expiry = NEVER  # not later than the first message to drop, so that `expire` seldom looks at all FIFOs
 
     def put(self, message: QueuedMessage, *, urgent: bool = False, management: bool = False) -> bool:
-        """Queue it; `urgent` before what of its topic has not started and may wait longer. False: there is no room.
+        """Queue a message; `urgent`: before those of its topic that have not started and may wait longer. False: full.
 
-        `management` has room of its own, and goes before others of the same laxity, as it does on the bus: else events
-        that are overdue but not dropped would stop leases and discovery. Raises `MessageError` for what RTCAN can't
-        carry.
+        `management` does not count for the capacity, and goes before others of the same laxity, as on the bus: else
+        events that are overdue but not dropped would stop leases and discovery. Raises `MessageError` for payloads that
+        RTCAN can't carry.
         """
         message.frames = rtcan.fragment_count(len(message.payload))
-        lane = self._lanes.get(message.message)
-        if (self.size >= self._capacity and not management) or (lane is not None and len(lane.waiting) >= self._depth):
+        fifo = self._fifos.get(message.message)
+        if (self.size >= self._capacity and not management) or (fifo is not None and len(fifo.waiting) >= self._depth):
             return False
         self._count += 1
         message.order = self._count - (_FIRST if management else 0)
-        if lane is None:
-            lane = self._lanes[message.message] = _MessageFifo(deque((message,)))
-            self._enter(lane)
+        if fifo is None:
+            fifo = self._fifos[message.message] = _MessageFifo(deque((message,)))
+            self._enter(fifo)
         elif urgent:
-            self._leave(lane)
-            lane.deadline = min(lane.deadline, message.deadline)
-            lane.waiting.insert(self._place(lane, message.deadline), message)
-            self._enter(lane)
+            self._leave(fifo)
+            fifo.deadline = min(fifo.deadline, message.deadline)
+            fifo.waiting.insert(self._place(fifo, message.deadline), message)
+            self._enter(fifo)
         else:
-            self._append(lane, message)
+            self._append(fifo, message)
         self.size += 1
         return True
 
     def expire(self, now: int) -> list[QueuedMessage]:
-        """Remove and return what is overdue and to be dropped; what is with the port stays."""
+        """Remove and return overdue messages that are to be dropped; one whose frame is with the port stays."""
         if now < self._expiry:
             return []
-        dropped = []
-        for lane in [lane for lane in self._lanes.values() if lane.expiry <= now]:
-            first = lane.waiting[0] if lane.busy else None
-            gone = [each for each in lane.waiting if each.expiry <= now and each is not first]
+        dropped: list[QueuedMessage] = []
+        for fifo in [fifo for fifo in self._fifos.values() if fifo.expiry <= now]:
+            first = fifo.waiting[0] if fifo.busy else None
+            gone = [each for each in fifo.waiting if each.expiry <= now and each is not first]
             if gone:
                 dropped += gone
-                self._remove(lane, gone)
-        self._expiry = min((lane.expiry for lane in self._lanes.values() if not lane.busy), default=NEVER)
+                self._drop(fifo, gone)
+        self._expiry = min((fifo.expiry for fifo in self._fifos.values() if not fifo.busy), default=NEVER)
         return dropped
 
     @property
@@ -125,15 +121,16 @@ class LaxityQueue:
         return self._expiry if self.size else NEVER
 
     def best(self, now: int, *, nrt: bool = True) -> QueuedMessage | None:
-        """The message to try now. `nrt=False`: among those that are not non real-time."""
+        """The message to try now. `nrt=False`: only among real-time ones."""
         if self.only is not None:
-            lane = self._lanes.get(self.only)
-            return lane.waiting[0] if lane is not None and not lane.busy and lane.held <= now else None
+            fifo = self._fifos.get(self.only)
+            return fifo.waiting[0] if fifo is not None and not fifo.busy and fifo.held <= now else None
+        # The first FIFO may not be the best: among those of the same laxity the oldest goes first.
         chosen: tuple[int, int, _MessageFifo] | None = None
         limit: int | None = None
         for entry in self._sorted:
-            lane = entry[2]
-            if lane.busy or lane.held > now:
+            fifo = entry[2]
+            if fifo.busy or fifo.held > now:
                 continue
             if chosen is None:
                 chosen = entry
@@ -157,115 +154,116 @@ class LaxityQueue:
                 return entry[2].waiting[0]
         return None
 
-    def take(self, message: QueuedMessage, now: int) -> Frame:
-        """Its next frame, with the laxity of this moment. Its topic has nothing else to try until `put_back`."""
-        lane = self._lanes[message.message]
-        lane.busy = True
-        laxity = NRT if lane.deadline == NEVER else rtcan.srt_laxity(lane.deadline - now)
+    def next_frame(self, message: QueuedMessage, now: int) -> Frame:
+        """Its next frame, with the laxity of this moment. Its topic does not compete until that is sent or put back."""
+        fifo = self._fifos[message.message]
+        fifo.busy = True
+        laxity = NRT if fifo.deadline == NEVER else rtcan.srt_laxity(fifo.deadline - now)
         at = message.sent * FRAME_MAX
-        identifier = laxity << 23 | message.message << 7 | message.frames - 1 - message.sent
+        # `encode_identifier` inlined: it would check for each frame what was checked for the message.
+        identifier = laxity << LAXITY_SHIFT | message.message << MESSAGE_SHIFT | message.frames - 1 - message.sent
         return Frame(identifier, message.payload[at : at + FRAME_MAX])
 
     def put_back(self, message: QueuedMessage, hold: int = LONG_AGO) -> None:
-        """The frame was not sent: the topic competes again, from the instant `hold` on."""
-        lane = self._lanes[message.message]
-        lane.busy = False
-        lane.held = hold
-        if lane.expiry < self._expiry:
-            self._expiry = lane.expiry
+        """Its frame was not sent: the topic competes again, from the instant `hold` on."""
+        fifo = self._fifos[message.message]
+        fifo.busy = False
+        fifo.held = hold
+        if fifo.expiry < self._expiry:
+            self._expiry = fifo.expiry
 
-    def sent(self, message: QueuedMessage) -> bool:
-        """The frame was sent. Says whether it was the last one: then the message is out of the queue."""
-        lane = self._lanes[message.message]
-        lane.busy = False
+    def frame_sent(self, message: QueuedMessage) -> bool:
+        """Its frame was sent. Says whether it was the last one: then the message is out of the queue."""
+        fifo = self._fifos[message.message]
+        fifo.busy = False
         message.sent += 1
         if message.sent == message.frames:
-            self._remove(lane, [message])
+            self._drop(fifo, [message])
             return True
         if message.sent == 1 and message.drop:  # from now on it is not given up any more
-            lane.expiry = min((each.expiry for each in lane.waiting), default=NEVER)
-        self._expiry = min(self._expiry, lane.expiry)
+            fifo.expiry = min((each.expiry for each in fifo.waiting), default=NEVER)
+        self._expiry = min(self._expiry, fifo.expiry)
         return False
 
-    def give_up(self, message: QueuedMessage) -> None:
-        """Remove a message, whose frame is no longer with the port."""
-        lane = self._lanes[message.message]
-        if message is lane.waiting[0]:
-            lane.busy = False
-        self._remove(lane, [message])
+    def remove(self, message: QueuedMessage) -> None:
+        """Give up a message whose frame is not with the port any more."""
+        fifo = self._fifos[message.message]
+        if message is fifo.waiting[0]:
+            fifo.busy = False
+        self._drop(fifo, [message])
 
     def withdraw(self, message: int, which: Callable[[QueuedMessage], bool] = lambda each: True) -> list[QueuedMessage]:
-        """Remove and return what waits of a topic, all or these of it, but for a message that has started."""
-        lane = self._lanes.get(message)
-        if lane is None:
+        """Remove and return messages of a topic, all or some, but not one that has started."""
+        fifo = self._fifos.get(message)
+        if fifo is None:
             return []
-        first = lane.waiting[0] if lane.busy else None
-        gone = [each for each in lane.waiting if not each.sent and each is not first and which(each)]
+        first = fifo.waiting[0] if fifo.busy else None
+        gone = [each for each in fifo.waiting if not each.sent and each is not first and which(each)]
         if gone:
-            self._remove(lane, gone)
+            self._drop(fifo, gone)
         return gone
 
-    def waits(self, message: int) -> bool:
-        """Whether there is anything of this topic."""
-        return message in self._lanes
+    def holds(self, message: int) -> bool:
+        """Whether messages of this topic wait."""
+        return message in self._fifos
 
     def messages(self) -> Iterator[QueuedMessage]:
         """All of them, topic by topic."""
-        for lane in self._lanes.values():
-            yield from lane.waiting
+        for fifo in self._fifos.values():
+            yield from fifo.waiting
 
     def clear(self) -> list[QueuedMessage]:
         """Remove and return everything."""
         gone = list(self.messages())
-        self._lanes.clear()
+        self._fifos.clear()
         self._sorted.clear()
         self.size = 0
         self._expiry = NEVER
         return gone
 
-    def _remove(self, lane: _MessageFifo, gone: list[QueuedMessage]) -> None:
-        self._leave(lane)
+    def _drop(self, fifo: _MessageFifo, gone: list[QueuedMessage]) -> None:
+        self._leave(fifo)
         for message in gone:
-            lane.waiting.remove(message)
+            fifo.waiting.remove(message)
         self.size -= len(gone)
-        if lane.waiting:
-            self._enter(lane)
+        if fifo.waiting:
+            self._enter(fifo)
         else:
-            del self._lanes[gone[0].message]
+            del self._fifos[gone[0].message]
 
-    def _leave(self, lane: _MessageFifo) -> None:
-        del self._sorted[bisect_left(self._sorted, (lane.deadline, lane.order))]
+    def _leave(self, fifo: _MessageFifo) -> None:
+        del self._sorted[bisect_left(self._sorted, (fifo.deadline, fifo.order))]
 
-    def _append(self, lane: _MessageFifo, message: QueuedMessage) -> None:
-        """Put it behind the others: the lane may become more urgent by that."""
-        lane.waiting.append(message)
-        if message.deadline < lane.deadline:
-            self._leave(lane)
-            lane.deadline = message.deadline
-            insort(self._sorted, (lane.deadline, lane.order, lane))
-        if message.expiry < lane.expiry:
-            lane.expiry = message.expiry
-            self._expiry = min(self._expiry, lane.expiry)
+    def _append(self, fifo: _MessageFifo, message: QueuedMessage) -> None:
+        """Put it after the others: the FIFO may become more urgent by that."""
+        fifo.waiting.append(message)
+        if message.deadline < fifo.deadline:
+            self._leave(fifo)
+            fifo.deadline = message.deadline
+            insort(self._sorted, (fifo.deadline, fifo.order, fifo))
+        if message.expiry < fifo.expiry:
+            fifo.expiry = message.expiry
+            self._expiry = min(self._expiry, fifo.expiry)
 
-    def _place(self, lane: _MessageFifo, deadline: int) -> int:
-        """Where a message with this deadline goes; not into one that has started."""
-        started = lane.busy or lane.waiting[0].sent > 0
-        later = (place for place, each in enumerate(lane.waiting) if each.deadline > deadline and place >= started)
-        return next(later, len(lane.waiting))
+    def _place(self, fifo: _MessageFifo, deadline: int) -> int:
+        """The index for a message with this deadline: not before one that has started."""
+        started = fifo.busy or fifo.waiting[0].sent > 0
+        later = (place for place, each in enumerate(fifo.waiting) if each.deadline > deadline and place >= started)
+        return next(later, len(fifo.waiting))
 
-    def _enter(self, lane: _MessageFifo) -> None:
-        """Sort it in, as urgent as its most urgent message."""
-        waiting = lane.waiting
+    def _enter(self, fifo: _MessageFifo) -> None:
+        """Sort it in, as urgent as its most urgent message. A FIFO is sorted anew by `_leave`, changes, `_enter`."""
+        waiting = fifo.waiting
         first = waiting[0]
-        lane.order = first.order
+        fifo.order = first.order
         if len(waiting) == 1:
-            lane.deadline, lane.expiry = first.deadline, first.expiry
-        elif lane.deadline < NEVER:  # else all are non real-time; there may be many
-            lane.deadline = min(each.deadline for each in waiting)
-            lane.expiry = min(each.expiry for each in waiting)
-        if lane.expiry < self._expiry:
-            self._expiry = lane.expiry
-        insort(self._sorted, (lane.deadline, lane.order, lane))
+            fifo.deadline, fifo.expiry = first.deadline, first.expiry
+        elif fifo.deadline < NEVER:  # else all are non real-time, and there may be many: don't look at each
+            fifo.deadline = min(each.deadline for each in waiting)
+            fifo.expiry = min(each.expiry for each in waiting)
+        if fifo.expiry < self._expiry:
+            self._expiry = fifo.expiry
+        insort(self._sorted, (fifo.deadline, fifo.order, fifo))
 
 
 def _same_laxity_until(deadline: int, now: int) -> int:

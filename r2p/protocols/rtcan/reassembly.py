@@ -1,8 +1,8 @@
 """Frames to messages, with an account of what was lost, by source (PROTOCOL.md 6).
 
-A frame says only how many follow it, so a beginning is known by the size that its topic must have. Whatever does not
-continue a message in the right way ends it; the rest of it is skipped up to the next beginning. A repeat of the last
-frame, which CAN can make, is no gap.
+A frame says only how many follow it, so a beginning is known by the size that its topic must have. A frame that
+does not continue a message in the right way ends it; the rest is skipped up to the next beginning. A repeat of the last
+frame, which CAN can make, is not a gap.
 """
 
 from collections import Counter
@@ -10,21 +10,22 @@ from collections import Counter
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import FRAME_MAX, Frame
+from r2p.codecs.rtcan import FRAME_MAX, LEFT_MASK, MESSAGE_MAX, MESSAGE_SHIFT, Frame
 from r2p.protocols.rtcan.events import NEVER, Received
 
 TIMEOUT = 100_000_000
 """ns from one frame of a message to the next."""
-_IDLE = -1  # Inlet.expected between two messages
+_IDLE = -1  # `SourceBuffer.expected` between two messages
 
 
 class SourceBuffer(msgspec.Struct, eq=False):
-    """What is being received from one publisher. `first` and `size` are those of all its messages.
+    """The unfinished message of one publisher. All of them have `size` bytes, and begin with `first` fragments left.
 
     With `parts`, a message is being received and `expected` is what its next frame says; without, frames from
-    `expected` down are the rest of something lost. `tail` is the last frame of the last message.
+    `expected` down are the rest of something lost. `tail` is the last frame of the message before.
     """
 
+    message: int
     first: int
     size: int
     expected: int = _IDLE
@@ -36,54 +37,56 @@ class SourceBuffer(msgspec.Struct, eq=False):
 
 
 class Reassembly:
-    """Puts messages together from frames in any order of sources; holds at most one unfinished message of each."""
+    """Joins frames, in any order of sources, to messages; holds at most one unfinished message of each source."""
 
     def __init__(self) -> None:
         self.losses: dict[int, Counter[str]] = {}
         """What was lost, by id8 of the source and reason."""
-        self._inlets: dict[int, SourceBuffer] = {}
+        self._buffers: dict[int, SourceBuffer] = {}
         self.open: dict[int, SourceBuffer] = {}
         """Unfinished messages by id, the oldest first."""
 
     def subscribe(self, message: int, size: int) -> None:
-        """Take messages with this id, of `size` bytes. Raises `MessageError` beyond 1..1024."""
-        before = self._inlets.get(message)
+        """Receive messages with this id, of `size` bytes. Raises `MessageError` beyond 1..1024."""
+        before = self._buffers.get(message)
         if before is None or before.size != size:
-            inlet = SourceBuffer(rtcan.fragment_count(size) - 1, size)
+            buffer = SourceBuffer(message, rtcan.fragment_count(size) - 1, size)
             self.unsubscribe(message)
-            self._inlets[message] = inlet
+            self._buffers[message] = buffer
 
     def unsubscribe(self, message: int) -> None:
-        """Take no more messages with this id; one that is being received is lost."""
+        """Receive no more messages with this id; an unfinished one is lost."""
         unfinished = self.open.get(message)
         if unfinished is not None:
-            self._reset(message, unfinished, "interrupted")
-        self._inlets.pop(message, None)
+            self._reset(unfinished, "interrupted")
+        self._buffers.pop(message, None)
 
     def subscribed(self, message: int) -> bool:
-        return message in self._inlets
+        return message in self._buffers
 
     def ends_with_next(self, message: int) -> bool:
         """Whether a message with this id is being received, and only its last frame is missing."""
-        inlet = self.open.get(message)
-        return inlet is not None and inlet.expected == 0
+        buffer = self.open.get(message)
+        return buffer is not None and buffer.expected == 0
 
     @property
     def messages(self) -> list[int]:
-        """The ids that are taken."""
-        return list(self._inlets)
+        """The ids of messages that are received."""
+        return list(self._buffers)
 
     def receive(self, frame: Frame, stamp: int) -> Received | None:
         """A frame came in; `stamp` is the instant when it ended. The message that it completes comes back."""
         identifier, data = frame.id, frame.data
-        inlet = self._inlets.get(identifier >> 7 & 0xFFFF)
-        if inlet is None:
+        # The codec's functions are inlined: this runs for each frame on the bus.
+        buffer = self._buffers.get(identifier >> MESSAGE_SHIFT & MESSAGE_MAX)
+        if buffer is None:
             return None
-        if inlet.first or identifier & 0x7F or inlet.expected != _IDLE:
-            return self._fragment(inlet, identifier, data, stamp)
-        if len(data) == inlet.size:
+        left = identifier & LEFT_MASK
+        if buffer.first or left or buffer.expected != _IDLE:
+            return self._fragment(buffer, frame, left, stamp)
+        if len(data) == buffer.size:
             return Received(identifier, data, stamp)
-        self._lose(identifier, "wrong length")
+        self._lose(buffer.message, "wrong length")
         return None
 
     @property
@@ -96,75 +99,73 @@ class Reassembly:
     def poll(self, now: int) -> None:
         """Give up messages whose next frame stays away."""
         while self.open:
-            message, inlet = next(iter(self.open.items()))
-            if now < inlet.last + TIMEOUT:
+            buffer = next(iter(self.open.values()))
+            if now < buffer.last + TIMEOUT:
                 return
-            self._reset(message, inlet, "time-out")
-            inlet.expected = _IDLE
+            self._reset(buffer, "time-out")
+            buffer.expected = _IDLE
 
     def reset(self) -> None:
-        """Forget what is unfinished."""
-        for message, inlet in list(self.open.items()):
-            self._reset(message, inlet, "interrupted")
-            inlet.expected = _IDLE
+        """Forget unfinished messages."""
+        for buffer in list(self.open.values()):
+            self._reset(buffer, "interrupted")
+            buffer.expected = _IDLE
 
-    def _fragment(self, inlet: SourceBuffer, identifier: int, data: bytes, stamp: int) -> Received | None:
-        message, left = identifier >> 7 & 0xFFFF, identifier & 0x7F
-        if stamp - inlet.last > TIMEOUT:
-            if inlet.parts:
-                self._reset(message, inlet, "time-out")
-            inlet.expected = _IDLE
-        if not inlet.parts:
-            return self._begin(inlet, identifier, data, stamp)
-        if left == inlet.expected:
-            return self._continue(message, inlet, data, stamp)
-        if left == inlet.expected + 1 and data == inlet.parts[-1]:
-            self._lose(identifier, "repeat")
+    def _fragment(self, buffer: SourceBuffer, frame: Frame, left: int, stamp: int) -> Received | None:
+        if stamp - buffer.last > TIMEOUT:
+            if buffer.parts:
+                self._reset(buffer, "time-out")
+            buffer.expected = _IDLE
+        if not buffer.parts:
+            return self._begin(buffer, frame, left, stamp)
+        if left == buffer.expected:
+            return self._continue(buffer, frame.data, stamp)
+        if left == buffer.expected + 1 and frame.data == buffer.parts[-1]:
+            self._lose(buffer.message, "repeat")
             return None
-        self._reset(message, inlet, "gap")
-        if left < inlet.expected:  # more of the same message
-            inlet.expected = left
-        return self._begin(inlet, identifier, data, stamp)
+        self._reset(buffer, "gap")
+        if left < buffer.expected:  # more of the same message: skip it as the rest of something lost
+            buffer.expected = left
+        return self._begin(buffer, frame, left, stamp)
 
-    def _begin(self, inlet: SourceBuffer, identifier: int, data: bytes, stamp: int) -> Received | None:
-        """Nothing is open: the frame is a beginning, or belongs to something of which the beginning is missing."""
-        left = identifier & 0x7F
-        rest = left == inlet.expected
-        if left == inlet.first and not rest:
-            inlet.identifier, inlet.started = identifier, stamp
-            return self._continue(identifier >> 7 & 0xFFFF, inlet, data, stamp)
-        if left == 0 and not rest and data == inlet.tail:
-            self._lose(identifier, "repeat")
+    def _begin(self, buffer: SourceBuffer, frame: Frame, left: int, stamp: int) -> Received | None:
+        """Nothing is open: the frame is a beginning, or belongs to a message of which the beginning is missing."""
+        rest = left == buffer.expected
+        if left == buffer.first and not rest:
+            buffer.identifier, buffer.started = frame.id, stamp
+            return self._continue(buffer, frame.data, stamp)
+        if left == 0 and not rest and frame.data == buffer.tail:
+            self._lose(buffer.message, "repeat")
         elif not rest:
-            self._lose(identifier, "too long" if left > inlet.first else "no beginning")
-        inlet.expected = left - 1
-        inlet.last = stamp
+            self._lose(buffer.message, "too long" if left > buffer.first else "no beginning")
+        buffer.expected = left - 1
+        buffer.last = stamp
         return None
 
-    def _continue(self, message: int, inlet: SourceBuffer, data: bytes, stamp: int) -> Received | None:
-        left = inlet.first - len(inlet.parts)
-        inlet.expected = left - 1
-        inlet.last = stamp
-        if len(data) != (FRAME_MAX if left else inlet.size - inlet.first * FRAME_MAX):
-            self._reset(message, inlet, "wrong length")
+    def _continue(self, buffer: SourceBuffer, data: bytes, stamp: int) -> Received | None:
+        left = buffer.first - len(buffer.parts)
+        buffer.expected = left - 1
+        buffer.last = stamp
+        if len(data) != (FRAME_MAX if left else buffer.size - buffer.first * FRAME_MAX):
+            self._reset(buffer, "wrong length")
             return None
-        inlet.parts.append(data)
-        self.open.pop(message, None)
+        buffer.parts.append(data)
+        self.open.pop(buffer.message, None)
         if left:
-            self.open[message] = inlet  # at the end: the oldest comes first
+            self.open[buffer.message] = buffer  # at the end: `poll` looks at the oldest only
             return None
-        payload = b"".join(inlet.parts)
-        inlet.parts.clear()
-        inlet.tail = data
-        return Received(inlet.identifier, payload, inlet.started)
+        payload = b"".join(buffer.parts)
+        buffer.parts.clear()
+        buffer.tail = data
+        return Received(buffer.identifier, payload, buffer.started)
 
-    def _reset(self, message: int, inlet: SourceBuffer, reason: str) -> None:
-        self._lose(message << 7, reason)
-        self.open.pop(message, None)
-        inlet.parts.clear()
+    def _reset(self, buffer: SourceBuffer, reason: str) -> None:
+        self._lose(buffer.message, reason)
+        self.open.pop(buffer.message, None)
+        buffer.parts.clear()
 
-    def _lose(self, identifier: int, reason: str) -> None:
-        source = identifier >> 7 & 0xFF
+    def _lose(self, message: int, reason: str) -> None:
+        source = rtcan.id8_of(message)
         counts = self.losses.get(source)
         if counts is None:
             counts = self.losses[source] = Counter()

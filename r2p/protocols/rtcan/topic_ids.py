@@ -1,11 +1,11 @@
-"""High bytes for topics: which one a publisher takes (PROTOCOL.md 6).
+"""High bytes for topics: which one a publisher uses (PROTOCOL.md 6).
 
 Firmware subscribers look at the high byte of a message id and nothing else, so no two topics on a bus may share one,
-and all publishers of one topic have to: the one with the lowest id8 leads, or firmware, which can't take another. The
-name decides which byte to try first: modules that know nothing of each other then seldom meet.
+and all publishers of one topic have to: the one with the lowest id8 leads, or firmware, which can't use another. The
+name decides which byte to try first: modules that don't know of each other then seldom choose the same one.
 
-What others use is learnt from their ADVERTISE and SUBSCRIBE_RESPONSE. That is a lease: it ends when it is not repeated,
-and at once when the module announces another id for the topic, or another topic for the id.
+The high bytes of others are learnt from their ADVERTISE and SUBSCRIBE_RESPONSE. That is a lease: it ends when it is not
+repeated, and at once when the module announces another id for the topic, or another topic for the id.
 """
 
 import zlib
@@ -16,9 +16,9 @@ import msgspec
 from r2p.codecs import rtcan
 from r2p.protocols.rtcan.events import LONG_AGO
 
-_COUNT = 0x100 - rtcan.FIRST_TOPIC
+_COUNT = rtcan.HIGH_MAX + 1 - rtcan.FIRST_TOPIC
 _SECOND = 1_000_000_000
-_LEASE = 20 * _SECOND
+_LEASE = 20 * _SECOND  # at least
 _ROUNDS = 2  # that may be missed on a slow bus
 _MESSAGES = 2  # of one topic in a round: its type and its ADVERTISE
 K = TypeVar("K")
@@ -26,7 +26,7 @@ V = TypeVar("V")
 
 
 class _AnnouncedId(msgspec.Struct, eq=False):
-    """What a message id of another module carries. `until`: the end of the lease (monotonic ns)."""
+    """The topic of another module's message id. `until`: the end of the lease (monotonic ns)."""
 
     topic: str
     firmware: bool
@@ -38,20 +38,20 @@ class TopicIdAllocator:
 
     def __init__(self) -> None:
         self.refused: set[str] = set()
-        """Our topics that have found none."""
+        """Our topics for which there is none."""
         self._lease = _LEASE
         self._ours: dict[str, int] = {}
-        self._announced: dict[int, _AnnouncedId] = {}  # by message id; what ends first comes first
+        self._announced: dict[int, _AnnouncedId] = {}  # by message id; the lease that ends first comes first
         self._topics: dict[int, dict[int, str]] = {}  # by high byte and id8
         self._messages: dict[str, dict[int, int]] = {}  # message ids by topic and id8
         self._freed = False
 
-    def pace(self, rate: float) -> None:
-        """A module on this bus makes so many announcements a second: a lease lasts for all that it may have to say."""
+    def set_rate(self, rate: float) -> None:
+        """Modules on this bus make so many announcements a second: a lease lasts until the longest round has ended."""
         self._lease = max(_LEASE, round(_ROUNDS * _MESSAGES * _COUNT / rate * _SECOND))
 
     def pick(self, topic: str) -> int | None:
-        """The high byte of our topic, always the same one. None: all are in use."""
+        """The high byte of our topic, the same at each call. None: all are in use."""
         high = self._ours.get(topic)
         if high is not None:
             return high
@@ -67,11 +67,11 @@ class TopicIdAllocator:
         return None
 
     def drop(self, topic: str) -> None:
-        """We don't publish it any more."""
+        """Give back the high byte of a topic that this module does not publish any more."""
         self._ours.pop(topic, None)
 
-    def heard(self, now: int, topic: str, message: int, own_id8: int, *, firmware: bool = False) -> list[str]:
-        """A module publishes a topic with this message id. Comes back: our topics that have to take another high byte.
+    def on_announced(self, now: int, topic: str, message: int, own_id8: int, *, firmware: bool = False) -> list[str]:
+        """A module publishes a topic with this message id. Our topics that need another high byte now come back.
 
         Of two modules that picked the same one for different topics, or different ones for the same topic, the one with
         the lower id8 keeps it; `firmware` always does.
@@ -90,13 +90,13 @@ class TopicIdAllocator:
             moved.append(topic)
         return moved
 
-    def gone(self, id8: int) -> None:
-        """A module left."""
+    def on_module_gone(self, id8: int) -> None:
+        """The module with this id8 left."""
         for message in [each for each in self._announced if rtcan.id8_of(each) == id8]:
             self._forget(message)
 
-    def freed(self, now: int) -> list[str]:
-        """Our topics that found no high byte, and may find one now."""
+    def retry(self, now: int) -> list[str]:
+        """Our topics for which there was no high byte, and may be one now."""
         self._forget_ended(now)
         freed, self._freed = self._freed, False
         return list(self.refused) if freed else []
@@ -106,13 +106,13 @@ class TopicIdAllocator:
         return len(self._announced)
 
     def _free(self, high: int, topic: str) -> bool:
-        """Whether nobody has it for another topic."""
+        """Whether no module uses it for another topic."""
         if high < rtcan.FIRST_TOPIC or high in self._ours.values():
             return False
         return all(other == topic for other in self._topics.get(high, {}).values())
 
     def _leader(self, topic: str) -> int | None:
-        """The message id of the other publisher of a topic whose high byte all of them take."""
+        """The message id of the other publisher of a topic whose high byte all of them use."""
         messages = self._messages.get(topic, {})
         return min(
             messages.values(),

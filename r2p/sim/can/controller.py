@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
-from r2p.codecs.rtcan import FRAME_MAX
+from r2p.codecs.rtcan import FRAME_MAX, IDENTIFIER_BITS
 from r2p.errors import MessageError
 from r2p.sim.can.faults import RECESSIVE_BITS, Confinement
 from r2p.sim.can.node import ControllerState, ErrorKind
@@ -251,7 +251,7 @@ class CanController:
 
     def _put(self, request: Request) -> None:
         frame = request.frame
-        if frame.id >> 29 or len(frame.data) > FRAME_MAX:
+        if frame.id >> IDENTIFIER_BITS or len(frame.data) > FRAME_MAX:
             raise MessageError(
                 f"a frame has an identifier of at most 29 bits and at most {FRAME_MAX} bytes, "
                 f"not {frame.id:#x} with {len(frame.data)} bytes"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING
 
-from r2p.codecs.rtcan import INTERMISSION
+from r2p.codecs.rtcan import INTERMISSION, message_of
 
 if TYPE_CHECKING:
     from r2p.sim.can.node import FrameRecord
@@ -67,7 +67,7 @@ class Statistics:
 
     def add(self, record: FrameRecord) -> None:
         """Count a frame or a failed attempt."""
-        count = self._counts[record.frame.id >> 7 & 0xFFFF, record.senders]
+        count = self._counts[message_of(record.frame.id), record.senders]
         if record.error is None:
             count.frames += 1
             count.bits += record.bits
@@ -77,7 +77,7 @@ class Statistics:
 
     def add_lost(self, name: str, identifier: int) -> None:
         """Count an arbitration that this node lost with this identifier."""
-        self._counts[identifier >> 7 & 0xFFFF, (name,)].lost += 1
+        self._counts[message_of(identifier), (name,)].lost += 1
 
     def load(self, now: int) -> float:
         """Return the share of the time up to `now` (ns) in which the bus was occupied: 1.0 is saturated."""

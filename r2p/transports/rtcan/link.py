@@ -18,18 +18,18 @@ from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import (
     Action,
-    Degraded,
     Done,
     Due,
     EngineSettings,
-    Granted,
     IdConflict,
     ParameterMismatch,
     ParametersMatch,
     Profile,
     Ready,
     Received,
-    Refused,
+    SlotsGranted,
+    SlotsLost,
+    SlotsRefused,
 )
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
@@ -130,7 +130,7 @@ class RtcanLink(BufferedLink):
             case ParametersMatch() if self.engine.ready:
                 self._notice(event)
                 self._announce()
-            case Granted() | Refused() | Degraded():
+            case SlotsGranted() | SlotsRefused() | SlotsLost():
                 self._slotted.slots_changed(event)
             case _ if not self._closed:
                 text = self._notice(event)
@@ -150,7 +150,7 @@ class RtcanLink(BufferedLink):
         if profile is Profile.FIRMWARE:
             rate, burst, quiet = _FIRMWARE_RATE, _BURST_MIN, _FIRMWARE_QUIET
         self._session.set_pace(rate, burst, quiet)
-        self._topic_ids.pace(rate)
+        self._topic_ids.set_rate(rate)
 
     def _announce(self) -> None:
         """Announce everything, under what may be another id8 than before."""
@@ -178,7 +178,7 @@ class RtcanLink(BufferedLink):
         if publisher is not None:
             firmware = source == FIRMWARE and message == rtcan.FIRMWARE_MANAGEMENT
             now, id8 = self._clock.monotonic(), self.engine.id8 or 0
-            self._renumber(self._topic_ids.heard(now, *publisher, id8, firmware=firmware))
+            self._renumber(self._topic_ids.on_announced(now, *publisher, id8, firmware=firmware))
         if self.up:  # before, only the message ids of others matter
             self.manage(data, source)
 
@@ -199,7 +199,7 @@ class RtcanLink(BufferedLink):
                 self.driver.update_filters()
             case _:
                 if isinstance(event, ModuleGone) and isinstance(event.info.source, int):
-                    self._topic_ids.gone(event.info.source)
+                    self._topic_ids.on_module_gone(event.info.source)
                 super()._act(event)
 
     # Out
@@ -276,7 +276,7 @@ class RtcanLink(BufferedLink):
     @property
     def losses(self) -> Counter[str]:
         own = Counter({kind: count for kind in _LOSSES if (count := self.engine.counts[kind])})
-        return sum(self.engine.losses.values(), super().losses + own)
+        return sum(self.engine.reassembly.losses.values(), super().losses + own)
 
     @property
     def slots(self) -> dict[str, SlottedTopic]:
@@ -316,13 +316,13 @@ class RtcanLink(BufferedLink):
 
     def _set_utc(self) -> None:
         """As the master, distribute this module's UTC."""
-        if self._utc_error is not None and self.engine.role is Role.MASTER:
+        if self._utc_error is not None and self.engine.election.role is Role.MASTER:
             self.engine.set_utc(self.driver.now(), self._clock.now(), self._utc_error)
 
     def _poll(self) -> None:
         self._set_utc()
         now = self._clock.monotonic()
-        self._renumber(self._topic_ids.freed(now))
+        self._renumber(self._topic_ids.retry(now))
         if self._message_ids.end_lingering(now):
             self.driver.update_filters()
         super()._poll()

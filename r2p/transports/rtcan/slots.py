@@ -14,7 +14,7 @@ from r2p.clock import Clock
 from r2p.codecs import rtcan
 from r2p.protocols.rtcan.calendar import Calendar, Refusal
 from r2p.protocols.rtcan.cycle import Timing
-from r2p.protocols.rtcan.events import Degraded, Done, Due, Fate, Granted, Refused
+from r2p.protocols.rtcan.events import Done, Due, Fate, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.runtime.topic import SlotPublisher, Topic
 from r2p.transports.link import Link
 from r2p.transports.rtcan.driver import EngineDriver
@@ -124,17 +124,17 @@ class SlottedTopics:
         slotted = self.by_topic.get(topic.name)
         return slotted is None or not (slotted.is_clock or slotted.clock_elsewhere)
 
-    def slots_changed(self, event: Granted | Refused | Degraded) -> None:
+    def slots_changed(self, event: SlotsGranted | SlotsRefused | SlotsLost) -> None:
         """Note that a topic got slots, was refused some, or lost them."""
         each = self._by_high.get(event.high)
         if each is None:
             return
-        if isinstance(event, Granted):
+        if isinstance(event, SlotsGranted):
             each.period, each.phase, each.interval = event.period, event.phase, event.interval
             each.refusal, each.due, each.sent, each.missed = "", 0, 0, 0
             return
         self._lose_slots(each)
-        if isinstance(event, Refused):
+        if isinstance(event, SlotsRefused):
             each.refusal = event.reason
         elif self._link.up:  # else the link tells the publisher that it is down
             each.publisher.link_degraded(self._link.name, f"slots lost: {event.reason}")

@@ -58,8 +58,8 @@ class LinkStatus:
     def guarantee(self, publisher_class: PublisherClass, slotted: SlottedTopic | None) -> str:
         """What a publisher class means for a topic; `slotted` if the topic is periodic and may have slots."""
         engine = self._engine
-        if engine.silenced is not None:
-            return f"nothing is sent: {engine.silenced}"
+        if engine.network.mismatch is not None:
+            return f"nothing is sent: {engine.network.mismatch}"
         if not engine.ready:
             return "nothing yet: not on the bus"
         match publisher_class:
@@ -82,7 +82,7 @@ class LinkStatus:
             return slotted.describe()
         if slotted.clock_elsewhere:
             return f"best effort: the slots of another link are its clock; {_SOFT}"
-        master = "" if self._engine.master is not None else ": there is no master yet"
+        master = "" if self._engine.network.master is not None else ": there is no master yet"
         return f"{slotted.describe()}{master}; meanwhile {_SOFT}"
 
 
@@ -136,7 +136,7 @@ class UtcEstimator:
 
     def _measure(self) -> None:
         engine = self._driver.engine
-        network_time, epoch = engine.network_time(self._driver.now()), engine.epoch
+        network_time, epoch = engine.network_time(self._driver.now()), engine.network.epoch
         if network_time is None or epoch is None:
             self._measured.clear()
             self._offset = None

@@ -34,7 +34,9 @@ def starts(bus: Bus, high: int, laxity: int | None = None) -> list[int]:
     return [
         at
         for at, frame, _ in bus.sent
-        if frame.id >> 15 & 0xFF == high and (laxity is None or frame.id >> 23 == laxity) and not is_sync(frame)
+        if rtcan.high_byte(rtcan.message_of(frame.id)) == high
+        and (laxity is None or rtcan.laxity_of(frame.id) == laxity)
+        and not is_sync(frame)
     ]
 
 
@@ -46,16 +48,21 @@ def syncs(bus: Bus, since: int = 0) -> list[tuple[int, Node]]:
     return [(at, node) for at, frame, node in bus.sent if is_sync(frame) and at >= since]
 
 
+def current_cycle(engine: Engine) -> int | None:
+    """The counter of its cycle; None: it has none."""
+    return engine.cycle.counter if engine.cycle.running else None
+
+
 def counted(node: Node, size: int = 8) -> list[bytes]:
     """Its periodic message gets a running number."""
-    told: list[bytes] = []
+    filled: list[bytes] = []
 
     def fill(due: Due) -> bytes:
-        told.append(len(told).to_bytes(size, "little"))
-        return told[-1]
+        filled.append(len(filled).to_bytes(size, "little"))
+        return filled[-1]
 
     node.fill = fill
-    return told
+    return filled
 
 
 def ready_engine(**settings: Any) -> tuple[Engine, int]:

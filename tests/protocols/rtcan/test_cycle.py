@@ -11,10 +11,10 @@ START = 1_000_000_000
 LATENCY = 7_000
 
 
-def heard(cycle: Cycle, start: int, counter: int, mask: int = 0) -> Alignment:
+def receive_sync(cycle: Cycle, start: int, counter: int, mask: int = 0) -> Alignment:
     """A sync frame whose start of frame was at `start`."""
     frame = rtcan.encode_sync(counter, mask)
-    return cycle.heard(frame, start + rtcan.frame_bits(frame.id, frame.data) * TIMING.bit + LATENCY)
+    return cycle.on_sync(frame, start + rtcan.frame_bits(frame.id, frame.data) * TIMING.bit + LATENCY)
 
 
 def slave() -> Cycle:
@@ -31,7 +31,7 @@ def test_the_timing_of_the_thesis() -> None:
 @pytest.mark.parametrize("mask", [0, 1, 0x0123_4567_89AB_CDEF, (1 << 64) - 1])
 def test_the_reference_is_the_start_of_frame_whatever_the_stuffing(mask: int) -> None:
     cycle = slave()
-    assert heard(cycle, START, 200, mask) is Alignment.STARTED
+    assert receive_sync(cycle, START, 200, mask) is Alignment.STARTED
     assert (cycle.reference, cycle.counter, cycle.mask, cycle.state) == (START, 200, mask, CycleState.FOLLOWING)
     assert cycle.slot_at(START + 166_000) == 1
     assert cycle.slot_at(START + 165_999) == 0
@@ -40,20 +40,20 @@ def test_the_reference_is_the_start_of_frame_whatever_the_stuffing(mask: int) ->
 
 def test_it_follows_the_sync_and_not_its_own_clock() -> None:
     cycle = slave()
-    heard(cycle, START, 1)
-    assert heard(cycle, START + TIMING.cycle + 480, 2, 0b10) is Alignment.ALIGNED
+    receive_sync(cycle, START, 1)
+    assert receive_sync(cycle, START + TIMING.cycle + 480, 2, 0b10) is Alignment.ALIGNED
     assert (cycle.reference, cycle.counter, cycle.mask) == (START + TIMING.cycle + 480, 2, 0b10)
     assert cycle.measured() == (TIMING.cycle + 480, 960)
 
 
 def test_the_counter_goes_on_beyond_8_bits() -> None:
     cycle = slave()
-    heard(cycle, START, 250)
+    receive_sync(cycle, START, 250)
     assert cycle.network_time(START) is None
     assert not cycle.anchor(0x1_0000_00F9)  # told one cycle ago
     assert cycle.counter == 0x1_0000_00FA
     for n in range(1, 600):
-        assert heard(cycle, START + n * TIMING.cycle, 250 + n & 0xFF) is Alignment.ALIGNED
+        assert receive_sync(cycle, START + n * TIMING.cycle, 250 + n & 0xFF) is Alignment.ALIGNED
         assert cycle.counter == 0x1_0000_00FA + n
     assert cycle.network_time(cycle.reference + 5) == (0x1_0000_00FA + 599) * TIMING.cycle + 5
     assert not cycle.anchor(0x1_0000_00FA + 590)
@@ -64,42 +64,42 @@ def test_the_counter_goes_on_beyond_8_bits() -> None:
 def test_there_is_no_cycle_before_the_first_one(low: int) -> None:
     """Whatever a NETWORK says: a count is a field without a sign."""
     cycle = slave()
-    heard(cycle, START, low)
+    receive_sync(cycle, START, low)
     cycle.anchor(0)
     assert (cycle.counter & 0xFF, cycle.counter >= 0) == (low, True)
 
 
 def test_missed_syncs_are_bridged_for_three_cycles() -> None:
     cycle = slave()
-    heard(cycle, START, 255, 0b10)
+    receive_sync(cycle, START, 255, 0b10)
     cycle.anchor(255)
     for n in range(1, HOLDOVER + 1):
-        assert cycle.roll()
+        assert cycle.bridge()
         assert cycle.state is CycleState.HOLDING
         assert (cycle.counter, cycle.reference, cycle.mask) == (255 + n, START + n * TIMING.cycle, None)
-    assert not cycle.roll()
+    assert not cycle.bridge()
     assert not cycle.running
     assert cycle.network_time(START) is None
 
 
 def test_resynchronised_after_missed_syncs() -> None:
     cycle = slave()
-    heard(cycle, START, 255)
+    receive_sync(cycle, START, 255)
     cycle.anchor(255)
-    cycle.roll()
-    cycle.roll()
-    assert heard(cycle, START + 3 * TIMING.cycle + 90, 2, 0b100) is Alignment.ALIGNED
+    cycle.bridge()
+    cycle.bridge()
+    assert receive_sync(cycle, START + 3 * TIMING.cycle + 90, 2, 0b100) is Alignment.ALIGNED
     assert (cycle.counter, cycle.missed, cycle.mask, cycle.state) == (258, 0, 0b100, CycleState.FOLLOWING)
     assert cycle.measured() == (TIMING.cycle + 30, 60)
 
 
 def test_a_sync_that_is_read_late_belongs_to_the_cycle_that_began_without_it() -> None:
     cycle = slave()
-    heard(cycle, START, 1)
-    cycle.roll()
-    assert heard(cycle, START + TIMING.cycle + 20, 2, 0b100) is Alignment.LATE
+    receive_sync(cycle, START, 1)
+    cycle.bridge()
+    assert receive_sync(cycle, START + TIMING.cycle + 20, 2, 0b100) is Alignment.LATE
     assert (cycle.counter, cycle.mask, cycle.missed) == (2, 0b100, 0)
-    assert heard(cycle, START + TIMING.cycle + 20, 2, 0b100) is Alignment.REPEATED
+    assert receive_sync(cycle, START + TIMING.cycle + 20, 2, 0b100) is Alignment.REPEATED
 
 
 @pytest.mark.parametrize(
@@ -107,17 +107,17 @@ def test_a_sync_that_is_read_late_belongs_to_the_cycle_that_began_without_it() -
 )
 def test_a_sync_off_the_grid_is_another_masters(late: int, counter: int) -> None:
     cycle = slave()
-    heard(cycle, START, 1, 0b10)
-    assert heard(cycle, START + TIMING.cycle + late, counter) is Alignment.FOREIGN
+    receive_sync(cycle, START, 1, 0b10)
+    assert receive_sync(cycle, START + TIMING.cycle + late, counter) is Alignment.FOREIGN
     assert (cycle.reference, cycle.counter, cycle.mask) == (START, 1, 0b10)
 
 
 def test_a_lost_cycle_starts_anew_with_any_sync_and_keeps_the_count() -> None:
     cycle = slave()
-    heard(cycle, START, 1)
+    receive_sync(cycle, START, 1)
     cycle.anchor(0x301)
     cycle.stop()
-    assert heard(cycle, START + 40 * TIMING.cycle + 4_000_000, 41) is Alignment.STARTED
+    assert receive_sync(cycle, START + 40 * TIMING.cycle + 4_000_000, 41) is Alignment.STARTED
     assert cycle.counter == 0x329
 
 
@@ -132,10 +132,10 @@ def test_a_lost_cycle_starts_anew_with_any_sync_and_keeps_the_count() -> None:
 )
 def test_a_lost_cycle_goes_on_where_a_new_master_begins_at_most_a_slot_late(late: int, alignment: Alignment) -> None:
     cycle = slave()
-    heard(cycle, START, 1)
+    receive_sync(cycle, START, 1)
     cycle.anchor(0x301)
     cycle.stop()
-    assert heard(cycle, START + 7 * TIMING.cycle + late, 8) is alignment
+    assert receive_sync(cycle, START + 7 * TIMING.cycle + late, 8) is alignment
     assert (cycle.counter, cycle.reference) == (0x308, START + 7 * TIMING.cycle + late)
 
 
@@ -154,10 +154,10 @@ def test_a_master_keeps_its_grid() -> None:
 
 def test_a_new_master_goes_on_with_the_grid_and_the_count_of_the_old_one() -> None:
     cycle = slave()
-    heard(cycle, START, 1)
+    receive_sync(cycle, START, 1)
     cycle.anchor(0x301)
     for _ in range(HOLDOVER + 1):
-        cycle.roll()
+        cycle.bridge()
     now = START + 7 * TIMING.cycle + 5
     assert cycle.upcoming(now) == (START + 8 * TIMING.cycle, 0x309)
 

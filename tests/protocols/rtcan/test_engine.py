@@ -11,7 +11,16 @@ from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Done, EngineSettings, Fate, LostSync, Profile, Received
 from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus
-from tests.protocols.rtcan.networks import SLOT, TOPIC, counted, firmware_management, network, publish, syncs
+from tests.protocols.rtcan.networks import (
+    SLOT,
+    TOPIC,
+    counted,
+    current_cycle,
+    firmware_management,
+    network,
+    publish,
+    syncs,
+)
 
 
 def test_a_network_of_firmware_is_recognised_and_management_waits_for_silence() -> None:
@@ -28,7 +37,7 @@ def test_a_network_of_firmware_is_recognised_and_management_waits_for_silence() 
     assert [(each.payload[:4], each.source) for each in node.of(Received)] == [(b"IMU2", 0)]
     bus.run(5 * SECOND)
     assert syncs(bus) == []
-    assert node.engine.role is Role.NONE
+    assert node.engine.election.role is Role.NONE
     assert {frame.id >> 7 & 0xFFFF for _, frame, _ in bus.sent} == {0}
     first = [at for at, frame, _ in bus.sent if frame.id & 0x7F == 3]
     firmware_management(bus, node, b"IMU1")
@@ -117,7 +126,7 @@ def test_stop_and_start_again() -> None:
     bus.start(node)
     bus.run(2 * SECOND)
     assert node.engine.id8 == 11
-    assert node.engine.cycle == master.engine.cycle
+    assert current_cycle(node.engine) == current_cycle(master.engine)
 
 
 def test_latencies_are_made_up_for() -> None:
@@ -138,7 +147,7 @@ def test_latencies_are_made_up_for() -> None:
     assert at is not None
     reference = syncs(bus)[-1][0]
     assert (at + 4_000 - reference) % SLOT == 0
-    assert master.engine.role is Role.MASTER
+    assert master.engine.election.role is Role.MASTER
 
 
 def hostile(epoch: int) -> list[management.Management]:
@@ -162,20 +171,20 @@ def hostile(epoch: int) -> list[management.Management]:
 def test_rubbish_from_the_bus_changes_nothing() -> None:
     bus = Bus()
     a, b = network(bus, 1, 0)
-    before = (b.engine.role, b.engine.epoch)
+    before = (b.engine.election.role, b.engine.network.epoch)
     for code in management.RTCAN_TYPES:
         for version in (0, 1, 2, 255):
             data = bytes([version]) + b"\xff" * 30 + bytes([code])
             for left, part in rtcan.fragments(data):
                 b.act(b.engine.receive(b.now, Frame(rtcan.encode_identifier(9, 0x01EE, left), part), b.now))
     b.act(b.engine.receive(b.now, Frame(0x00000080, b"short"), b.now))
-    for message in hostile(a.engine.epoch or 0):
+    for message in hostile(a.engine.network.epoch or 0):
         for left, part in rtcan.fragments(management.encode(message)):
             for node in a, b:
                 node.act(node.engine.receive(node.now, Frame(rtcan.encode_identifier(9, 0x01EE, left), part), node.now))
     bus.run(3 * SECOND)
-    assert (b.engine.role, b.engine.epoch) == before
-    assert a.engine.role is Role.MASTER
+    assert (b.engine.election.role, b.engine.network.epoch) == before
+    assert a.engine.election.role is Role.MASTER
 
 
 def test_a_node_that_slept_finds_its_place_again() -> None:
@@ -197,6 +206,6 @@ def test_a_node_that_slept_finds_its_place_again() -> None:
         bus.run(3 * SECOND)
         if sleeper == 0:
             assert "its computer was busy or stopped: give r2p a real-time priority" in node.of(LostSync)[before].reason
-        assert sorted(each.engine.role.value for each in nodes) == ["master", "slave", "slave"]
-        assert len({each.engine.cycle for each in nodes}) == 1
-        assert len({each.engine.master for each in nodes}) == 1
+        assert sorted(each.engine.election.role.value for each in nodes) == ["master", "slave", "slave"]
+        assert len({current_cycle(each.engine) for each in nodes}) == 1
+        assert len({each.engine.network.master for each in nodes}) == 1

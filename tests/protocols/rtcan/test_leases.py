@@ -3,11 +3,10 @@
 from r2p.codecs import management
 from r2p.codecs.management import Grant, Renew, Renewed, Reserve
 from r2p.protocols.rtcan.calendar import Reason
-from r2p.protocols.rtcan.cycle import Cycle, timing
-from r2p.protocols.rtcan.events import Action, Degraded, Granted, Refused
+from r2p.protocols.rtcan.context import EngineContext
+from r2p.protocols.rtcan.events import EngineSettings, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.protocols.rtcan.leases import LEASE, SlotRequests
 from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
-from r2p.protocols.timers import KeyedTimers
 
 SECOND = 1_000_000_000
 HIGH, MESSAGE = 5, 0x050A
@@ -17,38 +16,36 @@ class Owner:
     """One periodic message, and what it has asked for; nothing of that goes anywhere."""
 
     def __init__(self) -> None:
-        self.out: list[Action] = []
         self.asked: list[Reserve | Renew] = []
         self.abandoned: list[int] = []
-        self.timers = KeyedTimers()
         self.periodic = PeriodicMessage(HIGH, MESSAGE, 8, 1, 10_000_000, 0, None)
-        cycle = Cycle(timing())
-        self.wishes = SlotRequests(
-            cycle,
-            SlotPlan(cycle.timing),
-            self.timers,
-            {HIGH: self.periodic},
-            self.out,
+        context = EngineContext(EngineSettings(number=1))
+        plan = SlotPlan(context.timing)
+        plan.periodics[HIGH] = self.periodic
+        self.out, self.timers = context.actions, context.timers
+        self.requests = SlotRequests(
+            context,
+            plan,
             lambda now, wanted: self.asked.append(wanted),
-            lambda now, periodic: self.abandoned.append(now),
+            lambda now, periodic, reason: self.abandoned.append(now),
         )
-        self.wishes.open = True
+        self.requests.has_master = True
 
     def ask(self, now: int) -> int:
         """A request; comes back: its serial."""
-        self.wishes.request(now, self.periodic)
+        self.requests.request(now, self.periodic)
         return self.asked[-1].serial
 
     def renew(self, now: int) -> int:
-        self.wishes.renew(now)
+        self.requests.renew(now)
         return self.asked[-1].serial
 
     def grant(self, now: int, serial: int) -> None:
-        self.wishes.granted(now, self.periodic, Grant(MESSAGE, serial, 1, 60, 1, 3, 77, LEASE // 1_000_000))
+        self.requests.on_grant(now, self.periodic, Grant(MESSAGE, serial, 1, 60, 1, 3, 77, LEASE // 1_000_000))
 
     def renewed(self, now: int, serial: int, *highs: int) -> None:
         data = bytes(highs).ljust(management.RENEW_MAX, b"\0")
-        self.wishes.renewed(now, Renewed(10, serial, LEASE // 1_000_000, data))
+        self.requests.on_renewed(now, Renewed(10, serial, LEASE // 1_000_000, data))
 
     def lease(self) -> int | None:
         """When it ends."""
@@ -64,7 +61,7 @@ def test_a_grant_counts_though_it_was_asked_again_meanwhile() -> None:
     first = owner.ask(0)
     owner.ask(SECOND // 4)
     owner.grant(SECOND // 3, first)
-    assert owner.out == [Granted(HIGH, 60, 1, 9_960_000)]
+    assert owner.out == [SlotsGranted(HIGH, 60, 1, 9_960_000)]
     assert owner.lease() == LEASE  # from the request on that was answered
 
 
@@ -91,25 +88,25 @@ def test_an_older_answer_does_not_end_a_lease() -> None:
     owner = Owner()
     owner.grant(0, owner.ask(0))
     before = owner.renew(SECOND)
-    owner.wishes.suspend(SECOND, owner.periodic, "another master")
+    owner.requests.suspend(SECOND, owner.periodic, "another master")
     owner.grant(2 * SECOND, owner.ask(2 * SECOND))
     owner.renewed(2 * SECOND, before)
     assert owner.periodic.active
     owner.renewed(3 * SECOND, owner.renew(3 * SECOND))
     assert not owner.periodic.active
-    assert owner.out[-1] == Degraded(HIGH, "the master does not know of it")
+    assert owner.out[-1] == SlotsLost(HIGH, "the master does not know of it")
 
 
-def test_answers_to_nobody_change_nothing() -> None:
+def test_answers_without_a_request_change_nothing() -> None:
     owner = Owner()
     serial = owner.ask(0)
     owner.grant(0, serial + 1)
     owner.renewed(0, serial, HIGH)
     refusal = management.Refuse(MESSAGE, serial, int(Reason.FULL), 1, 60)
-    owner.wishes.refused(0, owner.periodic, refusal)
-    owner.wishes.refused(0, owner.periodic, refusal)
+    owner.requests.on_refuse(0, owner.periodic, refusal)
+    owner.requests.on_refuse(0, owner.periodic, refusal)
     owner.grant(0, serial)  # to what was refused
-    assert [type(each) for each in owner.out] == [Refused]
+    assert [type(each) for each in owner.out] == [SlotsRefused]
     forgotten = owner.ask(4 * SECOND)
     owner.ask(4 * SECOND + LEASE)
     owner.grant(4 * SECOND + LEASE, forgotten)
@@ -120,7 +117,7 @@ def test_what_waits_for_a_slot_that_is_lost_is_given_up() -> None:
     owner = Owner()
     owner.grant(0, owner.ask(0))
     owner.periodic.restart(b"12345678")
-    owner.wishes.suspend(SECOND, owner.periodic, "another master")
-    owner.wishes.suspend(SECOND, owner.periodic, "another master")
+    owner.requests.suspend(SECOND, owner.periodic, "another master")
+    owner.requests.suspend(SECOND, owner.periodic, "another master")
     assert owner.abandoned == [SECOND]
     assert owner.periodic.payload is None

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from r2p.protocols.rtcan.events import Received
 from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
-from tests.protocols.rtcan.networks import CYCLE, SLOT, counted, is_sync, network, publish, syncs
+from tests.protocols.rtcan.networks import CYCLE, SLOT, counted, current_cycle, is_sync, network, publish, syncs
 
 
 def busy(bus: Bus, *priorities: int, ppm: int = 0) -> list[Node]:
@@ -58,8 +58,11 @@ def test_a_lossy_network_recovers(seed: int, loss: float, all_of_them: bool) -> 
     for node in nodes:
         node.deaf = lambda frame: False
     bus.run(5 * SECOND)
-    assert sorted(node.engine.role.value for node in nodes) == ["master", "slave", "slave"]
-    assert len({(node.engine.master, node.engine.epoch, node.engine.cycle) for node in nodes}) == 1
+    assert sorted(node.engine.election.role.value for node in nodes) == ["master", "slave", "slave"]
+    assert (
+        len({(node.engine.network.master, node.engine.network.epoch, current_cycle(node.engine)) for node in nodes})
+        == 1
+    )
     began = bus.now
     failed = [hard_failures(node) for node in nodes]
     bus.run(100 * MS)
@@ -86,9 +89,9 @@ def test_what_was_lost_is_counted_by_source() -> None:
 
     c.deaf = deaf
     bus.run(SECOND)
-    assert dropped == 0 or c.engine.losses[11].total() >= dropped
-    assert 10 not in c.engine.losses
-    assert a.engine.losses == {}
+    assert dropped == 0 or c.engine.reassembly.losses[11].total() >= dropped
+    assert 10 not in c.engine.reassembly.losses
+    assert a.engine.reassembly.losses == {}
 
 
 @pytest.mark.parametrize("ppm", [0, 50, 200])
@@ -118,7 +121,7 @@ def test_master_and_slaves_agree_on_the_time() -> None:
         if bus.now > 3 * SECOND:
             times = [node.engine.network_time(node.now) or 0 for node in nodes]
             assert max(times) - min(times) < 1_500
-    assert nodes[0].engine.role is Role.MASTER
+    assert nodes[0].engine.election.role is Role.MASTER
 
 
 def test_ten_nodes_and_three_masters_dying_one_after_the_other() -> None:
@@ -129,9 +132,9 @@ def test_ten_nodes_and_three_masters_dying_one_after_the_other() -> None:
         node.act(node.engine.reserve(node.now, 2, 8, 10 * MS))
     bus.run(200 * MS)
     for expected in (15, 14, 13):
-        bus.kill(next(node for node in nodes if node.alive and node.engine.role is Role.MASTER))
+        bus.kill(next(node for node in nodes if node.alive and node.engine.election.role is Role.MASTER))
         bus.run(SECOND)
-        assert {node.engine.master for node in nodes if node.alive} == {expected}
+        assert {node.engine.network.master for node in nodes if node.alive} == {expected}
         owners = slots_of(bus, bus.now - 5 * CYCLE)
         assert {len(each) for each in owners.values()} == {1}
         assert {node for each in owners.values() for node in each} == set(nodes[-3:])

@@ -1,4 +1,4 @@
-"""Whether a master that sends no NETWORK has the same cycle: told by its length, which jitters."""
+"""Whether a master that sends no NETWORK has the same cycle: its length shows that, and jitters."""
 
 import random
 
@@ -12,22 +12,22 @@ US, MS, SECOND = 1_000, 1_000_000, 1_000_000_000
 FINE, COARSE = timing(), timing(10, 100 * MS)
 
 
-def heard(cycle: Cycle, start: int, counter: int) -> Alignment:
+def receive_sync(cycle: Cycle, start: int, counter: int) -> Alignment:
     frame = rtcan.encode_sync(counter, 1)
-    return cycle.heard(frame, start + rtcan.frame_bits(frame.id, frame.data) * 1_000)
+    return cycle.on_sync(frame, start + rtcan.frame_bits(frame.id, frame.data) * 1_000)
 
 
 def believed(ours: Timing, theirs: int, jitter: int, ppm: int = 0) -> bool | None:
     """After 2 s of syncs that are up to `jitter` ns off, every `theirs` ns."""
     numbers = random.Random(f"{theirs} {jitter}")
     cycle = Cycle(ours)
-    allegiance = MasterTracker(cycle)
+    tracker = MasterTracker(cycle)
     answer = None
     for n in range(2 * SECOND // theirs):
         start = n * (theirs + theirs * ppm // 1_000_000) + numbers.randint(-jitter, jitter)
-        if heard(cycle, start, n) is Alignment.STARTED:
-            allegiance.started(start)
-        answer = allegiance.believed(start)
+        if receive_sync(cycle, start, n) is Alignment.STARTED:
+            tracker.on_started(start)
+        answer = tracker.has_our_length(start)
         assert answer is None or start > SECOND
     return answer
 
@@ -51,10 +51,10 @@ def test_a_cycle_of_other_slots_is_not(slots: int, jitter: int) -> None:
 
 def test_one_sync_tells_nothing() -> None:
     cycle = Cycle(FINE)
-    allegiance = MasterTracker(cycle)
-    heard(cycle, 0, 1)
-    allegiance.started(0)
-    assert allegiance.believed(2 * SECOND) is None
+    tracker = MasterTracker(cycle)
+    receive_sync(cycle, 0, 1)
+    tracker.on_started(0)
+    assert tracker.has_our_length(2 * SECOND) is None
 
 
 # Two masters
@@ -67,31 +67,31 @@ def network(id8: int, cycle: int, epoch: int) -> management.Network:
 def following(*, count: int) -> tuple[Cycle, MasterTracker]:
     """A slave of node 10, which is in cycle 7, when 11 says that it is in cycle `count`."""
     cycle = Cycle(FINE)
-    allegiance = MasterTracker(cycle)
-    heard(cycle, 0, 7)
-    assert allegiance.started(0) is None
-    assert allegiance.told(MS, network(10, 7, 100), None, None)
-    assert not allegiance.told(2 * MS, network(11, count, 200), 10, 100)
-    return cycle, allegiance
+    tracker = MasterTracker(cycle)
+    receive_sync(cycle, 0, 7)
+    assert tracker.on_started(0) is None
+    assert tracker.on_network(MS, network(10, 7, 100), None, None)
+    assert not tracker.on_network(2 * MS, network(11, count, 200), 10, 100)
+    return cycle, tracker
 
 
 def test_syncs_that_go_on_after_a_better_master_has_spoken_are_its_own() -> None:
-    cycle, allegiance = following(count=7)
+    cycle, tracker = following(count=7)
     for n in range(1, 5):
-        assert heard(cycle, n * FINE.cycle, 7 + n) is Alignment.ALIGNED
-        told = allegiance.goes_on(n * FINE.cycle)
-        assert told == (network(11, 10, 200) if n == 4 else None)
+        assert receive_sync(cycle, n * FINE.cycle, 7 + n) is Alignment.ALIGNED
+        found = tracker.on_aligned(n * FINE.cycle)
+        assert found == (network(11, 10, 200) if n == 4 else None)
 
 
 def test_not_those_of_another_count() -> None:
-    cycle, allegiance = following(count=70)
-    heard(cycle, FINE.cycle, 8)
-    assert allegiance.goes_on(5 * FINE.cycle) is None
+    cycle, tracker = following(count=70)
+    receive_sync(cycle, FINE.cycle, 8)
+    assert tracker.on_aligned(5 * FINE.cycle) is None
 
 
 def test_not_where_the_better_ones_own_syncs_are_heard() -> None:
-    cycle, allegiance = following(count=7)
-    assert heard(cycle, FINE.cycle // 2, 8) is Alignment.FOREIGN
-    allegiance.foreign()
-    heard(cycle, FINE.cycle, 8)
-    assert allegiance.goes_on(5 * FINE.cycle) is None
+    cycle, tracker = following(count=7)
+    assert receive_sync(cycle, FINE.cycle // 2, 8) is Alignment.FOREIGN
+    tracker.on_foreign()
+    receive_sync(cycle, FINE.cycle, 8)
+    assert tracker.on_aligned(5 * FINE.cycle) is None

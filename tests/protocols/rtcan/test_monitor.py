@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import INTERMISSION, Frame, OtherFrame
 from r2p.protocols.rtcan.cycle import timing
-from r2p.protocols.rtcan.events import Granted
+from r2p.protocols.rtcan.events import SlotsGranted
 from r2p.protocols.rtcan.monitor import FrameKind, Monitor, SeenFrame, TrafficCount
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import CYCLE, TOPIC, counted, network, publish
@@ -35,11 +35,11 @@ class Watched:
     def say(self, node: Node, message: management.Management) -> None:
         node.act(node.engine.manage(node.now, management.encode(message)))
 
-    def reserve(self, interval: int = 5 * MS) -> Granted:
+    def reserve(self, interval: int = 5 * MS) -> SlotsGranted:
         counted(self.owner)
         self.owner.act(self.owner.engine.reserve(self.owner.now, TOPIC, 8, interval))
         self.run(3 * CYCLE)
-        return self.owner.of(Granted)[-1]
+        return self.owner.of(SlotsGranted)[-1]
 
     def watch(self, cycles: int) -> None:
         """Count from now on, for so many cycles."""
@@ -70,7 +70,7 @@ def test_names_are_learnt_from_what_the_modules_tell_each_other() -> None:
     watched = Watched()
     watched.reserve()
     watched.run(CYCLE)
-    assert (watched.seen[-1].topic or "sync", watched.monitor.census.module(0x050B)) != ("encoder", "MOTOR1")
+    assert (watched.seen[-1].topic or "sync", watched.monitor.directory.module(0x050B)) != ("encoder", "MOTOR1")
     params = rtcan.message_id(TOPIC, 11).to_bytes(2, "little") + bytes(8)
     watched.say(watched.owner, management.Hello("MOTOR1", 7, 0, 0, 5000))
     watched.say(watched.owner, management.SubscribeResponse("encoder", 8, 1, params))
@@ -79,8 +79,8 @@ def test_names_are_learnt_from_what_the_modules_tell_each_other() -> None:
     hrt = [seen for seen in watched.seen if seen.kind is FrameKind.HRT]
     assert (hrt[0].topic, hrt[0].module) == ("0x050B", "id 11")
     assert (hrt[-1].topic, hrt[-1].module, hrt[-1].fragments) == ("encoder", "MOTOR1", 1)
-    told = [seen.text for seen in watched.seen if seen.kind is FrameKind.MANAGEMENT and seen.text]
-    assert any(text.startswith("SubscribeResponse topic=encoder size=8") and "id=0x050B" in text for text in told)
+    texts = [seen.text for seen in watched.seen if seen.kind is FrameKind.MANAGEMENT and seen.text]
+    assert any(text.startswith("SubscribeResponse topic=encoder size=8") and "id=0x050B" in text for text in texts)
 
 
 def test_a_forwarded_hello_does_not_rename_the_gateway() -> None:
@@ -90,7 +90,7 @@ def test_a_forwarded_hello_does_not_rename_the_gateway() -> None:
     watched.say(watched.owner, management.Hello("FAR", 8, 0, 1, 5000))
     watched.say(watched.owner, management.Alive("FAR2", 0))
     watched.run(5 * CYCLE)
-    assert watched.monitor.census.modules[11] == "GW"
+    assert watched.monitor.directory.modules[11] == "GW"
 
 
 def test_the_slot_map_shows_owners_and_what_they_missed() -> None:
@@ -174,9 +174,9 @@ def test_the_network_tells_its_own_timing() -> None:
     monitor = Monitor(timing())
     for start, frame, _ in bus.sent:
         monitor.frame(frame, start + rtcan.frame_bits(frame.id, frame.data) * BIT)
-    assert monitor.census.told
-    assert (monitor.census.timing.slots, monitor.census.timing.slot) == (10, MS)
-    assert len(monitor.slots) == 10  # not those of before it was told
+    assert monitor.directory.timing_known
+    assert (monitor.directory.timing.slots, monitor.directory.timing.slot) == (10, MS)
+    assert len(monitor.slots) == 10  # not those of before
     assert monitor.cycles > 10
 
 
@@ -184,12 +184,12 @@ def test_the_network_tells_its_own_timing() -> None:
 def test_a_timing_that_cannot_be_is_not_learnt(slots: int, slot: int) -> None:
     monitor = Monitor(timing())
     monitor.frame(rtcan.encode_sync(1, 0b11), MS)
-    told = management.encode(management.Network(10, 1, 1, 1, slots, slot))
-    for left, data in rtcan.fragments(told):
+    announced = management.encode(management.Network(10, 1, 1, 1, slots, slot))
+    for left, data in rtcan.fragments(announced):
         identifier = rtcan.encode_identifier(10, rtcan.message_id(rtcan.MANAGEMENT, 10), left)
         monitor.frame(Frame(identifier, data), 2 * MS)
     monitor.frame(rtcan.encode_sync(2, 0b11), MS + CYCLE)
-    assert (monitor.census.told, monitor.census.timing, monitor.cycles) == (False, timing(), 1)
+    assert (monitor.directory.timing_known, monitor.directory.timing, monitor.cycles) == (False, timing(), 1)
 
 
 def test_an_owner_whose_name_comes_late_is_one_owner() -> None:
@@ -230,7 +230,7 @@ def test_management_of_firmware_that_has_no_time_left_is_not_shown_as_a_sync() -
 
 
 def test_a_frame_counts_for_the_period_in_which_it_was_on_the_bus() -> None:
-    """However late it is read: periods that are over wait until somebody asks for them."""
+    """However late it is read: periods that are over wait until they are asked for."""
     monitor = Monitor(timing())
     monitor.begin(SECOND, SECOND)
     for number in range(50):

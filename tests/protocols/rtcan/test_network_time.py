@@ -38,17 +38,17 @@ def test_the_next_master_s_first_sync_is_late_and_network_time_catches_up(late: 
     """The slaves go with it: they lose nothing by that."""
     bus = Bus()
     first, second, slave, _ = network(bus, 3, 2, 0, 0)
-    before, epoch = shown(slave), slave.engine.epoch
+    before, epoch = shown(slave), slave.engine.network.epoch
     first_sync_late(second, late)
     bus.kill(first)
     bus.run(200 * MS)
-    assert second.engine.role is Role.MASTER
+    assert second.engine.election.role is Role.MASTER
     losses = len(slave.of(LostSync))
     assert before - late - 100 * US < shown(slave) < before - late + 200 * US
     bus.run(20 * SECOND)
     assert abs(shown(slave) - before) < 2 * US
     assert abs(shown(slave) - shown(second)) < 2 * US
-    assert (slave.engine.epoch, second.engine.epoch) == (epoch, epoch)
+    assert (slave.engine.network.epoch, second.engine.network.epoch) == (epoch, epoch)
     assert len(slave.of(LostSync)) == losses
     assert slave.engine.counts["foreign syncs"] == 0
 
@@ -57,17 +57,19 @@ def test_masters_whose_first_syncs_are_late_never_add_up() -> None:
     """Each founds the network anew after it slept."""
     bus = Bus()
     master, slave, _ = network(bus, 3, 0, 0)
-    before, epoch = shown(slave), slave.engine.epoch
+    before, epoch = shown(slave), slave.engine.network.epoch
     for _ in range(6):
         first_sync_late(master, 3 * MS)
         asleep(master, 100 * MS)
         bus.run(SECOND)
-        assert master.engine.role is Role.MASTER
-        if master.engine.epoch == epoch:
+        assert master.engine.election.role is Role.MASTER
+        if master.engine.network.epoch == epoch:
             assert before - CYCLE // 2 <= shown(master) < before + 2 * US
             assert abs(shown(slave) - shown(master)) < 2 * US
-        before, epoch = (before, epoch) if master.engine.epoch == epoch else (shown(slave), master.engine.epoch)
-        assert slave.engine.epoch == epoch
+        before, epoch = (
+            (before, epoch) if master.engine.network.epoch == epoch else (shown(slave), master.engine.network.epoch)
+        )
+        assert slave.engine.network.epoch == epoch
 
 
 @pytest.mark.parametrize("late", [5 * MS, 50 * MS, 250 * MS])
@@ -75,13 +77,13 @@ def test_a_first_sync_whose_count_is_over_begins_another_network(late: int) -> N
     """Network time can't catch up any more: so it is not the same time."""
     bus = Bus()
     master, slave, _ = network(bus, 3, 0, 0)
-    epoch = master.engine.epoch
+    epoch = master.engine.network.epoch
     first_sync_late(master, late)
     asleep(master, 100 * MS)
     bus.run(SECOND + late)
-    assert master.engine.role is Role.MASTER
-    assert master.engine.epoch == slave.engine.epoch != epoch
-    assert slave.of(NewMaster)[-1].epoch == master.engine.epoch
+    assert master.engine.election.role is Role.MASTER
+    assert master.engine.network.epoch == slave.engine.network.epoch != epoch
+    assert slave.of(NewMaster)[-1].epoch == master.engine.network.epoch
     assert abs(shown(slave) - shown(master)) < 2 * US
 
 
@@ -108,7 +110,7 @@ def test_syncs_that_jitter_move_neither_the_master_s_time_nor_its_slots() -> Non
     """They move the slaves, which know nothing but when each sync came."""
     bus = Bus()
     master, slave, _ = network(bus, 3, 0, 0)
-    start, cycle = shown(master), master.engine._core.cycle
+    start, cycle = shown(master), master.engine.cycle
     master.late = lambda frame: bus.now // CYCLE % 4 * 2 * US if is_sync(frame) else 0
     phases, seen = set(), set()
     for _ in range(50):
@@ -126,12 +128,12 @@ def test_no_old_counter_is_told_when_a_master_wakes_up() -> None:
     bus = Bus()
     master, slave, _ = network(bus, 3, 0, 0)
     bus.run_until(lambda: waits(master))
-    before, epoch = shown(slave), slave.engine.epoch
+    before, epoch = shown(slave), slave.engine.network.epoch
     asleep(master, 256 * CYCLE)
     seen = 0
     for _ in range(1000):
         bus.run(MS // 4)
-        if slave.engine.epoch == epoch and slave.engine.network_time(slave.now) is not None:
+        if slave.engine.network.epoch == epoch and slave.engine.network_time(slave.now) is not None:
             seen += 1
             assert abs(shown(slave) - before) < CYCLE
     assert seen
@@ -140,7 +142,7 @@ def test_no_old_counter_is_told_when_a_master_wakes_up() -> None:
 def waits(node: Node) -> bool:
     """Whether its NETWORK has yet to be sent."""
     return any(
-        each.payload[-1] == ManagementType.NETWORK for each in node.engine._core.queue.messages() if not each.sent
+        each.payload[-1] == ManagementType.NETWORK for each in node.engine.transmitter.queue.messages() if not each.sent
     )
 
 
@@ -157,4 +159,4 @@ def test_a_count_that_was_heard_long_ago_is_the_nearest_one(ahead: int) -> None:
 
 def hear(cycle: Cycle, count: int, start: int) -> None:
     frame = rtcan.encode_sync(count, 1)
-    cycle.heard(frame, start + rtcan.frame_bits(frame.id, frame.data) * US)
+    cycle.on_sync(frame, start + rtcan.frame_bits(frame.id, frame.data) * US)

@@ -1,13 +1,11 @@
 """Claiming an id8, and losing it."""
 
-from collections import Counter
-
 import pytest
 
 from r2p.codecs.management import CLAIM_FIXED, Claim
-from r2p.protocols.rtcan.events import Action, IdConflict
-from r2p.protocols.rtcan.node_id import OBJECTION, Identity, Stage
-from r2p.protocols.timers import KeyedTimers
+from r2p.protocols.rtcan.context import EngineContext
+from r2p.protocols.rtcan.events import EngineSettings, IdConflict
+from r2p.protocols.rtcan.node_id import OBJECTION, NodeId, Stage
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -16,36 +14,33 @@ NUMBER = 0x1234_5678_9ABC_DEF0
 
 
 class Node:
-    """An identity, its timers, and what it said."""
+    """An id8, its timers, and what it said."""
 
     def __init__(self, wanted: int | None, number: int = NUMBER) -> None:
         self.now = 0
-        self.timers = KeyedTimers()
-        self.out: list[Action] = []
+        self.context = context = EngineContext(EngineSettings(number=number, id8=wanted, listen=LISTEN))
+        self.timers, self.out, self.counts = context.timers, context.actions, context.counts
         self.claims: list[tuple[int, int]] = []
         self.stages: list[Stage] = []
-        self.counts: Counter[str] = Counter()
-        self.identity = Identity(
-            wanted, number, LISTEN, self.timers, self.out, self.counts, self._announce, self._changed
-        )
-        self.identity.start(0)
+        self.node_id = NodeId(context, self._send_claim, self._stage_changed)
+        self.node_id.start(0)
 
-    def _announce(self, now: int) -> None:
-        self.claims.append((now, self.identity.id8))
+    def _send_claim(self, now: int) -> None:
+        self.claims.append((now, self.node_id.id8))
 
-    def _changed(self, now: int) -> None:
-        self.stages.append(self.identity.stage)
+    def _stage_changed(self, now: int) -> None:
+        self.stages.append(self.node_id.stage)
 
     def run(self, duration: int) -> None:
         end = self.now + duration
         while (at := self.timers.next()) is not None and at <= end:
             self.now = at
             for key in self.timers.pop(at):
-                (self.identity.listened if key == "listened" else self.identity.repeat)(at)
+                (self.node_id.on_listened if key == "listened" else self.node_id.on_claim_timer)(at)
         self.now = end
 
     def stage(self) -> Stage:
-        return self.identity.stage
+        return self.node_id.stage
 
     @property
     def conflicts(self) -> list[IdConflict]:
@@ -77,45 +72,45 @@ def test_a_free_id8_is_taken() -> None:
     node = Node(None)
     for id8 in range(1, 255):
         if id8 != 77:
-            node.identity.seen(id8)
+            node.node_id.mark_taken(id8)
     node.run(2 * SECOND)
-    assert node.identity.id8 == 77
-    assert node.identity.flags == 0
-    assert {Node(None, number).identity.draw(1000) for number in range(20)} != {0}
+    assert node.node_id.id8 == 77
+    assert node.node_id.flags == 0
+    assert {Node(None, number).context.draw(1000) for number in range(20)} != {0}
 
 
 def test_the_lower_number_keeps_it() -> None:
     node = owner()
-    number = node.identity.number
-    assert node.identity.flags == CLAIM_FIXED
+    number = node.node_id.number
+    assert node.node_id.flags == CLAIM_FIXED
     claims = len(node.claims)
     node.now += 200 * MS
-    node.identity.claimed(node.now, Claim(10, number + 1))
+    node.node_id.on_claim(node.now, Claim(10, number + 1))
     assert node.stage() is Stage.OWNING
-    assert len(node.claims) == claims + 1  # it is told
-    node.identity.claimed(node.now, Claim(11, 0))
+    assert len(node.claims) == claims + 1  # it answers
+    node.node_id.on_claim(node.now, Claim(11, 0))
     assert node.stage() is Stage.OWNING
-    node.identity.claimed(node.now, Claim(10, number - 1))
+    node.node_id.on_claim(node.now, Claim(10, number - 1))
     assert node.stage() is Stage.OWNING
-    node.identity.claimed(node.now, Claim(10, number - 1))
+    node.node_id.on_claim(node.now, Claim(10, number - 1))
     assert node.stage() is Stage.LISTENING
     assert node.conflicts == [IdConflict(10, False), IdConflict(10, True)]
 
 
 def test_who_can_not_take_another_one_wins_against_who_can() -> None:
     highest = (1 << 64) - 1
-    assert Node(10, highest).identity.number < Node(None, 0).identity.number
-    assert Node(None, highest).identity.number <= highest
+    assert Node(10, highest).node_id.number < Node(None, 0).node_id.number
+    assert Node(None, highest).node_id.number <= highest
 
 
 def test_who_can_takes_another_one() -> None:
     node = owner(None)
-    before = node.identity.id8
+    before = node.node_id.id8
     for _ in range(2):
-        node.identity.claimed(node.now, Claim(before, 5))
+        node.node_id.on_claim(node.now, Claim(before, 5))
     node.run(2 * SECOND)
     assert node.stage() is Stage.OWNING
-    assert node.identity.id8 != before
+    assert node.node_id.id8 != before
 
 
 @pytest.mark.parametrize("wanted", [10, None])
@@ -124,28 +119,28 @@ def test_one_better_claim_that_is_never_repeated_ends_nothing(wanted: int | None
     node = owner(wanted)
     for _ in range(3):
         claims = len(node.claims)
-        node.identity.claimed(node.now, Claim(node.identity.id8, 0))
+        node.node_id.on_claim(node.now, Claim(node.node_id.id8, 0))
         node.run(200 * MS)
         assert len(node.claims) == claims + 2  # at once, and when the other one may answer again
         node.run(5 * SECOND)
     assert node.stages == [Stage.LISTENING, Stage.CLAIMING, Stage.OWNING]
-    node.identity.claimed(node.now, Claim(node.identity.id8, 0))
-    node.identity.claimed(node.now + 150 * MS, Claim(node.identity.id8, 0))
+    node.node_id.on_claim(node.now, Claim(node.node_id.id8, 0))
+    node.node_id.on_claim(node.now + 150 * MS, Claim(node.node_id.id8, 0))
     assert node.stage() is Stage.LISTENING
 
 
 def test_a_fixed_one_waits_until_it_is_free() -> None:
     node = owner()
     for _ in range(2):
-        node.identity.claimed(node.now, Claim(10, 0))
+        node.node_id.on_claim(node.now, Claim(10, 0))
     for _ in range(60):
         node.run(100 * MS)
-        node.identity.seen(10)
+        node.node_id.mark_taken(10)
     assert node.stage() is Stage.LISTENING
     assert node.conflicts[-1] == IdConflict(10, True)
     node.run(5 * SECOND)
     assert node.stage() is Stage.OWNING
-    assert node.identity.id8 == 10
+    assert node.node_id.id8 == 10
 
 
 def test_who_never_claims_is_firmware_and_keeps_it() -> None:
@@ -153,12 +148,12 @@ def test_who_never_claims_is_firmware_and_keeps_it() -> None:
     node.now += 200 * MS
     claims = len(node.claims)
     for _ in range(5):
-        node.identity.duplicate_id_seen(node.now)
+        node.node_id.duplicate_id_seen(node.now)
         assert node.stage() is Stage.OWNING
         node.now += 100 * MS
     assert len(node.claims) == claims + 1  # it had its chance to object
     assert node.conflicts == [IdConflict(10, False)]
-    node.identity.duplicate_id_seen(node.now)
+    node.node_id.duplicate_id_seen(node.now)
     assert node.stage() is Stage.LISTENING
     assert node.conflicts[-1] == IdConflict(10, True)
     assert node.counts["frames with our id8"] == 6
@@ -168,7 +163,7 @@ def test_a_single_stray_frame_is_reported_and_no_more() -> None:
     node = owner()
     for _ in range(3):
         node.now += 10 * SECOND
-        node.identity.duplicate_id_seen(node.now)
+        node.node_id.duplicate_id_seen(node.now)
     assert node.stage() is Stage.OWNING
     assert node.conflicts == [IdConflict(10, False)] * 3
 
@@ -176,8 +171,8 @@ def test_a_single_stray_frame_is_reported_and_no_more() -> None:
 def test_who_claims_is_no_firmware() -> None:
     node = owner()
     for _ in range(20):
-        node.identity.claimed(node.now, Claim(10, node.identity.number + 1))
-        node.identity.duplicate_id_seen(node.now)
+        node.node_id.on_claim(node.now, Claim(10, node.node_id.number + 1))
+        node.node_id.duplicate_id_seen(node.now)
         node.now += 100 * MS
     assert node.stage() is Stage.OWNING
 
@@ -186,8 +181,8 @@ def test_who_claims_is_no_firmware() -> None:
 def test_while_listening_nothing_is_defended(call: str) -> None:
     node = Node(10)
     if call == "claimed":
-        node.identity.claimed(5, Claim(10, 0))
+        node.node_id.on_claim(5, Claim(10, 0))
     else:
-        node.identity.duplicate_id_seen(5)
+        node.node_id.duplicate_id_seen(5)
     assert node.claims == []
     assert node.out == []

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from r2p.codecs import rtcan
 from r2p.protocols.rtcan.calendar import Reservation
 from r2p.protocols.rtcan.cycle import timing
-from r2p.protocols.rtcan.events import Degraded, Done, Due, Fate, Granted, Refused
+from r2p.protocols.rtcan.events import Done, Due, Fate, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
 from tests.protocols.rtcan.bus import MS, SECOND, Bus
 from tests.protocols.rtcan.networks import CYCLE, SLOT, TOPIC, counted, is_sync, network, starts, syncs
@@ -18,12 +18,12 @@ from tests.protocols.rtcan.networks import CYCLE, SLOT, TOPIC, counted, is_sync,
 def test_a_periodic_message_owns_its_slots(size: int, lead: int) -> None:
     bus = Bus()
     _master, owner, listener = network(bus, 1, 0, 0)
-    told = counted(owner, size)
+    filled = counted(owner, size)
     listener.engine.subscribe(rtcan.message_id(TOPIC, 11), size)
     owner.act(owner.engine.reserve(owner.now, TOPIC, size, 5 * MS, lead=lead, handle="hrt"))
     bus.run(20 * MS)
-    granted = owner.of(Granted)
-    assert granted == [Granted(TOPIC, 30, 1, 30 * SLOT)]
+    granted = owner.of(SlotsGranted)
+    assert granted == [SlotsGranted(TOPIC, 30, 1, 30 * SLOT)]
     begin = bus.now
     bus.run(SECOND)
     fragments = rtcan.fragment_count(size)
@@ -32,8 +32,8 @@ def test_a_periodic_message_owns_its_slots(size: int, lead: int) -> None:
     assert {(start - reference) % (30 * SLOT) for start in at} == {SLOT * (1 + n) for n in range(fragments)}
     assert abs(len(at) - fragments * SECOND // (30 * SLOT)) <= fragments
     got = listener.received(TOPIC)
-    assert got == sorted(got, key=told.index)  # never an old one after a newer one
-    assert len(told) - len(got) <= 2
+    assert got == sorted(got, key=filled.index)  # never an old one after a newer one
+    assert len(filled) - len(got) <= 2
     assert owner.engine.counts["missed"] <= 1  # what still waited without slots when it got them
     asked = {due.at for due in owner.of(Due) if due.slotted}
     assert set(at[::fragments]) <= asked
@@ -47,14 +47,14 @@ def test_the_master_has_slots_too_and_none_is_given_twice() -> None:
             counted(node)
             node.act(node.engine.reserve(node.now, high, 8, period))
         bus.run(100 * MS)
-    phases = sorted((g.period, g.phase) for node in nodes for g in node.of(Granted))
+    phases = sorted((g.period, g.phase) for node in nodes for g in node.of(SlotsGranted))
     assert phases == [(6, 1), (6, 2), (6, 3), (30, 4), (30, 5), (30, 6), (60, 10), (60, 11), (60, 12)]
     begin = bus.now
     bus.run(20 * CYCLE)
     hrt = [at for at, frame, _ in bus.sent if frame.id >> 23 == 0 and at > begin and not is_sync(frame)]
     assert len(hrt) == pytest.approx(20 * 39, abs=39)
     assert all(node.engine.counts["missed"] == 0 for node in nodes)
-    mask = nodes[2].engine.mask
+    mask = nodes[2].engine.cycle.mask
     assert mask is not None
     assert (mask >> 1).bit_count() == 39
 
@@ -65,21 +65,21 @@ def test_a_refusal_says_why_and_the_message_goes_as_a_soft_one() -> None:
     counted(owner, 400)
     owner.engine.reserve(owner.now, TOPIC, 400, 5 * MS)
     bus.run(100 * MS)
-    (refused,) = owner.of(Refused)
+    (refused,) = owner.of(SlotsRefused)
     assert "a period of 30 slots" in refused.reason
     assert {frame.id >> 23 for _, frame, _ in bus.sent if frame.id >> 15 & 0xFF == TOPIC} <= set(range(1, 6))
-    assert master.engine.mask == 1
+    assert master.engine.cycle.mask == 1
 
 
 def test_without_a_master_periodic_messages_go_as_soft_ones_with_their_period_as_deadline() -> None:
     bus = Bus()
     a, b = network(bus, 0, 0)
-    told = counted(a)
+    filled = counted(a)
     b.engine.subscribe(rtcan.message_id(TOPIC, 10), 8)
     a.act(a.engine.reserve(a.now, TOPIC, 8, 10 * MS, handle="periodic"))
     bus.run(SECOND)
-    assert b.received(TOPIC) == told[:-1]
-    assert len(told) == 101
+    assert b.received(TOPIC) == filled[:-1]
+    assert len(filled) == 101
     assert {frame.id >> 23 for _, frame, _ in bus.sent if frame.id >> 15 & 0xFF == TOPIC} == {10}
     assert [due.at for due in a.of(Due)] == [a.of(Due)[0].at + n * 10 * MS for n in range(101)]
     assert {(done.handle, done.fate) for done in a.of(Done)} == {("periodic", Fate.SENT)}
@@ -100,7 +100,7 @@ def test_a_period_without_data_is_skipped() -> None:
 def test_a_missed_slot_abandons_the_message_and_the_next_one_has_fresh_data() -> None:
     bus = Bus()
     _, owner, listener = network(bus, 1, 0, 0)
-    told = counted(owner, 24)
+    filled = counted(owner, 24)
     listener.engine.subscribe(rtcan.message_id(TOPIC, 11), 24)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 24, 10 * MS, handle="hrt"))
     bus.run(100 * MS)
@@ -113,11 +113,11 @@ def test_a_missed_slot_abandons_the_message_and_the_next_one_has_fresh_data() ->
     owner.act(owner.engine.poll(owner.now))
     assert owner.of(Done)[-1].fate is Fate.ABANDONED
     assert owner.engine.counts["late_to_slot"] == 1
-    abandoned = len(told)
+    abandoned = len(filled)
     bus.run(3 * CYCLE)
-    assert listener.received(TOPIC)[before:] == told[abandoned:][:2]
-    assert len(told) >= abandoned + 2
-    assert listener.engine.losses[11]["gap"] == 1
+    assert listener.received(TOPIC)[before:] == filled[abandoned:][:2]
+    assert len(filled) >= abandoned + 2
+    assert listener.engine.reassembly.losses[11]["gap"] == 1
 
 
 def test_slots_are_given_back() -> None:
@@ -126,10 +126,10 @@ def test_slots_are_given_back() -> None:
     counted(owner)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
     bus.run(100 * MS)
-    assert master.engine.mask == 0b11
+    assert master.engine.cycle.mask == 0b11
     owner.act(owner.engine.release(owner.now, TOPIC))
     bus.run(30 * MS)
-    assert master.engine.mask == 0b1
+    assert master.engine.cycle.mask == 0b1
     assert starts(bus, TOPIC)[-1] < bus.now - 25 * MS
 
 
@@ -139,15 +139,15 @@ def test_the_slots_of_a_dead_node_come_free_after_3_s() -> None:
     counted(owner)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
     bus.run(10 * SECOND)
-    assert master.engine.mask == 0b11  # renewed and renewed
-    assert owner.of(Degraded) == []
+    assert master.engine.cycle.mask == 0b11  # renewed and renewed
+    assert owner.of(SlotsLost) == []
     bus.kill(owner)
-    other = bus.add(id8=12)  # somebody must acknowledge
+    other = bus.add(id8=12)  # another node must acknowledge
     bus.start(other)
     bus.run(SECOND)
-    assert master.engine.mask == 0b11
+    assert master.engine.cycle.mask == 0b11
     bus.run(2100 * MS)
-    assert master.engine.mask == 0b1
+    assert master.engine.cycle.mask == 0b1
 
 
 def test_the_owner_stops_when_the_master_does_not_answer() -> None:
@@ -158,12 +158,12 @@ def test_the_owner_stops_when_the_master_does_not_answer() -> None:
     bus.run(100 * MS)
     master.deaf = lambda frame: frame.id >> 15 & 0xFF == rtcan.MANAGEMENT
     bus.run(4 * SECOND)
-    assert owner.of(Degraded) == [Degraded(TOPIC, "the master does not answer")]
-    assert master.engine.mask == 0b1
+    assert owner.of(SlotsLost) == [SlotsLost(TOPIC, "the master does not answer")]
+    assert master.engine.cycle.mask == 0b1
     assert {frame.id >> 23 for at, frame, _ in bus.sent[-50:] if frame.id >> 15 & 0xFF == TOPIC} != {0}
     master.deaf = lambda frame: False
     bus.run(SECOND)
-    assert len(owner.of(Granted)) == 2  # it has asked all the time
+    assert len(owner.of(SlotsGranted)) == 2  # it has asked all the time
     assert starts(bus, TOPIC, 0)[-1] > bus.now - 2 * CYCLE
 
 
@@ -193,31 +193,33 @@ periodics = st.lists(
 
 
 @given(periodics, st.integers(0, 3))
-def test_an_agenda_that_knows_its_cycles_says_what_a_new_one_says(messages: list[PeriodicMessage], gone: int) -> None:
-    agenda = SlotPlan(timing())
+def test_a_plan_that_knows_its_cycles_says_what_a_new_one_says(messages: list[PeriodicMessage], gone: int) -> None:
+    plan = SlotPlan(timing())
+    plan.periodics = dict(enumerate(messages))
     for cycle in range(40):
         if cycle == 30:  # a message loses its slots
-            del messages[gone : gone + 1]
-            agenda.changed()
+            plan.periodics.pop(gone, None)
+            plan.invalidate()
         fresh = SlotPlan(timing())
-        agenda.turn(cycle, messages)
-        fresh.turn(cycle, messages)
-        assert (agenda.sends, agenda.fills, agenda.next) == (fresh.sends, fresh.fills, fresh.next)
+        fresh.periodics = plan.periodics
+        plan.begin_cycle(cycle)
+        fresh.begin_cycle(cycle)
+        assert (plan.sends, plan.fills, plan.next) == (fresh.sends, fresh.fills, fresh.next)
 
 
 def test_what_waits_for_its_slot_when_the_slots_are_given_back_is_counted() -> None:
     bus = Bus()
     _master, owner, _ = network(bus, 1, 0, 0)
-    told = counted(owner, 20)
+    filled = counted(owner, 20)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 20, 5 * MS, lead=2 * MS, handle="hrt"))
     bus.run(SECOND)
-    asked = len(told)
-    bus.run_until(lambda: len(told) > asked)
+    asked = len(filled)
+    bus.run_until(lambda: len(filled) > asked)
     owner.act(owner.engine.release(owner.now, TOPIC))
     bus.run(20 * MS)
     fates = [done.fate for done in owner.of(Done) if done.fate is not Fate.REPLACED]
     assert fates[-1] is Fate.ABANDONED
-    assert fates.count(Fate.SENT) == len(told) - 1
+    assert fates.count(Fate.SENT) == len(filled) - 1
     assert owner.engine.counts["hrt slots given back"] == 1
 
 
@@ -226,22 +228,22 @@ def test_a_forged_sync_without_our_slots_does_not_end_them(mask: int) -> None:
     """A broken node is a bit earlier than the master. What the last ten syncs said is believed for three cycles."""
     bus = Bus()
     _master, owner, listener = network(bus, 1, 0, 0)
-    told = counted(owner)
+    filled = counted(owner)
     listener.engine.subscribe(rtcan.message_id(TOPIC, 11), 8)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 5 * MS, handle="hrt"))
     bus.run(SECOND)
-    missed, got = owner.engine.counts["missed"], len(told)
+    missed, got = owner.engine.counts["missed"], len(filled)
     for _ in range(10):
-        reference, counter = owner.engine._core.cycle.reference, owner.engine.cycle
-        assert counter is not None
+        reference, counter = owner.engine.cycle.reference, owner.engine.cycle.counter
+        assert owner.engine.cycle.running
         forged = rtcan.encode_sync(counter + 1, mask)
         bus.run(reference + CYCLE + 120_000 - bus.now)  # the master's has not ended yet
         owner.act(owner.engine.receive(owner.now, forged, owner.now))
         bus.run(200 * MS)
     assert owner.engine.counts["masks doubted"] == 10
     assert owner.engine.counts["missed"] == missed
-    assert len(listener.received(TOPIC)) >= len(told) - 1
-    assert len(told) > got
+    assert len(listener.received(TOPIC)) >= len(filled) - 1
+    assert len(filled) > got
 
 
 def test_a_mask_that_stays_without_our_slots_is_believed() -> None:
@@ -250,7 +252,7 @@ def test_a_mask_that_stays_without_our_slots_is_believed() -> None:
     counted(owner)
     owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 5 * MS, handle="hrt"))
     bus.run(SECOND)
-    master.engine._core.grants.calendar.mask = lambda cycle: 1  # type: ignore[method-assign]
+    master.engine.grants.calendar.mask = lambda cycle: 1  # type: ignore[method-assign]
     bus.run(20 * CYCLE)
     assert owner.engine.counts["masks doubted"] == 3
     assert owner.engine.counts["hrt not in the mask"] > 0

@@ -8,7 +8,9 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import NEVER, EngineSettings, Profile, Received
-from r2p.protocols.rtcan.network import QUIET, Detector, RateLimiter
+from r2p.protocols.rtcan.management import QUIET, RateLimiter
+from r2p.protocols.rtcan.network import Detector
+from tests.protocols.rtcan.networks import current_cycle
 
 MS = 1_000_000
 STOP = management.encode(management.Stop("PC1"))
@@ -27,7 +29,7 @@ def test_what_is_found(wanted: Profile, firmware: bool, found: Profile) -> None:
     detector = Detector(wanted)
     detector.start()
     if firmware:
-        detector.firmware_heard()
+        detector.firmware_seen()
     detector.decide(synced=False)
     assert detector.profile is found
     detector.start()
@@ -38,38 +40,38 @@ def test_what_is_found(wanted: Profile, firmware: bool, found: Profile) -> None:
 
 def test_where_there_are_sync_frames_it_is_no_network_of_firmware_alone() -> None:
     detector = Detector(Profile.AUTO)
-    detector.firmware_heard()
+    detector.firmware_seen()
     detector.decide(synced=True)
     assert detector.profile is Profile.RTCAN
 
 
 def test_it_speaks_when_it_is_quiet_and_a_random_time_later() -> None:
-    pacer = RateLimiter(lambda below: below - 1, Counter())
-    assert pacer.due == NEVER
-    pacer.traffic(100 * MS)
-    pacer.put(b"a")
-    pacer.put(b"b")
+    limiter = RateLimiter(lambda below: below - 1, Counter())
+    assert limiter.due == NEVER
+    limiter.on_traffic(100 * MS)
+    limiter.put(b"a")
+    limiter.put(b"b")
     due = 100 * MS + QUIET + 20 * MS - 1
-    assert pacer.due == due
-    assert pacer.pop(due - 1) is None
-    pacer.traffic(110 * MS)
-    assert pacer.pop(due) is None
-    assert pacer.pop(due + 10 * MS) == (b"a", None)
-    assert pacer.due == due + 10 * MS + QUIET + 20 * MS - 1
-    pacer.put(b"urgent", urgent=True)
-    assert pacer.pop(pacer.due) == (b"urgent", None)
-    pacer.put(b"c", handle="c")
-    assert pacer.clear() == [None, "c"]
-    assert pacer.due == NEVER
+    assert limiter.due == due
+    assert limiter.pop(due - 1) is None
+    limiter.on_traffic(110 * MS)
+    assert limiter.pop(due) is None
+    assert limiter.pop(due + 10 * MS) == (b"a", None)
+    assert limiter.due == due + 10 * MS + QUIET + 20 * MS - 1
+    limiter.put(b"urgent", urgent=True)
+    assert limiter.pop(limiter.due) == (b"urgent", None)
+    limiter.put(b"c", handle="c")
+    assert limiter.clear() == [None, "c"]
+    assert limiter.due == NEVER
 
 
 def test_it_is_bounded() -> None:
     counts: Counter[str] = Counter()
-    pacer = RateLimiter(lambda below: 0, counts)
+    limiter = RateLimiter(lambda below: 0, counts)
     for n in range(70):
-        pacer.put(bytes([n]))
+        limiter.put(bytes([n]))
     assert counts == {"management dropped": 6}
-    assert pacer.pop(QUIET) == (bytes([6]), None)
+    assert limiter.pop(QUIET) == (bytes([6]), None)
 
 
 def hear(engine: Engine, now: int, laxities: list[int], payload: bytes = STOP, message: int = 0) -> list[bytes]:
@@ -93,7 +95,7 @@ def test_management_that_ends_with_laxity_0_is_no_sync_among_firmware(laxities: 
     engine = engine_of(Profile.FIRMWARE)
     assert hear(engine, MS, laxities) == [STOP]
     assert hear(engine, 5 * MS, laxities) == [STOP]
-    assert engine.losses == {}
+    assert engine.reassembly.losses == {}
 
 
 def test_a_topic_of_firmware_with_laxity_0_and_a_low_id_is_no_sync_either() -> None:
@@ -117,22 +119,22 @@ def test_firmware_without_time_left_is_found_by_its_management() -> None:
 def test_a_master_does_not_take_the_end_of_management_for_a_foreign_sync() -> None:
     engine = engine_of(Profile.RTCAN)
     hear(engine, MS, [0] * 4)
-    assert engine.cycle is None
+    assert current_cycle(engine) is None
     engine.receive(6 * MS, rtcan.encode_sync(256, 1), 6 * MS)
-    assert engine.cycle == 0
+    assert current_cycle(engine) == 0
 
 
 def test_urgent_ones_keep_their_order_and_are_the_last_to_be_dropped() -> None:
     counts: Counter[str] = Counter()
-    pacer = RateLimiter(lambda below: 0, counts)
-    pacer.put(b"later", handle="later")
+    limiter = RateLimiter(lambda below: 0, counts)
+    limiter.put(b"later", handle="later")
     orders = [bytes([n]) for n in range(64)]
-    assert [pacer.put(order, urgent=True, handle=order) for order in orders] == [*[None] * 63, "later"]
-    assert pacer.put(b"late", handle="late") == "late"
-    assert pacer.put(b"stop", urgent=True, handle="stop") == "stop"
+    assert [limiter.put(order, urgent=True, handle=order) for order in orders] == [*[None] * 63, "later"]
+    assert limiter.put(b"late", handle="late") == "late"
+    assert limiter.put(b"stop", urgent=True, handle="stop") == "stop"
     assert counts == {"management dropped": 3}
-    sent = [pacer.pop(n * QUIET) for n in range(1, 65)]
+    sent = [limiter.pop(n * QUIET) for n in range(1, 65)]
     assert [each[0] for each in sent if each is not None] == orders
-    pacer.put(b"later")
-    pacer.put(b"stop", urgent=True)
-    assert pacer.pop(100 * QUIET) == (b"stop", None)
+    limiter.put(b"later")
+    limiter.put(b"stop", urgent=True)
+    assert limiter.pop(100 * QUIET) == (b"stop", None)

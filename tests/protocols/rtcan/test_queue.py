@@ -37,9 +37,9 @@ def drain(queue: LaxityQueue, now: int = NOW, step: int = 0) -> list[tuple[int, 
         message = queue.best(now)
         if message is None:
             return order
-        identifier = rtcan.decode_identifier(queue.take(message, now).id)
+        identifier = rtcan.decode_identifier(queue.next_frame(message, now).id)
         order.append((identifier.message, identifier.laxity, identifier.left))
-        queue.sent(message)
+        queue.frame_sent(message)
         now += step
 
 
@@ -82,11 +82,11 @@ def test_laxity_is_new_at_every_try() -> None:
     queue = filled(srt(1, 20, size=20))
     message = queue.best(NOW)
     assert message is not None
-    assert queue.take(message, NOW).id >> 23 == 20
+    assert queue.next_frame(message, NOW).id >> 23 == 20
     queue.put_back(message)
-    assert queue.take(message, NOW + 5 * MS).id >> 23 == 15
-    queue.sent(message)
-    frame = queue.take(message, NOW + 9 * MS)
+    assert queue.next_frame(message, NOW + 5 * MS).id >> 23 == 15
+    queue.frame_sent(message)
+    frame = queue.next_frame(message, NOW + 9 * MS)
     assert (frame.id >> 23, frame.id & 0x7F) == (11, 1)
 
 
@@ -94,9 +94,9 @@ def test_a_more_urgent_message_goes_between_the_fragments() -> None:
     queue = filled(srt(1, 30, size=17))
     message = queue.best(NOW)
     assert message is not None
-    queue.take(message, NOW)
+    queue.next_frame(message, NOW)
     assert queue.put(srt(2, 5))
-    queue.sent(message)
+    queue.frame_sent(message)
     assert drain(queue) == [(2, 5, 0), (1, 30, 1), (1, 30, 0)]
 
 
@@ -116,17 +116,17 @@ def test_urgent_goes_to_the_front_of_its_topic_but_not_into_a_started_message() 
     queue = filled(srt(1, 50, size=16), srt(1, 50))
     message = queue.best(NOW)
     assert message is not None
-    queue.take(message, NOW)
+    queue.next_frame(message, NOW)
     assert queue.put(QueuedMessage(1, bytes(9), NOW + MS, drop=False), urgent=True)
-    queue.sent(message)
+    queue.frame_sent(message)
     assert drain(queue) == [(1, 1, 0), (1, 1, 1), (1, 1, 0), (1, 50, 0)]
 
 
 def test_overdue_is_dropped_unless_it_has_started_or_shall_be_sent() -> None:
     queue = filled(srt(1, 2), srt(2, 2, drop=False), srt(3, 2, size=9), srt(4, 9))
     started = next(each for each in queue.messages() if each.message == 3)
-    queue.take(started, NOW)
-    queue.sent(started)
+    queue.next_frame(started, NOW)
+    queue.frame_sent(started)
     assert queue.expire(NOW + 2 * MS - 1) == []
     assert [each.message for each in queue.expire(NOW + 2 * MS)] == [1]
     assert drain(queue, NOW + 3 * MS) == [(2, 1, 0), (3, 1, 0), (4, 6, 0)]
@@ -136,12 +136,12 @@ def test_overdue_in_the_mailbox_is_dropped_when_it_comes_back() -> None:
     queue = filled(srt(1, 2))
     message = queue.best(NOW)
     assert message is not None
-    queue.take(message, NOW)
+    queue.next_frame(message, NOW)
     assert queue.expire(NOW + 5 * MS) == []
     queue.put_back(message)
     assert queue.next_expiry <= NOW + 5 * MS
     assert queue.expire(NOW + 5 * MS) == [message]
-    assert len(queue) == 0
+    assert queue.size == 0
 
 
 def test_expiry_says_when_to_look() -> None:
@@ -160,8 +160,8 @@ def test_classes_apart() -> None:
     assert srt_message is not None
     assert nrt_message is not None
     assert (srt_message.message, nrt_message.message) == (2, 1)
-    queue.take(srt_message, NOW)
-    queue.take(nrt_message, NOW)
+    queue.next_frame(srt_message, NOW)
+    queue.next_frame(nrt_message, NOW)
     assert queue.best(NOW, nrt=False) is None
     other = queue.best_nrt(NOW)
     assert other is not None
@@ -172,7 +172,7 @@ def test_a_topic_is_held_after_an_error_and_others_go_on() -> None:
     queue = filled(srt(1, 10), srt(2, 20))
     message = queue.best(NOW)
     assert message is not None
-    queue.take(message, NOW)
+    queue.next_frame(message, NOW)
     queue.put_back(message, NOW + MS)
     assert [each.message for now in (NOW, NOW + MS) if (each := queue.best(now))] == [2, 1]
 
@@ -191,12 +191,12 @@ def test_only_one_topic_may_send() -> None:
 def test_it_is_bounded() -> None:
     queue = LaxityQueue(capacity=3, depth=2)
     assert [queue.put(nrt(1)), queue.put(nrt(1)), queue.put(nrt(1))] == [True, True, False]
-    assert not queue.full
+    assert queue.size == 2
     assert queue.put(nrt(2))
-    assert queue.full
+    assert queue.size == 3
     assert not queue.put(nrt(3))
     assert len(queue.clear()) == 3
-    assert len(queue) == 0
+    assert queue.size == 0
     assert queue.best(NOW) is None
 
 
@@ -230,7 +230,7 @@ def test_whatever_waits(messages: list[tuple[int, int | None, int, bool]], step:
         if best is None:
             break
         assert not any(each.sent for each in dropped)
-        frame = queue.take(best, now)
+        frame = queue.next_frame(best, now)
         identifier = rtcan.decode_identifier(frame.id)
         number, left = frame.data[0], identifier.left
         if identifier.message in open_topics:
@@ -243,11 +243,11 @@ def test_whatever_waits(messages: list[tuple[int, int | None, int, bool]], step:
         assert identifier.laxity == min(
             min(_laxity(each, now) for each in queue.messages() if each.message == topic) for topic in heads
         )
-        queue.sent(best)
+        queue.frame_sent(best)
         frames -= 1
         now += step
     assert frames == 0
-    assert len(queue) == 0
+    assert queue.size == 0
 
 
 def _laxity(message: QueuedMessage, now: int) -> int:
@@ -291,7 +291,7 @@ class Replay:
         self.pending = self.queue.best(self.now)
         if self.pending is not None:
             self.remaining.append((self.pending.deadline - self.now) // MS)
-            self.frames.append((step, self.queue.take(self.pending, self.now)))
+            self.frames.append((step, self.queue.next_frame(self.pending, self.now)))
 
     def _time(self, time: str) -> None:
         self.now = int(time, 0) * MS
@@ -309,7 +309,7 @@ class Replay:
 
     def _txok(self) -> None:
         assert self.pending is not None
-        self.queue.sent(self.pending)
+        self.queue.frame_sent(self.pending)
         self.pending = None
 
     def _alst(self) -> None:

@@ -110,7 +110,7 @@ def test_the_end_of_one_and_the_beginning_of_the_next_are_lost() -> None:
     assert receiver.losses == {10: {"gap": 1, "no beginning": 1}}
 
 
-def test_a_loss_that_nobody_can_see() -> None:
+def test_a_loss_that_can_not_be_seen() -> None:
     """Frames carry no number of their message: a tail that fits is taken."""
     receiver = Receiver(24)
     assert receiver.feed(*frames(payload(24))[:1], *frames(payload(24, 1))[1:]) == [payload(8) + payload(24, 1)[8:]]

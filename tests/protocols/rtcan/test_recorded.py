@@ -12,6 +12,7 @@ from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Outcome, Pro
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.plan import PeriodicMessage
 from tests.can_vectors import CanCase, arriving, can_cases, payload
+from tests.protocols.rtcan.networks import current_cycle
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -37,13 +38,13 @@ class Master:
         )
         self.engine = Engine(settings)
         low, high = (int(word, 0) for word in words["mask"])
-        self.engine._core.grants.calendar.mask = lambda cycle: low | high << 32  # type: ignore[method-assign]
-        self.engine._core._queue_management = lambda *_: None  # type: ignore[method-assign]  # there was no management
+        self.engine.grants.calendar.mask = lambda cycle: low | high << 32  # type: ignore[method-assign]
+        self.engine.management._enqueue = lambda *_: None  # type: ignore[method-assign]  # there was no management
         self._run(self.engine.start(0))
         for step in case.steps:
             if step.verb == "hrt":
                 self._reserve(*step.words)
-        self._until(lambda: self.engine.role is Role.MASTER)
+        self._until(lambda: self.engine.election.role is Role.MASTER)
 
     def _reserve(self, _: str, message: str, slot: str, period: str, data: str) -> None:
         high = rtcan.high_byte(int(message, 0))
@@ -52,15 +53,14 @@ class Master:
         periodic = PeriodicMessage(high, int(message, 0), size, rtcan.fragment_count(size), 0, 0, None)
         periodic.reservation = Reservation(periodic.message, int(period), int(slot), periodic.fragments)
         periodic.active, periodic.from_cycle = True, 1
-        self.engine._core.periodics[high] = periodic
-        self.engine._core.sender.add(periodic)
+        self.engine.periodics[high] = periodic
 
     def run(self, cycle: int, slot: int) -> None:
         """Up to this slot."""
         self._until(lambda: self._place() > (cycle, slot))
 
     def _place(self) -> tuple[int, int]:
-        cycle = self.engine._core.cycle
+        cycle = self.engine.cycle
         return cycle.counter, cycle.slot_at(self.engine.next_deadline() or 0)
 
     def _until(self, condition: Callable[[], bool]) -> None:
@@ -74,8 +74,8 @@ class Master:
             if isinstance(action, Due):
                 self._run(self.engine.fill(action.at, action.high, self.data[action.high]))
             elif isinstance(action, Transmit):
-                cycle = self.engine._core.cycle
-                if self.engine.role is Role.MASTER:
+                cycle = self.engine.cycle
+                if self.engine.election.role is Role.MASTER:
                     self.frames.append((cycle.counter, cycle.slot_at(action.not_before), action.frame))
                 elif rtcan.is_sync(action.frame.id):  # the one that makes it the master
                     self.frames.append((rtcan.decode_sync(action.frame).cycle, 0, action.frame))
@@ -132,7 +132,7 @@ def test_recorded_soft_messages_wait_for_free_slots(case: CanCase) -> None:
     master.run(1, 0)
     words = next(step.words for step in case.steps if step.verb == "msg")
     soft = rtcan.high_byte(int(words[1], 0))
-    begin = master.engine._core.cycle.reference
+    begin = master.engine.cycle.reference
     master._run(master.engine.publish(begin + 1, soft, payload(words[2]), deadline=begin + 20 * MS))
     master.run(1, 10)
     ours = [(slot, frame.id & 0x7FFFFF, frame.data) for _, slot, frame in master.frames if frame.id >> 15 & 255 == soft]
@@ -143,7 +143,7 @@ def test_recorded_mix_of_classes() -> None:
     (case,) = (each for each in can_cases("hrt-srt") if each.name == "hrtbuild_srt_and_hrt_mix")
     master = Master(case)
     master.run(1, 0)
-    begin = master.engine._core.cycle.reference
+    begin = master.engine.cycle.reference
     master._run(master.engine.publish(begin + 1, 0x77, payload(case.steps[5].words[2]), deadline=begin + 20 * MS))
     master.run(1, 10)
     in_cycle = [(slot, frame.id & 0x7F, frame.data) for c, slot, frame in master.frames if c == 1 and slot]
@@ -157,7 +157,7 @@ def test_recorded_overwriting_of_a_pending_frame_does_not_happen() -> None:
     master = Master(case)
     master.run(1, 2)
     engine = master.engine
-    start = engine._core.cycle.start_of(3)
+    start = engine.cycle.start_of(3)
     engine.publish(start - 1, 0x77, b"soft", deadline=start + 20 * MS, handle="soft")
     (pending,) = engine.poll(start)
     assert isinstance(pending, Transmit)
@@ -182,8 +182,8 @@ def test_recorded_syncs_at_a_slave(case: CanCase) -> None:
             now += slots * SLOT
             frame = arriving(step)
             engine.receive(now, frame, now + rtcan.frame_bits(frame.id, frame.data) * 1_000)
-            assert engine.cycle == rtcan.decode_sync(frame).cycle
-    assert engine.cycle == case.of("driver")[-1].fields["cycle"]
+            assert current_cycle(engine) == rtcan.decode_sync(frame).cycle
+    assert current_cycle(engine) == case.of("driver")[-1].fields["cycle"]
 
 
 def test_recorded_frames_with_high_byte_0_are_sync_only_with_laxity_0() -> None:
@@ -193,8 +193,8 @@ def test_recorded_frames_with_high_byte_0_are_sync_only_with_laxity_0() -> None:
     *syncs, no_sync, soft = [arriving(step) for step in case.steps if step.verb == "frame"]
     for n, frame in enumerate(syncs):
         engine.receive(n * 4 * SLOT, frame, n * 4 * SLOT + 160_000)
-    assert engine.cycle == 13
+    assert current_cycle(engine) == 13
     engine.receive(20 * SLOT, no_sync, 20 * SLOT)  # the original took this for a sync: 4 bytes, cycle 40
     engine.receive(20 * SLOT, soft, 20 * SLOT)
-    assert engine.cycle == 13
+    assert current_cycle(engine) == 13
     assert engine.counts == {"undecodable": 1, "management of firmware": 1}

@@ -27,22 +27,22 @@ def test_no_two_topics_share_one(topics: set[str]) -> None:
         high = mine.pick(topic)
         assert high is not None
         assert used.setdefault(high, topic) == topic
-        other.heard(0, topic, rtcan.message_id(high, 10 + n % 2), 99)
+        other.on_announced(0, topic, rtcan.message_id(high, 10 + n % 2), 99)
 
 
 def test_the_lower_id8_keeps_it() -> None:
     bytes_ = TopicIdAllocator()
     high = bytes_.pick("leds")
     assert high is not None
-    assert bytes_.heard(0, "motor", rtcan.message_id(high, 30), 20) == []
-    assert bytes_.heard(0, "leds", rtcan.message_id(high, 5), 20) == []
-    assert bytes_.heard(0, "motor", rtcan.message_id(high, 10), 20) == ["leds"]
-    bytes_.gone(5)
+    assert bytes_.on_announced(0, "motor", rtcan.message_id(high, 30), 20) == []
+    assert bytes_.on_announced(0, "leds", rtcan.message_id(high, 5), 20) == []
+    assert bytes_.on_announced(0, "motor", rtcan.message_id(high, 10), 20) == ["leds"]
+    bytes_.on_module_gone(5)
     again = bytes_.pick("leds")
     assert again not in (None, high)
     bytes_.drop("leds")
-    bytes_.gone(10)
-    bytes_.gone(30)
+    bytes_.on_module_gone(10)
+    bytes_.on_module_gone(30)
     assert bytes_.pick("leds") == high
 
 
@@ -56,52 +56,52 @@ def test_when_all_are_in_use() -> None:
 def test_what_is_not_repeated_ends() -> None:
     bytes_ = TopicIdAllocator()
     for high in range(rtcan.FIRST_TOPIC, 256):
-        bytes_.heard(0, f"t{high}", rtcan.message_id(high, 10), 20)
+        bytes_.on_announced(0, f"t{high}", rtcan.message_id(high, 10), 20)
     assert bytes_.pick("leds") is None
     for high in range(3, 256):
-        bytes_.heard(LEASE // 2, f"t{high}", rtcan.message_id(high, 10), 20)
-    assert bytes_.freed(LEASE - 1) == []
-    assert bytes_.freed(LEASE) == ["leds"]
+        bytes_.on_announced(LEASE // 2, f"t{high}", rtcan.message_id(high, 10), 20)
+    assert bytes_.retry(LEASE - 1) == []
+    assert bytes_.retry(LEASE) == ["leds"]
     assert len(bytes_) == 253
     assert bytes_.pick("leds") == rtcan.FIRST_TOPIC
-    assert bytes_.freed(2 * LEASE) == []
+    assert bytes_.retry(2 * LEASE) == []
     assert len(bytes_) == 0
 
 
 def test_a_lease_lasts_for_all_that_modules_on_a_slow_bus_have_to_say() -> None:
     bytes_ = TopicIdAllocator()
-    bytes_.pace(12.0)
-    bytes_.heard(0, "leds", 0x4210, 20)
-    bytes_.freed(80 * SECOND)
+    bytes_.set_rate(12.0)
+    bytes_.on_announced(0, "leds", 0x4210, 20)
+    bytes_.retry(80 * SECOND)
     assert len(bytes_) == 1
-    bytes_.freed(90 * SECOND)
+    bytes_.retry(90 * SECOND)
     assert len(bytes_) == 0
 
 
 def test_a_module_has_one_id_for_a_topic_and_one_topic_for_an_id() -> None:
     bytes_ = TopicIdAllocator()
     for number in range(3000):
-        bytes_.heard(0, f"t{number}", rtcan.message_id(2 + number % 254, 10), 20)
+        bytes_.on_announced(0, f"t{number}", rtcan.message_id(2 + number % 254, 10), 20)
     assert len(bytes_) == 254
     for number in range(254):
-        bytes_.heard(0, "leds", rtcan.message_id(2 + number, 10), 20)
+        bytes_.on_announced(0, "leds", rtcan.message_id(2 + number, 10), 20)
     assert len(bytes_) == 1
     assert len({bytes_.pick(f"ours{number}") for number in range(253)} - {None}) == 253
-    bytes_.gone(10)
+    bytes_.on_module_gone(10)
     assert len(bytes_) == 0
 
 
 def test_all_publishers_of_a_topic_take_the_byte_of_the_one_with_the_lowest_id8() -> None:
     bytes_ = TopicIdAllocator()
-    bytes_.heard(0, "leds", 0x4210, 30)
+    bytes_.on_announced(0, "leds", 0x4210, 30)
     assert bytes_.pick("leds") == 0x42
-    assert bytes_.heard(0, "leds", 0x4328, 30) == []
-    assert bytes_.heard(0, "leds", 0x4314, 30) == []  # not the lowest
-    assert bytes_.heard(0, "leds", 0x440A, 30) == ["leds"]
+    assert bytes_.on_announced(0, "leds", 0x4328, 30) == []
+    assert bytes_.on_announced(0, "leds", 0x4314, 30) == []  # not the lowest
+    assert bytes_.on_announced(0, "leds", 0x440A, 30) == ["leds"]
     assert bytes_.pick("leds") == 0x44
-    assert bytes_.heard(0, "motor", 0x4505, 30) == []
-    assert bytes_.heard(0, "leds", 0x450A, 30) == []  # it will take another one: that is the motor's
-    assert bytes_.heard(0, "leds", 0x460A, 30) == ["leds"]
+    assert bytes_.on_announced(0, "motor", 0x4505, 30) == []
+    assert bytes_.on_announced(0, "leds", 0x450A, 30) == []  # it will take another one: that is the motor's
+    assert bytes_.on_announced(0, "leds", 0x460A, 30) == ["leds"]
     assert bytes_.pick("leds") == 0x46
 
 
@@ -109,10 +109,10 @@ def test_firmware_can_take_no_other() -> None:
     bytes_ = TopicIdAllocator()
     high = bytes_.pick("leds")
     assert high is not None
-    assert bytes_.heard(0, "motor", rtcan.message_id(high, 0x30), 0x20, firmware=True) == ["leds"]
-    assert bytes_.heard(0, "leds", 0x4210, 0x20) == []
+    assert bytes_.on_announced(0, "motor", rtcan.message_id(high, 0x30), 0x20, firmware=True) == ["leds"]
+    assert bytes_.on_announced(0, "leds", 0x4210, 0x20) == []
     assert bytes_.pick("leds") == 0x42
-    assert bytes_.heard(0, "leds", 0x5030, 0x20, firmware=True) == ["leds"]
+    assert bytes_.on_announced(0, "leds", 0x5030, 0x20, firmware=True) == ["leds"]
     assert bytes_.pick("leds") == 0x50
 
 
@@ -128,9 +128,9 @@ def test_whatever_is_announced(announced: list[tuple[str, int, int, bool]]) -> N
     for topic, message, later, firmware in announced:
         now += later
         bytes_.pick("a")
-        bytes_.heard(now, topic, message, 99, firmware=firmware)
-        bytes_.gone(message + 1 & 0xFF)
-        bytes_.freed(now)
-    bytes_.freed(now + LEASE)
+        bytes_.on_announced(now, topic, message, 99, firmware=firmware)
+        bytes_.on_module_gone(message + 1 & 0xFF)
+        bytes_.retry(now)
+    bytes_.retry(now + LEASE)
     assert len(bytes_) == 0
     assert bytes_.pick("b") is not None

@@ -149,9 +149,9 @@ def test_coarse_ports_may_start_anywhere_in_free_slots() -> None:
     (transmit,) = slave.engine.poll(at + 90_000)
     assert isinstance(transmit, Transmit)
     assert transmit.not_after - at > 3 * SLOT
-    assert slave.engine.mask is not None
+    assert slave.engine.cycle.mask is not None
     reference = syncs(bus)[-1][0]
-    assert not slave.engine.mask >> ((transmit.not_after - reference) // SLOT) & 1
+    assert not slave.engine.cycle.mask >> ((transmit.not_after - reference) // SLOT) & 1
 
 
 def test_coarse_ports_send_one_frame_after_the_other_in_a_slot() -> None:
@@ -230,4 +230,4 @@ def test_what_is_not_ready_or_does_not_fit() -> None:
     ready, now = ready_engine(capacity=2)
     last = [ready.publish(now, high, b"x", handle=high) for high in (2, 3, 4)][-1]
     assert last == [Done(4, Fate.FULL, False, now)]
-    assert ready.full
+    assert ready.transmitter.queue.size == 2

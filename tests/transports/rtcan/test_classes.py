@@ -81,12 +81,12 @@ async def test_a_slot_is_reserved_without_a_subscriber_and_used_only_with_one() 
         assert not made.hrt("A")
         assert local.queue
         link = made.link("B")
-        assert link.engine.mask == 1 | 1 << 1 | 1 << 31
+        assert link.engine.cycle.mask == 1 | 1 << 1 | 1 << 31
         subscriber = bob.subscribe("pwm", PWM2)
         await subscriber.fetch(timeout=1.0)
         publisher.close()
         await asyncio.sleep(0.1)
-        assert link.engine.mask == 1
+        assert link.engine.cycle.mask == 1
 
 
 async def test_a_long_periodic_message_gets_slots_in_a_row() -> None:

@@ -186,7 +186,7 @@ async def test_what_a_class_means_depends_on_the_controller() -> None:
     assert "fresh at each try" in status.guarantee(PublisherClass.SPORADIC, None)
 
 
-@pytest.mark.parametrize("call", ["poll", "receive", "_sender._post.confirm"])
+@pytest.mark.parametrize("call", ["poll", "receive", "transmitter.mailboxes.confirm"])
 async def test_an_engine_that_raises_goes_on(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     driver, port, owner = make()
     place, _, name = f"engine.{call}".rpartition(".")

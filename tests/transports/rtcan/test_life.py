@@ -39,7 +39,7 @@ async def down(events: AsyncIterator[ModuleEvent]) -> r2p.LinkDown:
 
 def master_of(made: Lab, *names: str) -> str:
     """The module that keeps the cycle."""
-    (master,) = [name for name in names if made.link(name).engine.role is Role.MASTER]
+    (master,) = [name for name in names if made.link(name).engine.election.role is Role.MASTER]
     return master
 
 
@@ -77,7 +77,7 @@ async def test_the_master_dies_and_another_one_takes_over() -> None:
         assert made.link(survivor).slots[survivor].phase == phases
         assert master_of(made, watcher, survivor) != old
         made.can.port(old).power_on()
-        await until(lambda: made.link(old).engine.master is not None)
+        await until(lambda: made.link(old).engine.network.master is not None)
         assert master_of(made, "A", "B", "C") != old
         await publishers["ABC".index(old)].ready(5.0)
         assert wanted.subscribers
@@ -207,10 +207,10 @@ async def test_two_nodes_of_one_id_the_one_that_came_later_yields() -> None:
 async def test_a_network_of_other_parameters_is_left_alone() -> None:
     made = Lab()
     async with made.module("A", options={"priority": 9}) as alice:
-        await until(lambda: made.link("A").engine.role is Role.MASTER)
+        await until(lambda: made.link("A").engine.election.role is Role.MASTER)
         async with made.module("B", options={"slots": 50}) as bob:
             publisher = bob.advertise("leds", Led)
-            await until(lambda: made.link("B").engine.silenced)
+            await until(lambda: made.link("B").engine.network.mismatch)
             text = publisher.guarantees["sim:"]
             assert text.startswith("nothing is sent: the network has 60 slots of 166 us")
             made.clear()

@@ -39,7 +39,7 @@ async def test_one_election_and_not_a_period_is_missed(
                 await publisher.ready()
         await asyncio.sleep(2.0)
         assert [each.missed for each in publishers] == [0] * len(MODULES)
-        assert {made.link(name).engine.master for name in MODULES} == {made.link("A").engine.master}
+        assert {made.link(name).engine.network.master for name in MODULES} == {made.link("A").engine.network.master}
         losses = sum((made.link(name).losses for name in MODULES), Counter[str]())
         assert not losses.keys() & {"overdue", "slot missed", "no room"}  # announcements may be: they are repeated
         masters = [line for line in caplog.messages if "RTCAN" in line]
