@@ -1,7 +1,7 @@
-"""Messages as people and scripts write them, both ways: what `echo` prints, `pub` takes.
+"""Messages as text, in both directions: `pub` accepts what `echo` prints.
 
-A value gets its type from the message's field, never from how it is written: YAML is read as texts only. So `1e-3` is a
-number, the key `on` a text, and "nan" in quotes, as JSON needs it, is not-a-number all the same.
+A value gets its type from the field of the message, never from how it is written: all YAML scalars are read as texts.
+So `1e-3` is a number, the key `on` is a text, and "nan" in quotes, as JSON needs it, is still not-a-number.
 """
 
 import json
@@ -20,7 +20,7 @@ META = "_"
 """The key of what is not part of a message: its topic, stamp, source."""
 
 DEPTH = 32
-"""Levels of mappings and lists in what is given; no message has as many."""
+"""Levels of mappings and lists that are accepted; no message has as many."""
 
 _EXCERPT = 80  # characters of a text in an error
 _PAIR = re.compile(r"([A-Za-z_][\w.]*)=(.*)", re.DOTALL)
@@ -31,10 +31,10 @@ _SMALLEST_NORMAL = 2.0**-126
 
 
 def parse(cls: type[M], texts: Iterable[str]) -> M:
-    """A message from YAML or JSON mappings and `x=1.5` pairs, the later ones winning; what is left out is zero.
+    """Parse YAML or JSON mappings and `x=1.5` pairs to a message; later ones win, and missing fields are zero.
 
-    A pair's name may lead into a nested message (`stamp.sec=5`). Raises MessageError, also for what would take more
-    memory than it has characters: YAML's aliases.
+    The name of a pair may be a path into a nested message (`stamp.sec=5`). Raises MessageError, also for YAML aliases,
+    with which a short text could take all memory.
     """
     plain: dict[str, Any] = {}
     shape = layout(cls)
@@ -49,7 +49,7 @@ def parse(cls: type[M], texts: Iterable[str]) -> M:
 
 
 def parse_line(cls: type[M], line: str) -> M:
-    """A message from one line of a stream: JSON as `echo` prints it, else as `parse` takes it. Raises MessageError."""
+    """Parse one line of a stream: JSON as `echo` prints it, otherwise as in `parse`. Raises MessageError."""
     if line.lstrip().startswith("{"):
         try:
             plain = json.loads(line)
@@ -60,7 +60,7 @@ def parse_line(cls: type[M], line: str) -> M:
 
 
 def from_plain(cls: type[M], plain: Mapping[str, Any]) -> M:
-    """A message from a mapping of plain values; a key may be a path (`stamp.sec`). Raises MessageError."""
+    """Return the message of a mapping of plain values; a key may be a path (`stamp.sec`). Raises MessageError."""
     nested: dict[str, Any] = {}
     _merge(nested, {name: value for name, value in plain.items() if name != META})
     message: M = _message(layout(cls), nested, cls.__name__)
@@ -68,13 +68,13 @@ def from_plain(cls: type[M], plain: Mapping[str, Any]) -> M:
 
 
 def to_plain(message: Message) -> dict[str, Any]:
-    """A message as JSON can hold it: NaN and infinities as texts, an f32 as its shortest decimal."""
+    """Return a message as values for JSON: NaN and infinities as texts, an f32 as its shortest decimal."""
     shape = layout(type(message))
     return {field.name: _plain(field.shape, getattr(message, field.name)) for field in shape.fields}
 
 
 def pick(plain: Mapping[str, Any], path: str) -> Any:
-    """The value at a path: `stamp.sec`, `value[0]`. Raises KeyError that lists what there is."""
+    """Return the value at a path: `stamp.sec`, `value[0]`. Raises KeyError with the existing paths."""
     value: Any = plain
     for step in _STEP.findall(path):
         if isinstance(value, Mapping) and step in value:
@@ -82,12 +82,12 @@ def pick(plain: Mapping[str, Any], path: str) -> Any:
         elif isinstance(value, list) and step.isdecimal() and int(step) < len(value):
             value = value[int(step)]
         else:
-            raise KeyError(f"no field {path[:_EXCERPT]}: there are {', '.join(_names(plain))}")
+            raise KeyError(f"there is no field {path[:_EXCERPT]}; the fields are {', '.join(_names(plain))}")
     return value
 
 
 def _names(plain: Mapping[str, Any]) -> list[str]:
-    """The paths of all fields, for people."""
+    """Return the paths of all fields, for an error."""
     names: list[str] = []
     for name, value in plain.items():
         inner = _names(value) if isinstance(value, Mapping) else []
@@ -99,7 +99,7 @@ def _names(plain: Mapping[str, Any]) -> list[str]:
 
 
 def _yaml(text: str) -> Any:
-    """YAML, all scalars as texts. Its events are looked at first: building it could take all memory, or the stack."""
+    """Parse YAML with all scalars as texts. Its events are checked first: building it could exhaust memory or stack."""
     import yaml
 
     loader: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
@@ -113,11 +113,11 @@ def _yaml(text: str) -> Any:
                 raise _too_deep(text)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, UnicodeError) as error:
-        raise MessageError(f"{_excerpt(text)} is no YAML: {getattr(error, 'problem', None) or error}") from error
+        raise MessageError(f"{_excerpt(text)} is not valid YAML: {getattr(error, 'problem', None) or error}") from error
 
 
 def _excerpt(text: str) -> str:
-    """A text for an error."""
+    """Return the start of a text, for an error."""
     return repr(text if len(text) <= _EXCERPT else f"{text[:_EXCERPT]}...")
 
 
@@ -128,12 +128,12 @@ def _too_deep(text: str) -> MessageError:
 def _mapping(text: str) -> dict[str, Any]:
     value = _yaml(text)
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise MessageError(f"{_excerpt(text)} is no message: write '{{x: 1.5, w: 0.25}}' or x=1.5 w=0.25")
+        raise MessageError(f"{_excerpt(text)} is not a message: write '{{x: 1.5, w: 0.25}}' or x=1.5 w=0.25")
     return value
 
 
 def _is_text(shape: Layout[Any], path: str) -> bool:
-    """Whether the path leads to a text field, which is taken as it stands."""
+    """Return whether the path is that of a text field, whose value is used as it is."""
     kind: Shape = Nested(shape)
     for name in path.split("."):
         fields = {field.name: field.shape for field in kind.layout.fields} if isinstance(kind, Nested) else {}
@@ -144,7 +144,7 @@ def _is_text(shape: Layout[Any], path: str) -> bool:
 
 
 def _merge(into: dict[str, Any], plain: Mapping[str, Any], depth: int = 0) -> None:
-    """Add values, paths as keys taken apart; `depth` is that of `into`."""
+    """Add values to `into`, with keys that are paths split; `depth` is that of `into`."""
     for path, value in plain.items():
         *parents, name = path.split(".")
         inside = depth + len(parents) + 1
@@ -154,7 +154,7 @@ def _merge(into: dict[str, Any], plain: Mapping[str, Any], depth: int = 0) -> No
         for parent in parents:
             inner = place.setdefault(parent, {})
             if not isinstance(inner, dict):
-                raise MessageError(f"{path}: {parent} is given as a value already")
+                raise MessageError(f"{path}: {parent} already has a value")
             place = inner
         if isinstance(value, Mapping) and isinstance(place.get(name, {}), dict):
             _merge(place.setdefault(name, {}), value, inside)
@@ -180,17 +180,17 @@ def _value(shape: Shape, plain: Any, path: str) -> Any:
         case Array(item, count) if isinstance(plain, list) and len(plain) == count:
             return tuple(_value(item, each, f"{path}[{i}]") for i, each in enumerate(plain))
         case Chars():
-            value: Any = plain if isinstance(plain, str) else _refused
+            value: Any = plain if isinstance(plain, str) else _invalid
         case Scalar():
             value = _number(shape, plain)
         case _:
-            value = _refused
-    if value is _refused or (isinstance(shape, Scalar | Chars) and not shape.holds(value)):
+            value = _invalid
+    if value is _invalid or (isinstance(shape, Scalar | Chars) and not shape.holds(value)):
         raise MessageError(f"{path} takes {_wanted(shape)}, not {_shown(plain)}")
     return value
 
 
-_refused = object()
+_invalid = object()
 
 
 def _wanted(shape: Shape) -> str:
@@ -214,16 +214,16 @@ def _shown(plain: Any) -> str:
 
 
 def _number(shape: Scalar, plain: Any) -> Any:
-    """A number or a bool from what YAML (texts) or JSON (values) holds; `_refused` if it is none."""
+    """Return the number or bool of a YAML text or a JSON value; `_invalid` if it is none."""
     if shape.kind == "bool":
         text = str(plain).lower()
-        return True if text in _TRUE else False if text in _FALSE else _refused
+        return True if text in _TRUE else False if text in _FALSE else _invalid
     if isinstance(plain, bool) or not isinstance(plain, int | float | str):
-        return _refused
+        return _invalid
     try:
         return _float(plain) if shape.kind in {"f32", "f64"} else _integer(plain)
     except (ValueError, OverflowError):
-        return _refused
+        return _invalid
 
 
 def _float(plain: float | str) -> float:
@@ -233,7 +233,7 @@ def _float(plain: float | str) -> float:
 
 
 def _integer(plain: float | str) -> int:
-    """5, 0x1f, 5.0 and 1e3; raises ValueError for the rest."""
+    """Parse 5, 0x1f, 5.0 and 1e3. Raises ValueError for anything else."""
     if isinstance(plain, str):
         text = plain.strip()
         for base in (10, 0):
@@ -265,7 +265,7 @@ def _plain(shape: Shape, value: Any) -> Any:
 
 
 def shortest_f32(value: float) -> float:
-    """The float with the shortest decimal text that packs to the same four bytes."""
+    """Return the float with the shortest decimal text that packs to the same four bytes."""
     packed = struct.pack("<f", value)
     exact = struct.unpack("<f", packed)[0]
     for digits in range(6 if abs(exact) >= _SMALLEST_NORMAL else 1, 9):
@@ -276,7 +276,10 @@ def shortest_f32(value: float) -> float:
 
 
 def _decimals(value: float, digits: int) -> Iterable[float]:
-    """The nearest decimal of so many digits, and below a power of two, where floats lie closer, the two beside it."""
+    """Yield the nearest decimal with this many digits, and its neighbours at a power of two.
+
+    Below a power of two floats are denser, so the nearest decimal need not be the one that packs to the same bytes.
+    """
     nearest = f"{value:.{digits - 1}e}"
     yield float(nearest)
     if abs(math.frexp(value)[0]) == 0.5:

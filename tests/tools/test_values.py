@@ -113,13 +113,13 @@ def test_people_write(texts: list[str], message: r2p.Message) -> None:
         (Led, ["{led: [1]}"], "Led.led takes an integer from 0 to 4294967295, not a list of 1"),
         (Led, ["led.x=1"], "Led.led takes an integer from 0 to 4294967295, not a mapping"),
         (Led, ["{value: nan}"], "Led.value takes an integer from 0 to 255, not 'nan'"),
-        (Led, ["led"], "'led' is no message: write '{x: 1.5, w: 0.25}' or x=1.5 w=0.25"),
-        (Led, ["{led: 1"], "'{led: 1' is no YAML: did not find expected ',' or '}'"),
+        (Led, ["led"], "'led' is not a message: write '{x: 1.5, w: 0.25}' or x=1.5 w=0.25"),
+        (Led, ["{led: 1"], "'{led: 1' is not valid YAML: did not find expected ',' or '}'"),
         (Led, ["{? [1] : 2}"], "'{? [1] : 2}' is no"),
         (Velocity3, ["x=1e39"], "Velocity3.x takes a number up to"),
         (Velocity3, ["x=true"], "Velocity3.x takes a number up to"),
         (StampedPose3, ["timestamp=5"], "StampedPose3.timestamp takes a mapping of sec, nsec, not '5'"),
-        (StampedPose3, ["timestamp=5", "timestamp.sec=5"], "timestamp.sec: timestamp is given as a value already"),
+        (StampedPose3, ["timestamp=5", "timestamp.sec=5"], "timestamp.sec: timestamp already has a value"),
         (StampedPose3, ["timestamp.se=5"], "StampedPose3.timestamp has no field se: it has sec, nsec"),
         (Speed2, ["value=[1]"], "Speed2.value takes a list of 2, not a list of 1"),
         (Speed2, ["value=[1, x]"], r"Speed2.value[1] takes a number up to"),
@@ -160,8 +160,8 @@ def test_any_text_is_a_message_or_a_message_error(text: str) -> None:
         ("led" + ".x" * 30_000 + "=1", "is nested more than 32 levels deep"),
         ("{led" + ".x" * 100 + ": 1}", "is nested more than 32 levels deep"),
         ("{led.a.b.c.d.e.f.g.h: " * 8 + "1" + "}" * 8, "is nested more than 32 levels deep"),
-        ("led: \udcff", "is no YAML"),
-        ("x" * 1000, r"'x{80}\.\.\.' is no message"),
+        ("led: \udcff", "is not valid YAML"),
+        ("x" * 1000, r"'x{80}\.\.\.' is not a message"),
     ],
 )
 def test_what_would_take_all_memory_or_the_stack_is_a_mistake(text: str, complaint: str) -> None:
@@ -202,7 +202,7 @@ def test_pick(path: str, value: Any) -> None:
 
 @pytest.mark.parametrize("path", ["fat", "poses.x", "cells[2]", "far.x", "poses[0].z"])
 def test_pick_tells_what_there_is(path: str) -> None:
-    with pytest.raises(KeyError, match="there are cells, poses, names, far"):
+    with pytest.raises(KeyError, match="the fields are cells, poses, names, far"):
         pick(to_plain(Grid()), path)
-    with pytest.raises(KeyError, match=r"there are timestamp\.sec, timestamp\.nsec, x, y, w"):
+    with pytest.raises(KeyError, match=r"the fields are timestamp\.sec, timestamp\.nsec, x, y, w"):
         pick(to_plain(StampedPose3()), "z")

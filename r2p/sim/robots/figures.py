@@ -86,7 +86,7 @@ class _Reading(NamedTuple):
     bus: tuple[int, int, int]
 
 
-class Gauge:
+class FiguresReader:
     """Reads the figures; rates are those since a reading at least a second before, or the first one."""
 
     def __init__(self, robot: Triskar2, bus: SimCan | None, modules: Iterable[r2p.Module] = ()) -> None:
@@ -100,7 +100,7 @@ class Gauge:
         self._began = self._count(0.0)
         self._readings = deque([self._began])
 
-    def told(self, odometry: Odometry) -> None:
+    def odometry_received(self, odometry: Odometry) -> None:
         """Odometry came."""
         x, y, _ = self._robot.pose
         self._odometry = odometry

@@ -1,4 +1,4 @@
-"""The robot of the demo, and the PC that drives it."""
+"""The robot of `r2p demo line`, the PC that drives it, and counters of what passes between them."""
 
 import asyncio
 import contextlib
@@ -14,15 +14,16 @@ from r2p.messages import Message
 from r2p.msg import Encoder, Led, StampedIMURaw9, StampedVelocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
 
-# What the demo counts for each topic: messages, their rate, their latency.
-
-
 _WINDOW = 2_000_000_000  # ns, of the rate
-_LATENCIES = 10_000  # kept, the newest
+_LATENCIES = 10_000  # the newest are kept
+_SECOND = 1_000_000_000
+_GRAVITY = 1000  # counts of 1 mg
+_POLL = 0.02  # seconds
+_IN_FLIGHT = 1.0  # seconds to wait for messages that were sent
 
 
-class TopicTally:
-    """The messages of one topic; its times are those of one way, or of a `round_trip`."""
+class TopicCounter:
+    """Counts the messages of one topic, with their rate and latency; the latency is one way, or of a `round_trip`."""
 
     def __init__(self, topic: str, link: str, *, round_trip: bool = False) -> None:
         self.topic = topic
@@ -34,8 +35,8 @@ class TopicTally:
         self.latencies: deque[int] = deque(maxlen=_LATENCIES)
         self._recent: deque[int] = deque()
 
-    def take(self, now: int, message: Message, latency: int | None = None) -> None:
-        """A message came in at `now` (ns), after `latency` ns."""
+    def add(self, now: int, message: Message, latency: int | None = None) -> None:
+        """Count a message that arrived at `now` (ns), after `latency` ns."""
         self.received += 1
         self.last = message
         self._recent.append(now)
@@ -43,7 +44,7 @@ class TopicTally:
             self.latencies.append(latency)
 
     def rate(self, now: int) -> float:
-        """Messages a second, of the last two seconds."""
+        """Return the messages per second over the last two seconds."""
         recent = self._recent
         while recent and recent[0] <= now - _WINDOW:
             recent.popleft()
@@ -51,47 +52,38 @@ class TopicTally:
 
     @property
     def median(self) -> float | None:
-        """Of the latencies, in ms."""
+        """The median of the latencies, in ms."""
         return median(self.latencies) / 1e6 if self.latencies else None
 
     @property
     def slowest(self) -> float | None:
-        """The latency, in ms, that one in a hundred exceeds."""
+        """The 99th percentile of the latencies, in ms."""
         if len(self.latencies) < 2:
             return self.median
         return quantiles(self.latencies, n=100, method="inclusive")[98] / 1e6
 
 
-# robot
-
-
-_SECOND = 1_000_000_000
-_GRAVITY = 1000  # counts of 1 mg
-_LOOK = 0.02  # seconds
-_PATIENCE = 1.0  # seconds for what is on its way
-
-
 class Robot:
     """IMU1 and MOTOR1, emulated, and PC1 with its nodes, for the time of an `async with` block.
 
-    IMU1 measures, and switches LEDs as it is told; MOTOR1 drives as it is told, and says how fast it goes. The answers
-    carry what was asked, so PC1 knows how long the way there and back took.
+    IMU1 measures, and switches LEDs on command; MOTOR1 drives on command, and reports its velocity. Both answer with
+    the content of the command, so PC1 can measure the round trip.
     """
 
     def __init__(self) -> None:
-        self.tallies = {
-            tally.topic: tally
-            for tally in (
-                TopicTally("imu_raw", "tcp in"),
-                TopicTally("led_cmd", "tcp out"),
-                TopicTally("leds", "tcp in", round_trip=True),
-                TopicTally("encoder", "serial in"),
-                TopicTally("velocity_cmd", "serial out"),
-                TopicTally("velocity", "serial in", round_trip=True),
+        self.counters = {
+            counter.topic: counter
+            for counter in (
+                TopicCounter("imu_raw", "tcp in"),
+                TopicCounter("led_cmd", "tcp out"),
+                TopicCounter("leds", "tcp in", round_trip=True),
+                TopicCounter("encoder", "serial in"),
+                TopicCounter("velocity_cmd", "serial out"),
+                TopicCounter("velocity", "serial in", round_trip=True),
             )
         }
         self.address = ""
-        """Where IMU1 listens."""
+        """The address at which IMU1 listens."""
         self.device = ""
         """MOTOR1's serial port."""
         self._blinks: dict[int, int] = {}
@@ -105,7 +97,7 @@ class Robot:
         self._motor = FirmwareModule(
             "MOTOR1",
             publishers=[Publishes("encoder", Encoder, 0.05, self._turn), Publishes("velocity", StampedVelocity3)],
-            subscribers=[Subscribes("velocity_cmd", StampedVelocity3, answer=self._obey)],
+            subscribers=[Subscribes("velocity_cmd", StampedVelocity3, answer=self._move)],
         )
 
     async def __aenter__(self) -> Self:
@@ -125,22 +117,22 @@ class Robot:
         await self._stack.aclose()
 
     async def finish(self) -> None:
-        """Send no more, and wait for what is on its way."""
+        """Stop to send, and wait for messages in flight."""
         self._over = True
         loop = asyncio.get_running_loop()
-        end = loop.time() + _PATIENCE
+        end = loop.time() + _IN_FLIGHT
         while loop.time() < end:
-            await asyncio.sleep(_LOOK)
-            if all(tally.received == tally.sent for tally in self.counted()):
+            await asyncio.sleep(_POLL)
+            if all(counter.received == counter.sent for counter in self.updated_counters()):
                 return
 
-    def counted(self) -> Iterator[TopicTally]:
-        """The tallies, up to date."""
-        for tally in self.tallies.values():
-            sender = self._imu if tally.link.startswith("tcp") else self._motor
-            if tally.topic in sender.sent:
-                tally.sent = sender.sent[tally.topic]
-            yield tally
+    def updated_counters(self) -> Iterator[TopicCounter]:
+        """Yield the counters, with what was sent so far."""
+        for counter in self.counters.values():
+            sender = self._imu if counter.link.startswith("tcp") else self._motor
+            if counter.topic in sender.sent:
+                counter.sent = sender.sent[counter.topic]
+            yield counter
 
     # The emulated modules
 
@@ -161,12 +153,12 @@ class Robot:
 
     def _switch(self, led: Led) -> list[tuple[str, r2p.Message]]:
         now = self.clock.now()
-        self.tallies["led_cmd"].take(now, led, now - self._blinks[led.led])
+        self.counters["led_cmd"].add(now, led, now - self._blinks[led.led])
         return [("leds", led)]
 
-    def _obey(self, command: StampedVelocity3) -> list[tuple[str, r2p.Message]]:
+    def _move(self, command: StampedVelocity3) -> list[tuple[str, r2p.Message]]:
         now = self.clock.now()
-        self.tallies["velocity_cmd"].take(now, command, now - command.timestamp.ns)
+        self.counters["velocity_cmd"].add(now, command, now - command.timestamp.ns)
         return [("velocity", command)]
 
     # The nodes of PC1
@@ -178,7 +170,7 @@ class Robot:
             if self._over:
                 return
             stamp = r2p.Timestamp.from_ns(node.now())
-            self.tallies["velocity_cmd"].sent += 1
+            self.counters["velocity_cmd"].sent += 1
             await commands.publish(StampedVelocity3(stamp, x=0.5, w=round(math.sin(tick.due / _SECOND), 2)))
 
     async def _blink(self, node: r2p.Node) -> None:
@@ -190,21 +182,21 @@ class Robot:
                 return
             number += 1
             self._blinks[number] = node.now()
-            self.tallies["led_cmd"].sent += 1
+            self.counters["led_cmd"].sent += 1
             await commands.publish(Led(led=number, value=number % 2))
 
     async def _watch(self, node: r2p.Node) -> None:
         def measured(message: StampedIMURaw9 | StampedVelocity3, topic: str) -> None:
             now = node.now()
-            self.tallies[topic].take(now, message, now - message.timestamp.ns)
+            self.counters[topic].add(now, message, now - message.timestamp.ns)
 
         def lit(led: Led) -> None:
             now = node.now()
-            self.tallies["leds"].take(now, led, now - self._blinks.pop(led.led))
+            self.counters["leds"].add(now, led, now - self._blinks.pop(led.led))
 
         node.subscribe("imu_raw", StampedIMURaw9, lambda message: measured(message, "imu_raw"))
         node.subscribe("velocity", StampedVelocity3, lambda message: measured(message, "velocity"))
-        node.subscribe("encoder", Encoder, lambda message: self.tallies["encoder"].take(node.now(), message))
+        node.subscribe("encoder", Encoder, lambda message: self.counters["encoder"].add(node.now(), message))
         node.subscribe("leds", Led, lit)
         while True:
             await node.spin()

@@ -1,4 +1,4 @@
-"""What the demo shows: at a terminal a table that lives, else lines of plain text."""
+"""Shows the topics of the demo: as a live table at a terminal, otherwise as lines of plain text."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -9,10 +9,10 @@ from rich.live import Live
 from rich.table import Table
 
 from r2p.messages import Message
-from r2p.tools.demo.robot import Robot, TopicTally
+from r2p.tools.demo.robot import Robot, TopicCounter
 
 _REFRESH = 0.25  # seconds
-_LINES = 2.0  # seconds between lines where there is no terminal
+_LINES = 2.0  # seconds between two rounds of lines, without a terminal
 
 Row = tuple[str, ...]
 
@@ -21,17 +21,17 @@ _WIDTHS = (-12, -10, 5, 12, -22, 6, 4)  # negative: to the left
 
 
 class DemoScreen:
-    """Standard output."""
+    """Standard output as the demo uses it."""
 
     def __init__(self) -> None:
         self.console = Console(highlight=False)
         self._sent: dict[str, int] = {}
 
-    def introduce(self, robot: Robot) -> None:
-        self._say(
+    def print_introduction(self, robot: Robot) -> None:
+        self._print(
             f"IMU1, an emulated R2P module, serves the debug line on tcp:{robot.address}",
             f"MOTOR1, another one, serves it on serial:{robot.device}",
-            "PC1, in Python, talks to both. Look on from a second terminal:",
+            "PC1, in Python, talks to both. Watch them from a second terminal:",
             f"  r2p topic hz imu_raw --via tcp:{robot.address}",
             "",
         )
@@ -40,22 +40,22 @@ class DemoScreen:
         """Show the topics for `duration` seconds."""
         end = asyncio.get_running_loop().time() + duration
         if not self.console.is_terminal:
-            self._say(_text(_HEADER))
+            self._print(_text(_HEADER))
             async for _ in _until(end, _LINES):
-                self._say(*(_text(row) for row in self._rows(robot)))
+                self._print(*(_text(row) for row in self._rows(robot)))
             return
         with Live(console=self.console, auto_refresh=False) as live:
             async for _ in _until(end, _REFRESH):
                 live.update(_table(self._rows(robot)), refresh=True)
 
-    def conclude(self, robot: Robot) -> None:
-        self._say("")
+    def print_summary(self, robot: Robot) -> None:
+        self._print("")
         for link, what in (("tcp", f"tcp:{robot.address}"), ("serial", f"serial:{robot.device}")):
-            tallies = [tally for tally in robot.counted() if tally.link.startswith(link)]
-            sent, received = sum(tally.sent for tally in tallies), sum(tally.received for tally in tallies)
-            self._say(f"{what}: {sent} messages sent, {received} received, {sent - received} lost")
-            self._say(*(f"  {_times(tally)}" for tally in tallies if tally.latencies))
-        self._say(
+            counters = [counter for counter in robot.updated_counters() if counter.link.startswith(link)]
+            sent, received = sum(counter.sent for counter in counters), sum(counter.received for counter in counters)
+            self._print(f"{what}: {sent} messages sent, {received} received, {sent - received} lost")
+            self._print(*(f"  {_times(counter)}" for counter in counters if counter.latencies))
+        self._print(
             "",
             "Try next, without hardware, in two terminals:",
             "  r2p topic pub leds --type Led led=3 value=1 -r 2 --via tcp-listen:2323",
@@ -64,24 +64,32 @@ class DemoScreen:
         )
 
     def _rows(self, robot: Robot) -> list[Row]:
-        """A row for each topic. Lost is what had been sent by the last time and is still not there."""
+        """Return a row for each topic. Lost: sent before the last display, and still not received."""
         rows: list[Row] = []
-        for tally in robot.counted():
-            lost = max(0, self._sent.get(tally.topic, 0) - tally.received)
-            self._sent[tally.topic] = tally.sent
-            rate = f"{tally.rate(robot.clock.now()):.1f}"
+        for counter in robot.updated_counters():
+            lost = max(0, self._sent.get(counter.topic, 0) - counter.received)
+            self._sent[counter.topic] = counter.sent
+            rate = f"{counter.rate(robot.clock.now()):.1f}"
             rows.append(
-                (tally.topic, tally.link, rate, _latency(tally), _value(tally.last), str(tally.received), str(lost))
+                (
+                    counter.topic,
+                    counter.link,
+                    rate,
+                    _latency(counter),
+                    _value(counter.last),
+                    str(counter.received),
+                    str(lost),
+                )
             )
         return rows
 
-    def _say(self, *lines: str) -> None:
+    def _print(self, *lines: str) -> None:
         for line in lines:
             self.console.print(line, markup=False, soft_wrap=True)
 
 
 async def _until(end: float, period: float) -> AsyncIterator[None]:
-    """Once each period, and at the end."""
+    """Yield once each period, and at the end."""
     loop = asyncio.get_running_loop()
     while (left := end - loop.time()) > 0:
         await asyncio.sleep(min(period, left))
@@ -102,14 +110,14 @@ def _text(row: Row) -> str:
     return " ".join(cells)
 
 
-def _latency(tally: TopicTally) -> str:
-    if tally.median is None:
+def _latency(counter: TopicCounter) -> str:
+    if counter.median is None:
         return ""
-    return f"{tally.median:.2f} ms" + (" rtt" if tally.round_trip else "    ")
+    return f"{counter.median:.2f} ms" + (" rtt" if counter.round_trip else "    ")
 
 
 def _value(message: Message | None) -> str:
-    """The fields, without the time; if there are too many, without those that are zero."""
+    """Return the fields without the timestamp; if they are too long, without those that are zero."""
     if message is None:
         return "nothing yet"
     fields = {name: value for name, value in msgspec.structs.asdict(message).items() if name != "timestamp"}
@@ -119,6 +127,6 @@ def _value(message: Message | None) -> str:
     return " ".join(texts)
 
 
-def _times(tally: TopicTally) -> str:
-    what = "there and back" if tally.round_trip else "one way"
-    return f"{tally.topic:<12} {what}: {tally.median:.2f} ms (median), {tally.slowest:.2f} ms (99 %)"
+def _times(counter: TopicCounter) -> str:
+    what = "there and back" if counter.round_trip else "one way"
+    return f"{counter.topic:<12} {what}: {counter.median:.2f} ms (median), {counter.slowest:.2f} ms (99 %)"

@@ -1,4 +1,8 @@
-"""`r2p sim`: an emulated robot on a simulated RTCAN bus, open to the outside as a real one is through its gateway."""
+"""`r2p sim`: an emulated robot on a simulated RTCAN bus, which other programs reach through its gateway.
+
+The command is here. `simulation` runs the robot (`r2p demo` does, too), and `screen` shows its figures; both are
+imported when they are needed, as `r2p --help` must be fast.
+"""
 
 import importlib.util
 from typing import Annotated, Literal
@@ -9,9 +13,9 @@ from r2p.tools.options import Quiet, Verbose, Via, seconds
 from r2p.tools.session import UsageError, check_urls, execute
 
 DEBUG = "tcp-listen:0"
-"""The debug line, on the loopback interface, at a port that is free."""
+"""The debug line, on the loopback interface, at a free port."""
 ZENOH = "zenoh:?listen=tcp/127.0.0.1:0&scouting=off"
-"""On the loopback interface, too. It looks for nobody: two robots on one computer are two."""
+"""On the loopback interface, too, and without scouting: two robots on one computer stay separate."""
 
 _FAST = 60.0  # seconds
 
@@ -19,19 +23,21 @@ _FAST = 60.0  # seconds
 def command(
     robot: Annotated[Literal["triskar2"], typer.Argument(help="The omnidirectional robot of the thesis.")] = "triskar2",
     fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as possible, in virtual time; nobody can look on meanwhile.")
+        bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
     ] = False,
     duration: Annotated[
         float | None,
-        typer.Option("--duration", parser=seconds, metavar="TIME", help="How long; else until Ctrl-C; --fast: 60 (s)."),
+        typer.Option(
+            "--duration", parser=seconds, metavar="TIME", help="How long; default: until Ctrl-C; --fast: 60 s."
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of all that is random; the same seed, the same robot.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random numbers.")] = 0,
     square: Annotated[
-        bool, typer.Option("--square", help="Let a PC drive it along squares; --fast does so anyway.")
+        bool, typer.Option("--square", help="Let a PC drive it along squares; implied by --fast.")
     ] = False,
-    bus: Annotated[bool, typer.Option("--bus", help="Tell at the end who sent how much on the bus.")] = False,
+    bus: Annotated[bool, typer.Option("--bus", help="At the end, report how much each node sent on the bus.")] = False,
     allow_control: Annotated[
-        bool, typer.Option("--allow-control", help="Let the gateway take REBOOT and BOOTLOAD from IP links.")
+        bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT and BOOTLOAD from IP links.")
     ] = False,
     via: Via = None,
     verbose: Verbose = 0,
@@ -39,25 +45,25 @@ def command(
 ) -> None:
     """Run an emulated robot: modules, motors, a body that moves, and a gateway for other programs.
 
-    With --via the gateway opens these links, else the debug line on TCP and zenoh, on this computer only.
+    The gateway opens the links of --via; by default the debug line on TCP, and zenoh, for this computer only.
     """
 
     async def main() -> None:
-        from r2p.tools.simulator.simulation import Play, play
+        from r2p.tools.simulator.simulation import SimulationOptions, simulate
 
         if fast and via:
-            raise UsageError("--fast runs in virtual time, which nobody outside shares: leave out --via, or --fast")
+            raise UsageError("--fast runs in virtual time, so other programs can't connect: leave out --via or --fast")
         check_urls(via or [])
-        wish = Play(
+        options = SimulationOptions(
             duration=duration or (_FAST if fast else None),
             seed=seed,
-            outside=() if fast else tuple(via or outside()),
+            outside=() if fast else tuple(via or default_links()),
             laps=float("inf") if square or fast else 0,
             fast=fast,
             bus=bus,
             allow_control=allow_control,
         )
-        await play(wish)
+        await simulate(options)
 
     def virtually(_main: object) -> None:
         from r2p import sim
@@ -67,6 +73,6 @@ def command(
     execute(main, verbose=verbose, quiet=quiet + 2, run=virtually if fast else None)
 
 
-def outside() -> list[str]:
-    """Where a robot is open by default: as far as this installation goes."""
+def default_links() -> list[str]:
+    """Return the links that the gateway opens by default: zenoh only if it is installed."""
     return [DEBUG, *([ZENOH] if importlib.util.find_spec("zenoh") else [])]

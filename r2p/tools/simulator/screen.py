@@ -1,6 +1,6 @@
-"""How the figures are shown: at a terminal all of them, live, in 80 columns and 24 lines; else lines of plain text.
+"""Shows the figures of a robot: live at a terminal, in 80 columns and 24 lines; otherwise as lines of plain text.
 
-A smaller terminal gets less of them: first the map goes, then topics. What to do next stays.
+A smaller terminal gets less of them: first the map goes, then topics. The hints stay.
 """
 
 import math
@@ -22,6 +22,12 @@ _LABEL = 10  # columns
 _WIDE = 72  # ... of the whole table
 _FULL = _STATE + 2 + _WIDTH  # ... of figures and map
 
+_ASPECT = 2.0  # a character is twice as high as wide
+_MARGIN = 0.3  # m around walls and path
+_EXTENT_MIN = 2.0  # m
+_WALL, _PATH = "#", "."
+_ARROWS = ">^<v"
+
 
 class SimulatorScreen:
     """Standard output, for the time of a `with` block."""
@@ -30,9 +36,9 @@ class SimulatorScreen:
         """`duration` in s, if it is known."""
         self.console = Console(highlight=False)
         self.live = live and self.console.is_terminal and not self.console.is_dumb_terminal
-        """Whether the figures stay where they are."""
+        """Whether the figures are drawn in place."""
         self._duration = duration
-        self._chart = Chart(world, _WIDTH, _HEIGHT)
+        self._map = Map(world, _WIDTH, _HEIGHT)
         self._view = Live(console=self.console, auto_refresh=False)
         self._hints: list[str] = []
 
@@ -44,44 +50,44 @@ class SimulatorScreen:
     def __exit__(self, *_exception: object) -> None:
         self._view.stop()
 
-    def say(self, *lines: str) -> None:
+    def print(self, *lines: str) -> None:
         """Print lines."""
         for line in lines:
             self.console.print(line, markup=False, soft_wrap=True)
 
-    def introduce(self, *hints: str) -> None:
-        """Say what can be done meanwhile; it stays on the screen."""
+    def print_hints(self, *hints: str) -> None:
+        """Show hints for what to do meanwhile; they stay on the screen."""
         self._hints = list(hints)
         if not self.live:
-            self.say(*hints)
+            self.print(*hints)
 
     def show(self, figures: Figures) -> None:
-        """Draw the figures, or print a line of them."""
+        """Draw the figures, or print a line about them."""
         if self.live:
             self._view.update(self.draw(figures), refresh=True)
         else:
-            self.say(line(figures))
+            self.print(line(figures))
 
     def draw(self, figures: Figures) -> RenderableType:
-        """The figures as they fit the terminal."""
+        """Return the figures, as many as fit the terminal."""
         width, height = self.console.size
         lines = state(figures)
         upper = Table.grid(padding=(0, 2))
         upper.add_column(width=min(_STATE, width), no_wrap=True)
         if width >= _FULL:
-            upper.add_row(_labelled(lines), _coloured(self._chart.draw(figures.pose)))
+            upper.add_row(_labelled(lines), _coloured(self._map.draw(figures.pose)))
         else:
             upper.add_row(_labelled(lines))
         hints = sum(math.ceil(len(hint) / width) for hint in self._hints)
-        room = height - 1 - max(len(lines), _HEIGHT) - 1 - hints  # the title, and the head of the table
+        rows = height - 1 - max(len(lines), _HEIGHT) - 1 - hints  # without the title, and the head of the table
         parts: list[RenderableType] = [_title(figures, self._duration, min(width, _FULL)), upper]
-        if room > 0:
-            parts.append(_table(figures.topics[:room], names_only=width < _WIDE))
+        if rows > 0:
+            parts.append(_table(figures.topics[:rows], names_only=width < _WIDE))
         return Group(*parts, *map(_hint, self._hints))
 
 
 def _title(figures: Figures, duration: float | None, width: int) -> Text:
-    """A line over all: how long, how far, and whether all was in time."""
+    """Return the title line: how long, how far, and how many deadlines were missed."""
     until = f" of {duration:.0f}" if duration else ""
     late = f"{figures.missed or 'no'} deadline{'' if figures.missed == 1 else 's'} missed"
     text = f" Triskar2   {figures.time:.1f}{until} s   {figures.path:.2f} m driven  "
@@ -89,14 +95,14 @@ def _title(figures: Figures, duration: float | None, width: int) -> Text:
 
 
 def state(figures: Figures) -> list[str]:
-    """Nine lines of 48 characters: the robot and its bus."""
+    """Return nine lines of 48 characters about the robot and its bus."""
     x, y, w = figures.pose
     off = "" if figures.off is None else f"  off by {figures.off * 1000:.0f} mm"
-    told = figures.odometry.pose if figures.odometry else None
+    odometry = figures.odometry.pose if figures.odometry else None
     volts, amperes, charge = figures.battery
     return [
         f"position  x {x:z6.2f}  y {y:z6.2f} m  heading {math.degrees(w):z4.0f} deg",
-        f"odometry  x {told.x:z6.2f}  y {told.y:z6.2f} m{off}" if told else "odometry  nothing yet",
+        f"odometry  x {odometry.x:z6.2f}  y {odometry.y:z6.2f} m{off}" if odometry else "odometry  nothing yet",
         "motors     wanted     speed (rad/s)    current",
         *(_wheel(wheel) for wheel in figures.wheels),
         f"battery   {volts:.1f} V  {amperes:.1f} A  {charge:.0%}",
@@ -105,7 +111,7 @@ def state(figures: Figures) -> list[str]:
 
 
 def bus_lines(bus: BusFigures | None) -> list[str]:
-    """Two lines."""
+    """Return two lines about the bus."""
     if bus is None:
         return ["CAN bus   none: a network in memory"]
     slots = f"{bus.of} in a cycle, {bus.slots:.1f} of them reserved" if bus.of else "none: no master yet"
@@ -113,7 +119,7 @@ def bus_lines(bus: BusFigures | None) -> list[str]:
 
 
 def line(figures: Figures) -> str:
-    """One line of plain text, at most 80 characters."""
+    """Return one line of plain text, at most 80 characters."""
     x, y, w = figures.pose
     speeds = " ".join(f"{wheel.speed:z6.2f}" for wheel in figures.wheels)
     bus = "" if figures.bus is None else f"  bus {figures.bus.load:4.0%}"
@@ -135,9 +141,9 @@ def _table(topics: Iterable[TopicFigures], *, names_only: bool) -> Table:
     for name in ("HZ", "COUNT", "MISSED"):
         table.add_column(name, justify="right", min_width=8, no_wrap=True)
     for each in topics:
-        words = () if names_only else (each.source, each.real_time)
+        details = () if names_only else (each.source, each.real_time)
         missed = Text(str(each.missed), style="bold red" if each.missed else "")
-        table.add_row(each.topic, *words, f"{each.rate:.1f}", str(each.sent), missed)
+        table.add_row(each.topic, *details, f"{each.rate:.1f}", str(each.sent), missed)
     return table
 
 
@@ -150,45 +156,35 @@ def _labelled(lines: list[str]) -> Text:
     return text
 
 
-def _coloured(chart: str) -> Text:
-    text = Text(chart, style="green")
+def _coloured(drawing: str) -> Text:
+    text = Text(drawing, style="green")
     text.highlight_regex("#+", "dim default")
     text.highlight_regex(r"[<>^v]", "bold yellow")
     return text
 
 
 def _hint(hint: str) -> Text:
-    """Commands are indented."""
+    """Return a hint in its style; commands are indented."""
     return Text(hint, style="cyan" if hint.startswith(" ") else "bold")
 
 
-# A small map of the world in characters: walls, where the robot was, and where it is.
-
-
-_ASPECT = 2.0  # a character is twice as high as wide
-_MARGIN = 0.3  # m
-_LEAST = 2.0  # m: no map shows less
-_WALL, _TRACE = "#", "."
-_ARROWS = ">^<v"
-
-
-class Chart:
-    """A map of so many characters; north, the y axis, is up. It grows with the way that the robot goes."""
+class Map:
+    """A map in characters: walls, the robot's path, and its pose. The y axis is up; the map grows with the path."""
 
     def __init__(self, world: World, width: int, height: int) -> None:
         self._world = world
         self._width = width
         self._height = height
-        self._trace: set[tuple[float, float]] = set()
+        self._path: set[tuple[float, float]] = set()
 
     def draw(self, pose: Triple) -> str:
-        """The map, with the robot there."""
+        """Return the map with the robot at this pose, which is added to the path."""
         x, y, heading = pose
-        self._trace.add((round(x, 1), round(y, 1)))
-        points = [*self._trace, *(point for wall in self._world.walls for point in wall)]
+        self._path.add((round(x, 1), round(y, 1)))
+        points = [*self._path, *(point for wall in self._world.walls for point in wall)]
         left, right = min(p[0] for p in points) - _MARGIN, max(p[0] for p in points) + _MARGIN
         low, high = min(p[1] for p in points) - _MARGIN, max(p[1] for p in points) + _MARGIN
-        across, up = max(_LEAST, right - left), max(_LEAST, high - low)
+        across, up = max(_EXTENT_MIN, right - left), max(_EXTENT_MIN, high - low)
         scale = max(across / self._width, up / self._height / _ASPECT)  # m for each character's width
         cells = [[" "] * self._width for _ in range(self._height)]
 
@@ -198,8 +194,8 @@ class Chart:
             if 0 <= column < self._width and 0 <= row < self._height:
                 cells[row][column] = sign
 
-        for px, py in self._trace:
-            put(px, py, _TRACE)
+        for px, py in self._path:
+            put(px, py, _PATH)
         for wall in self._world.walls:
             for px, py in _along(wall, scale / 2):
                 put(px, py, _WALL)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from r2p.msg import Led, StampedIMURaw9, StampedVelocity3
-from r2p.tools.demo.robot import Robot, TopicTally
+from r2p.tools.demo.robot import Robot, TopicCounter
 from r2p.tools.demo.screen import _value
 from tests.tools.rig import process
 
@@ -27,16 +27,16 @@ SECOND = 1_000_000_000
 
 
 def test_a_tally_counts() -> None:
-    tally = TopicTally("leds", "tcp in")
-    assert (tally.rate(0), tally.median, tally.slowest) == (0.0, None, None)
+    counter = TopicCounter("leds", "tcp in")
+    assert (counter.rate(0), counter.median, counter.slowest) == (0.0, None, None)
     for number in range(40):
-        tally.take(number * SECOND // 10, Led(led=number), latency=number * 1_000_000)
-    assert tally.received == 40
-    assert tally.last == Led(led=39)
-    assert tally.rate(39 * SECOND // 10) == pytest.approx(10.0)
-    assert tally.rate(9 * SECOND) == 0.0
-    assert tally.median == 19.5
-    assert tally.slowest == pytest.approx(38.6, abs=0.1)
+        counter.add(number * SECOND // 10, Led(led=number), latency=number * 1_000_000)
+    assert counter.received == 40
+    assert counter.last == Led(led=39)
+    assert counter.rate(39 * SECOND // 10) == pytest.approx(10.0)
+    assert counter.rate(9 * SECOND) == 0.0
+    assert counter.median == 19.5
+    assert counter.slowest == pytest.approx(38.6, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -55,24 +55,26 @@ def test_values_fit_their_column(message: Message | None, text: str) -> None:
 @pytest.mark.anyio
 async def test_everything_flows_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     enough = asyncio.Event()
-    take = TopicTally.take
+    take = TopicCounter.add
 
-    def count(tally: TopicTally, now: int, message: Message, latency: int | None = None) -> None:
-        take(tally, now, message, latency)
-        if all(each.received >= 3 for each in robot.tallies.values()):
+    def count(counter: TopicCounter, now: int, message: Message, latency: int | None = None) -> None:
+        take(counter, now, message, latency)
+        if all(each.received >= 3 for each in robot.counters.values()):
             enough.set()
 
-    monkeypatch.setattr(TopicTally, "take", count)
+    monkeypatch.setattr(TopicCounter, "add", count)
     async with Robot() as robot:
         await enough.wait()
         await robot.finish()
-        tallies = {tally.topic: tally for tally in robot.counted()}
-        assert set(tallies) == TOPICS
-        assert [tally.sent - tally.received for tally in tallies.values()] == [0] * 6
+        counters = {counter.topic: counter for counter in robot.updated_counters()}
+        assert set(counters) == TOPICS
+        assert [counter.sent - counter.received for counter in counters.values()] == [0] * 6
         assert all(
-            tally.median is not None and tally.median > 0 for tally in tallies.values() if tally.topic != "encoder"
+            counter.median is not None and counter.median > 0
+            for counter in counters.values()
+            if counter.topic != "encoder"
         )
-        assert tallies["leds"].received == tallies["led_cmd"].received
+        assert counters["leds"].received == counters["led_cmd"].received
 
 
 def rows(text: str) -> dict[str, list[str]]:

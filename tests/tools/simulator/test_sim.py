@@ -21,12 +21,12 @@ from r2p.msg import Odometry, Pose3
 from r2p.sim import can_bus
 from r2p.sim.physics.world import World, box
 from r2p.sim.robots.emulated import Triskar2
-from r2p.sim.robots.figures import BusFigures, Figures, Gauge, TopicFigures, WheelFigures
+from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, TopicFigures, WheelFigures
 from r2p.sim.robots.square import square
 from r2p.tools.main import app
-from r2p.tools.simulator import outside, screen
-from r2p.tools.simulator.screen import Chart
-from r2p.tools.simulator.simulation import Play, play, program
+from r2p.tools.simulator import default_links, screen
+from r2p.tools.simulator.screen import Map
+from r2p.tools.simulator.simulation import SimulationOptions, program, simulate
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
@@ -34,20 +34,20 @@ if TYPE_CHECKING:
 
     from r2p.bridge import BridgeOptions
 
-VIA = "sim:gauge"
+VIA = "sim:reader"
 
 
 @pytest.mark.virtual_time
 async def test_figures_of_a_drive() -> None:
-    bus = can_bus("gauge")
+    bus = can_bus("reader")
     async with Triskar2(VIA, seed=1) as robot, r2p.Module("PC1", via=VIA) as pc:
         await robot.ready(10)
-        gauge = Gauge(robot, bus, [pc])
+        reader = FiguresReader(robot, bus, [pc])
         pc.start(square, 1.0, 0.4, name="square")
         await asyncio.sleep(2)
-        gauge.read(2.0)
+        reader.read(2.0)
         await asyncio.sleep(1)
-        figures = gauge.read(3.0)
+        figures = reader.read(3.0)
         assert figures.path == robot.hardware.body.path
     topics = {topic.topic: topic for topic in figures.topics}
     assert topics["velocity_cmd"].rate == pytest.approx(20, abs=1)
@@ -73,10 +73,10 @@ async def test_what_was_missed_before_does_not_count_and_what_is_off_says_so() -
         await asyncio.sleep(1)
         publisher = next(iter(robot.modules["PS"].nodes["battery"].node.publishers))
         publisher.missed += 5
-        gauge = Gauge(robot, None)
+        reader = FiguresReader(robot, None)
         publisher.missed += 2
         await robot.switch_off("MOTOR2")
-        figures = gauge.read(1.0)
+        figures = reader.read(1.0)
     assert figures.missed == 2
     assert [wheel.on for wheel in figures.wheels] == [True, False, True]
     assert figures.odometry is None
@@ -97,7 +97,7 @@ def test_what_its_gateway_takes_from_outside(monkeypatch: pytest.MonkeyPatch, al
 
 
 def test_the_map_shows_walls_way_and_robot() -> None:
-    chart = Chart(World(box(0, 0, 4, 4)), 20, 10)
+    chart = Map(World(box(0, 0, 4, 4)), 20, 10)
     chart.draw((-1.0, 0.0, 0.0))
     lines = chart.draw((1.0, 0.0, 1.6)).splitlines()
     assert len(lines) == 10
@@ -109,7 +109,7 @@ def test_the_map_shows_walls_way_and_robot() -> None:
 
 
 def test_the_map_grows_with_the_way() -> None:
-    chart = Chart(World(), 20, 10)
+    chart = Map(World(), 20, 10)
     for step in range(100):
         picture = chart.draw((step / 2, 0.0, 0.0))
     assert picture.count(">") == 1
@@ -117,7 +117,7 @@ def test_the_map_grows_with_the_way() -> None:
 
 
 def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureFixture[str]) -> None:
-    sim.run(play(Play(duration=20.0, seed=4, laps=1, fast=True, bus=True)), seed=4)
+    sim.run(simulate(SimulationOptions(duration=20.0, seed=4, laps=1, fast=True, bus=True)), seed=4)
     fast = capsys.readouterr().out
     lines = fast.splitlines()
     assert max(len(line) for line in lines) <= 80
@@ -128,7 +128,7 @@ def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureF
     assert driven == pytest.approx(8.0, rel=0.03)
     assert abs(x) + abs(y) < 0.1
     assert re.search(r"messages published, \d+ missed a deadline$", fast, re.MULTILINE)
-    assert not re.search(r"most of them of (encoder|speed)", fast)  # which have slots of their own
+    assert not re.search(r"of them of (encoder|speed)", fast)  # which have slots of their own
     assert re.search(r"^MOTOR1 +\d+ +\d+% +0 +\d+$", fast, re.MULTILINE)
 
 
@@ -161,7 +161,7 @@ def test_it_fits_the_terminal_and_always_says_what_to_do(
     text = io.StringIO()
     monkeypatch.setattr(screen, "Console", functools.partial(Console, file=text, width=width, height=height))
     shown = screen.SimulatorScreen(World(box(0, 0, 4, 4)), duration=20.0)
-    shown.introduce("Try:", "  r2p topic list")
+    shown.print_hints("Try:", "  r2p topic list")
     assert text.getvalue() == "Try:\n  r2p topic list\n"
     shown.console.print(shown.draw(moment()))
     lines = text.getvalue().splitlines()[2:]
@@ -180,7 +180,7 @@ def test_at_a_terminal_the_figures_stay_where_they_are(monkeypatch: pytest.Monke
     )
     monkeypatch.setattr(screen, "Console", console)
     with screen.SimulatorScreen(World()) as shown:
-        shown.introduce("Try:", "  r2p topic list")
+        shown.print_hints("Try:", "  r2p topic list")
         for _ in range(3):
             shown.show(moment())
     drawn = text.getvalue()
@@ -206,7 +206,7 @@ def test_others_reach_it_through_its_gateway() -> None:
     with process("sim", "triskar2", "--square") as robot:
         assert robot.stdout is not None
         found = (re.search(r"topic echo odometry --via (\S+)", line) for line in robot.stdout)
-        urls = [next(match[1] for match in found if match) for _ in outside()]
+        urls = [next(match[1] for match in found if match) for _ in default_links()]
         assert [url.partition(":")[0] for url in urls] == ["tcp", "zenoh"][: len(urls)]
         for url in urls:
             with process("topic", "echo", "odometry", "--via", url, "--type", "Odometry", "--once") as echo:

@@ -86,7 +86,9 @@ async def test_an_unknown_field_is_a_mistake() -> None:
     async with robot(poses), tool() as session:
         with pytest.raises(ExceptionGroup) as caught:
             await echo(session, ["poses"], field=["z"])
-    assert caught.group_contains(UsageError, match="no field z: there are timestamp.sec, timestamp.nsec, x, y, w")
+    assert caught.group_contains(
+        UsageError, match="there is no field z; the fields are timestamp.sec, timestamp.nsec, x, y, w"
+    )
 
 
 @pytest.mark.virtual_time
