@@ -55,7 +55,6 @@ _LONGEST_PAUSE = 300 * _SECOND
 class LivelinessDiscovery(DiscoveryProtocol):
     """The discovery of one module on a network with liveliness tokens.
 
-    Every method takes `now` (monotonic ns) and returns what to do, in order; call `poll` at `next_deadline()`.
     `counts` is the counter to use, if its owner wants to see it grow.
     """
 
@@ -77,17 +76,14 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     @property
     def flags(self) -> int:
-        """Our own flags, as in ALIVE."""
         return self._own.flags
 
     @property
     def modules(self) -> dict[str, ModuleInfo]:
-        """The other modules by name; one of our own name is another module that has it too."""
         return self._modules.modules
 
     @property
     def endpoints(self) -> dict[EndpointKey, EndpointInfo]:
-        """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
         return self._modules.endpoints
 
     @property
@@ -97,18 +93,15 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     @property
     def generation(self) -> int:
-        """Another number means that `modules` or `endpoints` have changed in more than when they were heard."""
         return self._modules.generation
 
     @property
     def topics(self) -> dict[str, TopicInfo]:
-        """The topics of the others, by name."""
         return self._matching.topics
 
     # What the module has and wants
 
     def set_flags(self, now: int, flags: int) -> list[Event]:
-        """The module's state changed. `flags` are FLAG_... of ALIVE."""
         if flags != self._own.flags:
             self._own.set_flags(flags)
         return self._pop_events()
@@ -116,45 +109,36 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def advertise(
         self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
     ) -> list[Event]:
-        """The module publishes this topic: messages of `size` bytes (0: not known)."""
         return self._set_topic(topic, ROLE_PUBLISHES, DeclaredTopic(TopicType(size, fingerprint)))
 
     def withdraw(self, now: int, topic: str) -> list[Event]:
-        """The module does not publish this topic any more: its subscribers have left."""
         return self._remove_topic(topic, ROLE_PUBLISHES)
 
     def subscribe(
         self, now: int, topic: str, size: int = 0, queue: int = 16, fingerprint: bytes = ANY_TYPE
     ) -> list[Event]:
-        """The module subscribes this topic. Size 0 and no fingerprint: of any type.
-
-        `queue`: how many messages may be on the way to it; 0: any number, it would rather lose some.
-        """
+        """`queue` 0: any number of messages may be on the way, the module would rather lose some."""
         return self._set_topic(topic, ROLE_SUBSCRIBES, DeclaredTopic(TopicType(size, fingerprint), queue))
 
     def unsubscribe(self, now: int, topic: str) -> list[Event]:
-        """The module does not subscribe this topic any more: its publishers are gone."""
         return self._remove_topic(topic, ROLE_SUBSCRIBES)
 
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
-        """A node publishes or subscribes (ROLE_...) the topic, as CLASS_..."""
         self._own.add_node(topic, role, node, publisher_class)
         return self._pop_events()
 
     def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
-        """It does not any more."""
         self._own.remove_node(topic, role, node)
         return self._pop_events()
 
     # For gateways
 
     def demand(self) -> Demand:
-        """Return what other modules publish and subscribe."""
         return self._matching.demand
 
     def relay(self, now: int, message: Relayed) -> list[Event]:
-        """Pass on what a module on another link has announced: r2p modules and their nodes as tokens with more hops, of
-        firmware each sign of life, so that its age can be seen.
+        """Pass on r2p modules and their nodes as tokens with more hops, and of firmware each sign of life, so that its
+        age can be seen.
         """
         match message:
             case management.Hello(name, instance, flags, hops):
@@ -191,7 +175,6 @@ class LivelinessDiscovery(DiscoveryProtocol):
     # What the user wants
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
-        """Order a module to stop, reboot or enter its loader."""
         self._send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
         return self._pop_events()
 
@@ -200,14 +183,12 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._pop_events()
 
     def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
-        """Tell two modules, which don't see each other, that they have the same name."""
         self._send(management.Conflict(module_alias(module), instance_a, instance_b))
         return self._pop_events()
 
-    # The network
+    # The link
 
     def link_up(self, now: int) -> list[Event]:
-        """The network can be reached: declare what there is."""
         self._up = True
         self._events += self._own.pop_changes()
         self._review_refused(now)
@@ -224,13 +205,12 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._pop_events()
 
     def leave(self, now: int) -> list[Event]:
-        """Say nothing any more: the tokens go with the session."""
+        """Send nothing any more: the tokens go with the session."""
         self._up = False
         self._refused.clear()
         return self._pop_events()
 
     def next_deadline(self) -> int | None:
-        """When to call `poll` (monotonic ns); a time in the past means at once."""
         if self._up and self._own.has_changes:
             return 0
         due = (self._modules.next_deadline(), self._refused.next_deadline(), self._mark_at)
@@ -248,7 +228,6 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._pop_events()
 
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
-        """A management message of the session `source`. Never raises for bad bytes: they are counted."""
         try:
             message = management.decode(data)
         except UnknownType:
@@ -258,6 +237,8 @@ class LivelinessDiscovery(DiscoveryProtocol):
         else:
             self._handle(now, message, source)
         return self._pop_events()
+
+    # Tokens of other modules
 
     def appeared(self, now: int, key: str) -> list[Event]:
         """A token is there; what is known already is ignored."""

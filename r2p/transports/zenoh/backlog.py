@@ -3,6 +3,9 @@
 A message is offered again in the next turns of the event loop, as most readers make room within one. After that events
 and periodic messages replace older ones. A message that does not expire gets in line at its sinks, for as long as it
 takes: its publisher learns that from the credit that does not come.
+
+Links whose topics share one line have `ReceiveBackpressure` instead (r2p.transports.receive_backpressure): there no
+message may wait without a limit, and a reader that made no room once is not waited for again.
 """
 
 import asyncio

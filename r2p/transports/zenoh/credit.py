@@ -113,13 +113,14 @@ class ZenohSubscriber(LinkSubscriber):
 
     def add_session(self, session: int, window: int) -> None:
         """Add a session that subscribes, or give it another window."""
+        # Events and periodic messages never wait; their windows only count what was acknowledged.
         for publisher_class, stream in self._streams.items():
             stream.window.add(session, window if publisher_class == _NRT else 0)
         self.refill()
 
     def remove_session(self, session: int) -> int:
         """Remove a session; return how many messages it did not acknowledge, unless it left in order."""
-        self._sender.credits.receive()
+        self._sender.credits.receive()  # its final credit may have come before its token went
         unacknowledged = sum([stream.window.remove(session) for stream in self._streams.values()])
         self.refill()
         return unacknowledged
@@ -189,7 +190,7 @@ class ZenohSender:
         self.publishers.close()
 
     def subscribers(self) -> Iterator[ZenohSubscriber]:
-        """Return the topics that are subscribed."""
+        """Return what the link sends to: one for each topic that other modules subscribe."""
         return (each for each in self._subscribers.values() if isinstance(each, ZenohSubscriber))
 
     def subscriber(self, topic: str) -> ZenohSubscriber | None:
@@ -282,13 +283,14 @@ class ZenohSender:
 
 # Credit
 
-CREDIT_PAUSE_S = 0.02
+_CREDIT_PAUSE_S = 0.02
 """Seconds after which credit is read that no publisher waits for."""
 
 _CREDIT_RING = 1024
 """Credits that come in that time at most."""
 
 _CREDIT_BYTES_MAX = 256
+"""Longer messages are not copied: they are no credit."""
 
 
 class CreditReader:
@@ -296,7 +298,7 @@ class CreditReader:
 
     Under load the thread of the event loop seldom lets another one run, and credit that had to come through another
     thread would come when the publisher has stopped for it. So it stays in zenoh's ring until a publisher has no room,
-    or for CREDIT_PAUSE_S.
+    or for _CREDIT_PAUSE_S.
     """
 
     def __init__(self, sender: ZenohSender) -> None:
@@ -370,7 +372,7 @@ class CreditReader:
         if any(subscriber.awaits_credit for subscriber in subscribers):
             self.wait()
         elif not self._waits and self._pause is None:
-            self._pause = self._loop.call_later(CREDIT_PAUSE_S, self._pause_over)
+            self._pause = self._loop.call_later(_CREDIT_PAUSE_S, self._pause_over)
 
     def _pause_over(self) -> None:
         self._pause = None

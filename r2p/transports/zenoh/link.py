@@ -95,7 +95,7 @@ class ZenohLink(Link):
         for name, announced in self._announced.items():
             if announced.publishes:
                 self.sender.publishers.declare(self._space.topics[name])
-        if not self._connects:
+        if not self._connects:  # before tokens come: they are believed only on a link that is up
             self.on_up()
         session.watch_transports(self._queue(self._transport_changed))
         session.watch_tokens(f"{prefix}/{liveliness.PLACE}", self._token_changes)
@@ -147,7 +147,7 @@ class ZenohLink(Link):
     def on_up(self) -> None:
         self.receiver.resumed()
         super().on_up()
-        self._tokens.on_up()
+        self._tokens.on_up()  # last: to a subscriber that appears something may be sent at once
 
     def on_down(self, reason: str) -> None:
         self._tokens.on_down()
@@ -155,7 +155,7 @@ class ZenohLink(Link):
         super().on_down(reason)
 
     def close(self) -> None:
-        self.sender.batcher.flush()
+        self.sender.batcher.flush()  # while the link is up: what was published before goes out
         self._tokens.on_down()
         super().close()
         self.sender.close()

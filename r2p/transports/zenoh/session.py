@@ -19,6 +19,7 @@ from zenoh.handlers import FifoChannel, Handler, RingChannel
 
 from r2p.codecs import liveliness
 from r2p.errors import TransportError
+from r2p.runtime.sample import PublisherClass
 from r2p.transports.link import MESSAGES_PER_TURN
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh import threads
@@ -36,10 +37,10 @@ _CHANNEL_MAX = 65_536
 very call that asks for them, while it holds its locks, and would wait there for ever if they did not fit.
 """
 
-_PRIORITIES = {
-    1: zenoh.Priority.DATA,
-    2: zenoh.Priority.INTERACTIVE_HIGH,
-    3: zenoh.Priority.REAL_TIME,
+_PRIORITIES: dict[int, zenoh.Priority] = {
+    PublisherClass.NON_REAL_TIME: zenoh.Priority.DATA,
+    PublisherClass.SPORADIC: zenoh.Priority.INTERACTIVE_HIGH,
+    PublisherClass.PERIODIC: zenoh.Priority.REAL_TIME,
 }
 
 
@@ -314,13 +315,13 @@ class ZenohSession:
 
     def declare_publisher(self, key: str, publisher_class: int) -> zenoh.Publisher:
         """Declare a publisher with the priority of the class. Never BLOCK: that would stop the loop."""
-        periodic = publisher_class == 3
+        periodic = publisher_class == PublisherClass.PERIODIC
         publisher = self._session.declare_publisher(
             key,
             priority=_PRIORITIES[publisher_class],
             congestion_control=zenoh.CongestionControl.DROP,
             reliability=zenoh.Reliability.BEST_EFFORT if periodic else zenoh.Reliability.RELIABLE,
-            express=publisher_class != 1,
+            express=publisher_class != PublisherClass.NON_REAL_TIME,  # zenoh would wait for more to fill a batch
             allowed_destination=zenoh.Locality.REMOTE,
         )
         self._publishers.add(publisher)

@@ -222,7 +222,7 @@ class RxStream:
     def _set_expiry(self, publisher: RemotePublisher, samples: list[Sample]) -> None:
         """Translate the deadline to this computer's clock."""
         clock = self._receiver.clock
-        now, utc = clock.monotonic(), clock.now()
+        now, utc = clock.monotonic(), clock.now()  # once for the packet: its messages arrived together
         for sample in samples:
             sample.expires = utc + publisher.time_left.left(now, sample.stamp, sample.deadline)
 
@@ -371,8 +371,9 @@ class RxStream:
             Source(origin.module, origin.node, self._receiver.link.name),
             PublisherClass(origin.publisher_class),
             self._window(*key),
-            -1,
+            -1,  # until `_check_type`, as well as the next one
             False,
+            # By the run of the module, on whatever way it comes; firmware has no such number, so there the sender has to do.
             self.topic.last_received((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
         self._check_type(publisher)
@@ -382,7 +383,7 @@ class RxStream:
         window = self.windows.pop((session, publisher_class), None)
         if window is None:
             if len(self.windows) >= _SENDERS_MAX:
-                self.windows.clear()
+                self.windows.clear()  # bounded memory comes before counting gaps: each window begins anew
             window = ReceiveWindow(self._receiver.window(self.topic) if publisher_class == _NRT else 0)
         self.windows[session, publisher_class] = window  # as the last entry
         return window
