@@ -61,7 +61,7 @@ def parse_options(url: Url) -> ZenohOptions:
             raise TransportError(f"{url}: {error}") from None
     mode = given.get("mode") or _default_mode(endpoint, given.get("config"))
     if mode == "client" and given.get("listen"):
-        raise TransportError(f"{url}: a client listens nowhere: leave out listen=, or use mode=peer or mode=router")
+        raise TransportError(f"{url}: a client does not listen: leave out listen=, or use mode=peer or mode=router")
     config = given.get("config")
     return ZenohOptions(
         name=f"{url.scheme}:{url.address}",
@@ -90,7 +90,9 @@ def choose_network(found: set[str]) -> str:
     if own in found or not others:
         return own
     if len(others) > 1:
-        raise ValueError(f"there are the networks {list_networks(others)}: say which, as ?network={others[0]}")
+        raise ValueError(
+            f"there are several networks, {list_networks(others)}: choose one, as with ?network={others[0]}"
+        )
     return others[0]
 
 

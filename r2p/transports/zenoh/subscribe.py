@@ -373,7 +373,7 @@ class RxStream:
             self._window(*key),
             -1,  # until `_check_type`, as well as the next one
             False,
-            # By the run of the module, on whatever way it comes; firmware has no such number, so there the sender has to do.
+            # By the run of the module, whatever way it comes; firmware has no such number, so there by the sender.
             self.topic.last_received((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
         self._check_type(publisher)

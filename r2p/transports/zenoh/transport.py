@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 from r2p.clock import Backoff
 from r2p.errors import TransportError
 from r2p.transports.link import Hub, Transport
-from r2p.transports.zenoh.config import ZenohOptions, choose_network, default_network, list_networks
+from r2p.transports.zenoh.config import (
+    ZenohOptions,
+    build_config,
+    choose_network,
+    connection_settings,
+    default_network,
+    list_networks,
+    open_endpoints,
+    use_any_port,
+)
 from r2p.transports.zenoh.diagnose import NOT_ADMITTED, diagnose_connection, diagnose_listening
 
 if TYPE_CHECKING:
@@ -49,7 +58,6 @@ class ZenohTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         try:  # in a thread: loading zenoh takes longer than a loop should be blocked
             await asyncio.to_thread(importlib.import_module, "r2p.transports.zenoh.link")
-            from r2p.transports.zenoh.config import build_config, connection_settings, open_endpoints
             from r2p.transports.zenoh.link import ZenohLink
         except ImportError as error:
             if (error.name or "").partition(".")[0] != "zenoh":
@@ -79,7 +87,6 @@ class ZenohTransport(Transport):
     async def _open(
         self, config: "zenoh.Config", link: "ZenohLink", backoff: Backoff, opened: Callable[[], object]
     ) -> "ZenohSession":
-        from r2p.transports.zenoh.config import connection_settings, use_any_port
         from r2p.transports.zenoh.session import Unreachable, open_session
 
         while True:
@@ -123,8 +130,6 @@ class ZenohTransport(Transport):
 
     async def _explain(self, config: "zenoh.Config", link: "ZenohLink") -> None:
         """Say what is wrong whenever the link is down; never returns."""
-        from r2p.transports.zenoh.config import connection_settings
-
         reason = ""
         while True:
             await asyncio.sleep(_DIAGNOSE_EVERY_S)

@@ -3,6 +3,8 @@
 import json
 import re
 import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +22,13 @@ def test_alone_it_is_a_peer_of_the_hosts_network() -> None:
     found = options("zenoh:")
     assert (found.mode, found.connect, found.listen, found.scouting) == ("peer", None, None, None)
     assert found.network is None
+
+
+def test_a_url_is_checked_without_loading_zenoh() -> None:
+    code = "import sys; from r2p.transports.url import open_transport; open_transport('zenoh:'); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "r2p.transports.zenoh.config" in done.stdout.split()
+    assert "zenoh" not in done.stdout.split()
 
 
 def test_with_an_endpoint_it_is_a_client() -> None:
@@ -53,7 +62,7 @@ def test_a_file_decides_what_the_url_does_not() -> None:
         ("zenoh:?listen=7447", "tcp/ADDRESS:PORT"),
         ("zenoh:?network=a/b", "letters"),
         ("zenoh:?network=", "letters"),
-        ("zenoh:tcp/localhost:7447?listen=tcp/0.0.0.0:7447", "listens nowhere"),
+        ("zenoh:tcp/localhost:7447?listen=tcp/0.0.0.0:7447", "a client does not listen"),
         ("zenoh:?speed=9600", "batching, config, listen, mode, network, scouting"),
     ],
 )
@@ -85,9 +94,11 @@ def test_the_network_of_a_tool_that_was_told_none() -> None:
     assert choose_network(set()) == own
     assert choose_network({"robot1", own}) == own
     assert choose_network({"robot1"}) == "robot1"
-    with pytest.raises(ValueError, match="networks robot1, robot2: say which"):
+    with pytest.raises(ValueError, match="networks, robot1, robot2: choose one"):
         choose_network({"robot2", "robot1"})
-    with pytest.raises(ValueError, match=r"n0, n1, n2, n3, n4, n5, n6, n7 and 2 more: say which, as \?network=n0$"):
+    with pytest.raises(
+        ValueError, match=r"n0, n1, n2, n3, n4, n5, n6, n7 and 2 more: choose one, as with \?network=n0$"
+    ):
         choose_network({f"n{number}" for number in range(10)})
 
 
