@@ -19,8 +19,6 @@ from r2p.transports.link import is_booting
 
 logger = get_logger("r2p.bridge")
 
-Order = management.Stop | management.Reboot | management.Bootload
-
 _DENIED_APART = 200_000_000  # ns between two DENIED on one link
 _MOST_AMBIGUOUS = 100  # aliases of two modules that are remembered, so that each is logged once
 
@@ -91,20 +89,20 @@ class OrderRelay:
             order = management.decode(data)
         except (DecodeError, UnknownType):
             return False
-        if not isinstance(order, Order):
+        if not isinstance(order, management.Order):
             return False
         harmless = isinstance(order, management.Stop)
         if order.module == self._module:
             reason = self._policy.own_order_denied(port.name, harmless=harmless)
             if reason:
-                self._refuse(port, order, data[-1], reason, known=True)
+                self._refuse(port, order, reason, known=True)
                 return True
         name = self._names.to_canonical(order.module, port.name)
         if name is not None:
-            self._forward_to(name, port, order, data[-1])
+            self._forward_to(name, port, order)
         return False
 
-    def _forward_to(self, name: str, port: BridgePort, order: Order, order_type: int) -> None:
+    def _forward_to(self, name: str, port: BridgePort, order: management.Order) -> None:
         """The module may be anywhere: send the order to all links that it may go to. Refuse it if the module is known
         behind a link that it may not go to, or if it may go nowhere.
         """
@@ -122,7 +120,7 @@ class OrderRelay:
                 known = link_name in other.link.discovery.modules
                 refused = reason if known else refused or reason
         if refused and (known or not passed):
-            self._refuse(port, order, order_type, refused, known=known)
+            self._refuse(port, order, refused, known=known)
 
     def forward_denial(self, port: BridgePort, data: bytes) -> None:
         """Forward a DENIED to all links: the sender of the order may be anywhere."""
@@ -148,14 +146,14 @@ class OrderRelay:
         others = [each for each in self._ports.values() if each is not port and each.link.up]
         return [each for each in others if now < each.tree_port.forwards_until]
 
-    def _denied(self, port: BridgePort, other: BridgePort, order: Order, link_name: str) -> int:
+    def _denied(self, port: BridgePort, other: BridgePort, order: management.Order, link_name: str) -> int:
         """Why an order may not go to another link, where its module has this name (DENIED_..., 0: it may)."""
         harmless = isinstance(order, management.Stop)
         if harmless and is_booting(other.link, link_name):
             return management.DENIED_BOOT
         return self._policy.order_denied(port.name, other.name, harmless=harmless)
 
-    def _refuse(self, port: BridgePort, order: Order, order_type: int, reason: int, *, known: bool) -> None:
+    def _refuse(self, port: BridgePort, order: management.Order, reason: int, *, known: bool) -> None:
         """Count the order, log it once in a while, and answer if it is for a module that is `known`."""
         now = self._clock.monotonic()
         port.count_dropped("order refused")
@@ -171,5 +169,5 @@ class OrderRelay:
             )
         if known and now >= port.denied_at + _DENIED_APART:
             port.denied_at = now
-            denied = management.Denied(self._module, order.module, order_type, reason)
+            denied = management.Denied(self._module, order.module, management.order_type(order), reason)
             port.link.write_management(management.encode(denied))

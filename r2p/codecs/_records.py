@@ -77,6 +77,9 @@ class Codec(Generic[T]):
         version = b"" if record.version is None else bytes((record.version,))
         return (version + record.pack(message)).ljust(self._size - 1, b"\0") + bytes((record.code,))
 
+    def code_of(self, message: T) -> int:
+        return self._by_class[type(message)].code
+
     def decode(self, data: bytes) -> T:
         if len(data) != self._size:
             raise DecodeError(f"{len(data)} bytes instead of {self._size}")

@@ -29,6 +29,8 @@ Gateways agree on their tree (`r2p.protocols.bridge`) with three more types, whi
 
 import enum
 import functools
+import struct
+from collections.abc import Iterable
 
 import msgspec
 
@@ -142,6 +144,11 @@ NO_UTC = 0xFFFF  # Network.utc_error: the offset is unknown
 
 _VERSION = 1
 _PIECE = 22  # characters of Name.piece
+BRIDGE_ACKS = 2  # acks in a Bridge
+LEAF_ACKS = 3  # acks in a Leaf
+MESH_HEARD = 3  # entries in Mesh.heard
+_ACK = struct.Struct("<IH")
+_HEARD = struct.Struct("<BIB")
 _MARK = b"r2p"
 _MARKED = slice(22, 25)  # of an encoded message: in its params, behind RTCAN's message id
 
@@ -169,6 +176,9 @@ class Bootload(msgspec.Struct, frozen=True, gc=False):
     """Order a module to restart into its loader."""
 
     module: str
+
+
+Order = Stop | Reboot | Bootload
 
 
 class Advertise(msgspec.Struct, frozen=True, gc=False):
@@ -505,6 +515,11 @@ def type_of(data: bytes) -> int:
     return data[-1] if len(data) == SIZE else 0
 
 
+def order_type(order: Order) -> int:
+    """The type byte of an order, by which a Denied names it."""
+    return _CODEC.code_of(order)
+
+
 def queue_length(size: int, wanted: int = QUEUE) -> int:
     """The entries of a queue to request of firmware, for messages of `size` bytes: 1 to 16, and 1024 bytes at most."""
     return max(1, min(wanted, QUEUE_MOST, QUEUE_BYTES // (size + QUEUE_ENTRY)))
@@ -517,6 +532,26 @@ def alias_messages(name: str) -> list[Name]:
         return []
     pieces = [name[at : at + _PIECE] for at in range(0, len(name), _PIECE)]
     return [Name(alias, number << 4 | len(pieces) - 1, piece) for number, piece in enumerate(pieces)]
+
+
+def encode_acks(acks: Iterable[tuple[int, int]], places: int) -> bytes:
+    """The `acks` of a Bridge (BRIDGE_ACKS places) or a Leaf (LEAF_ACKS): senders and counts."""
+    return b"".join(_ACK.pack(*ack) for ack in acks).ljust(places * _ACK.size, b"\0")
+
+
+def decode_acks(acks: bytes) -> list[tuple[int, int]]:
+    """Senders and counts in the `acks` of a Bridge or a Leaf; the sender of a free place is 0."""
+    return list(_ACK.iter_unpack(acks))
+
+
+def encode_heard(heard: Iterable[tuple[int, int, int]]) -> bytes:
+    """The `heard` of a Mesh: own port, other gateway, and its port."""
+    return b"".join(_HEARD.pack(*each) for each in heard).ljust(MESH_HEARD * _HEARD.size, b"\0")
+
+
+def decode_heard(heard: bytes) -> list[tuple[int, int, int]]:
+    """Own port, other gateway and its port in the `heard` of a Mesh, free places left out."""
+    return [each for each in _HEARD.iter_unpack(heard) if each[1]]
 
 
 # What params hold: on RTCAN a message id and the mark, and in the last byte the state of an r2p subscription.

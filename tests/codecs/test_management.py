@@ -182,3 +182,18 @@ def test_an_endpoint_that_is_gone_has_its_role() -> None:
     assert m.decode(m.encode(message)) == message
     with pytest.raises(UnknownType):
         m.decode(m.encode(m.TypeInfo(m.ROLE_SUBSCRIBES | m.ROLE_GONE, "leds", m.ANY_TYPE, 5)))
+
+
+def test_acks_and_what_gateways_hear_fill_their_fields() -> None:
+    acks = m.encode_acks([(9, 1)], m.BRIDGE_ACKS)
+    assert acks == b"\x09\0\0\0\x01\0" + bytes(6)
+    assert m.decode_acks(acks) == [(9, 1), (0, 0)]
+    heard = m.encode_heard([(1, 9, 2)])
+    assert heard == b"\x01\x09\0\0\0\x02" + bytes(12)
+    assert m.decode_heard(heard) == [(1, 9, 2)]
+
+
+@pytest.mark.parametrize("order", [m.Stop("PC1"), m.Reboot("PC1"), m.Bootload("PC1")])
+def test_an_order_has_the_type_of_its_bytes(order: m.Order) -> None:
+    assert m.order_type(order) == m.type_of(m.encode(order))
+    assert m.order_type(order) in m.ORDER_TYPES

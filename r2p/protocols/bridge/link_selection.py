@@ -13,7 +13,7 @@ from collections import Counter
 
 import msgspec
 
-from r2p.codecs.management import Bridge, Leaf
+from r2p.codecs.management import LEAF_ACKS, Bridge, Leaf
 from r2p.codecs.probes import PORT_MODULUS
 from r2p.protocols.bridge.mesh import PortId
 from r2p.protocols.bridge.ports import (
@@ -34,7 +34,6 @@ from r2p.protocols.bridge.ports import (
 TWIN_MEMORY = 7_000_000_000
 """Ns after which two links that led to one network are not believed to do so any more, unless it shows again."""
 
-_LEAF_ACKS = 3
 _SUSPICION = 1_000_000_000  # ns in which it shows by which link our own messages came back
 _LINGER = 1_000_000_000  # ns for which LEAF goes on after its use has ended: gateways may be waiting for an answer
 
@@ -409,7 +408,7 @@ class LinkSelection:
 
     def _send_leaf(self, now: int, link: CandidateLink) -> None:
         count = self._sent.number(now)
-        for packed in pack_acks(link.gateways, _LEAF_ACKS):
+        for packed in pack_acks(link.gateways, LEAF_ACKS):
             self._messages.append((link.number, Leaf(self._instance, link.number & 0xFF, count, packed)))
         if link.asks:
             self._messages.append((link.number, None))

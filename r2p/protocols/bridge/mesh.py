@@ -5,14 +5,13 @@ what both sides say counts. The functions here are pure; `MeshMap` keeps what on
 MESH, and what follows from that.
 """
 
-import struct
 from collections import defaultdict, deque
 from collections.abc import Iterable, Mapping
 from hashlib import blake2b
 
 import msgspec
 
-from r2p.codecs.management import Mesh
+from r2p.codecs.management import MESH_HEARD, Mesh, decode_heard, encode_heard
 
 PortId = tuple[int, int]
 """A port: gateway, and the number of the port there."""
@@ -22,12 +21,10 @@ Adjacency = tuple[int, int, int]
 
 Edge = tuple[PortId, PortId]
 
-_EACH = 3  # adjacencies in a message
-_HEARD = struct.Struct("<BIB")
 _MOST_PARTS = 16  # the number of a part has four bits
 _UNFINISHED = 64  # records of which parts are missing: forged, or of gateways that died in the middle
 
-MOST_HEARD = _EACH * _MOST_PARTS
+MOST_HEARD = MESH_HEARD * _MOST_PARTS
 """Adjacencies that a gateway can announce; with more it can't agree with any other one, and forwards nothing."""
 
 MOST_RECORDS = 256
@@ -46,12 +43,9 @@ _KEPT = 5_000_000_000  # ns for which the record of a gateway outside the mesh i
 def mesh_messages(gateway: int, serial: int, heard: Iterable[Adjacency]) -> list[Mesh]:
     """The messages that announce whom a gateway hears."""
     adjacencies = sorted(heard)[:MOST_HEARD]
-    pieces = [adjacencies[at : at + _EACH] for at in range(0, len(adjacencies), _EACH)] or [[]]
+    pieces = [adjacencies[at : at + MESH_HEARD] for at in range(0, len(adjacencies), MESH_HEARD)] or [[]]
     last = len(pieces) - 1
-    return [
-        Mesh(gateway, serial, number << 4 | last, b"".join(_HEARD.pack(*each) for each in piece).ljust(18, b"\0"))
-        for number, piece in enumerate(pieces)
-    ]
+    return [Mesh(gateway, serial, number << 4 | last, encode_heard(piece)) for number, piece in enumerate(pieces)]
 
 
 class MeshAssembler:
@@ -65,7 +59,7 @@ class MeshAssembler:
         number, last = message.part >> 4, message.part & 15
         key = (message.gateway, message.serial)
         pieces = self._pieces.setdefault(key, {})
-        pieces[number] = frozenset(each for each in _HEARD.iter_unpack(message.heard) if each[1])
+        pieces[number] = frozenset(decode_heard(message.heard))
         if set(pieces) != set(range(last + 1)):
             while len(self._pieces) > _UNFINISHED:
                 del self._pieces[next(iter(self._pieces))]

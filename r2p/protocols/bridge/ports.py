@@ -8,13 +8,12 @@ and that the other end knows what that message said.
 """
 
 import enum
-import struct
 from collections import Counter, deque
 from collections.abc import Mapping
 
 import msgspec
 
-from r2p.codecs.management import Bridge, Leaf, Mesh
+from r2p.codecs.management import BRIDGE_ACKS, Bridge, Leaf, Mesh, decode_acks, encode_acks
 from r2p.protocols.bridge.mesh import PortId
 
 _MS = 1_000_000
@@ -58,11 +57,9 @@ APART = 10 * _MS
 """Ns between two messages out of turn at least."""
 FOREVER = 1 << 62
 """An instant (monotonic ns) that never comes; negative: one that never was."""
-ACK = struct.Struct("<IH")
-BRIDGE_ACKS = 2
 MOST_LEAVES = 32  # on one network; all modules beyond these use one link only
 
-_NO_ACKS = bytes(BRIDGE_ACKS * ACK.size)
+_NO_ACKS = encode_acks((), BRIDGE_ACKS)
 
 
 class PortState(enum.Enum):
@@ -146,7 +143,7 @@ class SentMessages:
 
     def acked_at(self, acks: bytes) -> int:
         """When the message was sent that these acknowledge; 0: none of this sender that still counts."""
-        for sender, count in ACK.iter_unpack(acks):
+        for sender, count in decode_acks(acks):
             if sender == self._sender:
                 return next((at for each, at in reversed(self._sent) if each == count), 0)
         return 0
@@ -162,7 +159,7 @@ def pack_acks(heard: Mapping[PortId, Neighbour], each: int) -> list[bytes]:
     latest = sorted(heard.items(), key=lambda item: item[1].heard_at)  # of several ports of a sender the last one heard
     acks = list({sender: neighbour.count for (sender, _), neighbour in latest}.items())
     starts = range(0, max(len(acks), 1), each)
-    return [b"".join(ACK.pack(*ack) for ack in acks[at : at + each]).ljust(each * ACK.size, b"\0") for at in starts]
+    return [encode_acks(acks[at : at + each], each) for at in starts]
 
 
 # Ports
@@ -256,7 +253,7 @@ class TreePort(msgspec.Struct, eq=False):
 
 def _may_hear(message: Leaf, gateway: int) -> bool:
     """Whether the module hears the gateway, or may: one that does not has no consent of it any more."""
-    names = [name for name, _ in ACK.iter_unpack(message.acks)]
+    names = [name for name, _ in decode_acks(message.acks)]
     return gateway in names or 0 not in names  # with no free entry it may be one of those that did not fit
 
 

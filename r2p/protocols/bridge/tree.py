@@ -16,11 +16,10 @@ Modules that are not gateways may have several links, too (`link_selection`). Th
 so by LEAF; and before a gateway forwards in another mesh than before (with another root), these modules know of it.
 """
 
-from r2p.codecs.management import Bridge, Leaf, Mesh
+from r2p.codecs.management import BRIDGE_ACKS, Bridge, Leaf, Mesh
 from r2p.codecs.probes import PORT_MODULUS
 from r2p.protocols.bridge.mesh import MOST_HEARD, Edge, MeshMap, digest
 from r2p.protocols.bridge.ports import (
-    BRIDGE_ACKS,
     DEAD,
     FLAP_FORGIVEN,
     FLAPS,

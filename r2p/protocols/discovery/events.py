@@ -24,10 +24,7 @@ class Command(enum.Enum):
     BOOTLOAD = "bootload"
 
 
-Order = management.Stop | management.Reboot | management.Bootload
-"""The message of a command."""
-
-MESSAGE_OF_COMMAND: dict[Command, type[Order]] = {
+MESSAGE_OF_COMMAND: dict[Command, type[management.Order]] = {
     Command.STOP: management.Stop,
     Command.REBOOT: management.Reboot,
     Command.BOOTLOAD: management.Bootload,
@@ -36,7 +33,7 @@ COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, MESSAGE_O
 """The command by the type byte of its message, as a DENIED names it."""
 
 
-def command_of(message: Order) -> Command:
+def command_of(message: management.Order) -> Command:
     """The command that a message gives."""
     return next(command for command, cls in MESSAGE_OF_COMMAND.items() if type(message) is cls)
 

@@ -27,7 +27,6 @@ from r2p.protocols.discovery.events import (
     ConnectionDenied,
     Event,
     ModuleInfo,
-    Order,
     Outbox,
     PeerAddress,
     TopicType,
@@ -289,6 +288,6 @@ class Discovery(DiscoveryProtocol):
             command = COMMAND_OF_TYPE[message.order]
             self._outbox.emit(CommandDenied(message.gateway, command, message.module, message.reason))
 
-    def _commanded(self, now: int, message: Order, source: PeerAddress) -> None:
+    def _commanded(self, now: int, message: management.Order, source: PeerAddress) -> None:
         if message.module == self._announcer.module:
             self._outbox.emit(CommandReceived(command_of(message)))

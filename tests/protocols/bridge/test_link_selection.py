@@ -7,9 +7,8 @@ import random
 
 import pytest
 
-from r2p.codecs.management import Bridge, Leaf
+from r2p.codecs.management import Bridge, Leaf, encode_acks
 from r2p.protocols.bridge.link_selection import LinkSelection
-from r2p.protocols.bridge.ports import ACK
 from tests.protocols.bridge.test_tree import SECOND, STABLE, _connected, _talk, _trouble, reached, start, states, world
 from tests.protocols.bridge.wires import MS, Module, World
 
@@ -339,7 +338,7 @@ def step(selection: LinkSelection, now: int, count: int, numbers: random.Random)
     elif operation < 14:
         selection.set_remote(now, number, numbers.choice([None, 5, 6, 7, 8]))
     elif operation < 16:
-        selection.receive_bridge(now, number, Bridge(9, 1, count, 0, 9, ACK.pack(1, count)))
+        selection.receive_bridge(now, number, Bridge(9, 1, count, 0, 9, encode_acks([(1, count)], 1)))
     elif operation == 16:
         selection.receive_leaf(now, number, Leaf(1, (number + 1) % 8, count, b""))
     elif operation == 17:
