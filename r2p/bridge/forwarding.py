@@ -204,8 +204,7 @@ class BridgedTopic(Topic):
             self.by_link[sink.link] = sink
             if self.relayed is not None:
                 self.relayed.subscriber_changed(self, sink)
-        super().join(sink)
-        self._forward_latched(sink)
+        super().join(sink)  # which ends with `resend_latched`
 
     def leave(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
         if isinstance(sink, RemoteSubscriber) and self.by_link.get(sink.link) is sink:
