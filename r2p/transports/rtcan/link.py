@@ -66,17 +66,18 @@ class RtcanLink(BufferedLink):
     ) -> None:
         name = unique_name(name, hub)
         counts = LoggedCounter(name, hub.space.clock)
-        self._session = Discovery(
+        discovery = Discovery(
             hub.space.module, hub.instance, rate=_RATE, burst=_BURST, observer=hub.observer, counts=counts
         )
-        super().__init__(name, hub, discovery=self._session)
+        super().__init__(name, hub, discovery=discovery)
+        self._set_pace = discovery.set_pace  # which other kinds of discovery lack
         self.engine = Engine(settings)
-        self.stats.faults = self.engine.counts
+        self.stats.faults = self.engine.counts  # one counter for what goes wrong in the engine and on the bus
         self.driver = EngineDriver(self.engine, port, self)
         self._utc_error = utc_error
         self._utc = UtcEstimator(self.driver, self._clock)
         self._topic_ids = TopicIdAllocator()
-        self._samples = SampleBuilder(self.driver, self._session, name, self._clock, self._utc)
+        self._samples = SampleBuilder(self.driver, discovery, name, self._clock, self._utc)
         self._message_ids = MessageIdMap(self.engine, self, self._space, self.stats.lost)
         self._slotted = SlottedTopics(self, self.driver, self._clock, self._has_subscribers)
         self._status = LinkStatus(self.driver, settings)
@@ -149,7 +150,7 @@ class RtcanLink(BufferedLink):
         rate, burst, quiet = _RATE * _BIT / bit, max(_BURST_MIN, _BURST * _BIT // bit), 0.0
         if profile is Profile.FIRMWARE:
             rate, burst, quiet = _FIRMWARE_RATE, _BURST_MIN, _FIRMWARE_QUIET
-        self._session.set_pace(rate, burst, quiet)
+        self._set_pace(rate, burst, quiet)
         self._topic_ids.set_rate(rate)
 
     def _announce(self) -> None:

@@ -282,7 +282,7 @@ async def test_no_module_gets_what_it_does_not_subscribe() -> None:
         await subscriber.fetch(timeout=1.0)
         message = made.identifiers(lambda found: found.laxity == rtcan.NRT)[0].message
         wanted = {each: made.link(each).engine.filters() for each in ("B", "C")}
-        needed = rtcan.encode_identifier(0, message), rtcan.MESSAGE_MASK
+        needed = rtcan.message_filter(message)
         assert needed in wanted["B"]
         assert needed not in wanted["C"]
         subscriber.close()

@@ -25,10 +25,8 @@ async def test_its_topics_arrive_under_the_id_that_it_answers() -> None:
         sample = await anext(samples)
         assert sample.source == r2p.Source("IMU1", "", "sim:")
         assert sample.publisher_class is r2p.PublisherClass.SPORADIC
-        mask = rtcan.MESSAGE_MASK
-        assert [each for each in made.link("PC1").engine.filters() if each[1] == mask] == [
-            (rtcan.encode_identifier(0, MESSAGE), mask)
-        ]
+        filters = made.link("PC1").engine.filters()
+        assert [each for each in filters if each[1] == rtcan.MESSAGE_MASK] == [rtcan.message_filter(MESSAGE)]
         assert any(isinstance(each, management.SubscribeRequest) for each in firmware.received)
         assert not made.link("PC1").losses
 
