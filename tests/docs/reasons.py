@@ -137,7 +137,7 @@ def _keys(file: _File) -> Iterator[ast.expr]:
     for node in file.nodes:
         match node:
             case ast.AugAssign(target=ast.Subscript(value=counter, slice=key), op=ast.Add()):
-                if _is_counter(counter) or (isinstance(key, ast.Constant) and isinstance(key.value, str)):
+                if _is_counter(counter) or _is_text(key):
                     yield key
             case ast.Assign(targets=[ast.Subscript(value=counter, slice=key)], value=ast.BinOp()) if _is_counter(
                 counter
@@ -145,6 +145,16 @@ def _keys(file: _File) -> Iterator[ast.expr]:
                 yield key
             case ast.Call(func=ast.Name(id="Counter"), args=[ast.Dict(keys=keys)]):
                 yield from filter(None, keys)
+
+
+def _is_text(key: ast.expr) -> bool:
+    """Whether it is a text, or a constant with one."""
+    match key:
+        case ast.Constant(value=str()):
+            return True
+        case ast.Name(id=name):
+            return name.isupper()
+    return False
 
 
 def _is_counter(node: ast.expr) -> bool:
