@@ -168,11 +168,14 @@ def _place(function: Function, name: str) -> int | None:
 
 
 def _passed(file: _File, function: Function, name: str, place: int) -> Iterator[tuple[_File, ast.expr]]:
-    """What callers pass for that parameter. A private function is called in its own file only."""
+    """What callers pass for that parameter. A private function is called in its own file only; a public one may be kept
+    in a private attribute, and be called from there.
+    """
+    names = (function.name, f"_{function.name}")
     method = bool(function.args.args) and function.args.args[0].arg == "self"
     for each in [file] if function.name.startswith("_") else _files():
         for node in each.nodes:
-            if not isinstance(node, ast.Call) or ast.unparse(node.func).rpartition(".")[2] != function.name:
+            if not isinstance(node, ast.Call) or ast.unparse(node.func).rpartition(".")[2] not in names:
                 continue
             if place - method < len(node.args):
                 yield each, node.args[place - method]
