@@ -4,7 +4,7 @@ A peer that is new on a link, or asks, gets all of it at once. r2p modules are p
 back when they are gone. Of firmware only what it sends itself is passed on, so that its age can be seen everywhere; it
 does not answer, so a peer that asks gets what was heard lately.
 
-`_facts` is what is known on each link, by key; where something has changed on a link, only that is compared, and
+`facts` are what is known on each link, by key; where something has changed on a link, only that is compared, and
 announced on the others. Links on which much comes and goes are looked at ROUNDS times a second. What is repeated is
 spread over more time the more there is of it.
 """
@@ -73,6 +73,32 @@ class _Announced(msgspec.Struct, frozen=True):
     heard_at: int
 
 
+class _LinkDirectory(msgspec.Struct, eq=False):
+    """What is known on one link, and what has been announced there; instants in monotonic ns, None: not yet.
+
+    `dirty`: the facts may have changed. `joined`: it is in the tree, and knows all. `behind`: it has to wait until the
+    gateways agree, and lacks what has changed meanwhile. `met` are the instances there that have got everything, or
+    will. `asked`: a peer wants everything; `to_repeat` are the keys of what is yet to be repeated, to answer that if it
+    is `answering`.
+    """
+
+    facts: dict[_Key, _Fact] = {}
+    announced: dict[_Key, _Announced] = {}
+    dirty: bool = False
+    joined: bool = False
+    behind: bool = False
+    met: set[int] | None = None
+    asked: bool = False
+    answered_at: int | None = None
+    repeat_at: int | None = None
+    to_repeat: deque[_Key] | None = None
+    answering: bool = False
+
+    def answer_due(self) -> int:
+        """The instant before which no other answer goes out."""
+        return 0 if self.answered_at is None else self.answered_at + _APART
+
+
 class DirectoryRelay:
     """Announces on each link of the gateway `instance` what is known of modules and nodes on the others.
 
@@ -93,52 +119,40 @@ class DirectoryRelay:
         self._clock = space.clock
         self._policy = policy
         self._repeating = repeating
-        self._facts: dict[str, dict[_Key, _Fact]] = {}
-        """By link, then by key."""
+        self._links: dict[str, _LinkDirectory] = {}
         self._sources: dict[_Key, dict[str, _Fact]] = {}
-        """The same by key, then by link."""
-        self._announced: dict[str, dict[_Key, _Announced]] = {}
-        """What each link knows from this gateway."""
+        """All facts by key, then by link."""
         self._alarm = Alarm(space.loop, self._poll, background=True)
-        self._dirty: set[str] = set()
-        self._joined: set[str] = set()
-        """Links in the tree, which know all."""
-        self._behind: set[str] = set()
-        """Links that have to wait until the gateways agree, and lack what has changed meanwhile."""
-        self._asked: set[str] = set()
-        self._met: dict[str, set[int]] = {}
-        """Instances that have got everything, by link."""
-        self._answered_at: dict[str, int] = {}
-        self._repeat_at: dict[str, int] = {}
-        self._to_repeat: dict[str, deque[_Key]] = {}
-        """What is yet to be repeated, by link."""
-        self._answering: set[str] = set()
-        """The links where that is an answer."""
         self._rounds: deque[int] = deque(maxlen=ROUNDS)
         self._next_round_at = 0
         self._repeated_at = 0
 
     def query(self, port: BridgePort) -> None:
         """A peer on the link wants to know everything."""
-        self._asked.add(port.name)
+        self._link(port).asked = True
         self._set_alarm(self._clock.monotonic())
 
     def changed(self, port: BridgePort) -> None:
         """A module or a node came or went there, or the link has another place in the tree."""
-        self._dirty.add(port.name)
-        self._set_alarm(self._clock.monotonic())
+        link = self._link(port)
+        if not link.dirty:  # else the alarm is set: many changes at once must not cost as many looks at all links
+            link.dirty = True
+            self._set_alarm(self._clock.monotonic())
 
     def forget(self, port: BridgePort) -> None:
-        """The link is gone."""
-        for known in (self._announced, self._met, self._answered_at, self._repeat_at, self._to_repeat):
-            known.pop(port.name, None)
-        for links in (self._asked, self._behind, self._joined, self._answering):
-            links.discard(port.name)
-        self.changed(port)
+        """The link is down, or gone. Its facts are compared with those of other links when it is looked at next."""
+        self._links[port.name] = _LinkDirectory(self._link(port).facts, dirty=True)
+        self._set_alarm(self._clock.monotonic())
 
     def close(self) -> None:
         """The gateway ends."""
         self._alarm.close()
+
+    def _link(self, port: BridgePort) -> _LinkDirectory:
+        link = self._links.get(port.name)
+        if link is None:
+            link = self._links[port.name] = _LinkDirectory()
+        return link
 
     def own_modules(self) -> list[str]:
         """The canonical names of the robot's modules that are known."""
@@ -156,15 +170,19 @@ class DirectoryRelay:
     # When
 
     def _set_alarm(self, now: int) -> None:
-        dues = [now + _REPEAT, *self._repeat_at.values()]
-        if self._dirty:
-            dues.append(max(now + _SOON, self._next_round_at))
-        if self._behind:
-            dues.append(now + _APART)
-        if self._to_repeat:
-            dues.append(now + _SLICE_APART)
-        dues += [max(now + _SOON, self._answered_at.get(name, -_APART) + _APART) for name in self._asked]
-        self._alarm.set(min(dues))
+        due = now + _REPEAT
+        for link in self._links.values():
+            if link.repeat_at is not None:
+                due = min(due, link.repeat_at)
+            if link.dirty:
+                due = min(due, max(now + _SOON, self._next_round_at))
+            if link.behind:
+                due = min(due, now + _APART)
+            if link.to_repeat is not None:
+                due = min(due, now + _SLICE_APART)
+            if link.asked:
+                due = min(due, max(now + _SOON, link.answer_due()))
+        self._alarm.set(due)
 
     def _poll(self) -> None:
         now = self._clock.monotonic()
@@ -177,8 +195,9 @@ class DirectoryRelay:
             self._set_alarm(now)
 
     def _do_due(self, now: int) -> None:
-        may_catch_up = any(self._is_open(port, now) for port in self._ports.values() if port.name in self._behind)
-        if (self._dirty or may_catch_up) and now >= self._next_round_at:
+        is_dirty = any(each.dirty for each in self._links.values())
+        may_catch_up = any(self._link(port).behind and self._is_open(port, now) for port in self._ports.values())
+        if (is_dirty or may_catch_up) and now >= self._next_round_at:
             self._rounds.append(now)
             self._look(now)
             took = self._clock.monotonic() - now
@@ -197,22 +216,24 @@ class DirectoryRelay:
     def _repeat(self, port: BridgePort, now: int, period: int) -> None:
         """Repeat on a link what a peer asks for, or what was not announced for a while."""
         self._meet(port)
-        if port.name in self._asked and now >= self._answered_at.get(port.name, -_APART) + _APART:
-            self._asked.discard(port.name)
-            self._answered_at[port.name] = now
-            self._answering.add(port.name)
-            self._to_repeat[port.name] = deque(self._announced.get(port.name, ()))
-        if now >= self._repeat_at.setdefault(port.name, now + period):
-            self._repeat_at[port.name] = now + period
-            self._to_repeat.setdefault(port.name, deque(self._announced.get(port.name, ())))
-        if port.name in self._to_repeat:
-            self._repeat_slice(port, now)
+        link = self._link(port)
+        if link.asked and now >= link.answer_due():
+            link.asked, link.answering, link.answered_at = False, True, now
+            link.to_repeat = deque(link.announced)
+        if link.repeat_at is None or now >= link.repeat_at:
+            if link.repeat_at is not None and link.to_repeat is None:
+                link.to_repeat = deque(link.announced)
+            link.repeat_at = now + period
+        if link.to_repeat is not None:
+            self._repeat_slice(port, link, link.to_repeat, now)
 
     def _put_off(self, port: BridgePort, now: int) -> None:
         """Nothing can be announced there now: look again soon."""
-        for when, gap in ((self._repeat_at, _APART), (self._answered_at, 0)):
-            if port.name in when or port.name in self._asked:
-                when[port.name] = max(when.get(port.name, 0), now + gap)
+        link = self._link(port)
+        if link.repeat_at is not None or link.asked:
+            link.repeat_at = max(link.repeat_at or 0, now + _APART)
+        if link.answered_at is not None or link.asked:
+            link.answered_at = max(link.answered_at or 0, now)
 
     def _period(self) -> int:
         """The time (ns) in which everything is repeated."""
@@ -221,12 +242,13 @@ class DirectoryRelay:
 
     def _meet(self, port: BridgePort) -> None:
         """See whether a peer is new there, which is to get everything."""
-        if port.name in self._met and port.name not in self._facts:
+        link = self._link(port)
+        if link.met is not None and not link.facts:
             return
         here = {info.instance for info in port.link.discovery.modules.values() if info.instance and not info.hops}
-        if not here <= self._met.get(port.name, set()):
-            self._asked.add(port.name)
-        self._met[port.name] = here
+        if not here <= (link.met or set()):
+            link.asked = True
+        link.met = here
 
     def _is_open(self, port: BridgePort, now: int) -> bool:
         """Whether it need not wait until the gateways agree."""
@@ -236,48 +258,53 @@ class DirectoryRelay:
 
     def _look(self, now: int) -> None:
         """See what has changed on the links, and announce it on the others."""
-        dirty, behind = self._dirty | self._behind, self._behind
-        self._dirty, self._behind = set(), set()
+        catch_up = {name for name, link in self._links.items() if link.behind}
         changed: dict[_Key, None] = {}
-        catch_up = [port for port in self._ports.values() if port.name in behind]
-        for name in dirty:
-            port = self._ports.get(name)
-            if port is not None and port.link.up and not self._is_open(port, now):
-                self._behind.add(name)  # what is known there holds until the gateways agree
-                continue
-            try:
-                self._collect(name, port, changed)
-            except Exception as error:  # noqa: BLE001 - counted and logged; it is read anew, and the next link follows
-                count_internal_error((each.link.stats.lost for each in self._ports.values()), error)
-                self._dirty.add(name)
-                continue
-            if port is not None and port.link.up and port.in_tree != (name in self._joined):
-                catch_up.append(port)  # it has just joined the tree, or left it
-                self._joined ^= {name}
+        for name, link in list(self._links.items()):
+            if link.dirty or link.behind:
+                link.dirty = link.behind = False
+                try:
+                    if self._look_at(name, link, now, changed):
+                        catch_up.add(name)
+                except Exception as error:  # noqa: BLE001 - counted and logged; it is read anew, after the next link
+                    count_internal_error((each.link.stats.lost for each in self._ports.values()), error)
+                    link.dirty = True
         for port in self._ports.values():
+            link = self._link(port)
             if port.link.up and self._is_open(port, now):
-                announced = self._announced.get(port.name, ())
-                keys: Iterable[_Key] = [*self._sources, *announced] if port in catch_up else changed
+                keys: Iterable[_Key] = [*self._sources, *link.announced] if port.name in catch_up else changed
                 for key in list(dict.fromkeys(keys)):
                     port.link.stats.lost.guard(self._announce, port, key)
             elif port.link.up:
-                self._behind.add(port.name)
+                link.behind = True
 
-    def _collect(self, name: str, port: BridgePort | None, changed: dict[_Key, None]) -> None:
+    def _look_at(self, name: str, link: _LinkDirectory, now: int, changed: dict[_Key, None]) -> bool:
+        """See what has changed on a link; True: it has just joined the tree, or left it."""
+        port = self._ports.get(name)
+        if port is not None and port.link.up and not self._is_open(port, now):
+            link.behind = True  # what is known there holds until the gateways agree
+            return False
+        self._collect(name, link, port, changed)
+        if port is None:
+            del self._links[name]
+        if port is None or not port.link.up or port.in_tree == link.joined:
+            return False
+        link.joined = port.in_tree
+        return True
+
+    def _collect(self, name: str, link: _LinkDirectory, port: BridgePort | None, changed: dict[_Key, None]) -> None:
         """Read what is known on a link now, and enter the keys of what has changed."""
-        before = self._facts.pop(name, {})
-        facts = {} if port is None or not port.link.up or not port.in_tree else self._facts_of(port)
-        for key in before.keys() - facts.keys():
+        before = link.facts
+        link.facts = {} if port is None or not port.link.up or not port.in_tree else self._facts_of(port)
+        for key in before.keys() - link.facts.keys():
             changed[key] = None
             self._sources[key].pop(name)
             if not self._sources[key]:
                 del self._sources[key]
-        for key, fact in facts.items():
+        for key, fact in link.facts.items():
             if not _is_same(before.get(key), fact):
                 changed[key] = None
             self._sources.setdefault(key, {})[name] = fact
-        if facts:
-            self._facts[name] = facts
 
     def _facts_of(self, port: BridgePort) -> dict[_Key, _Fact]:
         facts: dict[_Key, _Fact] = {}
@@ -296,27 +323,25 @@ class DirectoryRelay:
 
     # What is announced
 
-    def _repeat_slice(self, port: BridgePort, now: int) -> None:
+    def _repeat_slice(self, port: BridgePort, link: _LinkDirectory, keys: deque[_Key], now: int) -> None:
         """Repeat a part of everything: what lives, and of firmware what was heard since, or as an answer lately."""
-        keys, announced = self._to_repeat[port.name], self._announced.setdefault(port.name, {})
-        answers = port.name in self._answering
         for key in [keys.popleft() for _ in range(min(len(keys), _SLICE))]:
-            before = announced.get(key)
+            before = link.announced.get(key)
             new = None if before is None else self._announce(port, key)
             if before is None or new is None or new.messages != before.messages:
                 continue  # it has just been announced
-            announced[key] = new
+            link.announced[key] = new
             for message in new.messages:
                 is_alive = isinstance(message, management.Alive)
-                if not is_alive or new.heard_at > before.heard_at or (answers and now < new.heard_at + _LATELY):
+                was_heard = new.heard_at > before.heard_at or (link.answering and now < new.heard_at + _LATELY)
+                if not is_alive or was_heard:
                     self._send(port, message)
         if not keys:
-            del self._to_repeat[port.name]
-            self._answering.discard(port.name)
+            link.to_repeat, link.answering = None, False
 
     def _announce(self, port: BridgePort, key: _Key) -> _Announced | None:
         """Announce on a link what has changed of a fact; gives back what is known there from now on."""
-        announced = self._announced.setdefault(port.name, {})
+        announced = self._link(port).announced
         before = announced.get(key)
         new = self._desired(port, key) if port.in_tree else None
         if new is not None:
