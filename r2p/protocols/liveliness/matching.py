@@ -55,7 +55,7 @@ class Matching:
         self._sessions_of.setdefault(topic_role, {})[token.session] = session
         self._token_counts[topic_role] += 1
         self.demand.add(*topic_role, token.session)
-        self._note(now, token)
+        self._update_topic(now, token)
         self._match(token.session, session, topic_role)
 
     def disappeared(self, key: str, token: TopicToken) -> None:
@@ -71,12 +71,12 @@ class Matching:
         self._match(token.session, session, topic_role)
         if not session.tokens:
             del self._sessions[token.session]
-        self._retype(self.topics[token.topic], token.role)
+        self._update_type(self.topics[token.topic], token.role)
         self._token_counts[topic_role] -= 1
         if not self._token_counts[topic_role]:
             del self._token_counts[topic_role]
             del self._sessions_of[topic_role]
-            self._forget_role(*topic_role)
+            self._remove_role(*topic_role)
 
     def changed(self, topic: str, role: int) -> None:
         """What this module does with the topic in this role has changed."""
@@ -88,7 +88,7 @@ class Matching:
     def mark_heard(self, now: int) -> None:
         """Mark what has a token as heard now."""
         for topic, role in self._token_counts:
-            self._mark(now, self.topics[topic], role)
+            self._set_heard(now, self.topics[topic], role)
 
     def _match(self, number: int, session: _PeerSession, key: TopicRole) -> None:
         topic, role = key
@@ -142,24 +142,24 @@ class Matching:
             del self._subscribers[topic]
             self._events.append(SubscribersGone(topic))
 
-    def _note(self, now: int, token: TopicToken) -> None:
+    def _update_topic(self, now: int, token: TopicToken) -> None:
         info = self.topics.setdefault(token.topic, TopicInfo(token.topic))
-        self._mark(now, info, token.role)
-        self._retype(info, token.role)
+        self._set_heard(now, info, token.role)
+        self._update_type(info, token.role)
 
-    def _retype(self, info: TopicInfo, role: int) -> None:
+    def _update_type(self, info: TopicInfo, role: int) -> None:
         """A topic has the type of the first session that declares one."""
         sessions = self._sessions_of.get((info.name, role), {}).values()
         types = (_type_of(session.tokens[info.name, role]) for session in sessions)
         info.set_type(role, next((each for each in types if each != TopicType()), None))
 
-    def _mark(self, now: int, info: TopicInfo, role: int) -> None:
+    def _set_heard(self, now: int, info: TopicInfo, role: int) -> None:
         if role == ROLE_PUBLISHES:
             info.advertised_at = now
         else:
             info.requested_at = now
 
-    def _forget_role(self, topic: str, role: int) -> None:
+    def _remove_role(self, topic: str, role: int) -> None:
         """No token has the topic in this role any more; if none has it in the other role, it is forgotten."""
         if (topic, counterpart(role)) not in self._token_counts:
             del self.topics[topic]

@@ -38,14 +38,14 @@ class ModuleRegistry:
 
     def module_appeared(self, now: int, key: str, token: ModuleToken) -> None:
         self._tokens.setdefault(token.name, {})[key] = token
-        self._review(now, token.name)
+        self._update(now, token.name)
 
     def module_disappeared(self, now: int, key: str, token: ModuleToken) -> None:
         named = self._tokens[token.name]
         del named[key]
         if not named:
             del self._tokens[token.name]
-        self._review(now, token.name)
+        self._update(now, token.name)
 
     def endpoint_appeared(self, token: TopicToken) -> None:
         key = _endpoint_key(token)
@@ -69,8 +69,8 @@ class ModuleRegistry:
 
     # Without tokens
 
-    def firmware(self, info: ModuleInfo) -> None:
-        """A gateway announces a module that has no token of its own."""
+    def add_firmware(self, info: ModuleInfo) -> None:
+        """Enter a module that has no token of its own, as a gateway announces it."""
         if info.name != self._module and info.name not in self._tokens:
             self._keep(self.modules.get(info.name), info)
 
@@ -84,7 +84,7 @@ class ModuleRegistry:
     def clear(self) -> None:
         """Forget the modules without a token."""
         for info in list(self.modules.values()):
-            self._gone(info)
+            self._remove(info)
 
     # Deadlines
 
@@ -97,7 +97,7 @@ class ModuleRegistry:
     def poll(self, now: int) -> None:
         """Show modules that have room now, and report two modules that have had the same name for long enough."""
         while self._without_room and len(self.modules) < MOST:
-            self._review(now, next(iter(self._without_room)))
+            self._update(now, next(iter(self._without_room)))
         for name in [name for name, due in self._conflict_at.items() if due <= now]:
             del self._conflict_at[name]
             instances = [each.instance for each in self._tokens.get(name, {}).values()]
@@ -106,7 +106,7 @@ class ModuleRegistry:
             one, other, *_ = dict.fromkeys(instances)
             self._events.append(NameConflict(name, one, other))
 
-    def _review(self, now: int, name: str) -> None:
+    def _update(self, now: int, name: str) -> None:
         """The tokens of a name have changed: the nearest and latest of them becomes the module."""
         tokens = [each for each in self._tokens.get(name, {}).values() if each.instance != self._instance]
         before = self.modules.get(name)
@@ -114,7 +114,7 @@ class ModuleRegistry:
         if not tokens:
             self._conflict_at.pop(name, None)
             if before is not None:
-                self._gone(before)
+                self._remove(before)
             return
         self._keep(before, _info(min(reversed(tokens), key=lambda each: each.hops), now))
         own = {self._instance} if name == self._module else set()
@@ -148,7 +148,7 @@ class ModuleRegistry:
         if not siblings:
             del self._endpoints_of[key[0]]
 
-    def _gone(self, info: ModuleInfo) -> None:
+    def _remove(self, info: ModuleInfo) -> None:
         del self.modules[info.name]
         if info.instance is not None:
             self._names.pop(info.instance, None)

@@ -335,7 +335,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
                 self._aliases.receive(message)
             case management.Alive(name, flags):
                 name = self._aliases.name_of(name)
-                self._modules.firmware(ModuleInfo(name, flags, now, hops=1, source=source))
+                self._modules.add_firmware(ModuleInfo(name, flags, now, hops=1, source=source))
 
     def _send(self, message: management.Management, *, urgent: bool = False) -> None:
         if self._up:

@@ -14,8 +14,8 @@ from r2p.protocols.discovery.events import Declare, TopicType, Undeclare
 TopicRole = tuple[str, int]
 """A topic, and ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
 
-_MODULE: TopicRole = ("", 0)
-_RELAYED: TopicRole = ("", -1)
+_MODULE: TopicRole = ("", 0)  # stands for the token of the module itself, where topics and roles are keys
+_RELAYED: TopicRole = ("", -1)  # ... and for all that is relayed
 
 
 class DeclaredTopic(msgspec.Struct, frozen=True):
@@ -33,11 +33,12 @@ class TokenSet:
         self._module = module
         self._instance = instance
         self._observer = observer
-        self._own: dict[TopicRole, DeclaredTopic] = {}
+        self._topics: dict[TopicRole, DeclaredTopic] = {}
         self._nodes: dict[TopicRole, dict[str, int]] = {}
         self._relayed: dict[tuple[str | int, ...], liveliness.Token] = {}
         self._declared: dict[TopicRole, set[str]] = {}
         self._dirty: set[TopicRole] = {_MODULE}
+        """What may need other tokens than are declared."""
 
     @property
     def has_changes(self) -> bool:
@@ -45,24 +46,24 @@ class TokenSet:
         return bool(self._dirty)
 
     def get(self, topic: str, role: int) -> DeclaredTopic | None:
-        return self._own.get((topic, role))
+        return self._topics.get((topic, role))
 
     def set_flags(self, flags: int) -> None:
         self.flags = flags
         self._dirty.add(_MODULE)
 
     def set_topic(self, topic: str, role: int, own: DeclaredTopic) -> None:
-        """The module publishes or subscribes the topic."""
-        self._own[topic, role] = own
+        """Declare that the module publishes or subscribes a topic."""
+        self._topics[topic, role] = own
         self._dirty.add((topic, role))
 
     def remove_topic(self, topic: str, role: int) -> None:
-        """It does not any more."""
-        self._own.pop((topic, role), None)
+        """Undeclare that."""
+        self._topics.pop((topic, role), None)
         self._dirty.add((topic, role))
 
     def add_node(self, topic: str, role: int, node: str, publisher_class: int) -> None:
-        """A node of the module does it."""
+        """Add a node that publishes or subscribes the topic; each has a token of its own."""
         self._nodes.setdefault((topic, role), {})[node] = publisher_class
         self._dirty.add((topic, role))
 
@@ -111,7 +112,7 @@ class TokenSet:
             return {liveliness.encode(module)}
         if key == _RELAYED:
             return {liveliness.encode(token) for token in self._relayed.values()}
-        own = self._own.get(key)
+        own = self._topics.get(key)
         if own is None:
             return set()
         nodes = self._nodes.get(key) or {"": 0}

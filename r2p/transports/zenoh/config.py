@@ -198,7 +198,7 @@ def build_config(options: ZenohOptions) -> "zenoh.Config":
         for key, value in _from_url(options).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        raise options.error(f"zenoh does not take this: {plain_text(error)}") from error
+        raise options.error(f"zenoh rejects this: {plain_text(error)}") from error
     return config
 
 

@@ -25,7 +25,7 @@ NOT_ADMITTED = "accepts the connection, but not this module"
 _STREAMS = {"tcp", "tls", "ws"}
 _DATAGRAMS = {"udp", "quic"}
 
-_NO_TLS = "it does not speak TLS: connect to tcp/ instead of tls/, or mend the router's listen endpoint"
+_NO_TLS = "it does not speak TLS: connect to tcp/ instead of tls/, or correct the router's listen endpoint"
 
 
 class Tls(msgspec.Struct, frozen=True):
@@ -143,7 +143,7 @@ def _listening_text(error: OSError, endpoint: _ParsedEndpoint) -> str:
         case errno.EADDRNOTAVAIL:
             return f"can't listen at {endpoint.address}: this computer has no address {endpoint.host} (see: ip address)"
         case errno.EACCES:
-            return f"can't listen at {endpoint.address}: ports below 1024 are for root; take another one"
+            return f"can't listen at {endpoint.address}: ports below 1024 are for root; use another"
         case _:
             return f"can't listen at {endpoint.address}: {error.strerror}"
 
@@ -183,11 +183,17 @@ def _context(tls: Tls) -> ssl.SSLContext:
 
 def _tls_text(error: ssl.SSLError, tls: Tls) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        check = f"{tls.root or 'root_ca_certificate'} has to be the authority that signed it, and its name the host's"
+        check = (
+            f"{tls.root or 'root_ca_certificate'} has to be the authority that signed it, and the name in it the host's"
+        )
         return f"its certificate is not accepted here ({error.verify_message}): {check}"
     reason = (error.reason or str(error)).replace("_", " ").lower()
     if "alert" in reason:  # the other end's
-        ours = f"{tls.certificate} is not one that it accepts" if tls.certificate else "connect_certificate is missing"
+        ours = (
+            f"{tls.certificate} is not a certificate that it accepts"
+            if tls.certificate
+            else "connect_certificate is missing"
+        )
         return f"it does not accept our certificate ({reason}): {ours}; check connect_certificate and its authority"
     if "wrong version" in reason or "record" in reason:
         return _NO_TLS
@@ -198,5 +204,5 @@ def _not_admitted_text(protocol: str, settings: ConnectionSettings) -> str:
     if settings.user is not None:
         asks = f"check the password of user {settings.user} (transport/auth/usrpwd), and that it"
         return f"{asks} is a zenoh 1 router that does not hang"
-    checks = "it may ask for a user and a password (transport/auth/usrpwd), hang, or be no zenoh 1 router"
+    checks = "it may require a user and a password (transport/auth/usrpwd), hang, or not be a zenoh 1 router"
     return checks if protocol == "tls" else f"{checks}, or want TLS (tls/ instead of tcp/)"

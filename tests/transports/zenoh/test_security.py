@@ -141,7 +141,7 @@ async def test_passwords(tmp_path: Path) -> None:
         text = await refused(net.client(transport=auth(user="alice", password="wrong")))
         assert "check the password of user alice" in text
         text = await refused(net.client())
-        assert "it may ask for a user and a password" in text
+        assert "it may require a user and a password" in text
 
 
 def denial(*messages: str) -> dict[str, Any]:
