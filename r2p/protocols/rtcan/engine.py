@@ -83,7 +83,7 @@ class Engine:
         """The periodic messages of this node by high byte."""
         self.management = ManagementSender(context, self.node_id, self.detector, self.transmitter)
         self.grants = SlotGrants(context)
-        self.requests = SlotRequests(context, self.transmitter.plan, self._ask, self.transmitter.abandon)
+        self.requests = SlotRequests(context, self.transmitter.plan, self._ask, self._abandon)
         self.network = NetworkMembership(
             context, self.transmitter, self.node_id, self.grants, self.requests, self.management.send
         )
@@ -480,6 +480,9 @@ class Engine:
                 self.grants.remove(periodic.message)
             else:
                 self.management.send(now, management.Release(periodic.message))
+
+    def _abandon(self, now: int, periodic: PeriodicMessage) -> None:
+        self.transmitter.abandon(now, periodic, "slots lost")
 
     def _ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
         self._handlers.ask(now, wanted)

@@ -83,7 +83,7 @@ class SlotRequests:
         context: EngineContext,
         plan: SlotPlan,
         ask: Callable[[int, Reserve | Renew], None],
-        abandon: Callable[[int, PeriodicMessage, str], None],
+        abandon: Callable[[int, PeriodicMessage], None],
     ) -> None:
         self.has_master = False
         """Whether there is a master to ask."""
@@ -226,7 +226,7 @@ class SlotRequests:
         if periodic.active:
             periodic.active = False
             if periodic.payload is not None:
-                self._abandon(now, periodic, "slots lost")
+                self._abandon(now, periodic)
             periodic.restart()
             self._plan.invalidate()
             self._actions.append(SlotsLost(periodic.high, reason))

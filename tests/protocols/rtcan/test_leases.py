@@ -27,7 +27,7 @@ class Owner:
             context,
             plan,
             lambda now, wanted: self.asked.append(wanted),
-            lambda now, periodic, reason: self.abandoned.append(now),
+            lambda now, periodic: self.abandoned.append(now),
         )
         self.requests.has_master = True
 
