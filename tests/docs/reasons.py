@@ -16,8 +16,8 @@ from r2p.protocols.rtcan.events import Fate, Outcome
 from r2p.transports.can import errorframes
 from tests.docs.blocks import ROOT
 
-COUNTERS = {"lost", "losses", "counts", "dropped", "drops", "faults", "missed", "errors"}
-"""Names of counters by reason, without underscores around them."""
+COUNTERS = {"lost", "losses", "counts", "dropped", "drops", "faults", "missed", "errors", "self"}
+"""Names of counters by reason, without underscores around them; `self` in a class that is a counter."""
 
 _FATES = {fate.value for fate in Fate} - {Fate.SENT.value, Fate.UNKNOWN.value, Fate.DISCARDED.value}  # no losses
 _ERROR_FRAMES = {
