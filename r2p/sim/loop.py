@@ -1,15 +1,15 @@
 """Virtual time: an event loop whose clock jumps to the next timer as soon as nothing else is left to do.
 
-Time stands still while code runs, so what a program does depends on its timers alone, not on the computer. Everything
-in asyncio that goes through the loop works unchanged. What virtual time can't see is the world outside, nor work:
+Time stands still while code runs, so a program depends only on its timers, not on the speed of the computer. Everything
+in asyncio that goes through the loop works unchanged. These things are outside virtual time:
 
 - Jobs in threads (`asyncio.to_thread`, `loop.run_in_executor`) are counted: time stands still until they are done.
-  Other threads are not seen, nor are subprocesses.
-- A task that never waits, such as one that publishes in a loop, would stop the world, and so would a descriptor that
-  is always ready: after 100 000 turns of the loop at one instant the next timer comes all the same.
-- Real file descriptors are polled, but never waited for: time goes on without them. Keep sockets and devices out.
-- `time.time`, `time.sleep`, `random` and the order of sets of strings are as real as ever: use `r2p.clock` for the
-  first three.
+  Other threads, and subprocesses, are not seen.
+- A task that never waits, such as one that publishes in a loop, would stop time, and so would a descriptor that is
+  always ready: after 100 000 iterations of the loop at one instant the next timer runs anyway.
+- Real file descriptors are polled, but not waited for: time goes on without them. Don't use sockets and devices.
+- `time.time`, `time.sleep`, `random` and the order of sets of strings stay real: use `r2p.clock` instead of the first
+  three.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ Ts = TypeVarTuple("Ts")
 
 _SECOND: Final = 1_000_000_000
 _EPOCH: Final = 1_356_998_400 * _SECOND  # 2013-01-01T00:00:00Z
-_HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two floats to each nanosecond
-_PATIENCE: Final = 20 * _SECOND  # for which only what repeats itself goes on at least, and half a second of real time
-_MOST_PATIENCE: Final = 300 * _SECOND  # ... and at most
-_REAL_PATIENCE: Final = _SECOND // 2
-_LOOK: Final = 5 * _SECOND  # between two looks whether it has woken a task
-_BUSY: Final = 100_000  # turns of the loop at one instant
+_HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two floats for each nanosecond
 _END: Final = 2**22 * _SECOND  # the same in ns
-_AHEAD: Final = 1000  # events; then the loop has its turn, for signals and real file descriptors
-_OFTEN: Final = 64  # turns of the loop; so often it looks for signals
-_REAL: Final = SystemClock()  # only tells how long a program without hope may take
-_RESOLUTION: Final = 0.4e-9  # seconds; tells nanoseconds apart, and is more than rounding error at the horizon
+_RESOLUTION: Final = 0.4e-9  # seconds: less than a nanosecond, and more than the rounding error at the horizon
+_IDLE_MIN: Final = 20 * _SECOND  # of virtual time with nothing but background timers, before a Deadlock...
+_IDLE_REAL_MIN: Final = _SECOND // 2  # ... which also takes this much real time...
+_IDLE_MAX: Final = 300 * _SECOND  # ... but never more virtual time than this
+_IDLE_CHECK: Final = 5 * _SECOND  # between two checks whether a task has been woken
+_BUSY: Final = 100_000  # iterations of the loop at one instant, after which the next timer runs anyway
+_AHEAD: Final = 1000  # events in one iteration of the loop: signals and real file descriptors wait for so long
+_POLL_EVERY: Final = 64  # iterations between two polls of asyncio's own descriptor, which signals wake
+_REAL: Final = SystemClock()  # only measures the real time until a Deadlock
 
 
 def run(
@@ -57,11 +57,11 @@ def run(
 
     Virtual time starts at 2013-01-01 UTC and lasts 48 days at most. `seed` goes to the loop's random numbers,
     `loop.random`. Tasks that `main` leaves behind are cancelled, as by `asyncio.run`. Raises what `main` raises, and
-    `Deadlock` when it waits for something that can't happen any more; KeyboardInterrupt on Ctrl-C.
+    `Deadlock` when it waits for something that can't happen any more, and KeyboardInterrupt on Ctrl-C.
 
-    What only repeats itself (announcements, periodic publishers, time-outs for which nobody waits) keeps no program
-    going: Deadlock comes when it has woken no task for half a second of real time and 20 seconds of virtual time. Where
-    nodes talk to each other for ever, only `limit` ends that: Deadlock comes after so many seconds of virtual time.
+    Timers that only repeat themselves (announcements, periodic publishers, time-outs that no task waits for) do not
+    keep a program alive: Deadlock is raised when they have woken no task for half a second of real time and 20 seconds
+    of virtual time. Where nodes exchange messages forever, `limit` raises it after this many seconds of virtual time.
     """
     check_timeout("the limit", limit)
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed=seed, limit=limit)) as runner:
@@ -69,7 +69,7 @@ def run(
 
 
 Event: TypeAlias = tuple[int, int, Callable[..., object], tuple[Any, ...]]
-"""When (ns since the start), its place among those of one instant, what to call, with what."""
+"""When (ns since the start), the order within one instant, what to call, and with which arguments."""
 
 
 class VirtualClock:
@@ -81,11 +81,11 @@ class VirtualClock:
         self.elapsed = 0  # ns
 
     def now(self) -> int:
-        """UTC in ns: 2013-01-01 at the start."""
+        """Return UTC in ns; it starts at 2013-01-01."""
         return _EPOCH + self.elapsed
 
     def monotonic(self) -> int:
-        """Ns since the start."""
+        """Return the ns since the start."""
         return self.elapsed
 
     def move_to(self, instant: int) -> None:
@@ -94,7 +94,7 @@ class VirtualClock:
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """An asyncio event loop under virtual time. `clock` and `random` are what `r2p.clock` finds here."""
+    """An asyncio event loop under virtual time. `r2p.clock` uses its `clock` and `random`."""
 
     _ready: Sized  # what asyncio will call next
     _scheduled: list[asyncio.TimerHandle]  # asyncio's heap of timers; when it polls, the first one is not cancelled
@@ -103,9 +103,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def __init__(self, *, seed: int = 0, limit: float | None = None) -> None:
         super().__init__(_Selector(self._idle, self._turn))
         self._end = _HORIZON if limit is None else min(limit, _HORIZON)  # s
-        self._looked = 0  # ns; when it was last seen whether there is more than what repeats itself
-        self._waited_for: dict[asyncio.Task[Any], object] | None = None  # what each task waited for then, if not
-        self._alive = self._alive_really = 0  # ns; since when nothing has changed in that, and the same in real time
+        self._checked = 0  # ns: the last check for tasks that were woken, or the last timer not in the background
+        self._waited_for: dict[asyncio.Task[Any], object] | None = None  # what each task waited for at that check
+        self._alive = self._alive_really = 0  # ns: since when no task has been woken; the same in real time
         self.clock = VirtualClock()
         self.random = random.Random(seed)
         self.task_numbers = itertools.count(1)
@@ -118,7 +118,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self.set_task_factory(_Task.make)
 
     def time(self) -> float:
-        """Virtual seconds since the start."""
+        """Return the virtual seconds since the start."""
         return self.clock.elapsed / _SECOND
 
     def call_at(
@@ -128,10 +128,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         *args: *Ts,
         context: contextvars.Context | None = None,
     ) -> asyncio.TimerHandle:
-        """As in asyncio, at the nanosecond nearest to `when`; timers of one instant go off in the order they were set.
+        """Do as asyncio, at the nanosecond nearest to `when`; timers of one instant run in the order they were set.
 
-        Rounding is what keeps long runs exact: the error of adding two floats is gone before it can be added to the
-        next one.
+        Rounding keeps long runs exact: the error of a sum of two floats is gone before it enters the next sum.
         """
         if self.is_closed():
             raise RuntimeError("Event loop is closed")
@@ -147,7 +146,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def run_in_executor(
         self, executor: Executor | None, func: Callable[[Unpack[Ts]], T], *args: *Ts
     ) -> asyncio.Future[T]:
-        """As in asyncio; virtual time stands still until the job is done, or nobody waits for it any more."""
+        """Do as asyncio; virtual time stands still until the job is done or cancelled."""
         future = super().run_in_executor(executor, func, *args)
         self._jobs += 1
         self._limit = 0
@@ -155,7 +154,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return future
 
     async def shutdown_default_executor(self, *args: Any, **kwargs: Any) -> None:
-        """As in asyncio."""
+        """Do as asyncio."""
         self._jobs += 1  # asyncio does this in a thread of its own
         try:
             await super().shutdown_default_executor(*args, **kwargs)
@@ -163,10 +162,10 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             self._jobs -= 1
 
     def run_ahead(self, events: list[Event]) -> None:
-        """Carry out events of this sorted list, each at its instant, for as long as nothing else is due in between.
+        """Run events of this sorted list, each at its instant, until something else is due.
 
-        For whoever has many events, and keeps them in order himself: a turn of the loop for each would cost more than
-        the event. What is over is now. After some events, the loop has its turn all the same.
+        For code with many events, such as the CAN bus: an iteration of the loop for each would cost more than the event
+        itself. An event in the past runs now. After 1000 events the loop continues, also if nothing else is due.
         """
         ready, clock = self._ready, self.clock
         self._limit = 0 if self._jobs else self._next_timer()
@@ -188,7 +187,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._jobs -= 1
 
     def _turn(self) -> None:
-        """There is more to do at this instant. Who never waits takes time, too: in the end the next timer comes."""
+        """Count an iteration of the loop at this instant; after too many, jump to the next timer nevertheless."""
         if self._instant != self.clock.elapsed:
             self._instant, self._turns = self.clock.elapsed, 0
         self._turns += 1
@@ -198,7 +197,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
                 self.clock.move_to(max(self.clock.elapsed, _nanoseconds(when)))
 
     def _idle(self) -> bool:
-        """Nothing is left to do at this instant: go on to the next timer, or say True: wait for a job in a thread."""
+        """Jump to the next timer: nothing is left to do at this instant. True: wait for a job in a thread instead."""
         if self._jobs:
             return True
         timer = self._scheduled[0] if self._scheduled else None
@@ -207,41 +206,43 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         instant = _nanoseconds(timer.when())
         background = getattr(timer, "background", False)
         if background is False or (background is not True and not background()):
-            self._looked, self._waited_for = instant, None
-        elif instant - self._looked >= _LOOK:
-            self._look_for_life(instant)
+            self._checked, self._waited_for = instant, None
+        elif instant - self._checked >= _IDLE_CHECK:
+            self._check_progress(instant)
         self.clock.move_to(instant)
         return False
 
     def _give_up(self, later: bool) -> NoReturn:
         if not later:
-            raise Deadlock(self._who_waits("virtual time stands still: nothing is scheduled that could wake a task"))
+            raise Deadlock(self._with_tasks("virtual time stands still: nothing is scheduled that could wake a task"))
         if self._end == _HORIZON:
-            raise Deadlock(self._who_waits("virtual time is over: the next timer is more than 48 days after the start"))
+            raise Deadlock(
+                self._with_tasks("virtual time is over: the next timer is more than 48 days after the start")
+            )
         text = f"virtual time is over: its limit of {self._end:g} s is reached"
-        self._end = min(self._end + _MOST_PATIENCE / _SECOND, _HORIZON)  # for clean-up
-        raise Deadlock(self._who_waits(text))
+        self._end = min(self._end + _IDLE_MAX / _SECOND, _HORIZON)  # for clean-up
+        raise Deadlock(self._with_tasks(text))
 
-    def _look_for_life(self, instant: int) -> None:
-        """Only what repeats itself has come for a while. Raise Deadlock if that has woken no task for long."""
+    def _check_progress(self, instant: int) -> None:
+        """Raise Deadlock if background timers, which alone have run for a while, have woken no task for too long."""
         before, waits = self._waited_for, {task: _future_of(task) for task in asyncio.all_tasks(self)}
-        self._looked, self._waited_for = instant, waits
+        self._checked, self._waited_for = instant, waits
         if before is None or not _same(before, waits) or not all(_in_background(timer) for timer in self._scheduled):
             self._alive, self._alive_really = instant, _REAL.monotonic()
-        elif instant - self._alive >= _MOST_PATIENCE or (
-            instant - self._alive >= _PATIENCE and _REAL.monotonic() - self._alive_really >= _REAL_PATIENCE
+        elif instant - self._alive >= _IDLE_MAX or (
+            instant - self._alive >= _IDLE_MIN and _REAL.monotonic() - self._alive_really >= _IDLE_REAL_MIN
         ):
             repeated = "only announcements and the like go on, and wake no task"
-            raise Deadlock(self._who_waits(f"virtual time leads nowhere: {repeated}"))
+            raise Deadlock(self._with_tasks(f"virtual time leads nowhere: {repeated}"))
 
-    def _who_waits(self, why: str) -> str:
+    def _with_tasks(self, why: str) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=hash)
         waiting = [(task.get_name(), _where(task.get_coro())) for task in tasks]
         return "\n".join([why, *(f"  {name}: {place}" for name, place in waiting if not name.endswith(" guard"))])
 
 
 def _future_of(task: asyncio.Task[Any]) -> object:
-    """What the task waits for: another one each time that it has been woken."""
+    """Return what the task waits for: a different object each time it has been woken."""
     return task._fut_waiter  # type: ignore[attr-defined]  # noqa: SLF001 - asyncio's own
 
 
@@ -250,44 +251,45 @@ def _same(before: dict[asyncio.Task[Any], object], now: dict[asyncio.Task[Any], 
 
 
 def _in_background(timer: asyncio.TimerHandle) -> bool:
-    """Whether it only repeats itself, or is cancelled."""
+    """Return whether a timer only repeats itself, or is cancelled."""
     background = getattr(timer, "background", False)
     return bool(background() if callable(background) else background)
 
 
 class _Selector(selectors.DefaultSelector):
-    """Never waits while virtual time can go on instead."""
+    """A selector that does not wait while virtual time can go on instead."""
 
     def __init__(self, idle: Callable[[], bool], turn: Callable[[], None]) -> None:
         super().__init__()
         self._idle = idle
         self._turn = turn
-        self._looked = itertools.count()
+        self._selects = itertools.count()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        if len(self.get_map()) > 1 or not next(self._looked) % _OFTEN:  # asyncio's own descriptor is the first one
+        # A system call for each iteration would take most of the time; alone, asyncio's own descriptor can wait.
+        if len(self.get_map()) > 1 or not next(self._selects) % _POLL_EVERY:
             events = super().select(0)
             if events:
                 self._turn()
                 return events
-        if timeout == 0:  # what asyncio says when callbacks are ready
+        if timeout == 0:  # callbacks are ready
             self._turn()
             return []
         return super().select(None) if self._idle() else []
 
 
 class _VirtualTimer(asyncio.TimerHandle):
-    """A timer that has its place behind those set earlier for the same instant: a heap alone forgets that."""
+    """A timer that keeps its place behind earlier ones of the same instant: a heap alone does not."""
 
     def __init__(self, when: float, number: int, callback: Any, args: Any, loop: VirtualLoop, context: Any) -> None:
         super().__init__(when, callback, args, loop, context)
         self.order = (when, number)
         self.background: bool | Callable[[], bool] = False
         """Set by `r2p.clock.in_background`."""
-        self._scheduled = True  # how asyncio marks what is in its heap
+        self._scheduled = True  # asyncio's mark for timers in its heap
 
     def cancel(self) -> None:
-        """As in asyncio: it stays in the heap, and holds nothing there."""
+        """Do as asyncio: a cancelled timer stays in the heap, but does not keep the program alive."""
         super().cancel()
         self.background = True
 
@@ -311,7 +313,7 @@ class _Task(asyncio.Task[Any]):
         return self._number
 
     def set_name(self, value: object) -> None:
-        """As in asyncio; Python 3.13.0 calls it with None for a task without a name."""
+        """Do as asyncio; Python 3.13.0 calls this with None for a task without a name."""
         if value is not None:
             super().set_name(value)
 
@@ -322,14 +324,14 @@ class _Task(asyncio.Task[Any]):
 
 
 def _nanoseconds(seconds: float) -> int:
-    whole = int(seconds)  # apart from the fraction: which is exact, and small enough to be multiplied
+    whole = int(seconds)  # separate from the fraction, which is exact, and small enough to be multiplied
     return whole * _SECOND + round((seconds - whole) * _SECOND)
 
 
 def _where(awaitable: object) -> str:
-    """The chain of calls in which a task waits, outermost first, and for which topic.
+    """Return the chain of calls in which a task waits, outermost first, and the topic it waits for.
 
-    Such as `blink (app.py:12) > Subscriber.fetch (subscriber.py:166), topic leds`.
+    For example `blink (app.py:12) > Subscriber.fetch (subscriber.py:166), topic leds`.
     """
     steps: list[str] = []
     topic: object = ""

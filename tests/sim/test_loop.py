@@ -291,7 +291,7 @@ def test_what_is_going_to_happen_some_day_is_waited_for(monkeypatch: pytest.Monk
                 await module.nodes["idle"].node.subscribe("b", Led, timeout=60).fetch()
             await asyncio.sleep(60)
 
-    monkeypatch.setattr("r2p.sim.loop._MOST_PATIENCE", 20 * SECOND)
+    monkeypatch.setattr("r2p.sim.loop._IDLE_MAX", 20 * SECOND)
     run(main)
 
 

@@ -1,16 +1,17 @@
-"""Emulated R2P modules: peers that behave as those of a robot do, without a board.
+"""Emulated R2P modules: peers that behave like those of a robot, without a board.
 
     imu = FirmwareModule("IMU1", publishers=[Publishes("leds", Led, period=0.5, fill=blink)])
     async with Powered(imu) as power:
         async with r2p.Module("PC1", via=power.wire()) as module:
             ...
 
-`FirmwareModule` is a module with the firmware of 2014, bytes in and bytes out, with time as an argument. `Powered` runs
-it in an event loop, and connects it: by a `wire` inside the process, which virtual time can follow, by TCP, or by a
-pseudo terminal that stands in for a serial port.
+`firmware` has `FirmwareModule`, a module with the firmware of 2014: bytes in and bytes out, with time as an argument.
+`power` has `Powered`, which runs it in an event loop and connects it: by a `wire` inside the process, which works under
+virtual time, by TCP, or by a pseudo terminal in place of a serial port.
 
-The hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...) are `r2p.Module`s with nodes around a model
-of `r2p.sim.physics`, on any transport; a `Plant` moves the models on. `r2p.sim.robots` makes robots of them.
+`boards` and `imu` have the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s with
+nodes around a model of `r2p.sim.physics`, on any transport. `Plant` advances the models. `r2p.sim.robots` assembles
+modules to robots.
 """
 
 from r2p.sim.modules.boards import Board, GatewayModule, IoModule, MotorModule, PowerModule, ProximityModule

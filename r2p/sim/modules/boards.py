@@ -1,7 +1,7 @@
-"""What the emulated hardware modules share: each is an `r2p.Module` that starts its nodes by itself when it is opened.
+"""The hardware modules of the thesis (chapter 7), emulated: motor, proximity, input/output, power supply and gateway.
 
-The nodes are ordinary ones, around a model of `r2p.sim.physics`; so a board runs on any transport, and can't be told
-from a real one by its messages.
+Each is a `Board`, an `r2p.Module` that starts its nodes by itself when it is opened. The nodes are ordinary ones around
+a model of `r2p.sim.physics`, so a board runs on any transport, and sends the same messages as a real one.
 """
 
 import functools
@@ -21,10 +21,17 @@ from r2p.sim.physics.world import RangeFinder, RangeSpec
 from r2p.transports.link import Transport
 
 Via = str | Transport | Iterable[str | Transport] | None
+Look = Callable[[int], float]
+"""Returns the distance in mm to what sensor 0 to 3 sees, or infinity."""
+
+_ADC = 4095  # counts of 12 bits
+_REFERENCE = 3.3  # V
+_VOLTAGE_COUNT = 36_000 / _ADC  # mV per count: a divider turns 36 V into 3.3 V
+_CURRENT_COUNT = 50_000 / _ADC  # mA per count
 
 
 class Board(r2p.Module):
-    """A hardware module. `nodes`: its node functions by name; more can be started once it is open, as on any module."""
+    """A hardware module with its node functions by name; more can be started once it is open, as on any module."""
 
     def __init__(
         self,
@@ -39,18 +46,15 @@ class Board(r2p.Module):
         self._programs = dict(nodes or {})
 
     async def __aenter__(self) -> Self:
-        """Power on. Raises as `r2p.Module` does."""
+        """Open the module and start its nodes. Raises as `r2p.Module` does."""
         await super().__aenter__()
         for name, function in self._programs.items():
             self.start(function, name=name)
         return self
 
 
-# The DC motor controller module (thesis 7.3): subscribes `setpoint`, publishes `encoder` and `current`.
-
-
 class Setpoints(msgspec.Struct, frozen=True):
-    """Where setpoints come from: a topic, its type, and what a message means in ticks or ticks/s."""
+    """The source of setpoints: a topic, its type, and how to convert a message to ticks or ticks/s."""
 
     topic: str = "setpoint"
     message: type[r2p.Message] = Setpoint
@@ -58,7 +62,7 @@ class Setpoints(msgspec.Struct, frozen=True):
 
 
 class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """The node's configuration, as the firmware keeps it in its flash memory."""
+    """The configuration of the motor module, which firmware has in its flash memory."""
 
     setpoints: Setpoints = Setpoints()
     timeout: float = 0.2
@@ -74,7 +78,7 @@ class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
 
 
 async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
-    """Control the motor."""
+    """Control the motor: the node of the DC motor controller module."""
 
     def command(message: r2p.Message) -> None:
         drive.setpoint = config.setpoints.ticks(message)
@@ -94,14 +98,17 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
 
 
 async def monitor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
-    """Tell the motor's current."""
+    """Publish the motor's current."""
     current = node.advertise(config.current, Float32)
     async for _ in node.every(config.current_period):
         await current.publish(Float32(data=drive.motor.current))
 
 
 class MotorModule(Board):
-    """The module. `drive` is its hardware: whoever made it moves it on, in a `Plant`."""
+    """The DC motor controller module (thesis 7.3): subscribes `setpoint`, publishes `encoder` and `current`.
+
+    `drive` is its hardware, which the caller steps in a `Plant`.
+    """
 
     def __init__(
         self,
@@ -121,22 +128,15 @@ class MotorModule(Board):
         super().__init__(name, via=via, remap=remap, nodes=nodes)
 
 
-# The proximity module (thesis 7.5): four range finders, published in millimetres on `proximity`.
-
-
-Look = Callable[[int], float]
-"""What is before sensor 0 to 3: its distance in mm, or infinity."""
-
-
 class RangeArray:
-    """Four sensors of one kind, and their inputs of the A/D converter."""
+    """Four sensors of the same kind, and their inputs of the A/D converter."""
 
     def __init__(self, look: Look, noise: random.Random, spec: RangeSpec | None = None) -> None:
         self._look = look
         self._sensors = [RangeFinder(spec or RangeSpec(), noise) for _ in range(4)]
 
     def read(self) -> Proximity:
-        """All four, corrected, in mm."""
+        """Read all four, corrected, in mm."""
         one, two, three, four = (
             sensor.millimetres(sensor.read(self._look(number))) for number, sensor in enumerate(self._sensors)
         )
@@ -144,14 +144,14 @@ class RangeArray:
 
 
 async def proximity(node: r2p.Node, sensors: RangeArray, topic: str, period: float) -> None:
-    """Publish what the sensors see: event-triggered, for the most important thing is to react to it at once."""
+    """Publish what the sensors see: event-triggered, because an obstacle needs an immediate reaction."""
     ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=0.02))
     async for _ in node.every(period):
         await ranges.publish(sensors.read())
 
 
 class ProximityModule(Board):
-    """The module. `look(number)` says how far away what sensor 0 to 3 sees is, in mm."""
+    """The proximity module (thesis 7.5): four range finders, published in millimetres on `proximity`."""
 
     def __init__(
         self,
@@ -171,15 +171,8 @@ class ProximityModule(Board):
         super().__init__(name, via=via, remap=remap, nodes={"prox": node})
 
 
-# The input/output module (thesis 7.6): 16 digital and 8 analog inputs, 2 analog outputs, and no node by default.
-
-
-_ADC = 4095  # counts of 12 bits
-_REFERENCE = 3.3  # V
-
-
 class Pins:
-    """The module's connectors; what is plugged into them sets the inputs and sees the outputs."""
+    """The module's connectors: external hardware sets the inputs and reads the outputs."""
 
     def __init__(self) -> None:
         self.digital = [False] * 16
@@ -195,16 +188,16 @@ class Pins:
         return one, two
 
     def read(self, channel: int) -> int:
-        """Counts of the A/D converter, 12 bits for 3.3 V."""
+        """Return the counts of the A/D converter, 12 bits for 3.3 V."""
         return max(0, min(_ADC, round(self.inputs[channel] / _REFERENCE * _ADC)))
 
     def write(self, channel: int, counts: int) -> None:
-        """Set the D/A converter, 12 bits for 3.3 V."""
+        """Set the counts of the D/A converter, 12 bits for 3.3 V."""
         self._outputs[channel] = max(0, min(_ADC, counts))
 
 
 async def leds(node: r2p.Node, pins: Pins) -> None:
-    """Switch the digital outputs as messages on `leds` say."""
+    """Switch the digital outputs as commanded on `leds`."""
 
     def switch(led: Led) -> None:
         if led.led < len(pins.digital):
@@ -216,14 +209,17 @@ async def leds(node: r2p.Node, pins: Pins) -> None:
 
 
 async def sample(node: r2p.Node, pins: Pins, channel: int = 0, topic: str = "analog", period: float = 0.1) -> None:
-    """Publish the voltage at an analog input, each `period` seconds."""
+    """Publish the voltage at an analog input every `period` seconds."""
     voltages = node.advertise(topic, Float32)
     async for _ in node.every(period):
         await voltages.publish(Float32(data=pins.read(channel) * _REFERENCE / _ADC))
 
 
 class IoModule(Board):
-    """The module. `nodes`: functions of `(node, pins)` by name."""
+    """The input/output module (thesis 7.6): 16 digital inputs and outputs, 8 analog inputs, 2 analog outputs.
+
+    `nodes`: functions of `(node, pins)` by name; by default it has none.
+    """
 
     def __init__(
         self,
@@ -239,15 +235,8 @@ class IoModule(Board):
         super().__init__(name, via=via, remap=remap, nodes=programs)
 
 
-# The power supply module (thesis 7.2): measures voltage and current of the battery, and publishes `battery`.
-
-
-_VOLTAGE_COUNT = 36_000 / 4095  # mV for each count of the A/D converter: the divider makes 3.3 V of 36 V
-_CURRENT_COUNT = 50_000 / 4095  # mA
-
-
 def measured(battery: Battery) -> BatteryMessage:
-    """What the A/D converter sees of it, with a resolution of 9 mV and 12 mA; its charge is not calibrated."""
+    """Return what the A/D converter measures, with a resolution of 9 mV and 12 mA; the charge is not calibrated."""
     return BatteryMessage(
         voltage=round(round(battery.voltage * 1000 / _VOLTAGE_COUNT) * _VOLTAGE_COUNT),
         current=max(-32768, min(32767, round(round(battery.current * 1000 / _CURRENT_COUNT) * _CURRENT_COUNT))),
@@ -264,7 +253,10 @@ async def power(node: r2p.Node, battery: Battery, topic: str, period: float) -> 
 
 
 class PowerModule(Board):
-    """The module. `battery` is what it is connected to: whoever made it moves it on, in a `Plant`."""
+    """The power supply module (thesis 7.2): measures voltage and current of the battery, and publishes `battery`.
+
+    The caller steps `battery` in a `Plant`.
+    """
 
     def __init__(
         self,
@@ -282,11 +274,11 @@ class PowerModule(Board):
         super().__init__(name, via=via, remap=remap, nodes={"power": node})
 
 
-# The gateway module (thesis 7.7): joins the robot's bus to the computers outside, by TCP, serial line or zenoh.
-
-
 class GatewayModule(Board):
-    """The module. `outside`: where computers connect; without any it is a module like others."""
+    """The gateway module (thesis 7.7): joins the robot's bus to computers by TCP, serial line or zenoh.
+
+    `outside`: the links for computers; without any it is an ordinary module.
+    """
 
     def __init__(
         self,
@@ -296,6 +288,6 @@ class GatewayModule(Board):
         outside: Iterable[str | Transport] = (),
         options: BridgeOptions | None = None,
     ) -> None:
-        """Raises as `r2p.Module` does; `options`: what it lets through, by default everything but commands."""
+        """`options`: what it forwards, by default everything but commands. Raises as `r2p.Module` does."""
         links = [via, *outside]
         super().__init__(name, via=links, bridge=False if len(links) == 1 else options or True)

@@ -1,12 +1,12 @@
-"""A module with the firmware of 2014, as its debug line shows it (PROTOCOL.md 3 and 4): bytes in, bytes out.
+"""A module with the firmware of 2014, as seen on its debug line (PROTOCOL.md 3 and 4): bytes in, bytes out.
 
-It says what the recorded firmware says, in the same order: the boot marker, ALIVE, the announcements of its nodes half
-a second later, then one step of repetition each half second; it has no r2p extensions. Three things are not firmware's:
-a line with a wrong checksum is dropped and counted (firmware does not look), bad lines do it no lasting harm, and in
-boot mode there is no loader.
+It sends what the recorded firmware sends, in the same order: the boot marker, ALIVE, the announcements of its nodes
+half a second later, then one step of repetition each half second. It has no r2p extensions. Three things differ from
+firmware: a line with a wrong checksum is dropped and counted (firmware does not check it), invalid lines do no lasting
+harm, and there is no loader in boot mode.
 
-It breaks where firmware breaks, and `fault` says why: at a SUBSCRIBE_REQUEST of queue length 0, of a queue that its
-heap can't hold, or of size 0 (as gateways of firmware do; the others do not look at the size), and at STOP in boot
+It fails where firmware fails, and `fault` says why: at a SUBSCRIBE_REQUEST with queue length 0, with a queue that does
+not fit its heap, or with size 0 (as gateways of firmware do; other firmware ignores the size), and at STOP in boot
 mode. It drops data that follow a SUBSCRIBE_RESPONSE within 50 ms.
 """
 
@@ -22,20 +22,21 @@ from r2p.errors import DecodeError, Error
 from r2p.messages import Layout, Message, layout
 from r2p.names import MANAGEMENT, module_name, topic_name
 
+# All durations in ns, as measured in recordings of the firmware.
 _MS = 1_000_000
 _SECOND = 1_000_000_000
 _BOOT = 10 * _MS  # from REBOOT to the boot marker
 _NODES = 500 * _MS  # from the boot marker to the nodes' first announcements
-_FIRST_STEP = 496 * _MS  # after power on
-_STEP = 528 * _MS  # on a silent line
-_STEP_AFTER_TRAFFIC = 500 * _MS
-_QUIET = 33 * _MS
+_FIRST_STEP = 496 * _MS  # from power on to the first step of repetition
+_STEP = 528 * _MS  # between two steps on a silent line
+_STEP_AFTER_TRAFFIC = 500 * _MS  # ... and if a management message came in between
+_QUIET = 33 * _MS  # without management messages before a step
 _MARKER = b"\r\n\r\n"
-_NO_DEADLINE = 0x7FFFFFFF
-_SLUGGISH = 50 * _MS  # what the thread of management takes, which has the lowest priority
+_NO_DEADLINE = 0x7FFFFFFF  # us: what firmware puts into a line for "no deadline"
+_RESPONSE_DELAY = 50 * _MS  # until a response takes effect: its management thread has the lowest priority
 
 HEAP = 20_000
-"""Bytes of RAM in which a module keeps its queues."""
+"""Bytes of RAM for the queues of a module."""
 
 Answer = Iterable[tuple[str, Message]]
 
@@ -43,8 +44,8 @@ Answer = Iterable[tuple[str, Message]]
 class Publishes(msgspec.Struct, frozen=True):
     """A publisher of an emulated module.
 
-    Every `period` seconds, while somebody subscribes, it publishes what `fill(time)` gives, None for nothing; `time` is
-    in ns since the module started. Without a period it publishes only what its module is told to.
+    Every `period` seconds, while there is a subscriber, it publishes what `fill(time)` returns, None for nothing;
+    `time` is in ns since the module started. Without a period it publishes only with `FirmwareModule.publish`.
     """
 
     topic: str
@@ -54,7 +55,7 @@ class Publishes(msgspec.Struct, frozen=True):
 
 
 class Subscribes(msgspec.Struct, frozen=True):
-    """A subscriber of an emulated module. `answer(message)` gives what is published in return, as (topic, message)."""
+    """A subscriber of an emulated module. `answer(message)` returns what to publish in return: (topic, message)."""
 
     topic: str
     type: type[Message]
@@ -63,7 +64,7 @@ class Subscribes(msgspec.Struct, frozen=True):
 
 
 class FirmwareModule:
-    """An emulated module. All times are monotonic ns; each method that returns bytes returns what it sends.
+    """An emulated module. All times are monotonic ns; methods return the bytes that it sends.
 
     Raises InvalidName or NameTooLong, and MessageError for a type without a layout.
     """
@@ -78,16 +79,16 @@ class FirmwareModule:
         heap: int = HEAP,
         behind_gateway: bool = False,
     ) -> None:
-        """`heap`: bytes for queues. `behind_gateway`: one of firmware, which lets data in after a second response."""
+        """`heap`: bytes for queues. `behind_gateway`: behind firmware's gateway, data needs a second response."""
         self.name = module_name(name)
         self.flags = 0
-        """As in its ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
+        """The flags of its ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
         self.fault = ""
-        """What has broken it, in words; only power helps."""
+        """Why it has failed; only `power_on` helps."""
         self.heap = 0
-        """Bytes that are still free for queues."""
+        """Bytes that are free for queues."""
         self.sent: Counter[str] = Counter()
-        """Messages by topic, since it was made."""
+        """Messages by topic, since the object was made."""
         self.received: Counter[str] = Counter()
         self.last: dict[str, Message] = {}
         """The last message received on each topic."""
@@ -97,8 +98,8 @@ class FirmwareModule:
         self._subscribers = {topic_name(each.topic): _FirmwareSubscriber(each) for each in subscribers}
         self._repeats = repeats
         self._memory = heap
-        self._rounds = 2 if behind_gateway else 1
-        self._hung = False  # its management
+        self._responses_needed = 2 if behind_gateway else 1
+        self._management_hangs = False  # its management
         self._reader = debug.Reader(self.drops)
         self._out: list[bytes] = []
         self._booted = 0
@@ -107,41 +108,41 @@ class FirmwareModule:
         self._step_at: int | None = None
         self._stepped = 0
         self._steps: list[bytes | None] = []
-        self._heard = 0  # the last management message
+        self._last_management = 0  # the last management message
         self._running = False  # its nodes
 
     @property
     def halted(self) -> bool:
-        """Whether it does nothing any more; see `fault`. After a STOP in boot mode only its management hangs."""
-        return bool(self.fault) and not self._hung
+        """Whether it has failed altogether, see `fault`. After a STOP in boot mode only its management hangs."""
+        return bool(self.fault) and not self._management_hangs
 
     # Input
 
     def power_on(self, now: int, *, boot_mode: bool = False) -> bytes:
-        """Start, or start again after a cut of its power."""
+        """Start, or restart after a power cut."""
         self.fault = ""
-        self._hung = False
+        self._management_hangs = False
         self._boot(now, FLAG_BOOT if boot_mode else 0, _FIRST_STEP)
-        return self._take()
+        return self._drain()
 
     def receive(self, now: int, data: bytes) -> bytes:
-        """Bytes came in by its line."""
-        return b"".join([self.take(now, line) for line in self._reader.feed(data)])
+        """Receive bytes from its line."""
+        return b"".join([self.receive_line(now, line) for line in self._reader.feed(data)])
 
-    def take(self, now: int, line: debug.Line) -> bytes:
-        """A line came in; for a module with several lines, each with a `debug.Reader` of its own."""
+    def receive_line(self, now: int, line: debug.Line) -> bytes:
+        """Receive a decoded line; for a module with several lines, each with a `debug.Reader` of its own."""
         if self.halted or self._boot_at is not None:
             return b""
         topic = line.topic.decode()
         if topic == MANAGEMENT:
-            if not self._hung:
+            if not self._management_hangs:
                 self._manage(now, line.data)
         else:
             self._deliver(now, topic, line.data)
-        return self._take()
+        return self._drain()
 
     def poll(self, now: int) -> bytes:
-        """Time has passed: call it at `next_deadline()`."""
+        """Do what is due: call it at `next_deadline()`."""
         if self._boot_at is not None and now >= self._boot_at:
             self._boot(self._boot_at, self.flags, _STEP)
         if self._nodes_at is not None and now >= self._nodes_at:
@@ -153,10 +154,10 @@ class FirmwareModule:
                 message = publisher.filled(now, self._booted)
                 if message is not None:
                     self._publish(now, publisher, message)
-        return self._take()
+        return self._drain()
 
     def next_deadline(self) -> int | None:
-        """When it wants to be polled."""
+        """Return when to call `poll`."""
         if self.halted:
             return None
         if self._boot_at is not None:
@@ -165,13 +166,13 @@ class FirmwareModule:
         return min((time for time in times if time is not None), default=None)
 
     def publish(self, now: int, topic: str, message: Message) -> bytes:
-        """Publish a message, if somebody subscribes. Raises Error if that is no topic of its publishers."""
+        """Publish a message, if there is a subscriber. Raises Error if it has no publisher of this topic."""
         publisher = self._publishers.get(topic)
         if publisher is None:
             raise Error(f"module {self.name} has no publisher of {topic}: give it one (publishers=[Publishes(...)])")
         if self._running and not self.halted:
             self._publish(now, publisher, message)
-        return self._take()
+        return self._drain()
 
     # Life
 
@@ -190,7 +191,7 @@ class FirmwareModule:
             subscriber.opened_at = None
             subscriber.responses = 0
         self._out.append(_MARKER)
-        self._say(now, management.Alive(self.name, flags))
+        self._send(now, management.Alive(self.name, flags))
         self._nodes_at = now + _NODES
         self._stepped = now
         self._step_at = now + first_step if self._repeats else None
@@ -201,15 +202,15 @@ class FirmwareModule:
         self._running = True
         for publisher in self._publishers.values():
             publisher.start(now)
-            self._say(now, publisher.advertisement)
+            self._send(now, publisher.advertisement)
         for subscriber in self._subscribers.values():
-            self._say(now, subscriber.request)
+            self._send(now, subscriber.request)
 
     def _stop(self, now: int) -> None:
-        """The nodes end; of the round of repetition, what the node at hand has is still said."""
+        """Stop the nodes; of the round of repetition, what belongs to the current node is still sent."""
         if self.flags & FLAG_BOOT:
             self.fault = "STOP in boot mode: its management hangs"
-            self._hung = True
+            self._management_hangs = True
             self._step_at = self._nodes_at = None
             return
         self._end_nodes()
@@ -230,20 +231,20 @@ class FirmwareModule:
         self._boot_at = now + _BOOT
 
     def _step(self, now: int) -> None:
-        """One step of repetition: ALIVE, then node by node what it has, and nothing between two nodes."""
-        if now < self._heard + _QUIET:
-            self._step_at = self._heard + _QUIET
+        """Do one step of repetition: ALIVE, then what each node has, with an empty step between two nodes."""
+        if now < self._last_management + _QUIET:
+            self._step_at = self._last_management + _QUIET
             return
         self._stepped = now
         self._step_at = now + _STEP
         if not self._steps:
             self._steps = self._round()
-            self._say(now, management.Alive(self.name, self.flags))
+            self._send(now, management.Alive(self.name, self.flags))
         elif (message := self._steps.pop()) is not None:
-            self._say_raw(now, message)
+            self._send_raw(now, message)
 
     def _round(self) -> list[bytes | None]:
-        """What comes between two ALIVE, the last step first; each publisher and subscriber is a node of its own."""
+        """Return the steps between two ALIVE, last first; each publisher and subscriber counts as a node."""
         if not self._running:
             return []
         messages: list[management.Management] = [each.advertisement for each in self._publishers.values()]
@@ -253,7 +254,7 @@ class FirmwareModule:
     # Management
 
     def _manage(self, now: int, data: bytes) -> None:
-        self._heard = now
+        self._last_management = now
         if self._step_at is not None:
             self._step_at = min(self._step_at, self._stepped + _STEP_AFTER_TRAFFIC)
         try:
@@ -280,15 +281,15 @@ class FirmwareModule:
     def _advertised(self, now: int, topic: str) -> None:
         subscriber = self._subscribers.get(topic)
         if subscriber is not None and self._running:
-            self._say(now, subscriber.request)
+            self._send(now, subscriber.request)
 
     def _opened(self, now: int, subscriber: "_FirmwareSubscriber") -> None:
-        """A publisher's data may come in, once the response has been seen to."""
+        """Accept data of a publisher, from when on the response takes effect."""
         subscriber.responses += 1
         if not self._running:
             subscriber.opened_at = None
-        elif subscriber.opened_at is None and subscriber.responses >= self._rounds:
-            subscriber.opened_at = now + _SLUGGISH
+        elif subscriber.opened_at is None and subscriber.responses >= self._responses_needed:
+            subscriber.opened_at = now + _RESPONSE_DELAY
 
     def _requested(self, now: int, message: management.SubscribeRequest) -> None:
         if not message.size:
@@ -300,10 +301,10 @@ class FirmwareModule:
         if not publisher.joined and not self._allocate(publisher, message):
             return
         publisher.joined = True
-        self._say(now, management.SubscribeResponse(message.topic, publisher.layout.size))
+        self._send(now, management.SubscribeResponse(message.topic, publisher.layout.size))
 
     def _allocate(self, publisher: "_FirmwarePublisher", message: management.SubscribeRequest) -> bool:
-        """The queue of a remote subscriber; False if that is the end."""
+        """Allocate the queue of a remote subscriber. False: the module has failed."""
         if not message.queue:
             self.fault = f"SUBSCRIBE_REQUEST of {message.topic} with queue length 0: an assertion fails"
             return False
@@ -323,12 +324,12 @@ class FirmwareModule:
         elif len(data) != subscriber.layout.size:
             self.drops["wrong size"] += 1
         else:
-            self._hand_over(now, subscriber, data)
+            self._receive_message(now, subscriber, data)
 
-    def _hand_over(self, now: int, subscriber: "_FirmwareSubscriber", data: bytes) -> None:
+    def _receive_message(self, now: int, subscriber: "_FirmwareSubscriber", data: bytes) -> None:
         try:
             message = subscriber.layout.decode(data)
-        except DecodeError:  # a text that is none: firmware has no such types
+        except DecodeError:  # an invalid text: firmware has no such types
             self.drops["undecodable"] += 1
             return
         topic = subscriber.request.topic
@@ -345,16 +346,16 @@ class FirmwareModule:
 
     # Output
 
-    def _say(self, now: int, message: management.Management) -> None:
-        self._say_raw(now, management.encode(message))
+    def _send(self, now: int, message: management.Management) -> None:
+        self._send_raw(now, management.encode(message))
 
-    def _say_raw(self, now: int, message: bytes) -> None:
+    def _send_raw(self, now: int, message: bytes) -> None:
         self._out.append(debug.encode(MANAGEMENT.encode(), message, self._deadline(now)))
 
     def _deadline(self, now: int) -> int:
         return (now - self._booted) // 1000 + _NO_DEADLINE
 
-    def _take(self) -> bytes:
+    def _drain(self) -> bytes:
         data = b"".join(self._out)
         self._out.clear()
         return data
@@ -379,7 +380,7 @@ class _FirmwarePublisher:
         return self.next is not None and now >= self.next
 
     def filled(self, now: int, booted: int) -> Message | None:
-        """This period's message. Sets when the next one is due; those that were missed are skipped."""
+        """Return the message of this period, and schedule the next one; missed periods are skipped."""
         if self.next is None or self._period is None or self._fill is None:
             return None
         self.next += ((now - self.next) // self._period + 1) * self._period
@@ -401,5 +402,5 @@ class _FirmwareSubscriber:
 
 
 def _bytes(size: int, queue: int) -> int:
-    """What a queue takes of the heap."""
+    """Return the heap that a queue uses."""
     return queue * (size + management.QUEUE_ENTRY)

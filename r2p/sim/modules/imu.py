@@ -1,6 +1,6 @@
-"""The inertial measurement unit (thesis 7.4): `imu`, `imu_raw`, `tilt` and `pressure`.
+"""The inertial measurement unit (thesis 7.4): publishes `imu`, `imu_raw`, `tilt` and `pressure`.
 
-The sensors give counts at their own rates; a complementary filter makes roll, pitch, yaw and their rates of them.
+The sensors return counts at their own rates; a complementary filter computes roll, pitch, yaw and their rates.
 """
 
 import asyncio
@@ -33,20 +33,20 @@ _BARO = 0.04  # seconds: the barometer makes 25 measurements a second
 
 
 class Motion(msgspec.Struct, frozen=True):
-    """The truth that the sensors measure, in the frame of the module (x forward, y to the left, z up)."""
+    """The true values that the sensors measure, in the frame of the module (x forward, y to the left, z up)."""
 
     force: Vector = (0.0, 0.0, GRAVITY)
-    """Acceleration without gravity's, so upwards at rest, m/s^2."""
+    """Specific force (acceleration minus gravity), upwards at rest, m/s^2."""
     rates: Vector = (0.0, 0.0, 0.0)
     """rad/s."""
     field: Vector = (220.0, 0.0, -400.0)
-    """Of the earth, mgauss; north is where x points."""
+    """Magnetic field, mgauss; by default x points north."""
     altitude: float = 120.0
     """m."""
 
 
 class InertialUnit:
-    """The sensors and the filter. Its part of a `Plant` is itself."""
+    """The sensors and the filter; it is a part of a `Plant`."""
 
     def __init__(self, motion: Callable[[], Motion], noise: random.Random) -> None:
         self.attitude = ComplementaryFilter()
@@ -57,7 +57,7 @@ class InertialUnit:
         self._barometer = Barometer(noise)
 
     def step(self, dt: float) -> None:
-        """Move on by `dt` seconds; the filter does so at each sample of the gyroscope."""
+        """Advance by `dt` seconds; the filter advances at each sample of the gyroscope."""
         motion = self._motion()
         fx, fy, fz = motion.force
         gx, gy, gz = motion.rates
@@ -67,21 +67,21 @@ class InertialUnit:
             self.attitude.step(self._rates(), self._acc.values, self._mag.values, 1 / GYROSCOPE.rate)
 
     def imu(self) -> IMU:
-        """Attitude and rates, filtered."""
+        """Return attitude and rates, filtered."""
         roll, pitch, yaw = self.attitude.angles
         x, y, z = (rate - bias for rate, bias in zip(self._rates(), self.attitude.bias, strict=True))
         return IMU(roll=roll, pitch=pitch, yaw=yaw, roll_rate=x, pitch_rate=y, yaw_rate=z)
 
     def raw(self) -> IMURaw9:
-        """The sensors' counts."""
+        """Return the counts of the sensors."""
         return IMURaw9(*self._acc.counts, *self._gyro.counts, *self._mag.counts)
 
     def tilt(self) -> Tilt:
-        """The pitch alone: what a robot that balances on two wheels needs."""
+        """Return the pitch: what a robot that balances on two wheels needs."""
         return Tilt(angle=self.attitude.angles[1])
 
     def pressure(self) -> Pressure:
-        """Air pressure, and the altitude that it means."""
+        """Return the air pressure, and its altitude."""
         pressure = self._barometer.read(self._motion().altitude)
         return Pressure(pressure=pressure, altitude=altitude_at(pressure))
 
@@ -99,7 +99,7 @@ async def publish(
 
 
 class ImuModule(Board):
-    """The module. `motion()` is the truth; `unit` is its hardware: whoever made it moves it on, in a `Plant`."""
+    """The inertial measurement unit. `unit` is its hardware, which the caller steps in a `Plant`."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class ImuModule(Board):
         via: Via = None,
         remap: dict[str, str] | None = None,
     ) -> None:
-        """`period` in seconds of all topics but `pressure`, which comes 25 times a second; `topics`: which of them."""
+        """`period` in seconds, of all topics but `pressure`, which has 25 Hz; `topics`: those to publish."""
         self.unit = unit
         streams: dict[str, tuple[type[r2p.Message], Callable[[], r2p.Message], float]] = {
             "imu": (IMU, unit.imu, period),

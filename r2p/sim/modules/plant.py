@@ -1,4 +1,4 @@
-"""The clock of the physics: moves everything that has a `step(dt)` on, as the event loop's time goes on."""
+"""The clock of the physics: steps everything that has a `step(dt)` with the time of the event loop."""
 
 import asyncio
 from collections.abc import Iterable
@@ -9,24 +9,24 @@ from r2p.clock import Ticker
 
 _SECOND = 1_000_000_000
 _CATCH_UP = 1.0
-"""Seconds of physics that are made up for when the loop was blocked; a computer that slept is not to be punished."""
+"""Seconds of physics to make up for after the loop was blocked; after a long sleep of the computer, more would hang."""
 
 
 class Part(Protocol):
     """Something that changes with time."""
 
     def step(self, dt: float) -> object:
-        """Move on by `dt` seconds."""
+        """Advance by `dt` seconds."""
 
 
 class Plant:
-    """Steps its parts, in their order, every `dt` seconds of the running loop's clock, inside of `async with`."""
+    """Steps its parts in order, every `dt` seconds of the running loop's clock, inside `async with`."""
 
     def __init__(self, parts: Iterable[Part] = (), *, dt: float = 0.001) -> None:
         self.parts = list(parts)
         self.dt = dt
         self.steps = 0
-        """Done so far."""
+        """The number of steps so far."""
         self._ticker: Ticker | None = None
 
     async def __aenter__(self) -> Self:
@@ -41,7 +41,7 @@ class Plant:
             self._ticker.close()
 
     def step(self, count: int = 1) -> None:
-        """So many steps at once."""
+        """Do `count` steps at once."""
         dt, parts = self.dt, self.parts
         for _ in range(count):
             for part in parts:

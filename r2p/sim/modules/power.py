@@ -1,7 +1,7 @@
-"""Running an emulated module: its timer, and the lines that connect it.
+"""Runs an emulated module: its timer, and the lines that connect it.
 
-Everybody on its lines hears all that the module says, as listeners on one serial line do; what each of them says is
-read apart, so that half a line of one does not spoil the other's.
+All peers on its lines receive everything that the module sends, as on one serial line; what each of them sends is read
+separately, so that half a line of one does not corrupt the line of another.
 """
 
 import asyncio
@@ -20,34 +20,34 @@ from r2p.transports.line import Carrier, LineLink
 from r2p.transports.link import Hub, Transport
 
 BUFFER = 64 * 1024
-"""Bytes that wait for a listener that does not read; beyond that it misses what the module says."""
+"""Bytes that are kept for a peer that does not read; beyond that it loses what the module sends."""
 
 _CHUNK = 4096
 
 
-class End(Protocol):
-    """One line's end at the module."""
+class LineEnd(Protocol):
+    """The end of a line at the module."""
 
     @property
     def waiting(self) -> int:
-        """Bytes that were sent and not taken."""
+        """Bytes that the peer has not read."""
 
     def send(self, data: bytes) -> None:
-        """Take what the module says, or lose it."""
+        """Send bytes of the module, or drop them if the peer does not read."""
 
     def close(self) -> None:
-        """Unplug it."""
+        """Close the line."""
 
 
 class Powered:
     """An emulated module under power, for the time of an `async with` block.
 
-    It starts at the beginning of the block; who connects later misses the boot marker, as with a board.
+    It starts at the beginning of the block; a peer that connects later misses the boot marker, as with a board.
     """
 
     def __init__(self, module: FirmwareModule) -> None:
         self.module = module
-        self._ends: set[End] = set()
+        self._ends: set[LineEnd] = set()
         self._servers: list[asyncio.Server] = []
 
     async def __aenter__(self) -> Self:
@@ -73,49 +73,49 @@ class Powered:
     # Lines
 
     async def listen(self, host: str = "127.0.0.1", port: int = 0) -> tuple[str, int]:
-        """Serve the line on TCP, to any number of clients; gives the address (port 0: any free one)."""
+        """Serve the line on TCP to any number of clients, and return the address (port 0: any free one)."""
         server = await self._loop.create_server(lambda: _Client(self), host, port)
         self._servers.append(server)
         bound: tuple[str, int] = server.sockets[0].getsockname()[:2]
         return bound
 
     def open_pty(self) -> str:
-        """Serve the line on a new pseudo terminal; gives its device name. Raises OSError where there are none."""
+        """Serve the line on a new pseudo terminal, and return its device name. Raises OSError where there are none."""
         end = _Pty(self)
         self._ends.add(end)
         return end.device
 
     def wire(self) -> "Wire":
-        """A transport of this process for `Module(via=...)`; works under virtual time."""
+        """Return a transport inside the process for `Module(via=...)`; it works under virtual time."""
         return Wire(self)
 
     # The module
 
     def reset(self, *, boot_mode: bool = False) -> None:
-        """Cut its power for a moment: it starts anew."""
-        self._spread(self.module.power_on(self._clock.monotonic(), boot_mode=boot_mode))
+        """Cut its power for a moment: it restarts."""
+        self._broadcast(self.module.power_on(self._clock.monotonic(), boot_mode=boot_mode))
 
     def publish(self, topic: str, message: Message) -> None:
-        """Let it publish a message; Error if it has no publisher of the topic."""
-        self._spread(self.module.publish(self._clock.monotonic(), topic, message))
+        """Let it publish a message. Raises Error if it has no publisher of the topic."""
+        self._broadcast(self.module.publish(self._clock.monotonic(), topic, message))
 
     # For the ends
 
-    def plugged(self, end: End) -> None:
+    def attach(self, end: LineEnd) -> None:
         self._ends.add(end)
 
-    def unplugged(self, end: End) -> None:
+    def detach(self, end: LineEnd) -> None:
         self._ends.discard(end)
 
-    def heard(self, lines: list[debug.Line]) -> None:
-        """Somebody said this."""
+    def receive(self, lines: list[debug.Line]) -> None:
+        """Receive lines from a peer."""
         now = self._clock.monotonic()
-        self._spread(b"".join([self.module.take(now, line) for line in lines]))
+        self._broadcast(b"".join([self.module.receive_line(now, line) for line in lines]))
 
     def _poll(self) -> None:
-        self._spread(self.module.poll(self._clock.monotonic()))
+        self._broadcast(self.module.poll(self._clock.monotonic()))
 
-    def _spread(self, data: bytes) -> None:
+    def _broadcast(self, data: bytes) -> None:
         if data:
             for end in list(self._ends):
                 end.send(data)
@@ -143,18 +143,18 @@ class _Client(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self._power.plugged(self)
+        self._power.attach(self)
 
     def data_received(self, data: bytes) -> None:
-        self._power.heard(self._reader.feed(data))
+        self._power.receive(self._reader.feed(data))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._power.unplugged(self)
+        self._power.detach(self)
         self.closed.set_result(None)
 
 
 class _Pty:
-    """The master's side of a pseudo terminal; the other side stays open, so users may come and go."""
+    """The master's side of a pseudo terminal; the other side stays open, so that programs can come and go."""
 
     def __init__(self, power: Powered) -> None:
         import tty  # not on Windows
@@ -185,11 +185,11 @@ class _Pty:
         self._loop.remove_writer(self._master)
         os.close(self._master)
         os.close(self._slave)
-        self._power.unplugged(self)
+        self._power.detach(self)
 
     def _read(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            self._power.heard(self._reader.feed(os.read(self._master, _CHUNK)))
+            self._power.receive(self._reader.feed(os.read(self._master, _CHUNK)))
 
     def _write(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -199,7 +199,7 @@ class _Pty:
 
 
 class Wire(Transport, Carrier):
-    """A cable between an emulated module and one `Module` of this process; it can be pulled and plugged in again."""
+    """A cable between an emulated module and one `Module` in this process; it can be pulled and plugged in again."""
 
     def __init__(self, power: Powered) -> None:
         self._power = power
@@ -224,21 +224,21 @@ class Wire(Transport, Carrier):
     def plug_in(self) -> None:
         """Connect; a `Module` that opens it does so by itself. Raises Broken while no module has it open."""
         if self._link is None:
-            raise Broken("this wire has one end only: give it to a Module(via=...) first")
+            raise Broken("this wire has only one end: give it to a Module(via=...) first")
         if not self._plugged:
             self._plugged = True
             self._paused = False
-            self._power.plugged(self._end)
+            self._power.attach(self._end)
             self._link.connected(self)
 
     def pull(self) -> None:
-        """Disconnect. The emulated module does not notice, the other one does."""
+        """Disconnect. The emulated module does not notice it, the other one does."""
         if self._plugged and self._link is not None:
             self.close()
             self._link.disconnected("the wire is pulled")
 
-    def arrive(self, data: bytes) -> None:
-        """The emulated module said this."""
+    def receive(self, data: bytes) -> None:
+        """Receive bytes of the emulated module."""
         if not self._plugged or self._link is None:
             return
         if self._paused:
@@ -249,7 +249,7 @@ class Wire(Transport, Carrier):
     # Carrier: the end at the Module
 
     def send(self, data: bytes) -> None:
-        asyncio.get_running_loop().call_soon(self._power.heard, self._reader.feed(data))
+        asyncio.get_running_loop().call_soon(self._power.receive, self._reader.feed(data))
 
     def pause(self) -> None:
         self._paused = True
@@ -258,24 +258,24 @@ class Wire(Transport, Carrier):
         self._paused = False
         held, self._held = self._held, []
         for data in held:
-            self.arrive(data)
+            self.receive(data)
 
     def close(self) -> None:
         self._plugged = False
         self._held.clear()
-        self._power.unplugged(self._end)
+        self._power.detach(self._end)
 
 
 class _WireEnd:
     """The end at the emulated module."""
 
-    waiting = 0  # the link at the other end holds back nobody but itself
+    waiting = 0  # the link at the other end has a buffer of its own
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
 
     def send(self, data: bytes) -> None:
-        asyncio.get_running_loop().call_soon(self._wire.arrive, data)
+        asyncio.get_running_loop().call_soon(self._wire.receive, data)
 
     def close(self) -> None:
         self._wire.pull()

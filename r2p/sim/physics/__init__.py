@@ -1,5 +1,6 @@
-"""Physics for emulated robots: small models, each a state and `step(dt)`, in the units of data sheets.
+"""Physics for emulated robots: small models with a state and `step(dt)`, in the units of data sheets.
 
-Nothing here knows of messages, event loops or clocks: time comes in as `dt`, randomness as a `random.Random`. The
-modules of `r2p.sim.modules` put nodes around these models; `r2p.sim.modules.plant` moves them on.
+`motor` (with its control and the battery), `omni` (a body on three wheels), `world` (walls and range finders) and
+`inertial` (sensors and attitude) are independent of messages, event loops and clocks: time is the argument `dt`,
+randomness a `random.Random`. The modules of `r2p.sim.modules` put nodes around these models, and a `Plant` steps them.
 """

@@ -1,7 +1,8 @@
-"""MEMS sensors: what they make of the truth, in counts, at their own rate (thesis 7.4.1).
+"""Inertial sensors, and the attitude that a filter computes from them (thesis 7.4).
 
-Each axis has a bias that it keeps, noise of the data sheet's density over the bandwidth of its rate, a resolution and a
-full scale.
+A MEMS sensor turns true values into counts at its own rate. Each axis has a constant bias, noise with the density of
+the data sheet over the bandwidth of its rate, a resolution and a full scale. The filter is a non-linear complementary
+filter (Mahony, Hamel and Pflimlin 2008).
 """
 
 import math
@@ -11,27 +12,28 @@ import msgspec
 
 Vector = tuple[float, float, float]
 Counts = tuple[int, int, int]
+Quaternion = tuple[float, float, float, float]
 
 GRAVITY = 9.80665
 """m/s^2."""
 
 
 class MemsSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """Data sheet of a sensor of three axes; all values in one unit, which the constants below tell."""
+    """Data sheet of a sensor with three axes; all values in one unit, see the constants below."""
 
     resolution: float
-    """For each count."""
+    """Per count."""
     full_scale: float
     rate: float
-    """Samples each second, Hz."""
+    """Samples per second, Hz."""
     density: float
-    """Of its noise, for each root of Hz."""
+    """Of the noise, per root of Hz."""
     bias: float
     """One sigma from device to device."""
 
     @property
     def sigma(self) -> float:
-        """Of the noise of one sample."""
+        """The noise of one sample, one sigma."""
         return self.density * math.sqrt(self.rate / 2)
 
 
@@ -44,20 +46,20 @@ MAGNETOMETER = MemsSpec(resolution=0.9, full_scale=1300.0, rate=220.0, density=0
 
 
 class MemsSensor:
-    """One device: it samples at its rate, and shows its last sample in between."""
+    """One device: it samples at its rate, and holds the last sample in between."""
 
     def __init__(self, spec: MemsSpec, noise: random.Random) -> None:
         self.spec = spec
         self.counts: Counts = (0, 0, 0)
         """Its last sample."""
         self.samples = 0
-        """How many it has taken."""
+        """The number of samples so far."""
         self._noise = noise
         self._bias = [noise.gauss(0, spec.bias) for _ in range(3)]
         self._elapsed = 0.0
 
     def step(self, truth: Vector, dt: float) -> bool:
-        """Move on by `dt` seconds; says whether there is a new sample. `truth` is in the unit of the data sheet."""
+        """Advance by `dt` seconds; return whether there is a new sample. `truth` is in the unit of the data sheet."""
         self._elapsed += dt * self.spec.rate
         if self._elapsed < 1.0 - 1e-9:
             return False
@@ -80,37 +82,31 @@ class MemsSensor:
 
 
 class Barometer:
-    """LPS331AP: pressure with 2 Pa of noise, and what it means as an altitude."""
+    """LPS331AP: pressure with 2 Pa of noise."""
 
     def __init__(self, noise: random.Random) -> None:
         self._noise = noise
 
     def read(self, altitude: float) -> float:
-        """Pressure (Pa) at this altitude (m) in the standard atmosphere."""
+        """Return the pressure (Pa) at an altitude (m) in the standard atmosphere, with noise."""
         return pressure_at(altitude) + self._noise.gauss(0, 2.0)
 
 
 def pressure_at(altitude: float) -> float:
-    """Pa in the standard atmosphere at so many m."""
+    """Return the pressure (Pa) of the standard atmosphere at an altitude (m)."""
     return 101_325.0 * math.pow(1 - altitude / 44_330.77, 5.255876)
 
 
 def altitude_at(pressure: float) -> float:
-    """m in the standard atmosphere at so many Pa."""
+    """Return the altitude (m) of a pressure (Pa) in the standard atmosphere."""
     return 44_330.77 * (1 - math.pow(pressure / 101_325.0, 1 / 5.255876))
 
 
-# Attitude from inertial sensors: a non-linear complementary filter (Mahony, Hamel and Pflimlin 2008; thesis 7.4.2).
-
-
-Quaternion = tuple[float, float, float, float]
-
-
 class ComplementaryFilter:
-    """The filter; `quaternion` turns vectors of the body into the world's (x north, y west, z up)."""
+    """The attitude filter; `quaternion` rotates vectors of the body into the world (x north, y west, z up)."""
 
     def __init__(self, *, gain: float = 1.0, bias_gain: float = 0.2) -> None:
-        """`gain` (1/s): how fast the directions win; `bias_gain` (1/s^2): how fast the bias is learnt."""
+        """`gain` (1/s): how fast gravity and field win; `bias_gain` (1/s^2): how fast the bias is learnt."""
         self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self.bias: Vector = (0.0, 0.0, 0.0)
         """Of the gyroscope, rad/s."""
@@ -118,11 +114,11 @@ class ComplementaryFilter:
         self._bias_gain = bias_gain
 
     def step(self, gyro: Vector, acc: Vector, mag: Vector, dt: float) -> None:
-        """Move on by `dt` seconds. `gyro` in rad/s; `acc` (up, at rest) and `mag` in any unit."""
-        pull = self._pull(_unit(acc), _unit(mag))
-        x, y, z = (bias - self._bias_gain * error * dt for bias, error in zip(self.bias, pull, strict=True))
+        """Advance by `dt` seconds. `gyro` in rad/s; `acc` (up, at rest) and `mag` in any unit."""
+        errors = self._correction(_unit(acc), _unit(mag))
+        x, y, z = (bias - self._bias_gain * error * dt for bias, error in zip(self.bias, errors, strict=True))
         self.bias = (x, y, z)
-        rates = [rate - bias + self._gain * error for rate, bias, error in zip(gyro, self.bias, pull, strict=True)]
+        rates = [rate - bias + self._gain * error for rate, bias, error in zip(gyro, self.bias, errors, strict=True)]
         self.quaternion = _turned(self.quaternion, (rates[0], rates[1], rates[2]), dt)
 
     @property
@@ -133,8 +129,8 @@ class ComplementaryFilter:
         pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
         return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
-    def _pull(self, up: Vector, field: Vector) -> Vector:
-        """The rotation (rad, in the body) from where the directions should be seen to where they are."""
+    def _correction(self, up: Vector, field: Vector) -> Vector:
+        """Return the rotation (rad, in the body) from the expected directions to the measured ones."""
         ex, ey, ez = _cross(up, to_body(self.quaternion, (0.0, 0.0, 1.0)))
         x, y, _ = to_world(self.quaternion, field)
         heading = -math.atan2(y, x)  # only the field's horizontal part counts: roll and pitch are gravity's
@@ -143,14 +139,14 @@ class ComplementaryFilter:
 
 
 def to_world(q: Quaternion, v: Vector) -> Vector:
-    """A vector of the body, as the world sees it."""
+    """Rotate a vector from the body's frame into the world's."""
     w, x, y, z = q
     tx, ty, tz = 2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])
     return v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx
 
 
 def to_body(q: Quaternion, v: Vector) -> Vector:
-    """A vector of the world, as the body sees it."""
+    """Rotate a vector from the world's frame into the body's."""
     w, x, y, z = q
     return to_world((w, -x, -y, -z), v)
 

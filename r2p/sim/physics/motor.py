@@ -1,7 +1,8 @@
-"""A brushed DC motor with gear and encoder, and the axle that it turns.
+"""A brushed DC motor with gear and encoder, its load, its closed-loop control, and the battery.
 
-The winding's inductance is left out: its time constant, 0.2 ms, is under every step that makes sense here. What is left
-is a first-order system, so `MotorSpec.gain` and `MotorSpec.time_constant` say all that there is to say about a step.
+The inductance of the winding is left out: its time constant, 0.2 ms, is shorter than every useful step. What is left is
+a first-order system, which `MotorSpec.gain` and `MotorSpec.time_constant` describe completely. The control is what the
+firmware of the motor module does between the encoder and the bridge (thesis 7.3.2), with everything in ticks.
 """
 
 import math
@@ -9,7 +10,9 @@ from typing import Literal
 
 import msgspec
 
-_TURN = 2 * math.pi
+Mode = Literal["speed", "position"]
+
+_TURN = 2 * math.pi  # rad
 
 
 class MotorSpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -20,11 +23,11 @@ class MotorSpec(msgspec.Struct, frozen=True, kw_only=True):
     resistance: float = 1.11
     """Of the winding, ohm."""
     torque_constant: float = 36.4
-    """mNm/A; in mV s/rad it is that of the back EMF, too."""
+    """mNm/A; also the constant of the back EMF in mV s/rad."""
     rotor_inertia: float = 67.7
     """g cm^2."""
     gear: float = 14.0
-    """Turns of the motor for one of the wheel."""
+    """Turns of the motor per turn of the wheel."""
     ticks_per_turn: int = 2000
     """Of the encoder, on the motor's shaft."""
     friction: float = 60.0
@@ -36,38 +39,38 @@ class MotorSpec(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def ticks_per_radian(self) -> float:
-        """Encoder ticks for one radian of the wheel."""
+        """Encoder ticks per radian of the wheel."""
         return self.ticks_per_turn * self.gear / _TURN
 
     @property
     def constant(self) -> float:
-        """Torque at the wheel for each ampere, Nm/A; and V s/rad of the wheel."""
+        """Torque at the wheel per ampere, Nm/A; also the back EMF, V s/rad of the wheel."""
         return self.torque_constant * 1e-3 * self.gear
 
     @property
     def inertia(self) -> float:
-        """Of the rotor, as felt at the wheel, kg m^2."""
+        """Inertia of the rotor at the wheel, kg m^2."""
         return self.rotor_inertia * 1e-7 * self.gear**2
 
     @property
     def gain(self) -> float:
-        """Speed of the wheel for each volt, in the long run and without dry friction, rad/s per V."""
+        """Steady-state speed of the wheel per volt, without dry friction, rad/s per V."""
         return self.constant / (self.constant**2 + self.resistance * self.damping * 1e-3)
 
     def time_constant(self, load: float) -> float:
-        """Seconds to 63 % of the final speed with a load of this inertia (kg m^2) at the wheel, rotor included."""
+        """Return the seconds to 63 % of the final speed; `load` is the inertia at the wheel with the rotor, kg m^2."""
         return self.resistance * load / (self.constant**2 + self.resistance * self.damping * 1e-3)
 
 
 class Motor:
-    """The winding, the gear and the encoder; whoever owns the load tells it how the wheel turns."""
+    """The winding, the gear and the encoder; the model of the load calls `turn` with the wheel's speed."""
 
     def __init__(self, spec: MotorSpec) -> None:
         self.spec = spec
         self.voltage = 0.0
-        """That the bridge puts on the winding, V; 0 brakes."""
+        """Voltage of the bridge at the winding, V; 0 brakes."""
         self.current = 0.0
-        """A, since the last `torque`."""
+        """A, of the last `torque()`."""
         self.angle = 0.0
         """Of the wheel, rad."""
         self.speed = 0.0
@@ -78,28 +81,28 @@ class Motor:
 
     @property
     def ticks(self) -> int:
-        """What the encoder has counted."""
+        """The count of the encoder."""
         return math.floor(self.angle * self._ticks_per_radian)
 
     def torque(self) -> float:
-        """What acts on the wheel at its present speed, friction included, Nm."""
+        """Return the torque on the wheel at its present speed, including friction, Nm."""
         limit = self.spec.current_limit
         current = (self.voltage - self._constant * self.speed) / self.spec.resistance
         self.current = current = max(-limit, min(limit, current))
         return current * self._constant - self._friction()
 
     def turn(self, speed: float, dt: float) -> None:
-        """The wheel's speed (rad/s) after the next `dt` seconds."""
+        """Turn the wheel for `dt` seconds, at the end of which it has this speed (rad/s)."""
         self.angle += (self.speed + speed) / 2 * dt
         self.speed = speed
 
     def _friction(self) -> float:
-        """Dry friction grows with the speed up to 0.1 rad/s, so that it never drives what it shall stop."""
+        """Return the friction, Nm: dry friction grows up to 0.1 rad/s, so that it never drives the wheel."""
         return self._dry * max(-1.0, min(1.0, self.speed * 10)) + self._damping * self.speed
 
 
 class Axle:
-    """A wheel that turns a load of its own, off the ground: what one motor drives when there is no robot."""
+    """A wheel off the ground with a load of its own: what a motor drives without a robot."""
 
     def __init__(self, motor: Motor, inertia: float) -> None:
         """`inertia` of the load at the wheel, without the rotor's, kg m^2."""
@@ -108,26 +111,23 @@ class Axle:
         """Rotor included, kg m^2."""
 
     def step(self, dt: float) -> None:
-        """Move on by `dt` seconds, which is short against the motor's time constant."""
+        """Advance by `dt` seconds, which must be short against the motor's time constant."""
         motor = self.motor
         motor.turn(motor.speed + motor.torque() / self.inertia * dt, dt)
 
 
-# The PID controller of the motor module: saturation, and an integrator that waits while it is saturated.
-
-
 class Gains(msgspec.Struct, frozen=True):
-    """V for each tick/s (speed) or tick (position), and for their integral (ki, s) and derivative (kd, 1/s)."""
+    """Gains of a PID controller: V per tick/s (speed) or tick (position), their integral (ki) and derivative (kd)."""
 
     kp: float
     ki: float = 0.0
     kd: float = 0.0
     limit: float = 24.0
-    """The output saturates at plus and minus this, V."""
+    """The output saturates at plus and minus this voltage, V."""
 
 
 class Pid:
-    """The controller."""
+    """A PID controller with saturation; its integrator stops while the output is saturated."""
 
     def __init__(self, gains: Gains) -> None:
         self.gains = gains
@@ -135,12 +135,12 @@ class Pid:
         self._measured: float | None = None
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Reset the integrator and the derivative."""
         self._integral = 0.0
         self._measured = None
 
     def step(self, setpoint: float, measured: float, dt: float) -> float:
-        """The output for the next `dt` seconds."""
+        """Return the output for the next `dt` seconds."""
         gains = self.gains
         error = setpoint - measured
         slope = 0.0 if self._measured is None else (measured - self._measured) / dt
@@ -148,13 +148,13 @@ class Pid:
         integral = self._integral + gains.ki * error * dt
         wanted = gains.kp * error + integral - gains.kd * slope
         output = max(-gains.limit, min(gains.limit, wanted))
-        if wanted == output or wanted * error < 0:  # saturated: integrate only what leads out of it
+        if wanted == output or wanted * error < 0:  # while saturated, integrate only what leads out of it
             self._integral = integral
         return output
 
 
 def speed_gains(spec: MotorSpec, load: float, *, frequency: float, damping: float) -> Gains:
-    """PI gains that give the closed loop this natural frequency (rad/s) and damping, by placing its two poles.
+    """Return PI gains for a closed loop with this natural frequency (rad/s) and damping, by pole placement.
 
     `load` is the inertia at the wheel, rotor included, kg m^2. Speeds are in ticks/s. With the motor gain/(time s + 1)
     the closed loop is (gain kp s + gain ki) / (time s^2 + (1 + gain kp) s + gain ki).
@@ -164,9 +164,9 @@ def speed_gains(spec: MotorSpec, load: float, *, frequency: float, damping: floa
 
 
 def step_response(spec: MotorSpec, load: float, gains: Gains, time: float) -> float:
-    """Speed `time` seconds after a step of the setpoint from 0 to 1: what the theory says of `speed_gains`.
+    """Return the speed `time` seconds after a step of the setpoint from 0 to 1, as theory predicts for `speed_gains`.
 
-    For damping under 1, where neither the voltage nor the current saturates, and without dry friction.
+    It holds for a damping below 1, without saturation of voltage or current, and without dry friction.
     """
     gain, tau = spec.gain * spec.ticks_per_radian, spec.time_constant(load)
     decay = (1 + gain * gains.kp) / (2 * tau)
@@ -175,14 +175,8 @@ def step_response(spec: MotorSpec, load: float, gains: Gains, time: float) -> fl
     return 1 - math.exp(-decay * time) * (math.cos(swing * time) - sine * math.sin(swing * time))
 
 
-# What the motor module's firmware does between the encoder and the bridge (thesis 7.3.2): everything in ticks.
-
-
-Mode = Literal["speed", "position"]
-
-
 class Drive:
-    """Closed-loop control of one motor; before the first setpoint, and when it is stopped, the winding is shorted."""
+    """Closed-loop control of one motor; without a setpoint the winding is shorted, which brakes."""
 
     def __init__(self, motor: Motor, gains: Gains, *, mode: Mode = "speed") -> None:
         self.motor = motor
@@ -190,8 +184,8 @@ class Drive:
         self.setpoint: float | None = None
         """Ticks (position) or ticks/s (speed); None: stopped."""
         self._pid = Pid(gains)
-        self._seen = motor.ticks
-        self._taken = motor.ticks
+        self._last_ticks = motor.ticks
+        self._returned = motor.ticks
 
     def stop(self) -> None:
         """Short the winding, which brakes, until the next setpoint."""
@@ -200,25 +194,22 @@ class Drive:
         self._pid.reset()
 
     def take_ticks(self) -> int:
-        """Ticks since the last time this was asked."""
+        """Return the ticks since the last call."""
         ticks = self.motor.ticks
-        taken, self._taken = self._taken, ticks
+        taken, self._returned = self._returned, ticks
         return ticks - taken
 
     def step(self, dt: float) -> None:
         """Read the encoder, and set the bridge for the next `dt` seconds."""
         ticks = self.motor.ticks
-        moved, self._seen = ticks - self._seen, ticks
+        moved, self._last_ticks = ticks - self._last_ticks, ticks
         if self.setpoint is not None:
             measured = ticks if self.mode == "position" else moved / dt
             self.motor.voltage = self._pid.step(self.setpoint, measured, dt)
 
 
-# A lead battery: its voltage falls with its charge and with the current that is drawn.
-
-
 class BatterySpec(msgspec.Struct, frozen=True, kw_only=True):
-    """Data sheet. Default: two 12 V, 7.2 Ah batteries in series."""
+    """Data sheet of a lead battery. Default: two 12 V, 7.2 Ah batteries in series."""
 
     capacity: float = 7.2
     """Ah."""
@@ -227,18 +218,18 @@ class BatterySpec(msgspec.Struct, frozen=True, kw_only=True):
     empty: float = 23.2
     """Voltage at rest when it is empty, V."""
     resistance: float = 60.0
-    """Inside, milliohm."""
+    """Internal, milliohm."""
 
 
 class Battery:
-    """Charge goes out as current flows; negative current charges it."""
+    """A battery whose voltage falls with its charge and with the current; a negative current charges it."""
 
     def __init__(self, spec: BatterySpec | None = None, *, charge: float = 1.0) -> None:
         """`charge` from 0 (empty) to 1 (full)."""
         self.spec = spec or BatterySpec()
         self.charge = charge
         self.current = 0.0
-        """That flows out of it now, A."""
+        """The current that flows out of it, A."""
 
     @property
     def voltage(self) -> float:
@@ -248,5 +239,5 @@ class Battery:
         return rest - self.current * spec.resistance * 1e-3
 
     def step(self, dt: float) -> None:
-        """Move on by `dt` seconds at the present current."""
+        """Advance by `dt` seconds at the present current."""
         self.charge = max(0.0, min(1.0, self.charge - self.current * dt / 3600 / self.spec.capacity))

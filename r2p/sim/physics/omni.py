@@ -18,7 +18,7 @@ _COS30, _COS60 = math.cos(math.pi / 6), 0.5
 
 
 class OmniSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """What the body is made of. Default: Triskar2, about 20 kg and 2 m/s (thesis 8.1.1)."""
+    """Data sheet of the body. Default: Triskar2, about 20 kg and 2 m/s (thesis 8.1.1)."""
 
     wheel_radius: float = 0.05
     """m."""
@@ -31,17 +31,17 @@ class OmniSpec(msgspec.Struct, frozen=True, kw_only=True):
     inertia: float = 0.4
     """About the vertical axis, kg m^2."""
     wear: float = 0.2
-    """How much the radii of the wheels differ, one sigma, %."""
+    """Spread of the wheels' radii, one sigma, %."""
 
     def wheel_speeds(self, x: float, y: float, w: float) -> Triple:
-        """Equation 8.2: speeds of the wheels (rad/s) for a velocity of the body (m/s, m/s, rad/s)."""
+        """Return the speeds of the wheels (rad/s) for a velocity of the body (m/s, m/s, rad/s): equation 8.2."""
         turn = self.arm * w
         ahead, aside = _COS60 * x, _COS30 * y
         radius = self.wheel_radius
         return (ahead - aside - turn) / radius, (ahead + aside - turn) / radius, (-x - turn) / radius
 
     def body_velocity(self, one: float, two: float, three: float) -> Triple:
-        """Equation 8.1 with the factors it lacks: velocity of the body for these speeds of the wheels."""
+        """Return the velocity of the body for these speeds of the wheels: equation 8.1 with the missing factors."""
         radius = self.wheel_radius
         return (
             2 / 3 * radius * (_COS60 * (one + two) - three),
@@ -51,10 +51,10 @@ class OmniSpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OmniBody:
-    """The body, driven by the torques of three motors: what one wheel does, the other two feel.
+    """The body, driven by the torques of three motors, which are coupled through it.
 
-    In speeds of the wheels, the mass matrix of such a body is `own` on the diagonal plus `shared` everywhere, which has
-    a closed inverse. Wheels do not slip, but their radii differ a little: that is why odometry drifts.
+    In the coordinates of wheel speeds, the mass matrix is `own` on the diagonal plus `shared` everywhere, which has a
+    closed inverse. Wheels do not slip, but their radii differ a little: that is why odometry drifts.
     """
 
     def __init__(self, spec: OmniSpec, motors: Sequence[Motor], noise: random.Random) -> None:
@@ -65,16 +65,16 @@ class OmniBody:
         self.velocity: Triple = (0.0, 0.0, 0.0)
         """True, in its own frame."""
         self.path = 0.0
-        """Length of the way so far, m."""
+        """Length of the path so far, m."""
         self._wear = [noise.gauss(1.0, spec.wear / 100) for _ in range(3)]
         square = spec.wheel_radius**2
         self.own = self.motors[0].spec.inertia + 2 / 3 * spec.mass * square
         """Inertia at each wheel, kg m^2."""
         self.shared = spec.inertia * square / (9 * spec.arm**2) - 2 / 9 * spec.mass * square
-        """Between each two of them, kg m^2."""
+        """Inertia that couples two wheels, kg m^2."""
 
     def step(self, dt: float) -> None:
-        """Move on by `dt` seconds."""
+        """Advance by `dt` seconds."""
         torques = [motor.torque() for motor in self.motors]
         common = self.shared / (self.own + 3 * self.shared) * sum(torques)
         before = [motor.speed for motor in self.motors]

@@ -1,4 +1,7 @@
-"""A flat world of walls and boxes, and rays through it."""
+"""A flat world of walls and boxes, and the range finders that measure it.
+
+The range finder is of Sharp's GP2Y series; `millimetres` is what the proximity module computes from its voltage.
+"""
 
 import math
 import random
@@ -9,24 +12,30 @@ import msgspec
 Point = tuple[float, float]
 Wall = tuple[Point, Point]
 
+NOTHING = 65535
+"""The reading in mm when nothing is in range."""
+
+_ADC = 4095  # counts of 12 bits
+_REFERENCE = 3.3  # V
+
 
 class World:
-    """Walls (m) that stop rays; nothing stops the robot but itself."""
+    """Walls (coordinates in m) that stop rays, but not the robot."""
 
     def __init__(self, walls: Iterable[Wall] = ()) -> None:
         self.walls = list(walls)
 
     def add_box(self, x: float, y: float, width: float, depth: float) -> None:
-        """A box with its centre there and sides of `width` (along x) and `depth` (along y), m."""
+        """Add a box by its centre, and its sides `width` (along x) and `depth` (along y), m."""
         self.walls += box(x, y, width, depth)
 
     def distance(self, x: float, y: float, angle: float) -> float:
-        """How far a ray from there (angle in rad from the x axis) goes before it meets a wall, m; inf: it does not."""
+        """Return the distance (m) to the first wall on a ray at `angle` (rad from the x axis), or infinity."""
         dx, dy = math.cos(angle), math.sin(angle)
         return min(self._hits(x, y, dx, dy), default=math.inf)
 
     def clearance(self, x: float, y: float) -> float:
-        """From there to the nearest wall, m."""
+        """Return the distance to the nearest wall, m."""
         return min((_to_wall(x, y, wall) for wall in self.walls), default=math.inf)
 
     def _hits(self, x: float, y: float, dx: float, dy: float) -> Iterator[float]:
@@ -42,7 +51,7 @@ class World:
 
 
 def box(x: float, y: float, width: float, depth: float) -> list[Wall]:
-    """The four walls of a box."""
+    """Return the four walls of a box."""
     left, right, low, high = x - width / 2, x + width / 2, y - depth / 2, y + depth / 2
     corners = [(left, low), (right, low), (right, high), (left, high)]
     return list(zip(corners, corners[1:] + corners[:1], strict=True))
@@ -54,16 +63,6 @@ def _to_wall(x: float, y: float, wall: Wall) -> float:
     along = ((x - ax) * ex + (y - ay) * ey) / ((ex * ex + ey * ey) or 1.0)
     along = max(0.0, min(1.0, along))
     return math.hypot(ax + along * ex - x, ay + along * ey - y)
-
-
-# An infrared range finder of Sharp's GP2Y series, and what the proximity module makes of its voltage.
-
-
-NOTHING = 65535
-"""The reading in mm when nothing is in range."""
-
-_ADC = 4095  # counts of 12 bits
-_REFERENCE = 3.3  # V
 
 
 class RangeSpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,7 +80,7 @@ class RangeSpec(msgspec.Struct, frozen=True, kw_only=True):
     """Of the voltage, one sigma, mV."""
 
     def voltage(self, distance: float) -> float:
-        """Output at this distance (mm), V; under the shortest one it falls to nothing again."""
+        """Return the output (V) at a distance (mm); below the shortest distance it falls to 0 again."""
         peak = self.scale / (self.shortest + self.offset)
         if distance < self.shortest:
             return peak * distance / self.shortest
@@ -89,19 +88,19 @@ class RangeSpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RangeFinder:
-    """One sensor and its input of the A/D converter."""
+    """One sensor, and its input of the A/D converter."""
 
     def __init__(self, spec: RangeSpec, noise: random.Random) -> None:
         self.spec = spec
         self._noise = noise
 
     def read(self, distance: float) -> int:
-        """Counts of the A/D converter for something at this distance (mm; infinite: nothing)."""
+        """Return the counts of the A/D converter for an object at a distance (mm, or infinity)."""
         voltage = self.spec.voltage(distance) + self._noise.gauss(0, self.spec.noise * 1e-3)
         return max(0, min(_ADC, round(voltage / _REFERENCE * _ADC)))
 
     def millimetres(self, counts: int) -> int:
-        """What the firmware makes of them, by the sensor's curve; NOTHING beyond its longest range."""
+        """Return the distance (mm) that firmware computes from counts; NOTHING beyond the longest range."""
         voltage = counts * _REFERENCE / _ADC
         spec = self.spec
         if voltage <= spec.scale / (spec.longest + spec.offset):

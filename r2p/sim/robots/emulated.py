@@ -4,9 +4,9 @@
         ...
         print(robot.pose)
 
-The robot has the modules that the thesis lists (8.1.2): three motor modules, two proximity modules, power supply and
-gateway. Programs talk to it as to a real one, by its network or through its gateway; what only an emulated robot has,
-the true pose and a power switch for each module, is here.
+The robot has the modules of the thesis (8.1.2): three motor modules, two proximity modules, power supply and gateway.
+Programs use it like a real one, on its network or through its gateway. An emulated robot also has its true pose, and a
+power switch for each module.
 """
 
 import asyncio
@@ -40,38 +40,38 @@ from r2p.transports.link import Transport
 STEP = 0.002
 """Seconds of the physics, and of the control of the motors."""
 FREQUENCY, DAMPING = 20.0, 0.8
-"""Natural frequency (rad/s) and damping of the wheels' speed control, as far as a wheel does not feel the others."""
+"""Natural frequency (rad/s) and damping of the wheels' speed control, apart from the coupling of the wheels."""
 
 MOTORS = ("MOTOR1", "MOTOR2", "MOTOR3")
 PROXIMITY = {"PROX1": "prox_front", "PROX2": "prox_rear"}
 """The proximity modules and their topics."""
 MODULES = (*MOTORS, *PROXIMITY, "PS", "GW")
 
-_SENSORS_AT = 0.12  # m from the centre: what touches the robot is at the sensors' shortest range
-_SENSOR_WIDTH = (-8.0, 0.0, 8.0)  # degrees
-_LOOK, _SETTLED = 0.02, 0.5  # seconds
-_ELECTRONICS = 0.25  # A that the modules take from the battery
+_SENSORS_AT = 0.12  # m from the centre: an object that touches the robot is at the sensors' shortest range
+_BEAM = (-8.0, 0.0, 8.0)  # degrees: rays that model the width of a sensor's beam
+_POLL, _SETTLED = 0.02, 0.5  # seconds
+_ELECTRONICS = 0.25  # A: the current of the modules
 
 
 class Supply:
-    """What motors and modules take from the battery."""
+    """Draws the current of motors and modules from the battery."""
 
     def __init__(self, battery: Battery, motors: Iterable[Motor]) -> None:
         self._battery = battery
         self._motors = list(motors)
 
     def step(self, dt: float) -> None:
-        """Move on by `dt` seconds."""
+        """Advance by `dt` seconds."""
         power = sum(motor.voltage * motor.current for motor in self._motors)
         self._battery.current = _ELECTRONICS + power / self._battery.voltage
         self._battery.step(dt)
 
 
 class Hardware:
-    """The body, its motors and its battery in the world: all that is not a module."""
+    """The body, its motors and its battery in the world: everything that is not a module."""
 
     def __init__(self, seed: object = 0, world: World | None = None, *, spec: OmniSpec = triskar2.BODY) -> None:
-        """Two of the same `seed` are the same."""
+        """`seed`: of all random numbers."""
         self.seed = seed
         self.world = world or World()
         self.motors = [Motor(triskar2.MOTOR) for _ in MOTORS]
@@ -83,27 +83,27 @@ class Hardware:
 
     @property
     def pose(self) -> Triple:
-        """The true one: x and y in m, heading in rad, since the start."""
+        """The true pose: x and y in m, heading in rad, since the start."""
         return self.body.x, self.body.y, self.body.w
 
     def noise(self, part: str) -> random.Random:
-        """The random numbers of a part."""
+        """Return the random numbers for a part."""
         return random.Random(f"{self.seed}/{part}")
 
     def look(self, angle: float) -> float:
-        """What a range finder that points there (degrees from ahead) sees: the nearest in its beam, mm."""
+        """Return the distance (mm) to the nearest wall in a range finder's beam; `angle` in degrees from ahead."""
         at = self.body.w + math.radians(angle)
         x = self.body.x + _SENSORS_AT * math.cos(at)
         y = self.body.y + _SENSORS_AT * math.sin(at)
-        return 1000 * min(self.world.distance(x, y, at + math.radians(beam)) for beam in _SENSOR_WIDTH)
+        return 1000 * min(self.world.distance(x, y, at + math.radians(ray)) for ray in _BEAM)
 
 
 class Triskar2:
     """The robot, on the network `via`, for the time of an `async with` block.
 
-    `traffic` is the class of all hops of the command chain; None: those that the nodes choose. `modules`: those that
-    are here, where the others are somewhere else. `outside`: where the gateway lets computers in, with these `options`.
-    Raises TransportError for a `via` that can't work.
+    `traffic` is the class of all messages of the command chain; None: the nodes' defaults. `modules`: the modules to
+    run in this process; default: all. `outside`: the gateway's links for computers, with these `options`. Raises
+    TransportError for an invalid `via`.
     """
 
     def __init__(
@@ -122,13 +122,13 @@ class Triskar2:
         self._options = options
         self.hardware = Hardware(seed, world)
         self.modules: dict[str, Board] = {}
-        """Those that are switched on, by name."""
+        """The modules that are switched on, by name."""
         self._traffic = traffic
         self._names = list(modules or MODULES)
 
     @property
     def pose(self) -> Triple:
-        """The true one: x and y in m, heading in rad, since the start."""
+        """The true pose: x and y in m, heading in rad, since the start."""
         return self.hardware.pose
 
     async def __aenter__(self) -> Self:
@@ -136,7 +136,7 @@ class Triskar2:
         try:
             for name in self._names:
                 await self.switch_on(name)
-        except BaseException:  # cancelled, too: who does not come to the block does not leave it either
+        except BaseException:  # also when cancelled: without the block, __aexit__ is not called
             await self._close()
             raise
         return self
@@ -147,7 +147,7 @@ class Triskar2:
         await self._close()
 
     async def ready(self, timeout: float | None = None) -> None:
-        """Wait until its network has admitted all that its modules publish, and has settled (who is RTCAN's master?).
+        """Wait until the network has admitted all publishers and has settled (with an elected master, on RTCAN).
 
         Raises TimeoutError after `timeout` seconds, and MessageError for a time-out that is not a number of seconds.
         """
@@ -156,28 +156,28 @@ class Triskar2:
         async with asyncio.timeout(timeout):
             since = time()
             while time() < since + _SETTLED:
-                await asyncio.sleep(_LOOK)
+                await asyncio.sleep(_POLL)
                 before = time()
                 for publisher in self.publishers():
                     await publisher.ready()
-                waited = time() > before + _LOOK  # by less, asking takes time, too
+                waited = time() > before + _POLL  # waiting on ready publishers takes time, too, but less
                 if waited or not all(link.up for board in self.modules.values() for link in board.links):
                     since = time()
 
     def publishers(self) -> list[AnyPublisher]:
-        """Of all nodes of its modules."""
+        """Return the publishers of all nodes of its modules."""
         nodes = [each.node for board in self.modules.values() for each in board.nodes.values()]
         return [publisher for node in nodes for publisher in node.publishers]
 
     async def switch_on(self, name: str) -> Board:
-        """Give a module its power."""
+        """Switch on the power of a module."""
         board = await self._make(name).__aenter__()
         self.modules[name] = board
         self._start_nodes(board)
         return board
 
     async def switch_off(self, name: str) -> None:
-        """Take it away. What its nodes do at their end is done; the others hear that it leaves."""
+        """Switch off the power of a module. Its nodes are cancelled in order, and it announces that it leaves."""
         await self.modules.pop(name).__aexit__(None, None, None)
 
     async def _close(self) -> None:
@@ -216,7 +216,7 @@ class Triskar2:
         )
 
     def _start_nodes(self, board: Board) -> None:
-        """The robot's own nodes, on the modules where the thesis has them (figure 8.3)."""
+        """Start the robot's nodes, on the modules as in the thesis (figure 8.3)."""
         traffic = () if self._traffic is None else (self._traffic,)
         match board.name:
             case "MOTOR1":

@@ -1,4 +1,4 @@
-"""What an emulated robot does, in figures: read from its counters, so that looking changes nothing."""
+"""The state of an emulated robot in figures, read from its counters, so that the display does not disturb it."""
 
 import math
 from collections import deque
@@ -15,7 +15,7 @@ from r2p.sim.physics.omni import Triple
 from r2p.sim.robots.emulated import MOTORS, Triskar2
 from r2p.transports.rtcan.link import RtcanLink
 
-_WINDOW = 1.0  # seconds of which rates are the mean
+_WINDOW = 1.0  # seconds to average rates over
 _LEFT_OUT = ("log", "current", "power")
 _HARD, _PERIODIC, _SOFT, _NOT = "hard: in slots", "by the clock", "soft: by deadline", "no"
 _CLASSES = {1: _NOT, 2: _SOFT, 3: _PERIODIC}
@@ -23,7 +23,7 @@ _URGENCY = [_HARD, _PERIODIC, _SOFT, _NOT]
 
 
 class TopicFigures(msgspec.Struct, frozen=True):
-    """One publisher: what real time means to it, messages each second, and since the start."""
+    """One publisher: its real-time class, messages per second, and messages since the start."""
 
     topic: str
     source: str
@@ -34,7 +34,7 @@ class TopicFigures(msgspec.Struct, frozen=True):
 
 
 class WheelFigures(msgspec.Struct, frozen=True):
-    """One wheel: rad/s and A; no setpoint: its motor is stopped."""
+    """One wheel, in rad/s and A; without a setpoint its motor is stopped."""
 
     name: str
     on: bool
@@ -44,28 +44,28 @@ class WheelFigures(msgspec.Struct, frozen=True):
 
 
 class BusFigures(msgspec.Struct, frozen=True):
-    """The bus: its load (0 to 1) and frames each second, what was since the start, and the slots that are reserved."""
+    """The bus: load (0 to 1) and frames per second, totals since the start, and reserved slots."""
 
     load: float
     rate: float
     frames: int
     errors: int
     slots: float
-    """Of each cycle, in the mean."""
+    """Reserved in each cycle, on average."""
     of: int
     mean: float = 0.0
     """Load since the start, 0 to 1."""
 
 
 class Figures(msgspec.Struct, frozen=True):
-    """All of them; the clock in s since the start."""
+    """All figures at a time, in s since the start."""
 
     time: float
     pose: Triple
     path: float
     odometry: Odometry | None
     off: float | None
-    """How far the last odometry was from the truth when it came, m."""
+    """Distance of the last odometry from the true position when it arrived, m."""
     wheels: list[WheelFigures]
     battery: tuple[float, float, float]
     """V, A, and 0 to 1."""
@@ -74,12 +74,12 @@ class Figures(msgspec.Struct, frozen=True):
 
     @property
     def missed(self) -> int:
-        """Messages that were not everywhere in time."""
+        """Messages that missed their deadline."""
         return sum(topic.missed for topic in self.topics)
 
 
 class _Reading(NamedTuple):
-    """The counters at an instant (s): messages by publisher; frames, bit times and errors of the bus."""
+    """The counters at a time (s): messages by publisher; frames, bit times and errors of the bus."""
 
     time: float
     sent: dict[tuple[str, str], int]
@@ -87,10 +87,10 @@ class _Reading(NamedTuple):
 
 
 class FiguresReader:
-    """Reads the figures; rates are those since a reading at least a second before, or the first one."""
+    """Reads the figures; rates are over at least a second, or since the first reading."""
 
     def __init__(self, robot: Triskar2, bus: SimCan | None, modules: Iterable[r2p.Module] = ()) -> None:
-        """`modules`: other ones whose topics count. What was before now does not."""
+        """`modules`: other modules whose topics count. Messages from before now do not."""
         self._odometry: Odometry | None = None
         self._off: float | None = None
         self._robot = robot
@@ -101,13 +101,13 @@ class FiguresReader:
         self._readings = deque([self._began])
 
     def odometry_received(self, odometry: Odometry) -> None:
-        """Odometry came."""
+        """Compare an odometry message with the true pose."""
         x, y, _ = self._robot.pose
         self._odometry = odometry
         self._off = math.hypot(odometry.pose.x - x, odometry.pose.y - y)
 
     def read(self, time: float) -> Figures:
-        """At this moment, in s since the start."""
+        """Return the figures; `time` is now, in s since the start."""
         hardware = self._robot.hardware
         battery = hardware.battery
         now = self._count(time)
@@ -173,7 +173,7 @@ class FiguresReader:
         return BusFigures(occupied * bit / span, frames / span, all_frames, errors, *self._slots(), mean)
 
     def _slots(self) -> tuple[float, int]:
-        """How many of a cycle are reserved, and how many there are."""
+        """Return the reserved slots per cycle, and the slots of a cycle."""
         links = [link for module in self._modules() for link in module.links if isinstance(link, RtcanLink)]
         used, of = 0.0, 0
         for link in links:
@@ -189,23 +189,23 @@ def _key(module: r2p.Module, publisher: AnyPublisher) -> tuple[str, str]:
 
 
 def _urgency(topic: TopicFigures) -> tuple[int, str]:
-    """What is hard real-time comes first."""
+    """Return the sort key: hard real-time topics come first."""
     return _URGENCY.index(topic.real_time), topic.topic
 
 
 def _span(before: _Reading, now: _Reading) -> float:
-    """Seconds; the first reading is at once."""
+    """Return the seconds between two readings; more than 0 also for the first one."""
     return max(now.time - before.time, 1e-9)
 
 
 def _counts(bus: SimCan) -> tuple[int, int, int]:
-    """Frames, bit times and errors since the bus was made."""
+    """Return frames, bit times and errors since the bus was made."""
     total = bus.bus.statistics.total
     return total.frames, total.occupied, total.errors
 
 
 def _real_time(module: r2p.Module, publisher: AnyPublisher) -> str:
-    """How it is sent: in slots of its own, by the local clock, by a deadline, or when there is room."""
+    """Return how a topic is sent: in its own slots, by the local clock, by a deadline, or without real time."""
     for link in module.links:
         if isinstance(link, RtcanLink) and publisher.topic in link.slots and link.slots[publisher.topic].period:
             return _HARD

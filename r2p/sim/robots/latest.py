@@ -1,7 +1,7 @@
-"""Two small things that the nodes of a control chain share; only the public API.
+"""What the nodes of a control chain share; it uses only the public API.
 
-A hop of the chain remembers the newest message of what it needs (`Latest`), and sends what it makes of that (`sender`):
-hard real-time by the clock, else as often as something new comes.
+A node of the chain keeps the newest message of each input (`Latest`), and sends its output (`sender`): periodically if
+it is hard real-time, otherwise with each new input.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,10 @@ import r2p
 
 M = TypeVar("M", bound=r2p.Message)
 
-_DEADLINE = 0.05  # seconds in which a soft real-time message has to be everywhere
+_DEADLINE = 0.05  # seconds, of soft real-time messages
 
 Traffic = Literal["hrt", "srt", "nrt"]
-"""How a hop is sent: hard real-time (`Periodic`), soft real-time (`Sporadic`), non real-time."""
+"""How messages are sent: hard real-time (`Periodic`), soft real-time (`Sporadic`), non real-time."""
 
 
 class Latest(Generic[M]):
@@ -35,14 +35,14 @@ class Latest(Generic[M]):
         self._changed = changed
         self._message: M | None = None
         self._at = 0
-        node.subscribe(topic, type, self._take, queue=1, lossy=True)
+        node.subscribe(topic, type, self._received, queue=1, lossy=True)
 
     @property
     def message(self) -> M | None:
-        """None when nothing came for too long."""
+        """The newest message; None if it is not fresh."""
         return self._message if self._node.now() - self._at <= self._fresh else None
 
-    def _take(self, message: M) -> None:
+    def _received(self, message: M) -> None:
         self._message = message
         self._at = self._node.now()
         self._changed()
@@ -51,7 +51,7 @@ class Latest(Generic[M]):
 def sender(
     node: r2p.Node, topic: str, type: type[M], fill: Callable[[], M | None], *, traffic: Traffic, period: float
 ) -> Callable[[], object]:
-    """Publish what `fill` gives, None for nothing: each `period` seconds ("hrt"), or when what comes back is called."""
+    """Publish what `fill` returns, None for nothing: every `period` seconds ("hrt"), or when the result is called."""
     if traffic == "hrt":
         node.advertise(topic, type, r2p.Periodic(period, fill))
         return lambda: None

@@ -1,4 +1,4 @@
-"""A node that drives a robot along a square, by the clock: what it was told and where it is can be compared."""
+"""A node that drives a robot along a square by the clock, so that command and position can be compared."""
 
 import r2p
 from r2p.msg import Velocity3
@@ -11,7 +11,7 @@ DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
 def velocity_at(elapsed: float, *, side: float, speed: float) -> Velocity3:
-    """The command so many seconds after the start, for sides of `side` m at `speed` m/s; the robot does not turn."""
+    """Return the command `elapsed` seconds after the start: sides of `side` m at `speed` m/s, without turning."""
     leg, within = divmod(elapsed, side / speed + REST)
     if elapsed < 0 or within >= side / speed:
         return Velocity3()
@@ -27,7 +27,7 @@ async def square(
     traffic: Traffic = "srt",
     wait: float = 1.0,
 ) -> None:
-    """Publish `velocity_cmd`: after `wait` seconds so many laps, and then stand still."""
+    """Publish `velocity_cmd`: after `wait` seconds drive `laps` laps, and then stand still."""
     start = node.now()
     lap = len(DIRECTIONS) * (side / speed + REST)
 

@@ -4,7 +4,7 @@
                         ^                     ^                       |
                     proximity              encoders  <----------------+--> fwdkin -> odometry
 
-They use the public API and nothing else, so each of them runs anywhere, on this robot or on another one:
+They use only the public API, so each of them runs on any module, of this robot or another one:
 
     r2p run r2p.sim.robots.triskar2:inverse_kinematics=invkin --via rtcan:can0
 
@@ -29,28 +29,28 @@ PERIOD = 0.02
 COMMANDS = 0.05
 """Of velocity commands, s."""
 FRESH = 0.15
-"""Seconds for which a message of the chain counts."""
+"""Seconds for which a message of the chain is used."""
 TIMEOUT = 0.2
 """Seconds without a setpoint after which a motor stops."""
 
 WHEELS = 3
 SIDES = {"prox_front": 0.0, "prox_rear": 180.0}
-"""Topics of the two proximity modules, and where they look, degrees from ahead."""
+"""Topics of the two proximity modules, and their directions, degrees from ahead."""
 BEARINGS = (67.5, 22.5, -22.5, -67.5)
-"""Of the four sensors of each, degrees from there."""
+"""Directions of the four sensors of each module, degrees from there."""
 
 _STOP = 0.15  # m: closer than this a sensor's reading always stops the robot
-_BRAKING = 0.4  # s: and so much further away for each m/s
+_BRAKING = 0.4  # s: plus this distance for each m/s
 _AHEAD = math.cos(math.radians(60))
-_BACKLOG = 250  # encoder readings, five seconds: each that is lost would bend the way
-_ROUNDS = 5  # encoder readings for one message of odometry: 10 Hz, thesis table 4.1
+_BACKLOG = 250  # encoder readings, five seconds: a lost one would distort the odometry
+_ROUNDS = 5  # encoder readings per message of odometry: 10 Hz, thesis table 4.1
 _LOW = 20  # percent
 
 
 async def obstacle_avoidance(node: r2p.Node, traffic: Traffic = "srt") -> None:
-    """Pass `velocity_cmd` on as `velocity`; where something is in the way, only its rotation.
+    """Forward `velocity_cmd` as `velocity`; if an obstacle is in the way, only its rotation.
 
-    Where a proximity module is silent, the robot does not go.
+    If a proximity module is silent, the robot does not move in its direction.
     """
     sides = {angle: Latest(node, topic, Proximity, fresh=2 * FRESH) for topic, angle in SIDES.items()}
 
@@ -78,7 +78,7 @@ async def obstacle_avoidance(node: r2p.Node, traffic: Traffic = "srt") -> None:
 
 
 async def inverse_kinematics(node: r2p.Node, traffic: Traffic = "hrt") -> None:
-    """Make speeds of the wheels (`speed`, rad/s) of `velocity`; all stand still while one of them is silent."""
+    """Convert `velocity` to speeds of the wheels (`speed`, rad/s); all wheels stop while one of them is silent."""
     wheels = [Latest(node, f"encoder{wheel + 1}", Encoder, fresh=FRESH) for wheel in range(WHEELS)]
 
     def speeds() -> Speed3 | None:
@@ -96,19 +96,19 @@ async def inverse_kinematics(node: r2p.Node, traffic: Traffic = "hrt") -> None:
 
 
 async def forward_kinematics(node: r2p.Node) -> None:
-    """Make `odometry` of the three encoders: where the robot is since the node started, and how fast it goes.
+    """Compute `odometry` from the three encoders: the pose since the node started, and the velocity.
 
-    While a wheel is silent there is none; what the others told meanwhile counts as soon as it is back.
+    It pauses while a wheel is silent; the readings of the others count as soon as that is back.
     """
     odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=0.1))
     turned, readings = [0.0] * WHEELS, [0] * WHEELS
 
-    def take(wheel: int, encoder: Encoder) -> None:
+    def turn(wheel: int, encoder: Encoder) -> None:
         turned[wheel] += encoder.delta / MOTOR.ticks_per_radian
         readings[wheel] += 1
 
     for wheel in range(WHEELS):
-        node.subscribe(f"encoder{wheel + 1}", Encoder, functools.partial(take, wheel), queue=_BACKLOG)
+        node.subscribe(f"encoder{wheel + 1}", Encoder, functools.partial(turn, wheel), queue=_BACKLOG)
     pose = Pose3()
     x = y = w = 0.0  # moved since the last message, in the frame of the robot
     rounds = 0
@@ -131,7 +131,7 @@ async def forward_kinematics(node: r2p.Node) -> None:
 
 
 async def battery_monitor(node: r2p.Node) -> None:
-    """Estimate from voltage and current (`power`) what is left in the battery (`battery`); warn once it is low."""
+    """Estimate the charge (`battery`) from voltage and current (`power`); warn once when it is low."""
     battery = node.advertise("battery", Battery, latch=True)
     current: float | None = None  # A, the mean of the last ten seconds or so
     warned = False
