@@ -75,7 +75,7 @@ async def test_the_load_is_that_of_the_bus() -> None:
         assert frames == pytest.approx(5 * 100.4, abs=2)
 
 
-async def test_the_slots_show_their_owner_and_who_died() -> None:
+async def test_the_slots_show_their_owner_also_one_that_died() -> None:
     async with robot() as (bus, listener):
         assert await listener.cycles(20, timeout=1.0)
         owned = [slot for slot in listener.slots if "encoder" in slot.owners]

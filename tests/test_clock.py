@@ -57,7 +57,7 @@ def test_utc_goes_on_at_half_speed_after_it_was_set_back() -> None:
     assert hands.wait(1 * SECOND) == before + 11 * SECOND == hands.utc
 
 
-def test_a_clock_that_is_set_back_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_clock_that_is_set_back_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     hands = Hands()
     hands.clock.now()
     hands.utc -= SECOND // 20  # what a time server does all day

@@ -120,7 +120,7 @@ class Module:
         try:
             for via in self._via:
                 await self._open_transport(self._tasks, via)
-        except BaseException:  # cancelled, too: without the block's beginning its end is not called either
+        except BaseException:  # also a cancellation: Python calls __aexit__ only after __aenter__ returned
             await self._close(self._tasks)
             raise
         if self._with_watchdog and not clock.virtual:  # not before: opening imports the transports' libraries

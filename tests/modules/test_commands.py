@@ -61,7 +61,7 @@ async def test_bootload_is_refused_and_counted(caplog: pytest.LogCaptureFixture)
 
 
 @pytest.mark.virtual_time
-async def test_a_flood_of_orders_is_logged_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_flood_of_commands_is_logged_once_a_second(caplog: pytest.LogCaptureFixture) -> None:
     async with joined("A") as a, joined("B") as b:
         b.start(hold)
         await settle(1.0)
@@ -90,7 +90,7 @@ async def test_a_reboot_does_not_end_wait() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_of_many_orders_the_last_one_counts_and_each_node_runs_once() -> None:
+async def test_of_many_commands_the_last_one_counts_and_each_node_runs_once() -> None:
     running = []
 
     async def slow(node: r2p.Node) -> None:
@@ -146,14 +146,14 @@ async def test_closing_during_a_reboot_starts_nothing() -> None:
 
 
 @pytest.mark.virtual_time
-@pytest.mark.parametrize("order", ["stop", "reboot"])
-async def test_a_node_may_order_its_own_module(order: str) -> None:
+@pytest.mark.parametrize("command", ["stop", "reboot"])
+async def test_a_node_may_command_its_own_module(command: str) -> None:
     starts = []
 
     async def boss(node: r2p.Node) -> None:
         starts.append("boss")
-        if len(starts) == 1 or order == "stop":
-            await (module.stop() if order == "stop" else module.reboot())
+        if len(starts) == 1 or command == "stop":
+            await (module.stop() if command == "stop" else module.reboot())
             raise AssertionError("not reached")
         await asyncio.Event().wait()
 
@@ -162,5 +162,5 @@ async def test_a_node_may_order_its_own_module(order: str) -> None:
         others = [module.start(hold, name=name) for name in "abc"]
         await settle(1.0)
         assert all(node.closed for node in others)
-        assert [module.nodes[name].running for name in "abc"] == [order == "reboot"] * 3
-        assert len(starts) == (2 if order == "reboot" else 1)
+        assert [module.nodes[name].running for name in "abc"] == [command == "reboot"] * 3
+        assert len(starts) == (2 if command == "reboot" else 1)

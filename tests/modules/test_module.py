@@ -204,7 +204,7 @@ async def test_closing_ends_nodes_before_links_and_waits_for_their_clean_up() ->
 
 
 @pytest.mark.virtual_time
-async def test_clean_up_that_takes_long_is_told_and_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+async def test_clean_up_that_takes_long_is_logged_and_waited_for(caplog: pytest.LogCaptureFixture) -> None:
     async def slow(node: r2p.Node) -> None:
         try:
             await asyncio.Event().wait()
@@ -278,7 +278,7 @@ async def test_events_from_the_call_on_until_the_module_closes() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_two_modules_with_one_name_are_both_told(caplog: pytest.LogCaptureFixture) -> None:
+async def test_both_of_two_modules_with_one_name_report_it(caplog: pytest.LogCaptureFixture) -> None:
     one, other = joined("A"), joined("A")
     events = one.events(), other.events()
     async with one, other:
@@ -291,7 +291,7 @@ async def test_two_modules_with_one_name_are_both_told(caplog: pytest.LogCapture
 
 
 @pytest.mark.virtual_time
-async def test_namesakes_on_two_links_are_told_by_who_hears_both() -> None:
+async def test_modules_with_one_name_on_two_links_are_reported_by_the_module_between_them() -> None:
     async with (
         r2p.Module("A", via="memory:left") as one,
         r2p.Module("A", via="memory:right") as other,
@@ -329,7 +329,7 @@ async def test_a_module_that_comes_back_on_another_link_is_no_namesake() -> None
 
 
 @pytest.mark.virtual_time
-async def test_another_layout_is_refused_and_both_sides_are_told(caplog: pytest.LogCaptureFixture) -> None:
+async def test_another_layout_is_refused_and_both_sides_report_it(caplog: pytest.LogCaptureFixture) -> None:
     async with joined("A") as a, joined("B") as b:
         events = a.events(), b.events()
         publisher = a.start(hold).advertise("leds", Led)
@@ -357,8 +357,8 @@ async def test_types_that_change_all_the_time_do_not_fill_the_log(caplog: pytest
             subscription.close()
     refused = [event.topic async for event in events if isinstance(event, Mismatched)]
     assert len(refused) > 20
-    told = [text for text in caplog.messages if "topic leds is refused" in text]
-    assert 0 < len(told) <= 4  # it takes 2 s, on two links
+    logged = [text for text in caplog.messages if "topic leds is refused" in text]
+    assert 0 < len(logged) <= 4  # it takes 2 s, on two links
 
 
 # Observers

@@ -219,7 +219,7 @@ def test_a_program_runs_on_uvloop_where_there_is_one(monkeypatch: pytest.MonkeyP
     assert str(run_main(main)).startswith("asyncio")
 
 
-def test_wrong_functions_are_told_before_anything_runs() -> None:
+def test_wrong_functions_raise_before_anything_runs() -> None:
     async def a_long_name(node: r2p.Node) -> None:
         await settle()
 

@@ -234,7 +234,7 @@ async def in_an_object_that_is_awaited() -> None:
         in_an_object_that_is_awaited,
     ],
 )
-def test_each_place_is_told(shape: Callable[[], Coroutine[Any, None, object]]) -> None:
+def test_each_place_is_recognised(shape: Callable[[], Coroutine[Any, None, object]]) -> None:
     coroutine = shape()
     places = 0
     with contextlib.suppress(StopIteration, OSError, KeyError):

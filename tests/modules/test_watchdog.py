@@ -25,7 +25,7 @@ PATIENCE = 30.0
 
 
 class Reports(logging.Handler):
-    """Collects what the watchdog logs, and tells that something came."""
+    """Collects what the watchdog logs, and says when something came."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ async def greedy(node: r2p.Node, came: threading.Event) -> None:
 
 
 class Opening(Transport):
-    """Tells whether the watchdog watches while it is opened, when it may import a library for long."""
+    """Says whether the watchdog watches while it is opened, when it may import a library for long."""
 
     watched: bool | None = None
 
@@ -99,7 +99,7 @@ async def test_a_callback_that_blocks_is_logged_too(reports: Reports) -> None:
 
 
 @pytest.mark.anyio
-async def test_a_loop_that_only_waits_has_nobody_to_blame(reports: Reports) -> None:
+async def test_a_loop_that_only_waits_is_not_blamed(reports: Reports) -> None:
     watchdog = Watchdog(asyncio.get_running_loop())
     watchdog.start()
     watchdog._ended.set()

@@ -1,4 +1,4 @@
-"""Events: who listens, from when on, and for how long."""
+"""Events: from when on a listener gets them, and for how long."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CUT = r2p.LinkDown("lab", "cut")
 
 
 @pytest.mark.virtual_time
-async def test_a_listener_that_nobody_holds_is_forgotten() -> None:
+async def test_a_listener_without_references_is_forgotten() -> None:
     hub = EventHub()
     for _ in range(1000):
         hub.listen()

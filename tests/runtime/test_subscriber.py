@@ -1,4 +1,4 @@
-"""Subscribers: how a queue is emptied, what is lost on the way, and who may read it."""
+"""Subscribers: how a queue is emptied, what is lost on the way, and that one task reads it."""
 
 from __future__ import annotations
 
@@ -279,7 +279,7 @@ async def test_the_time_out_of_fetch_counts_from_its_call_also_when_old_messages
 
 
 @pytest.mark.virtual_time
-async def test_subscribers_know_when_somebody_publishes() -> None:
+async def test_subscribers_know_when_there_is_a_publisher() -> None:
     async with local() as module:
         node = module.start(hold)
         leds = node.subscribe("leds", Led)

@@ -128,7 +128,7 @@ async def test_a_link_that_makes_no_room_in_time_is_lossy_until_it_has(monkeypat
         assert publisher.missed == 10
         link: Any = a.links[0]
         assert link.stats.lost["send buffer full"] == 10
-        assert len(link.wait_queue.recoveries) == 1  # it recovers by itself, and nobody else waits
+        assert len(link.wait_queue.recoveries) == 1  # it recovers by itself, and nothing else waits
         assert not link.wait_queue.non_real_time
         full = False
         link.made_room()
@@ -321,7 +321,7 @@ async def test_the_driver_of_a_periodic_publisher_sends_the_sample_itself() -> N
 
 @pytest.mark.virtual_time
 @pytest.mark.parametrize("late", ["drop", "send"])
-async def test_a_link_is_asked_for_room_and_told_what_late_means(
+async def test_a_link_is_offered_a_sample_with_what_late_means(
     late: Literal["drop", "send"], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[r2p.Sample] = []
@@ -335,7 +335,7 @@ async def test_a_link_is_asked_for_room_and_told_what_late_means(
 
 
 @pytest.mark.virtual_time
-async def test_a_link_that_does_not_wait_leaves_those_alone_who_do() -> None:
+async def test_a_link_that_became_lossy_does_not_disturb_those_that_wait() -> None:
     """A reader that is too slow for both: what comes over the link is lossy, the module's own publisher waits."""
     got = []
 

@@ -67,7 +67,7 @@ async def test_samples_are_numbered_and_say_where_they_come_from() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_publishers_know_when_somebody_subscribes() -> None:
+async def test_publishers_know_when_there_is_a_subscriber() -> None:
     async with local() as module:
         node, other = pair(module)
         publisher = node.advertise("leds", Led)
@@ -179,7 +179,7 @@ async def test_what_a_signal_raises_crashes_the_node() -> None:
 
 @pytest.mark.virtual_time
 @pytest.mark.parametrize("klass", [r2p.NonRealTime, functools.partial(r2p.Sporadic, 0.01, pending=1)])
-async def test_a_signal_that_publishes_is_told_what_becomes_of_that_a_little_later(
+async def test_a_callback_that_publishes_is_called_a_little_later_for_what_is_missed_by_that(
     klass: Callable[..., r2p.NonRealTime],
 ) -> None:
     async with local() as module:
@@ -264,7 +264,7 @@ async def test_queues_with_room_get_it_at_once_and_the_publisher_waits_for_the_o
 
 
 @pytest.mark.virtual_time
-async def test_who_makes_no_room_in_time_is_lossy_until_it_has() -> None:
+async def test_a_queue_that_makes_no_room_in_time_is_lossy_until_it_has_some() -> None:
     missed = Recorder()
     async with local() as module:
         node, other = pair(module)
@@ -273,7 +273,7 @@ async def test_who_makes_no_room_in_time_is_lossy_until_it_has() -> None:
         for number in range(5):
             await publisher.publish(led(number))
         assert elapsed(module) == pytest.approx(STALL)
-        for number in range(5, 8):  # lossy: nobody waits, the oldest are lost
+        for number in range(5, 8):  # lossy: no publisher waits, the oldest are lost
             await publisher.publish(led(number))
         assert elapsed(module) == pytest.approx(STALL)
         reasons = ["no room for 1.0 s", "no room", "no room", "no room"]
@@ -324,7 +324,7 @@ async def test_its_own_subscription_never_blocks_a_node() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_nobody_waits_for_a_lossy_subscriber() -> None:
+async def test_no_publisher_waits_for_a_lossy_subscriber() -> None:
     async with local() as module:
         node, other = pair(module)
         lossy = other.subscribe("leds", Led, queue=2, lossy=True)
@@ -339,7 +339,7 @@ async def test_nobody_waits_for_a_lossy_subscriber() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_publish_nowait_says_whether_all_who_are_waited_for_had_room() -> None:
+async def test_publish_nowait_says_whether_all_queues_that_are_not_lossy_had_room() -> None:
     missed = Recorder()
     async with local() as module:
         node, other = pair(module)
@@ -412,7 +412,7 @@ async def test_several_tasks_publish_at_once() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_who_waits_first_is_served_first() -> None:
+async def test_waiting_publishers_are_served_in_order() -> None:
     """Three that always have something to say, and a reader that is slower than each: all get their share."""
     got = []
 
@@ -491,7 +491,7 @@ async def test_a_newer_value_pushes_in_a_latched_one_that_waits() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_when_one_has_waited_long_enough_nobody_waits_any_more() -> None:
+async def test_when_one_publisher_has_waited_long_enough_none_waits_any_more() -> None:
     async with local() as module:
         node, other = pair(module)
         leds = other.subscribe("leds", Led, queue=1)

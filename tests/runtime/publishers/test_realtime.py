@@ -317,7 +317,7 @@ async def test_a_driver_is_the_clock_until_it_lets_go() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_late_news_of_a_link_is_counted_and_signalled() -> None:
+async def test_reports_of_a_link_are_counted_and_signalled() -> None:
     missed, late = Recorder(), Recorder()
     async with local() as module:
         node, _ = pair(module)
