@@ -65,7 +65,7 @@ class BridgeOptions(msgspec.Struct, frozen=True, kw_only=True):
     reserve: tuple[str, ...] = ()
 
 
-def rule(text: str) -> Rule:
+def parse_rule(text: str) -> Rule:
     """Read a rule `TOPIC[@FROM[>TO]]`. Raises Error for an empty part."""
     topic, at, links = text.partition("@")
     source, arrow, target = links.partition(">")
@@ -94,8 +94,8 @@ class Policy:
         self._options = options
         self._prefixes: dict[str, str] = {}
         check_prefix(options.prefix)
-        self._allow = [rule(each) for each in options.allow]
-        self._deny = [rule(each) for each in options.deny]
+        self._allow = [parse_rule(each) for each in options.allow]
+        self._deny = [parse_rule(each) for each in options.deny]
 
     def kind(self, link: str) -> tuple[bool, ...]:
         """What distinguishes a link for `allows`: between links of the same kinds the answers are the same.

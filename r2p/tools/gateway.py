@@ -19,7 +19,7 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics
-from r2p.bridge.options import check_prefix, is_link, rule
+from r2p.bridge.options import check_prefix, is_link, parse_rule
 from r2p.msg import GatewayStatus
 from r2p.names import module_name_from
 from r2p.tools.options import Format, Quiet, Verbose, Via, class_choice, hertz
@@ -128,7 +128,7 @@ def default_name() -> str:
 def _rules(given: _Rules, option: str, via: list[str]) -> tuple[str, ...]:
     for text in given or ():
         try:
-            parsed = rule(text)
+            parsed = parse_rule(text)
         except r2p.Error as error:
             raise UsageError(f"{option} {error}") from error
         _links([parsed.source, parsed.target], option, via)

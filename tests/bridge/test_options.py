@@ -6,13 +6,13 @@ import pytest
 
 import r2p
 from r2p.bridge import BridgeOptions
-from r2p.bridge.options import Policy, is_link, rule
+from r2p.bridge.options import Policy, is_link, parse_rule
 
 
 @pytest.mark.parametrize("text", ["", "@", "leds@", "leds@a>", "@a"])
 def test_rules_without_sense(text: str) -> None:
     with pytest.raises(r2p.Error, match="write TOPIC, TOPIC@FROM"):
-        rule(text)
+        parse_rule(text)
 
 
 def test_links_are_meant_by_name_kind_or_pattern() -> None:
