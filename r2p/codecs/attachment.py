@@ -159,7 +159,7 @@ class HeaderReader(Generic[T]):
         """
         try:
             version, flags, hops, more, serial, sequence, stamp, deadline = _unpack(data)
-        except struct.error:
+        except struct.error:  # too short; a header of another version may be
             version = data[0] if data else VERSION
         if version != VERSION:
             raise UnknownType(f"version {version} of the header")
@@ -178,7 +178,7 @@ class HeaderReader(Generic[T]):
             at += 8 * more
         if sequence + more > _SEQUENCE_MAX:
             raise DecodeError("the sequence ends in this packet")
-        tail = data[at:]
+        tail = data[at:]  # the key of what is known: the origin of a known publisher is not decoded again
         known = self.known.get(tail)
         if known is None:
             known = self._remember(tail)
@@ -187,7 +187,7 @@ class HeaderReader(Generic[T]):
     def _remember(self, tail: bytes) -> T:
         origin = _decode_origin(tail)
         if len(self.known) >= _REMEMBERED_MAX:
-            self.known.clear()
+            self.known.clear()  # forged origins can fill it; those in use are decoded once more
         known = self.known[tail] = self._make(origin)
         return known
 

@@ -50,6 +50,7 @@ class SendWindow:
         """Add a subscriber, or give it another window; 0: it is never waited for."""
         known = self.subscribers.get(session)
         if known is None:
+            # What went out before it joined was not for it, so that counts as acknowledged.
             self.subscribers[session] = _SubscriberWindow(window, self.serial, self.serial)
         elif known.window != window:  # it need not have granted anything for what went out before
             known.window = window
@@ -75,7 +76,7 @@ class SendWindow:
             return
         behind = (self.serial - serial) & _WRAP
         if behind < _HALF:  # else it was never sent: a credit of an earlier run, or a forged one
-            known.acknowledged = max(known.acknowledged, self.serial - behind)
+            known.acknowledged = max(known.acknowledged, self.serial - behind)  # one credit may overtake another
             known.answered = known.waited_for = True
         self._update()
 

@@ -207,7 +207,7 @@ class ZenohSender:
         """A subscriber's token appeared, or has another window."""
         subscriber = self.subscriber(topic)
         current = subscriber is not None and subscriber.topic is self._hub.space.topics.get(topic)
-        if subscriber is not None and current and subscriber.has_session(session):
+        if subscriber is not None and current and subscriber.has_session(session):  # messages reach it already
             subscriber.add_session(session, window)
         else:
             self.reachability.add(topic, session, window)
@@ -369,6 +369,7 @@ class CreditReader:
         for subscriber in subscribers:
             if subscriber.wait_queue():
                 self._lost.guard(subscriber.refill)
+        # Only a publisher that waits has a thread woken for the next credit; else that is read after a pause.
         if any(subscriber.awaits_credit for subscriber in subscribers):
             self.wait()
         elif not self._waits and self._pause is None:
@@ -440,7 +441,7 @@ class Reachability:
 
     def _try(self, topic: str, session: int, pending: _PendingSubscriber) -> None:
         if self._pending.get((topic, session)) is not pending or not self._sender.has_topic(topic):
-            return
+            return  # it has left, or joined anew, or the topic is not used here any more
         if not self._reaches(topic):
             pending.retries += 1
             if pending.retries == _RETRIES:
@@ -472,7 +473,7 @@ class Reachability:
     def _check_subscriber(self, subscriber: ZenohSubscriber) -> None:
         for session in subscriber.unacknowledged():
             subscriber.silent_checks[session] += 1
-            if subscriber.silent_checks[session] <= _RESENDS:
+            if subscriber.silent_checks[session] <= _RESENDS:  # a latched value that was lost would not come again
                 subscriber.resend_latched()
             elif subscriber.silent_checks[session] == _RESENDS + 1:
                 self._sender.report_unreachable(subscriber.topic.name, session)

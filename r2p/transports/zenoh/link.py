@@ -203,7 +203,7 @@ class ZenohLink(Link):
         if session is None:
             return None
         for answer in await session.query(f"{self._prefix}/schema/*/{fingerprint.hex()}", _TYPE_TIMEOUT_S):
-            try:
+            try:  # the first answer whose fields have this fingerprint: others may lie
                 return message_type(*schemas.decode(answer, fingerprint))
             except (DecodeError, MessageError):
                 self.stats.lost["wrong schema"] += 1
@@ -221,7 +221,7 @@ class ZenohLink(Link):
 
     def _transport_changed(self, change: tuple[str, bool]) -> None:
         other, opened = change
-        if self._closed or not self._connects:
+        if self._closed or not self._connects:  # one that takes connections is up even alone
             return
         if opened:
             self._transports.add(other)
@@ -235,7 +235,7 @@ class ZenohLink(Link):
     def _token_changed(self, change: tuple[str, bool]) -> None:
         if self._closed:
             return
-        if self._token_changes.overflowed != self._overflowed:
+        if self._token_changes.overflowed != self._overflowed:  # tokens were lost, which zenoh does not report again
             overflowed = self._token_changes.overflowed
             missed, self._overflowed = overflowed - self._overflowed, overflowed
             self._apply(self._liveliness.missed(self._clock.monotonic(), missed))

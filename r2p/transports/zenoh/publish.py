@@ -75,7 +75,7 @@ class TxStream:
         What is not sent is counted here. Subscribers must not count it as well, so what follows gets its serials.
         """
         waiting, self.waiting = self.waiting, []
-        serial = self.window.serial - len(waiting) + 1
+        serial = self.window.serial - len(waiting) + 1  # each was given one when it was offered
         for samples in _packets(waiting) if batching and len(waiting) > 1 else [[each] for each in waiting]:
             try:
                 data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
@@ -95,7 +95,7 @@ class TxStream:
     def _header(self, samples: list[Sample], serial: int) -> bytes:
         first = samples[0]
         hops = first.hops + bool(first.source.link)  # what comes from another link crosses this gateway
-        if first.clock is None:
+        if first.clock is None:  # nearly always: packed in one call, without a `Header`
             start = start_of(hops, stamped=first.stamped)
             if len(samples) == 1:
                 return self._packer.one(start, serial, first.sequence, first.stamp, first.deadline)
@@ -141,7 +141,7 @@ class Batcher:
 
     def add(self, stream: TxStream) -> None:
         """Send soon: a message waits in a stream that was empty, or that is full now."""
-        if not self._turn_begun:
+        if not self._turn_begun:  # so a message that comes alone is not held up
             self._turn_begun = True
             self._loop.call_soon(self._end_turn)
         elif not stream.urgent and len(stream.waiting) < BATCH_MAX:
@@ -226,7 +226,7 @@ class PublisherCache:
         if not publishers or self._session is None:
             return False
         outbound = self._session.outbound
-        if not outbound.uses_thread:
+        if not outbound.uses_thread:  # else zenoh may take long to answer: the result is there at a later call
             return all(_reaches(publisher) for publisher in publishers)
         answer = self._answers.pop(topic, None)
         if answer is None and topic not in self._asked:

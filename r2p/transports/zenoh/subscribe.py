@@ -191,6 +191,7 @@ class RxStream:
         except DecodeError as error:
             self._stats.lost["unknown type" if isinstance(error, UnknownType) else "undecodable"] += 1
             return 1
+        # Sequence 0 means that it is not known, so it is 0 in each message of the packet.
         source, publisher_class, step = publisher.source, publisher.publisher_class, 1 if sequence else 0
         samples = []
         for part, stamp in zip(parts, stamps, strict=True):
@@ -238,7 +239,7 @@ class RxStream:
         stats.bytes_received += count * publisher.last_size
         deliver = self.topic.deliver
         for sample in samples:
-            if backlog.blocked is not None:
+            if backlog.blocked is not None:  # by a message before it in the packet
                 self._queue(publisher, serial, sample)
                 serial += 1
                 continue
@@ -307,7 +308,7 @@ class RxStream:
             self._reject(publisher, serial)
             return False
         publisher.last_size = size
-        if serial == window.next_serial:
+        if serial == window.next_serial:  # `advance` inlined; where serials wrap it is called, and finds no gap
             window.next_serial = serial + 1
         elif not self._advance(publisher, serial):
             self._stats.lost["repeated"] += 1
@@ -449,7 +450,7 @@ class ZenohReceiver:
         """The link is down: keep how far each publisher had come, as what it sends until then is lost."""
         self._up = False
         if len(self._kept) >= _SENDERS_MAX or self.loop.time() >= self._kept_until:
-            self._kept.clear()
+            self._kept.clear()  # what was kept at an earlier outage, and is not used
         self._kept |= {name: (stream.windows, _progress(stream.windows)) for name, stream in self._streams.items()}
 
     def resumed(self) -> None:
