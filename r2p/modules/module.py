@@ -71,6 +71,7 @@ class Module:
     ) -> None:
         self.name = module_name(name) if name is not None else module_name_from(socket.gethostname())
         self.observer = observer
+        """Whether it is a tool that only looks."""
         self.rebooted = False
         """Whether REBOOT has restarted its nodes."""
         self.stopped = False
@@ -214,7 +215,7 @@ class Module:
         self._open = False
         self._commands.tasks = None
         try:
-            await self._end_nodes()
+            await self._end_nodes()  # while the links are up: clean-up publishes what stops the motors
         finally:
             if self._log is not None:
                 self._log.close()
@@ -294,6 +295,7 @@ class Module:
         """End all nodes, and wait for that. Links stay up, and other modules are informed (by a flag of ALIVE)."""
         async with self._switching:
             self.stopped = True
+            # Before the clean-up, which may take long: the module that sent STOP waits for this flag.
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
             await self._end_nodes()
 

@@ -88,6 +88,7 @@ class _Signals:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
+            # A thread: nodes may block the main one.
             threading.Thread(target=self._enforce, name="r2p-grace", daemon=True).start()
             self._before = {
                 number: signal.signal(number, self._interrupt) for number in (signal.SIGINT, signal.SIGTERM)

@@ -120,7 +120,7 @@ def _escapes(code: CodeType, offset: int) -> bool:
     """Whether an exception that is raised at this offset leaves the function without an `except` that catches it."""
     entries = dis.Bytecode(code).exception_entries  # type: ignore[attr-defined]  # since Python 3.11, unlisted
     by_start = {handler.start: handler for handler in _handlers(code)}
-    for _ in range(len(entries) + 1):
+    for _ in range(len(entries) + 1):  # outwards: each step leaves one handler, so this ends
         target = next((each.target for each in entries if each.start <= offset < each.end), None)
         if target is None:
             return True

@@ -79,7 +79,7 @@ class Sink(abc.ABC):
         queue = self.wait_queue()
         if not self.reachable:
             self.force(sample)
-        elif queue.line_of(sample) or not self.offer(sample):
+        elif queue.line_of(sample) or not self.offer(sample):  # never past what waits already
             queue.add_latched(self, sample)
 
     def become_lossy(self, reason: str) -> None:
@@ -159,7 +159,7 @@ class WaitQueue:
         """Let a latched value wait, too; of one publisher only the last."""
         for each, delivery in self.line_of(sample):
             if each is sink and isinstance(delivery, _LatchedDelivery) and delivery.sample.source == sample.source:
-                delivery.sample = sample
+                delivery.sample = sample  # at its place in the line
                 return
         _LatchedDelivery(sample, [sink])
 
@@ -170,7 +170,7 @@ class WaitQueue:
 
     def serve(self) -> None:
         """Hand out what room there is, in order."""
-        for line in (self.real_time, self.non_real_time):
+        for line in (self.real_time, self.non_real_time):  # what expires comes first
             while line:
                 first = line.popleft()
                 sink, delivery = first
@@ -186,7 +186,7 @@ class WaitQueue:
 
     def recover(self) -> None:
         """Call those that went on without waiting: there is plenty of room."""
-        recoveries, self.recoveries = self.recoveries, []
+        recoveries, self.recoveries = self.recoveries, []  # first: a callback may bring about that one registers again
         for callback in recoveries:
             callback()
 
@@ -205,7 +205,7 @@ class WaitQueue:
     def reject_all(self, reason: str) -> None:
         """Force everything into its sinks, which lose samples for this reason."""
         for line in (self.real_time, self.non_real_time):
-            while line:
+            while line:  # one by one: a completion may make its publisher publish, and that is rejected, too
                 sink, delivery = line.popleft()
                 sink.force(delivery.sample)
                 delivery.complete(sink, reason)
@@ -228,6 +228,6 @@ def _pop(line: _Line, sink: Sink) -> list[PendingDelivery]:
     popped = [delivery for each, delivery in line if each is sink]
     if popped:
         rest = [entry for entry in line if entry[0] is not sink]
-        line.clear()
+        line.clear()  # in place: `serve` may be in the middle of this line
         line.extend(rest)
     return popped

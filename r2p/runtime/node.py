@@ -81,10 +81,13 @@ class Node:
     ) -> None:
         self.name = name
         self.module = space.module
+        """The name of its module."""
         self.priority = priority
+        """Nodes of higher priority get their messages first."""
         self.log = NodeLogger(
             logging.getLogger(f"r2p.{space.module}.{name}"), lambda level, text: log(level, name, text)
         )
+        """Its logger; records from INFO up also go to the module's `log` topic."""
         self.publishers: dict[AnyPublisher, None] = {}
         """Its open publishers, in order (the values mean nothing)."""
         self.subscribers: dict[Subscriber[Any], None] = {}

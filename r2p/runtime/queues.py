@@ -83,6 +83,7 @@ class WakeScheduler:
 
     def wake_later(self, priority: int, waiter: asyncio.Future[None]) -> None:
         """Wake in its turn."""
+        # The number keeps the order within a priority, and futures from being compared.
         heapq.heappush(self._waiting, (-priority, next(self._order), waiter))
         if not self._running:
             self._running = True
@@ -91,9 +92,9 @@ class WakeScheduler:
     def _turn(self) -> None:
         while self._waiting:
             waiter = heapq.heappop(self._waiting)[2]
-            if not waiter.done():
+            if not waiter.done():  # else its task was cancelled meanwhile
                 waiter.set_result(None)
-                self._loop.call_soon(self._turn)
+                self._loop.call_soon(self._turn)  # the next one a turn later: important nodes come in between
                 return
         self._running = False
 
@@ -192,6 +193,6 @@ class SubscriberQueue(Sink):
     def _append(self, sample: Sample) -> None:
         # `Topic.deliver` has a copy of this: change both.
         self.queue.append(sample)
-        if (waiter := self.waiter) is not None:
+        if (waiter := self.waiter) is not None:  # woken once: messages that follow find the reader awake
             self.waiter = None
             self._wake_scheduler.wake(self.priority, waiter)

@@ -83,7 +83,9 @@ class Subscriber(Generic[T]):
         options: SubscriberOptions,
     ) -> None:
         self.topic = topic.name
+        """Its name, after remapping."""
         self.callback: Callback[T] | None = options.callback
+        """What `Node.spin` calls with each message; None: messages are read by iteration or `fetch`."""
         self.undecodable = 0
         """Messages whose bytes don't decode as the type; skipped."""
         self.stale = 0
@@ -179,14 +181,14 @@ class Subscriber(Generic[T]):
 
         Raises MessageError for a time-out that is not a number of seconds.
         """
-        if timeout is not None and (timeout.__class__ is not float or not timeout <= LONGEST):
+        if timeout is not None and (timeout.__class__ is not float or not timeout <= LONGEST):  # no call for a good one
             check_timeout(f"topic {self.topic}: the time-out of fetch", timeout)
-        if self.queue:
+        if self.queue:  # else the wait lets other tasks run
             await self._yield_sometimes()
         message = self._next()
         if message is not None:
             return message
-        if timeout is None:
+        if timeout is None:  # apart, as a time-out costs more than a message
             return await self._fetch_next()
         async with asyncio.timeout(timeout):
             return await self._fetch_next()

@@ -147,6 +147,7 @@ class Topic:
         for sink in self.queues:
             queue = sink.queue
             if len(queue) >= sink.limit:
+                # Never for a queue of the publishing node: it would wait for itself.
                 if sink.node is not own and (sink.waits or sink.waits_for(sample)):
                     blocked = [sink] if blocked is None else [*blocked, sink]
                     continue
@@ -172,6 +173,7 @@ class Topic:
     ) -> list[Sink] | None:
         """Offer the sample to links; returns `blocked`, and those that have no room."""
         for remote in subscribers:
+            # Behind what waits in the same line: nothing overtakes. Two look-ups, as lines are mostly empty.
             waiting = remote.waiting
             in_line = (waiting.real_time or waiting.non_real_time) and waiting.line_of(sample)
             if remote.link is slot_link or (not in_line and remote.offer(sample)):

@@ -33,7 +33,7 @@ _REMEMBERED = 64  # sequence numbers of messages that were missed last: several 
 
 
 class BasePublisher(Generic[M]):
-    """What all publishers share. Made by `Node.advertise`."""
+    """What all publishers share: made by `Node.advertise`, closed by `close()` or when their node ends."""
 
     publisher_class: PublisherClass
 
@@ -48,9 +48,13 @@ class BasePublisher(Generic[M]):
         latch: bool,
     ) -> None:
         self.topic = topic.name
+        """Its name, after remapping."""
         self.type = layout.cls
+        """The message class."""
         self.node = node
+        """The node that publishes."""
         self.latch = latch
+        """Whether the last message is sent to subscribers that join later."""
         self.sent = 0
         """Messages published; the sequence number of the last one."""
         self.missed = 0
@@ -122,7 +126,7 @@ class BasePublisher(Generic[M]):
         """Stop publishing; the links inform their peers."""
         if self in self._topic.publishers:
             self._topic.publishers.remove(self)
-            self._encode = self._closed
+            self._encode = self._closed  # so that publish() does not have to look each time
             self._space.release(self._topic)
             self.node.forget(self)
             for waiter in self._waiters:

@@ -14,7 +14,10 @@ _NRT = PublisherClass.NON_REAL_TIME
 
 
 class Publisher(BasePublisher[M]):
-    """A non real-time publisher."""
+    """A publisher of messages that do not expire: `publish()` waits for slow subscribers, up to the stall time.
+
+    Made by `Node.advertise` with `NonRealTime`, its default.
+    """
 
     publisher_class = PublisherClass.NON_REAL_TIME
 

@@ -27,7 +27,10 @@ _LATE_SHARE = 2  # a message is late by more than 1/2 of its period: it is neare
 
 
 class PeriodicPublisher(BasePublisher[M], SlotPublisher):
-    """A time-triggered publisher: it has no `publish()`; the `fill` of its class is called at every period."""
+    """A time-triggered publisher: it has no `publish()`; the `fill` of its class is called at every period.
+
+    Made by `Node.advertise` with `Periodic`.
+    """
 
     publisher_class = PublisherClass.PERIODIC
 
@@ -43,9 +46,11 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
     ) -> None:
         super().__init__(space, node, topic, layout, klass, latch=latch)
         self.period = klass.period
+        """Seconds: that of the slots, while a link has some for it."""
         self.skipped = 0
         """Periods that passed without a message because the event loop was blocked."""
         self.lead = klass.lead
+        """Seconds before a slot at which `fill` is called."""
         self._fill = klass.fill
         self._own_period = klass.period
         self._slot_link: object = None
@@ -92,7 +97,7 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         Local queues and all other links get the message from here; the link of the slots gets it as the result. None:
         there is no message.
         """
-        self._give_up(NO_ROOM)
+        self._give_up(NO_ROOM)  # before `fill`: a link without room loses the old message, not the new one
         if self._encode == self._closed or self.node.ending:
             return None
         if skipped or late > self.period * _SECOND / _LATE_SHARE:

@@ -16,7 +16,10 @@ _TOO_LATE = "no room by the deadline"
 
 
 class SporadicPublisher(BasePublisher[M]):
-    """An event-triggered publisher."""
+    """A publisher of events that are due by a deadline: `publish()` never waits.
+
+    Made by `Node.advertise` with `Sporadic`.
+    """
 
     publisher_class = PublisherClass.SPORADIC
 
@@ -67,7 +70,7 @@ class SporadicPublisher(BasePublisher[M]):
     def _wait(self, event: "_EventDelivery[M]") -> None:
         self._pending.append(event)
         if len(self._pending) > self._limit:
-            self._give_up(self._pending[0], "too many wait")
+            self._give_up(self._pending[0], "too many wait")  # the oldest: it is due first, and worth least
         self._arm()
 
     def delivery_completed(self, event: "_EventDelivery[M]", sink: Sink, reason: str) -> None:
