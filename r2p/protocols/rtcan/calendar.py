@@ -105,7 +105,7 @@ class Calendar:
         if before is not None:
             if before.fragments == fragments and self._wanted(message, period, round_down) == before.period:
                 return before
-            self.remove(message)
+            self.remove(message)  # its own slots are free for it
         wanted = self._wanted(message, period, round_down)
         refusal = self._impossible(message, wanted, fragments)
         if refusal is not None:
@@ -179,7 +179,7 @@ def occupied(reservation: Reservation, start: int, slots: int) -> int:
     """The slots of the reservation in a cycle that begins with number `start`, as a mask."""
     period, train = reservation.period, (1 << reservation.fragments) - 1
     offset = (reservation.phase - start) % period
-    if period >= slots:
+    if period >= slots:  # at most one occurrence, and a whole one: none spans two cycles
         return train << offset if offset < slots else 0
     return _comb(period, offset, reservation.fragments, slots)
 

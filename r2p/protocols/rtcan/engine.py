@@ -510,7 +510,7 @@ class Engine:
     def _drain(self) -> Sequence[Action]:
         if not self._actions:
             return _NOTHING
-        actions = self._actions[:]
+        actions = self._actions[:]  # the parts keep the list itself
         self._actions.clear()
         return actions
 

@@ -181,6 +181,7 @@ class ManagementHandlers:
             self._send(now, wanted)
             return
         id8 = self._network.node_id.id8
+        # Its own answer never goes over the bus: handle it as if it had.
         answer = self._answer(now, wanted, id8)
         if answer is not None:
             self._handlers[type(answer)](now, answer, id8)

@@ -119,7 +119,7 @@ class MasterTracker:
             return None
         ours = self._cycle.timing.cycle
         length, error = measured
-        return abs(length - ours) <= ours // 1000 + error
+        return abs(length - ours) <= ours // 1000 + error  # clocks differ less, other numbers of slots more
 
     def forget(self, master: int | None) -> None:
         """This master's syncs are over."""
@@ -133,6 +133,7 @@ class MasterTracker:
             return False
         if (network.id8, network.epoch) == (master, epoch):
             return False
+        # A better master that goes on with this epoch, grid and count has taken over: it is ours from now on.
         same_grid = network.epoch == epoch and -_NEAR <= network.cycle - self._cycle.counter <= _NEAR
         return not (same_grid and (network.priority, network.id8) > self._rank)
 
@@ -201,7 +202,7 @@ class NetworkMembership:
             self._counts["foreign syncs"] += 1
             self._answer(now)
             return
-        self._transmitter.poll(now)  # first what the cycle that ends now still has to do
+        self._transmitter.poll(now)  # first what is left to do of the cycle that ends now
         bridged = self._cycle.state is CycleState.HOLDING
         match self._cycle.on_sync(frame, stamp):
             case Alignment.ALIGNED:
@@ -222,7 +223,7 @@ class NetworkMembership:
     def on_network(self, now: int, network: management.Network) -> None:
         """A master says who it is, and the parameters of its network."""
         if network.cycle * self._cycle.timing.cycle > _LONGEST:
-            self._counts["undecodable"] += 1
+            self._counts["undecodable"] += 1  # forged: our own NETWORK could not say this count as a time
             return
         if self.election.role is Role.MASTER:
             if self.election.beats(self.node_id.id8, network.priority, network.id8):

@@ -84,6 +84,7 @@ class LaxityQueue:
         """
         message.frames = rtcan.fragment_count(len(message.payload))
         fifo = self._fifos.get(message.message)
+        # `depth`: one topic alone must not fill the queue.
         if (self.size >= self._capacity and not management) or (fifo is not None and len(fifo.waiting) >= self._depth):
             return False
         self._count += 1
@@ -197,7 +198,7 @@ class LaxityQueue:
         fifo = self._fifos.get(message)
         if fifo is None:
             return []
-        first = fifo.waiting[0] if fifo.busy else None
+        first = fifo.waiting[0] if fifo.busy else None  # its frame may be on the bus
         gone = [each for each in fifo.waiting if not each.sent and each is not first and which(each)]
         if gone:
             self._drop(fifo, gone)

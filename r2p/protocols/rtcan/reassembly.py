@@ -130,7 +130,7 @@ class Reassembly:
 
     def _begin(self, buffer: SourceBuffer, frame: Frame, left: int, stamp: int) -> Received | None:
         """Nothing is open: the frame is a beginning, or belongs to a message of which the beginning is missing."""
-        rest = left == buffer.expected
+        rest = left == buffer.expected  # of something that has been counted as lost
         if left == buffer.first and not rest:
             buffer.identifier, buffer.started = frame.id, stamp
             return self._continue(buffer, frame.data, stamp)
@@ -146,6 +146,7 @@ class Reassembly:
         left = buffer.first - len(buffer.parts)
         buffer.expected = left - 1
         buffer.last = stamp
+        # Only the last frame may be shorter.
         if len(data) != (FRAME_MAX if left else buffer.size - buffer.first * FRAME_MAX):
             self._reset(buffer, "wrong length")
             return None
