@@ -49,7 +49,6 @@ _SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer ha
 _SETTLED_ON_BUS = 0.6  # ... on a bus, where modules announce in turn
 _FIRMWARE = 1.5  # seconds in which firmware, which announces one item each half second, is heard at least once
 _SETTLE_MAX = 8.0  # seconds to listen while announcements arrive: a bus of 1 Mbit/s carries 100 of them a second
-_BUSES = ("rtcan", "sim")
 _POLL = 0.05  # seconds
 _LOOPBACK = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 _LINK_UP = 5.0  # seconds to wait for the first link
@@ -264,8 +263,7 @@ class Session:
 
     async def _settled(self) -> bool:
         """Wait until no new announcements arrive; False if they still did after the longest time."""
-        on_bus = any(url.partition(":")[0] in _BUSES for url in self.settings.via)
-        quiet = _SETTLED_ON_BUS if on_bus else _SETTLED
+        quiet = _SETTLED_ON_BUS if any(link.has_slots for link in self.module.links) else _SETTLED
         loop = asyncio.get_running_loop()
         start = changed_at = loop.time()
         known = 0
