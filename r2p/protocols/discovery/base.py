@@ -24,28 +24,17 @@ class DiscoveryProtocol(ABC):
 
     counts: Counter[str]
     """Received messages that were dropped, by reason."""
-
-    # What is known of the link
+    modules: dict[str, ModuleInfo]
+    """The other modules by name. One of this module's own name is another module that has it too."""
+    topics: dict[str, TopicInfo]
+    """The topics of the other modules, by name."""
+    endpoints: dict[EndpointKey, EndpointInfo]
+    """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
 
     @property
     @abstractmethod
     def flags(self) -> int:
         """This module's flags: FLAG_... of ALIVE."""
-
-    @property
-    @abstractmethod
-    def modules(self) -> dict[str, ModuleInfo]:
-        """The other modules by name. One of this module's own name is another module that has it too."""
-
-    @property
-    @abstractmethod
-    def topics(self) -> dict[str, TopicInfo]:
-        """The topics of the other modules, by name."""
-
-    @property
-    @abstractmethod
-    def endpoints(self) -> dict[EndpointKey, EndpointInfo]:
-        """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
 
     @property
     @abstractmethod

@@ -17,7 +17,7 @@ from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic, Relayed
 from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.demand import Demand, LeasedDemand
-from r2p.protocols.discovery.directory import Directory, EndpointInfo, EndpointKey, TopicInfo
+from r2p.protocols.discovery.directory import Directory
 from r2p.protocols.discovery.events import (
     COMMAND_OF_TYPE,
     MESSAGE_OF_COMMAND,
@@ -26,7 +26,6 @@ from r2p.protocols.discovery.events import (
     CommandReceived,
     ConnectionDenied,
     Event,
-    ModuleInfo,
     Outbox,
     PeerAddress,
     TopicType,
@@ -68,6 +67,9 @@ class Discovery(DiscoveryProtocol):
         self._schedule = Schedule(rate, burst, round(quiet * _SECOND))
         self._timers = KeyedTimers()
         self._directory = Directory(self._timers, self.counts)
+        self.modules = self._directory.modules
+        self.topics = self._directory.topics
+        self.endpoints = self._directory.endpoints
         self._announcer = Announcer(module, instance, self._schedule, self._outbox, self._directory, observer=observer)
         self._negotiation = SubscriptionNegotiation(
             self._announcer, self._directory, self._timers, self._outbox, self.counts
@@ -98,18 +100,6 @@ class Discovery(DiscoveryProtocol):
     @property
     def flags(self) -> int:
         return self._announcer.flags
-
-    @property
-    def modules(self) -> dict[str, ModuleInfo]:
-        return self._directory.modules
-
-    @property
-    def topics(self) -> dict[str, TopicInfo]:
-        return self._directory.topics
-
-    @property
-    def endpoints(self) -> dict[EndpointKey, EndpointInfo]:
-        return self._directory.endpoints
 
     @property
     def sole_peer(self) -> int | None:

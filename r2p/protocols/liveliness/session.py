@@ -18,7 +18,7 @@ from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.demand import Demand
-from r2p.protocols.discovery.directory import MOST, Aliases, EndpointInfo, EndpointKey, TopicInfo
+from r2p.protocols.discovery.directory import MOST, Aliases
 from r2p.protocols.discovery.events import (
     COMMAND_OF_TYPE,
     MESSAGE_OF_COMMAND,
@@ -69,6 +69,9 @@ class LivelinessDiscovery(DiscoveryProtocol):
         self._own = TokenSet(module, instance, observer=observer)
         self._matching = Matching(self._own, self._events)
         self._modules = ModuleRegistry(module, instance, self._events, self.counts)
+        self.modules = self._modules.modules
+        self.topics = self._matching.topics
+        self.endpoints = self._modules.endpoints
         self._tokens: dict[str, liveliness.Token] = {}
         self._refused = RefusedTokens(TOKENS_MAX, instance)
         self._aliases = Aliases()
@@ -79,14 +82,6 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._own.flags
 
     @property
-    def modules(self) -> dict[str, ModuleInfo]:
-        return self._modules.modules
-
-    @property
-    def endpoints(self) -> dict[EndpointKey, EndpointInfo]:
-        return self._modules.endpoints
-
-    @property
     def sole_peer(self) -> int | None:
         """None: there may always be more than one module on the network."""
         return None
@@ -94,10 +89,6 @@ class LivelinessDiscovery(DiscoveryProtocol):
     @property
     def generation(self) -> int:
         return self._modules.generation
-
-    @property
-    def topics(self) -> dict[str, TopicInfo]:
-        return self._matching.topics
 
     # What the module has and wants
 
