@@ -10,9 +10,9 @@ A topic goes out no further than its subscribers have room (r2p.protocols.flow_c
 import asyncio
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 import msgspec
+import zenoh
 
 from r2p.codecs import UnknownType
 from r2p.codecs.attachment import Credit, Origin, decode_credit, name_for
@@ -23,10 +23,7 @@ from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.link import Hub, Link, LinkSubscriber
 from r2p.transports.zenoh.publish import BATCH_MAX, Batcher, PublisherCache, TxStream
-from r2p.transports.zenoh.session import SubscriptionReader, ZenohError, ZenohSession
-
-if TYPE_CHECKING:
-    import zenoh
+from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 
 _NRT = PublisherClass.NON_REAL_TIME
 
@@ -169,7 +166,7 @@ class ZenohSender:
         self.link = link
         self.loop = hub.space.loop
         self.publishers = PublisherCache()
-        self.batcher = Batcher(self.loop, link.stats, ZenohError, batching=batching)
+        self.batcher = Batcher(self.loop, link.stats, batching=batching)
         self.credits = CreditReader(self)
         self.reachability = Reachability(self)
         self.final_credits = FinalCredits(self.loop, self.credits.receive, self._count_unknown)
@@ -335,18 +332,18 @@ class CreditReader:
         if self._pause is not None:
             self._pause.cancel()
 
-    def _arrived(self, first: "zenoh.Sample | None") -> None:
+    def _arrived(self, first: zenoh.Sample | None) -> None:
         self._waits = False
         self._read(first)
         self._serve()
 
-    def _read(self, sample: "zenoh.Sample | None") -> None:
+    def _read(self, sample: zenoh.Sample | None) -> None:
         subscribers = {each.topic.name: each for each in self._sender.subscribers()}
         while sample is not None and self._reader is not None:
             self._lost.guard(self._apply, sample.payload, subscribers)
             sample = self._reader.receive()
 
-    def _apply(self, payload: "zenoh.ZBytes", subscribers: dict[str, ZenohSubscriber]) -> None:
+    def _apply(self, payload: zenoh.ZBytes, subscribers: dict[str, ZenohSubscriber]) -> None:
         try:
             credit = decode_credit(payload.to_bytes() if len(payload) <= _CREDIT_BYTES_MAX else b"")
             PublisherClass(credit.publisher_class)

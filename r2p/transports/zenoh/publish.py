@@ -10,7 +10,8 @@ import asyncio
 import functools
 from collections.abc import Callable, Iterator
 from itertools import groupby
-from typing import TYPE_CHECKING
+
+import zenoh
 
 from r2p.codecs.attachment import PACKET_MAX, Header, Origin, Packer, encode, start_of
 from r2p.codecs.management import ANY_TYPE
@@ -19,12 +20,8 @@ from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.stats import LinkStats
+from r2p.transports.zenoh.session import ZenohSession
 from r2p.transports.zenoh.threads import WAITING_MAX, WAITING_MAX_URGENT
-
-if TYPE_CHECKING:
-    import zenoh
-
-    from r2p.transports.zenoh.session import ZenohSession
 
 Put = Callable[..., None]
 """`Publisher.put(data, *, attachment)` of zenoh."""
@@ -69,8 +66,8 @@ class TxStream:
         self._packer = Packer(origin)
         self._put = put
 
-    def send(self, stats: LinkStats, closed: type[Exception], *, batching: bool) -> None:
-        """Send what waits; zenoh drops it where the network is too slow. `closed` is raised without a session.
+    def send(self, stats: LinkStats, *, batching: bool) -> None:
+        """Send what waits; zenoh drops it where the network is too slow.
 
         What is not sent is counted here. Subscribers must not count it as well, so what follows gets its serials.
         """
@@ -80,7 +77,7 @@ class TxStream:
             try:
                 data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
                 self._put(data, attachment=self._header(samples, serial))
-            except closed:
+            except zenoh.ZError:  # the session is closed
                 stats.lost[LINK_DOWN] += len(samples)
             except BlockingIOError:  # the thread that sends is behind
                 stats.lost["send buffer full"] += len(samples)
@@ -126,14 +123,11 @@ def _header_key(numbered: tuple[int, Sample]) -> object:
 class Batcher:
     """Decides when the streams of one link send: the first message at once, the others when the turn is over."""
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, stats: LinkStats, closed: type[Exception], *, batching: bool
-    ) -> None:
-        """`closed` is what sending raises without a session; `batching`: several messages may share a payload."""
+    def __init__(self, loop: asyncio.AbstractEventLoop, stats: LinkStats, *, batching: bool) -> None:
+        """`batching`: several messages may share a payload."""
         self._loop = loop
         self._batching = batching
         self._stats = stats
-        self._closed = closed
         self._turn_begun = False
         self._turns = 0
         self._count = 0
@@ -147,19 +141,19 @@ class Batcher:
         elif not stream.urgent and len(stream.waiting) < BATCH_MAX:
             self._streams[stream] = None
             return
-        stream.send(self._stats, self._closed, batching=self._batching)
+        stream.send(self._stats, batching=self._batching)
 
     def send(self, stream: TxStream) -> None:
         """Send what waits in this stream."""
         if self._streams.pop(stream, stream) is None:
-            stream.send(self._stats, self._closed, batching=self._batching)
+            stream.send(self._stats, batching=self._batching)
 
     def flush(self) -> None:
         """Send what waits in all streams."""
         streams, self._streams = self._streams, {}
         self._turns = self._count = 0
         for stream in streams:
-            stream.send(self._stats, self._closed, batching=self._batching)
+            stream.send(self._stats, batching=self._batching)
 
     def discard(self) -> int:
         """Drop what waits, and return how much that was. It is counted here, so what follows gets its serials."""
@@ -198,7 +192,7 @@ class PublisherCache:
         self._answers: dict[str, bool] = {}
         self._windows: dict[tuple[str, int], SendWindow] = {}
 
-    def connect(self, session: "ZenohSession", prefix: str) -> None:
+    def connect(self, session: ZenohSession, prefix: str) -> None:
         """Use this session; the key of a topic is its name behind the prefix."""
         self._session = session
         self._prefix = prefix
@@ -247,7 +241,7 @@ class PublisherCache:
         most = WAITING_MAX if publisher_class == PublisherClass.NON_REAL_TIME else WAITING_MAX_URGENT
         return functools.partial(self._session.outbound.put, publisher.put, most)
 
-    def _publisher(self, topic: str, publisher_class: int) -> "zenoh.Publisher | None":
+    def _publisher(self, topic: str, publisher_class: int) -> zenoh.Publisher | None:
         key = topic, publisher_class
         if key not in self._publishers and self._session is not None:
             self._publishers[key] = self._session.declare_publisher(f"{self._prefix}{topic}", publisher_class)
@@ -258,7 +252,7 @@ class PublisherCache:
         return self._windows.setdefault((topic, publisher_class), SendWindow())
 
 
-def _reaches(publisher: "zenoh.Publisher") -> bool:
+def _reaches(publisher: zenoh.Publisher) -> bool:
     # The stubs of zenoh promise a bool; what comes is an object with one, and is itself always true.
     status: object = publisher.matching_status
     return bool(getattr(status, "matching", status))

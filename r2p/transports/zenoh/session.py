@@ -28,8 +28,6 @@ from r2p.transports.zenoh.threads import OutboundThread
 
 T = TypeVar("T")
 
-ZenohError = zenoh.ZError
-
 _CONTROL_BYTES_MAX = 4096
 
 _CHANNEL_MAX = 65_536

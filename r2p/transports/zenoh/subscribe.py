@@ -10,9 +10,9 @@ periodic messages wait a few turns of the event loop, then they replace older me
 
 import itertools
 from collections.abc import Hashable
-from typing import TYPE_CHECKING
 
 import msgspec
+import zenoh
 
 from r2p.codecs import UnknownType
 from r2p.codecs.attachment import SERIAL_WRAP, Credit, HeaderReader, Origin, encode_credit
@@ -26,11 +26,7 @@ from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link
 from r2p.transports.zenoh.backlog import Backlog
-
-if TYPE_CHECKING:
-    import zenoh
-
-    from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
+from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 
 RING = 4096
 """Packets of one topic that zenoh keeps; of more, it loses the oldest."""
@@ -144,7 +140,7 @@ class RxStream:
 
     # Packets
 
-    def arrived(self, packet: "zenoh.Sample | None") -> None:
+    def arrived(self, packet: zenoh.Sample | None) -> None:
         """Deliver this packet and those behind it, about MESSAGES_PER_TURN messages in a turn of the loop."""
         reader = self.reader
         if reader is None:
@@ -423,7 +419,7 @@ class ZenohReceiver:
         topic.latched_sources.append(self)
         self._start_reading(stream)
 
-    def connect(self, session: "ZenohSession", prefix: str) -> None:
+    def connect(self, session: ZenohSession, prefix: str) -> None:
         """Use this session; subscribe to the topics that were opened before there was one."""
         self._session = session
         self._prefix = prefix

@@ -5,6 +5,7 @@ from typing import Any
 
 import msgspec
 import pytest
+import zenoh
 
 from r2p.codecs import attachment
 from r2p.codecs.attachment import ClockOffset, Origin
@@ -27,7 +28,7 @@ class Wire:
         self.sent: list[bytes] = []
         self.headers: list[attachment.Header] = []
         self.stats = LinkStats()
-        self.batcher = Batcher(asyncio.get_running_loop(), self.stats, ConnectionError, batching=batching)
+        self.batcher = Batcher(asyncio.get_running_loop(), self.stats, batching=batching)
         self.streams = {urgent: TxStream(SendWindow(), urgent=urgent) for urgent in (False, True)}
         for stream in self.streams.values():
             stream.prepare(HERE, ORIGIN, self.put)
@@ -35,7 +36,7 @@ class Wire:
 
     def put(self, data: bytes, *, attachment: bytes) -> None:
         if data[:1] == b"x":
-            raise ConnectionError
+            raise zenoh.ZError("closed")
         self.sent.append(data)
         self.headers.append(_decode(attachment))
 

@@ -97,7 +97,7 @@ async def test_what_does_not_fit_is_counted() -> None:
     for sequence in range(1, WAITING_MAX_URGENT + 4):
         stream.window.serial += 1
         stream.waiting.append(Sample(b"x", Source("PC1", "talk"), 1, sequence=sequence))
-        stream.send(stats, ConnectionError, batching=True)
+        stream.send(stats, batching=True)
     assert (stats.sent, dict(stats.lost)) == (WAITING_MAX_URGENT, {"send buffer full": 3})
     assert stream.window.serial == WAITING_MAX_URGENT  # so the next one that is sent leaves no gap to count once more
     busy.free.set()
