@@ -178,17 +178,17 @@ class _Attempt:
         self._loop = task.get_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._cancelled = False
-        node.crashed = self.crash
-        self._waits: Callable[[], object] = lambda: None
-        self._unwound = False
-        node.unwinds = self._unwinds
+        self._awaited: Callable[[], object] = lambda: None  # what the task waited for when it was last looked at
+        self._was_unwinding = False
+        node.crash_handler = self.crash
+        node.is_unwinding = self._is_unwinding
 
     def crash(self, error: Exception) -> None:
         """End the function with an error of something that the node gave away."""
         if self._node.ending:
             self._node.log.error("node %s crashed while it ended: %r", self._node.name, error, exc_info=error)
         elif asyncio.current_task() is self._task:
-            raise error
+            raise error  # through the node's own code, as any other error of its calls
         else:
             self.error = error
             self.end()
@@ -199,17 +199,17 @@ class _Attempt:
         if self._timer is None:
             self._cancel(self._loop.time())
 
-    def _unwinds(self) -> bool:
+    def _is_unwinding(self) -> bool:
         """Whether the function is in its clean-up.
 
         Each tick of a periodic publisher asks this, and it is slow to find out. So the answer is kept while the task
         waits for the same future: it does not move meanwhile.
         """
-        waits = getattr(self._task, "_fut_waiter", None)  # asyncio's own
-        if waits is None or self._waits() is not waits:
-            self._unwound = ends(self._body)
-            self._waits = weakref.ref(waits) if waits is not None else lambda: None
-        return self._unwound
+        future = getattr(self._task, "_fut_waiter", None)  # asyncio's own
+        if future is None or self._awaited() is not future:
+            self._was_unwinding = ends(self._body)
+            self._awaited = weakref.ref(future) if future is not None else lambda: None
+        return self._was_unwinding
 
     def _cancel(self, since: float) -> None:
         """Cancel the function, which is to end since `since` (loop time), or look again while it cleans up."""

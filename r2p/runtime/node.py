@@ -93,9 +93,9 @@ class Node:
         self.subscribers: dict[Subscriber[Any], None] = {}
         """Its open subscribers, in order."""
         self.closed = False
-        self.crashed: Callable[[Exception], None] = self._log_crash
+        self.crash_handler: Callable[[Exception], None] = self._log_crash
         """Handles an error outside the node's own task; set by its supervisor."""
-        self.unwinds: Callable[[], bool] = lambda: False
+        self.is_unwinding: Callable[[], bool] = lambda: False
         """Says whether an exception is on its way out of the node's function; set by its supervisor."""
         self._ending = False
         self._space = space
@@ -313,7 +313,7 @@ class Node:
 
     def crash(self, error: Exception) -> None:
         """End this node with the error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
-        self.crashed(error)
+        self.crash_handler(error)
 
     @property
     def ending(self) -> bool:
@@ -321,7 +321,7 @@ class Node:
 
         From then on no `fill`, `on_missed`, `on_timeout` or the like is called: only its clean-up runs.
         """
-        return self._ending or self.unwinds()
+        return self._ending or self.is_unwinding()
 
     def end(self) -> None:
         """Begin the end: silence periodic publishers, so that nothing contradicts what the clean-up publishes."""
