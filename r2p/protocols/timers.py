@@ -20,7 +20,7 @@ class KeyedTimers:
         return key in self._due
 
     def set(self, key: Hashable, due: int) -> None:
-        """The key runs out at `due` (ns), earlier or later than before."""
+        """Let a key run out at `due` (ns), earlier or later than before."""
         before = self._due.get(key)
         self._due[key] = due
         if before is None or due < before:
@@ -30,7 +30,7 @@ class KeyedTimers:
         self._due.pop(key, None)
 
     def next(self) -> int | None:
-        """When the next key runs out."""
+        """When the next key runs out (ns)."""
         while self._heap:
             at, _, key = self._heap[0]
             due = self._due.get(key)
@@ -42,7 +42,7 @@ class KeyedTimers:
         return None
 
     def put_off(self, until: int) -> None:
-        """Nothing runs out before then."""
+        """Let no key run out before `until` (ns)."""
         self._due = {key: max(due, until) for key, due in self._due.items()}
 
     def pop(self, now: int) -> Iterator[Hashable]:

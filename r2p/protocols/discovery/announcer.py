@@ -74,7 +74,7 @@ class Announcer:
 
     def unsubscribe(self, topic: str) -> bool:
         was_there = self._remove(self.subscribers, ItemKind.SUBSCRIBER, topic)
-        if was_there and self.r2p:
+        if was_there and self.r2p:  # firmware has no such message: it goes on sending
             self.announce_once(ItemKind.UNSUBSCRIBE, topic)
         return was_there
 
@@ -185,7 +185,7 @@ class Announcer:
                 return [management.Endpoint(role, self.instance, node, topic, publisher_class)]
             case ItemKind.ENDPOINT_GONE, (str(node), str(topic), int(role)):
                 return [management.Endpoint(role | ROLE_GONE, self.instance, node, topic)]
-            case ItemKind.RELAY, key:
+            case ItemKind.RELAY, key:  # the last that the module said, if it said more meanwhile
                 return _with_alias(self._relayed.pop(key))
             case kind, _:
                 return self._presence(management.HELLO_QUERY if kind is ItemKind.QUERY else 0)
@@ -196,7 +196,7 @@ class Announcer:
         return [own.type_info(topic, role), *messages] if self.r2p else messages
 
     def _presence(self, flags: int) -> list[management.Management]:
-        hello = self.hello(flags)
+        hello = self.hello(flags)  # first: after an ALIVE alone the module would be taken for firmware
         return [hello] if self._observer else [hello, management.Alive(self.module, self.flags)]
 
     # The schedule

@@ -115,7 +115,7 @@ class LeasedDemand(Demand):
             self.expired(topic, role, source)
 
     def _enter(self, now: int, topic: str, role: int, source: PeerAddress) -> None:
-        lease = self._lease(source)
+        lease = self._lease(source)  # None also while an r2p module's HELLO has not come: see `_start_leases`
         if not self.add(topic, role, source):
             return
         if lease is not None:

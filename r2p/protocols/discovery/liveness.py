@@ -82,6 +82,7 @@ class PeerLiveness:
         if message.module == self._module and not self._is_namesake(now):
             return
         before, info = self._directory.read_alive(now, message, source)
+        # Firmware has no instance: a restart shows in its flags only, if at all.
         if before is not None and _restarted(before.flags, info.flags):
             self._negotiation.restarted(source)
         self._enter(now, before, info)
@@ -167,10 +168,12 @@ class PeerLiveness:
 
     def _present(self, now: int, message: management.Hello, source: PeerAddress) -> None:
         """An r2p module introduces itself, for the first time or again."""
+        # What was known before has to be looked at first: `_enter` replaces it.
         known_start = self._directory.was_before(message.module, message.instance)
         before, info = self._directory.read_hello(now, message, source)
         self._look_for_namesakes(now, before, message)
         is_new = not known_start and (before is None or before.instance != info.instance)
+        # Before `module_found`: what it had at its old address must not end what it gets at the new one.
         if before is not None and (before.source, before.hops) != (info.source, info.hops):
             self._negotiation.module_gone(now, before)
         if message.hops == 0:

@@ -256,7 +256,7 @@ class SubscriptionNegotiation:
         """
         peer = self._peers.get(source)
         joined = peer.waiting.pop(topic, None) if peer is not None else None
-        if joined is not None:
+        if joined is not None:  # else it left meanwhile
             self._attach(joined)
             if source is None:
                 self._own.advertise_again(topic)
@@ -320,11 +320,11 @@ class SubscriptionNegotiation:
             self._timers.clear(key)
             return
         peer.permanent.discard(topic)
-        if peer.lease is not None:
+        if peer.lease is not None:  # else the end of its module ends it
             self._timers.set(key, now + peer.lease)
 
     def _remove_subscriber(self, peer: Peer, topic: str) -> None:
-        self._requests.remove(peer.source, topic)
+        self._requests.remove(peer.source, topic)  # an answer that is due would attach it again
         self._timers.clear(("lease", peer.source, topic))
         if peer.waiting.pop(topic, None) is not None:
             self._timers.clear(("grace", peer.source, topic))
@@ -336,7 +336,7 @@ class SubscriptionNegotiation:
 
     def _remove_publisher(self, peer: Peer, topic: str) -> None:
         if peer.publishers.pop(topic, None) is not None:
-            if not any(topic in each.publishers for each in self._peers.all()):
+            if not any(topic in each.publishers for each in self._peers.all()):  # then requests say so again
                 self._own.with_publisher.discard(topic)
             self._outbox.emit(PublisherGone(topic, peer.source))
 

@@ -198,7 +198,7 @@ class Discovery(DiscoveryProtocol):
         """End all leases. Firmware's subscriptions stay, as it does not notice a reconnect."""
         self._outbox.up = False
         self._schedule.stop()
-        self._liveness.link_down(now)
+        self._liveness.link_down(now)  # first: negotiation then drops what modules leave behind for a while
         self._negotiation.link_down()
         if self._demand is not None:
             self._demand.link_down()
@@ -225,6 +225,7 @@ class Discovery(DiscoveryProtocol):
         due = self._timers.next()
         if due is not None and now - due > _SUSPENDED:
             self._timers.put_off(now + _HEARD_AGAIN)
+        # One that expires may set and clear others: each is popped when its turn comes.
         for key in self._timers.pop(now):
             self._expired(now, key)
         return self._flush(now)
