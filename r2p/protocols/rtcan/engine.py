@@ -22,7 +22,9 @@ a transport does this:
    `IdConflict` with `yielded` takes all that back until the next `Ready`, possibly with another id8.
 6. Answer each `Due` with `fill`, before the slot.
 
-Without a master, or while it refuses slots, periodic messages go as soft real-time ones with their period as deadline.
+Until the master grants slots, and while it refuses them, `Due` comes by the node's own clock (not `slotted`), and data
+then go as a soft real-time message with the period as deadline. After `SlotsLost` there may be no `Due` until the next
+`SlotsGranted`. An owner with a clock of its own, as links have, fills None when not `slotted`, and calls `publish`.
 """
 
 from collections.abc import Hashable, Sequence
