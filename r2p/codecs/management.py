@@ -242,7 +242,7 @@ class TypeInfo(msgspec.Struct, frozen=True, gc=False):
 
 
 class Unsubscribe(msgspec.Struct, frozen=True, gc=False):
-    """The r2p module that started as `instance` does not subscribe this topic any more."""
+    """The r2p module that started as `instance` does not subscribe to this topic any more."""
 
     topic: str
     instance: int

@@ -6,5 +6,5 @@ Read `events` first, what discovery hands to its link; then `base`, the interfac
 - `announcer`: what this module says, and `schedule`: when it says it again;
 - `negotiation`: which topics flow to and from which peer (`peers`);
 - `liveness`: which modules come and go, and `directory`: what they have said;
-- `demand`: what other modules publish and subscribe, for gateways.
+- `demand`: what other modules publish and subscribe to, for gateways.
 """

@@ -1,4 +1,4 @@
-"""What this module announces on one link: what it publishes and subscribes, and which of its nodes do so.
+"""What this module announces on one link: what it publishes and subscribes to, and which of its nodes do so.
 
 The schedule holds keys only. The announcer makes the messages of a key when its turn has come, from what is true then.
 """
@@ -16,7 +16,7 @@ Relayed = management.Hello | management.Alive | management.Endpoint
 
 
 class LocalTopic(msgspec.Struct, frozen=True):
-    """A topic that this module publishes (`params` are the transport's) or subscribes (with a `queue`)."""
+    """A topic that this module publishes (`params` are the transport's) or subscribes to (with a `queue`)."""
 
     type: TopicType
     params: bytes = NO_PARAMS
@@ -51,7 +51,7 @@ class Announcer:
         self.with_publisher: set[str] = set()
         """The subscribed topics that a peer publishes to this module."""
         self.with_subscriber: set[str] = set()
-        """The published topics that a peer subscribes."""
+        """The published topics that a peer subscribes to."""
         self._observer = observer
         self._directory = directory
         self._schedule = schedule

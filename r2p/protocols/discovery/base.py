@@ -48,7 +48,7 @@ class DiscoveryProtocol(ABC):
 
     @abstractmethod
     def demand(self) -> Demand:
-        """What the other modules publish and subscribe, for gateways."""
+        """What the other modules publish and subscribe to, for gateways."""
 
     # What this module has
 
@@ -70,7 +70,7 @@ class DiscoveryProtocol(ABC):
     def subscribe(
         self, now: int, topic: str, size: int = 0, queue: int = QUEUE, fingerprint: bytes = ANY_TYPE
     ) -> list[Event]:
-        """Subscribe a topic; size 0 and no fingerprint take every type. `queue`: how many messages a publisher may
+        """Subscribe to a topic; size 0 and no fingerprint take every type. `queue`: how many messages a publisher may
         have on the way to this module.
         """
 
@@ -80,7 +80,7 @@ class DiscoveryProtocol(ABC):
 
     @abstractmethod
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
-        """Announce that a node publishes or subscribes (ROLE_...) a topic, as CLASS_..."""
+        """Announce that a node publishes or subscribes to (ROLE_...) a topic, as CLASS_..."""
 
     @abstractmethod
     def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
@@ -94,7 +94,7 @@ class DiscoveryProtocol(ABC):
 
     @abstractmethod
     def query(self, now: int) -> list[Event]:
-        """Ask all modules to repeat what they publish and subscribe."""
+        """Ask all modules to repeat what they publish and subscribe to."""
 
     @abstractmethod
     def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:

@@ -1,4 +1,4 @@
-"""Which topics the other modules of a link publish and subscribe, whether this module has them or not.
+"""Which topics the other modules of a link publish and subscribe to, whether this module has them or not.
 
 Discovery itself only answers for the topics of its own module. A gateway has none, and must know what each link offers
 and wants; so only gateways keep this table.
@@ -16,7 +16,7 @@ _TopicRole = tuple[str, int]
 
 
 class Demand:
-    """Topics by role (ROLE_...), and the sources that publish or subscribe them: peers, or sessions of zenoh."""
+    """Topics by role (ROLE_...), and the sources that publish or subscribe to them: peers, or sessions of zenoh."""
 
     def __init__(self) -> None:
         self._sources: dict[_TopicRole, dict[Hashable, None]] = {}
@@ -35,7 +35,7 @@ class Demand:
         return list(self._sources.get((topic, role), ()))
 
     def entries_of(self, source: Hashable) -> list[_TopicRole]:
-        """What a source publishes and subscribes."""
+        """What a source publishes and subscribes to."""
         return [entry for entry, sources in self._sources.items() if source in sources]
 
     def pop_changed(self) -> set[str]:

@@ -202,7 +202,7 @@ class Undeclare(msgspec.Struct, frozen=True):
 
 
 class QueryTokens(msgspec.Struct, frozen=True):
-    """Query the network for all tokens; `appeared` takes each of them, `looked` the end of the answers."""
+    """Query the network for all tokens; `appeared` takes each of them, and `query_ended` the end."""
 
 
 Event = (

@@ -61,7 +61,7 @@ class SubscriptionNegotiation:
     # Messages
 
     def advertised(self, now: int, message: management.Advertise, source: PeerAddress) -> None:
-        """ADVERTISE, of a publisher: request its messages if this module subscribes the topic."""
+        """ADVERTISE, of a publisher: request its messages if this module subscribes to the topic."""
         topic = message.topic
         self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
         own = self._own.subscribers.get(topic)
@@ -122,7 +122,7 @@ class SubscriptionNegotiation:
     # Answers
 
     def answer(self, now: int, role: int, topic: str) -> None:
-        """Answer all r2p modules that have said since the last answer that they publish or subscribe the topic."""
+        """Answer all r2p modules that have said since the last answer that they publish or subscribe to the topic."""
         own, modules = self._counterpart(role).get(topic), self._directory.r2p_modules
         if role == ROLE_PUBLISHES:
             offers = self._with_peers(self._offers.pop(now, topic, modules))
@@ -190,7 +190,7 @@ class SubscriptionNegotiation:
             peer.forget_type(topic, ROLE_SUBSCRIBES)
 
     def subscription_ended(self, topic: str) -> None:
-        """Accept no more messages of a topic that this module subscribes no more."""
+        """Accept no more messages of a topic that this module subscribes to no more."""
         self._offers.forget(topic)
         for peer in self._peers.all():
             self._remove_publisher(peer, topic)

@@ -1,4 +1,4 @@
-"""The peers of one link by transport address: what each of them subscribes and publishes, and with which types.
+"""The peers of one link by transport address: what each of them publishes and subscribes to, and with which types.
 
 A subscription of firmware lasts for ever. That of an r2p peer (its HELLO came without a gateway in between) is a lease.
 After a good-bye a peer counts as r2p until its lease would be over, because what it sent before may still arrive.
@@ -25,7 +25,7 @@ class Peer(msgspec.Struct, eq=False):
     in ns, None: as long as the module lives. `publishers` are the topics whose messages are accepted from this address,
     with params and size.
 
-    `subscriptions` are the topics that the peer subscribes, and whether it may have restarted since: then its next
+    `subscriptions` are the topics that the peer subscribes to, and whether it may have restarted since: then its next
     request is as good as new. `permanent` are those that are no leases, `joined_at` (ns) is when `SubscriberJoined` was
     emitted last, and `waiting` are those that get no messages yet. The keys of `types` and `mismatched` are topic and
     role.
@@ -65,7 +65,7 @@ class Peer(msgspec.Struct, eq=False):
 
 
 class Peers:
-    """All peers of one link, and how many of them subscribe each topic."""
+    """All peers of one link, and how many of them subscribe to each topic."""
 
     def __init__(self, counts: Counter[str]) -> None:
         self._peers: dict[PeerAddress, Peer] = {}

@@ -111,7 +111,7 @@ class Discovery(DiscoveryProtocol):
         return self._directory.generation
 
     def demand(self) -> Demand:
-        """What the other modules publish and subscribe. It is kept from the first call on."""
+        """What the other modules publish and subscribe to. It is kept from the first call on."""
         if self._demand is None:
             self._demand = LeasedDemand(self._timers, self._directory)
         return self._demand
@@ -142,7 +142,7 @@ class Discovery(DiscoveryProtocol):
     def subscribe(
         self, now: int, topic: str, size: int = 0, queue: int = management.QUEUE, fingerprint: bytes = ANY_TYPE
     ) -> list[Event]:
-        """Subscribe a topic. Size 0 and no fingerprint take every type; nothing is requested before a size is known.
+        """Subscribe to a topic. Size 0 and no fingerprint take every type; nothing is requested before a size is known.
 
         `queue`: messages that a publisher may have to keep, bounded by what firmware has memory for (`queue_length`).
         """
