@@ -1,7 +1,7 @@
 """A link with one send buffer and one way in for all its topics: the debug line, the memory network and RTCAN.
 
     publisher  ->  BufferedSubscriber.offer  ->  write     while there is room, else the sample waits in `wait_queue`
-    wire       ->  receive  ->  sample  ->  Topic.deliver  what does not fit is left to `ReceiveBackpressure`
+    wire       ->  receive  ->  sample  ->  Topic.deliver  what does not fit is left to `LinkBackpressure`
 
 A subclass implements `full`, `write`, `write_management` and `sample`, calls `receive` with what came in, and
 `made_room` when it accepts again what it had rejected.
@@ -21,7 +21,7 @@ from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, LinkSubscriber
-from r2p.transports.receive_backpressure import ReceiveBackpressure
+from r2p.transports.receive_backpressure import LinkBackpressure
 
 _MANAGEMENT = MANAGEMENT.encode()
 _EARLY = 1_000_000_000  # ns by which a message may come before the answer to its subscription
@@ -66,7 +66,7 @@ class BufferedLink(Link):
         self._arrivals: deque[Any] = deque()
         self._delivering = False
         self._paused = False
-        self._backpressure = ReceiveBackpressure(self, self._space.loop)
+        self._backpressure = LinkBackpressure(self, self._space.loop)
         self._early: dict[tuple[bytes, Hashable], tuple[Arrival, int]] = {}
         """The last message of each publisher that is not announced yet, and when it came (ns)."""
 
