@@ -98,13 +98,13 @@ async def cyphal_throughput(messages: int) -> float:
 
 async def latencies(messages: int) -> list[float]:
     """Seconds from publish() to the subscriber's next line."""
-    taken: list[float] = []
+    durations: list[float] = []
     at = 0.0
 
     async def consume(node: r2p.Node) -> None:
         async for _ in node.subscribe("pairs", Pair):
-            taken.append(time.perf_counter() - at)
-            if len(taken) == messages:
+            durations.append(time.perf_counter() - at)
+            if len(durations) == messages:
                 return
 
     async def produce(node: r2p.Node) -> None:
@@ -122,13 +122,13 @@ async def latencies(messages: int) -> list[float]:
         module.start(consume)
         module.start(produce)
         await module.wait()
-    return taken
+    return durations
 
 
 async def wake_latencies(messages: int) -> list[float]:
-    """Seconds from setting a future to the next line of the task that waits for it: what the loop itself takes."""
+    """Seconds from setting a future to the next line of the task that waits for it: the loop's own time."""
     loop = asyncio.get_running_loop()
-    taken: list[float] = []
+    durations: list[float] = []
     waiter: asyncio.Future[None] = loop.create_future()
     at = 0.0
 
@@ -136,17 +136,17 @@ async def wake_latencies(messages: int) -> list[float]:
         nonlocal waiter
         for _ in range(messages):
             await waiter
-            taken.append(time.perf_counter() - at)
+            durations.append(time.perf_counter() - at)
             waiter = loop.create_future()
 
     task = asyncio.create_task(wait())
-    while len(taken) < messages:
+    while len(durations) < messages:
         await asyncio.sleep(0)
         at = time.perf_counter()
         waiter.set_result(None)
         await asyncio.sleep(0)
     await task
-    return taken
+    return durations
 
 
 def rows() -> Iterator[Row]:

@@ -1,4 +1,4 @@
-"""A gateway between a robot and a PC: how much passes from a debug line, and how long a message from CAN takes."""
+"""A gateway between a robot and a PC: its throughput from a debug line, and the latency of a message from CAN."""
 
 import asyncio
 import contextlib
@@ -49,7 +49,7 @@ class Sent(r2p.Message):
 
 
 async def _gateway(pipe: Connection, out: str) -> None:
-    """The process in the middle: says where it listens, and at the end how busy it was."""
+    """The gateway's process: reports where it listens, and at the end how busy it was."""
     robot = TcpListenTransport(parse("tcp-listen:127.0.0.1:0"))
     pc = TcpListenTransport(parse("tcp-listen:127.0.0.1:0")) if out == "tcp" else out
     async with r2p.Module("GW", via=[robot, pc], bridge=True, watchdog=False):
@@ -65,19 +65,19 @@ def _gateway_process(pipe: Connection, out: str) -> None:
 
 
 def _robot(go: Connection, port: int) -> None:
-    """Firmware: offers a topic, answers who wants it, then sends lines as fast as they are taken."""
+    """Firmware: advertises a topic, answers its subscriber, then sends lines as fast as possible."""
     line = debug.encode(b"eight", bytes(32), 0)
     with socket.create_connection(("127.0.0.1", port)) as connection:
 
-        def say(message: management.Management) -> None:
+        def send(message: management.Management) -> None:
             connection.sendall(debug.encode(b"R2P", management.encode(message), 0))
 
-        say(management.Alive("ROBOT"))
-        say(management.Advertise("eight", 32))
+        send(management.Alive("ROBOT"))
+        send(management.Advertise("eight", 32))
         reader = debug.Reader()
         while not any(each.data[-1] == _REQUEST for each in reader.feed(connection.recv(65536))):
             pass
-        say(management.SubscribeResponse("eight", 32))
+        send(management.SubscribeResponse("eight", 32))
         go.recv()
         for _ in range(MESSAGES // BURST):
             connection.sendall(line * BURST)

@@ -14,19 +14,19 @@ from r2p.transports.tcp import TcpListenTransport
 from r2p.transports.url import parse
 
 STEP = 40e-6
-"""Seconds of CPU that a low-priority node takes for a message."""
+"""Seconds of CPU that a low-priority node needs per message."""
 
 LOW = 20
 
 
 async def beside_slow_ones(messages: int, low: int) -> list[float]:
     """Latencies of the high-priority subscriber of a 1 kHz topic, beside `low` slow ones with full queues."""
-    taken: list[float] = []
+    durations: list[float] = []
     at = 0.0
 
     async def high(node: r2p.Node) -> None:
         async for _ in node.subscribe("pairs", Pair):
-            taken.append(time.perf_counter() - at)
+            durations.append(time.perf_counter() - at)
 
     async def slow(node: r2p.Node, seconds: float) -> None:
         async for _ in node.subscribe("pairs", Pair, queue=5, lossy=True):
@@ -49,7 +49,7 @@ async def beside_slow_ones(messages: int, low: int) -> list[float]:
             module.start(slow, 0.1 if index % 2 else 0.2, name=f"slow{index}")
         module.start(produce)
         await ended.wait()
-    return taken
+    return durations
 
 
 def burn() -> None:
@@ -60,13 +60,13 @@ def burn() -> None:
 
 async def beside_busy_ones(messages: int) -> list[float]:
     """Latencies from bytes in the socket to the line of the high-priority node, beside LOW busy low-priority ones."""
-    taken: list[float] = []
+    durations: list[float] = []
     handled = asyncio.Event()
     at = 0.0
 
     async def high(node: r2p.Node) -> None:
         async for _ in node.subscribe("high", Pair):
-            taken.append(time.perf_counter() - at)
+            durations.append(time.perf_counter() - at)
             handled.set()
 
     async def busy(node: r2p.Node) -> None:
@@ -94,7 +94,7 @@ async def beside_busy_ones(messages: int) -> list[float]:
                 line.sendall(high_line)
                 await handled.wait()
                 await asyncio.sleep(STEP * LOW * 1.5)
-    return taken
+    return durations
 
 
 def _response(topic: str, size: int) -> bytes:

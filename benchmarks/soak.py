@@ -1,12 +1,12 @@
 """A gateway from TCP to zenoh at full load, for as long as you like: `python -m benchmarks.soak SECONDS [--rate N]`.
 
 A robot publishes as fast as it can, or N messages a second; a PC subscribes and stays; other subscribers and modules
-come and go each 0.2 s; a hostile client sends garbage, half lines and floods of management, and connects anew. One line
-for each interval, and at the end a verdict (exit code 1 if it is bad):
+join and leave every 0.2 s; a hostile client sends garbage, half lines and floods of management messages, and
+reconnects. It prints a line per interval, and at the end a verdict (exit code 1 if it is bad):
 
 - memory, file descriptors and threads of the gateway do not grow after the first fifth of the time;
-- published = received + what is in counters, at every hop, for the PC; for those that came and went between their
-  first and last message.
+- published = received + counted losses, at every hop, for the PC; for short-lived subscribers between their first and
+  last message.
 """
 
 import argparse
@@ -51,7 +51,7 @@ class State(msgspec.Struct, frozen=True):
 
 
 class Verdict(msgspec.Struct):
-    """What was found; `troubles` is empty when all is well."""
+    """The result; `troubles` is empty if everything is well."""
 
     states: list[State] = []
     troubles: list[str] = []
@@ -61,7 +61,7 @@ class Verdict(msgspec.Struct):
     connections: int = 0
 
     def hop(self, name: str, went_in: int, came_out: int, counted: int) -> str:
-        """Compare what went into one hop with what came out of it and what was counted; say it in a line."""
+        """Compare the messages into a hop with those out of it and those counted; return a line about it."""
         difference = went_in - came_out - counted
         if difference:
             self.troubles.append(f"{name}: {difference} messages are in no counter")
@@ -69,14 +69,14 @@ class Verdict(msgspec.Struct):
 
 
 def state_of(pid: int, at: float) -> State:
-    """What a process uses now."""
+    """Return what a process uses now."""
     proc = Path(f"/proc/{pid}")
     pages = int((proc / "statm").read_text().split()[1])
     return State(at, pages * _PAGE, len(list((proc / "fd").iterdir())), len(list((proc / "task").iterdir())))
 
 
 def judge_growth(states: list[State]) -> Iterator[str]:
-    """What grew after the warm-up: compares the medians of its first and its last quarter."""
+    """Yield what grew after the warm-up: compares the medians of its first and its last quarter."""
     warm = [each for each in states if each.at >= _WARM_UP * states[-1].at]
     quarter = max(1, len(warm) // 4)
     first, last = warm[:quarter], warm[-quarter:]
@@ -94,7 +94,7 @@ def judge_growth(states: list[State]) -> Iterator[str]:
 
 
 class Soak:
-    """The processes, and what they say."""
+    """The processes, and pipes to ask them."""
 
     def __init__(self, stack: ExitStack, rate: float, seed: int) -> None:
         self._pipes: dict[str, Connection] = {}
@@ -113,35 +113,35 @@ class Soak:
         return pipe
 
     def ask(self, name: str, what: str = "report") -> Any:
-        """A process's counters."""
+        """Return the counters of a process."""
         self._pipes[name].send(what)
         return self._pipes[name].recv()
 
     def settled(self) -> dict[str, Any]:
-        """What the PC says when nothing moves on any link, for two seconds in a row."""
-        said = self.ask("pc")
+        """Return the PC's counters once nothing has changed on any link for two seconds."""
+        counters = self.ask("pc")
         end, still, before = time.monotonic() + _SETTLED, 0, ""
         while still < 2 and time.monotonic() < end:
             time.sleep(1.0)
-            said = self.ask("pc")
-            now = f"{self.ask('robot')} {self.ask('gateway')['links']} {said}"
+            counters = self.ask("pc")
+            now = f"{self.ask('robot')} {self.ask('gateway')['links']} {counters}"
             still, before = (still + 1, now) if now == before else (0, now)
-        return dict(said)
+        return dict(counters)
 
 
-def soak(seconds: float, *, rate: float = 0.0, seed: int = 1, say: Callable[[str], object] = print) -> Verdict:
-    """Run it; `rate` in messages/s, 0: as many as are taken. `say` gets each line."""
+def soak(seconds: float, *, rate: float = 0.0, seed: int = 1, report: Callable[[str], object] = print) -> Verdict:
+    """Run the soak; `rate` in messages/s, 0: as fast as possible. `report` is called with each line."""
     verdict = Verdict()
     with ExitStack() as stack:
         run = Soak(stack, rate, seed)
-        _watch(run, seconds, verdict, say)
-        _account(run, verdict, say)
+        _watch(run, seconds, verdict, report)
+        _account(run, verdict, report)
     if seconds >= JUDGED:
         verdict.troubles += judge_growth(verdict.states)
     return verdict
 
 
-def _watch(run: Soak, seconds: float, verdict: Verdict, say: Callable[[str], object]) -> None:
+def _watch(run: Soak, seconds: float, verdict: Verdict, report: Callable[[str], object]) -> None:
     began, received = time.monotonic(), 0
     interval = min(INTERVAL, seconds / 3)
     while (at := time.monotonic() - began) < seconds:
@@ -150,14 +150,14 @@ def _watch(run: Soak, seconds: float, verdict: Verdict, say: Callable[[str], obj
         verdict.states.append(state)
         pc, churn = run.ask("pc"), run.ask("churn")
         rate, received = (pc["received"] - received) / (state.at - at), pc["received"]
-        say(
+        report(
             f"{state.at:7.0f} s  {rate:8.0f} messages/s  gateway {state.memory:6.1f} MB {state.files:3} files"
             f" {state.threads:3} threads  PC lost {pc['lost']} {pc['losses']}  {churn['lives']} lives"
             f" {churn['missing']} lost before them"
         )
 
 
-def _account(run: Soak, verdict: Verdict, say: Callable[[str], object]) -> None:
+def _account(run: Soak, verdict: Verdict, report: Callable[[str], object]) -> None:
     churn = run.ask("churn", "stop")
     run.ask("robot", "stop")
     verdict.connections = run.ask("hostile")
@@ -165,11 +165,11 @@ def _account(run: Soak, verdict: Verdict, say: Callable[[str], object]) -> None:
     robot, gateway = run.ask("robot"), run.ask("gateway")
     verdict.published, verdict.received, verdict.lives = robot["published"], pc["received"], churn["lives"]
     for line in _hops(robot, gateway, pc, verdict):
-        say(line)
+        report(line)
     _judge(robot, pc, churn, _lost_before_zenoh(robot, gateway), verdict)
-    say(f"{churn['lives']} lives received {churn['received']}; {verdict.connections} hostile connections")
-    say(f"losses: robot {robot['losses']}, PC {pc['losses']}")
-    say(f"gateway {gateway['ports']} {gateway['links']}")
+    report(f"{churn['lives']} lives received {churn['received']}; {verdict.connections} hostile connections")
+    report(f"losses: robot {robot['losses']}, PC {pc['losses']}")
+    report(f"gateway {gateway['ports']} {gateway['links']}")
 
 
 def _hops(robot: dict[str, Any], gateway: dict[str, Any], pc: dict[str, Any], verdict: Verdict) -> Iterator[str]:
@@ -191,7 +191,7 @@ def _hops(robot: dict[str, Any], gateway: dict[str, Any], pc: dict[str, Any], ve
 
 
 def _lost_before_zenoh(robot: dict[str, Any], gateway: dict[str, Any]) -> int:
-    """What robot and gateway count as lost, so that no subscriber on zenoh can."""
+    """Return what robot and gateway count as lost: subscribers on zenoh can't count that."""
     lost: int = robot["published"] - robot["sent"]
     for name, (_, _, losses) in gateway["links"].items():
         lost += (
@@ -203,8 +203,8 @@ def _lost_before_zenoh(robot: dict[str, Any], gateway: dict[str, Any]) -> int:
     return lost
 
 
-def _of(who: dict[str, Any], *reasons: str) -> int:
-    return sum(who["losses"].get(reason, 0) for reason in reasons)
+def _of(process: dict[str, Any], *reasons: str) -> int:
+    return sum(process["losses"].get(reason, 0) for reason in reasons)
 
 
 def _judge(robot: dict[str, Any], pc: dict[str, Any], churn: dict[str, Any], upstream: int, verdict: Verdict) -> None:
@@ -213,24 +213,24 @@ def _judge(robot: dict[str, Any], pc: dict[str, Any], churn: dict[str, Any], ups
         verdict.troubles.append("the PC received nothing")
     if robot["ups"] != 1 or pc["ups"] != 1:
         verdict.troubles.append(f"links broke: the robot's was up {robot['ups']} times, the PC's {pc['ups']}")
-    for name, said in (("the PC", pc), ("those that came and went", churn)):
-        if said["disorder"]:
-            verdict.troubles.append(f"{name} got {said['disorder']} messages in the wrong order")
-    if churn["missing"] > roles.AT_ONCE * upstream:  # each of those that live misses what was lost before zenoh
+    for name, counters in (("the PC", pc), ("the short-lived subscribers", churn)):
+        if counters["disorder"]:
+            verdict.troubles.append(f"{name} got {counters['disorder']} messages in the wrong order")
+    if churn["missing"] > roles.AT_ONCE * upstream:  # each live subscriber misses what was lost before zenoh
         verdict.troubles.append(
-            f"{churn['missing']} messages of those that came and went are in none of their counters, and robot and"
+            f"{churn['missing']} messages of short-lived subscribers are in none of their counters, and robot and"
             f" gateway count {upstream}; the worst: {churn['worst']}"
         )
 
 
 def main() -> int:
-    """The command."""
+    """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.soak", description="A long run of a gateway under load")
-    parser.add_argument("seconds", type=float, nargs="?", default=HOUR, help="how long; an hour unless given")
-    parser.add_argument("--rate", type=float, default=0.0, help="messages a second; as many as are taken unless given")
-    parser.add_argument("--seed", type=int, default=1, help="of the hostile client")
+    parser.add_argument("seconds", type=float, nargs="?", default=HOUR, help="how long; default: an hour")
+    parser.add_argument("--rate", type=float, default=0.0, help="messages per second; default: as fast as possible")
+    parser.add_argument("--seed", type=int, default=1, help="random seed of the hostile client")
     given = parser.parse_args()
-    verdict = soak(given.seconds, rate=given.rate, seed=given.seed, say=lambda line: print(line, flush=True))
+    verdict = soak(given.seconds, rate=given.rate, seed=given.seed, report=lambda line: print(line, flush=True))
     for trouble in verdict.troubles:
         print("BAD", trouble)
     print("bad" if verdict.troubles else "good")

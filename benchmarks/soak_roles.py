@@ -1,7 +1,7 @@
-"""The processes of the soak: a robot, a gateway, a PC that stays, subscribers that come and go, and a hostile client.
+"""The processes of the soak: a robot, a gateway, a PC, short-lived subscribers, and a hostile client.
 
-Each answers `report` on its pipe with its counters, and ends with its pipe. The robot and those that come and go take
-`stop` before that.
+Each answers `report` on its pipe with its counters, and ends with its pipe. The robot and the short-lived subscribers
+accept `stop` before that.
 """
 
 import asyncio
@@ -26,9 +26,9 @@ from r2p.transports.url import parse
 
 TOPIC = "soak"
 LIFE = 0.2
-"""Seconds that a subscriber stays."""
+"""Seconds that a short-lived subscriber exists."""
 AT_ONCE = 2
-"""Lives at one time: a subscriber of a module that stays, and one of a module that comes and goes with it."""
+"""Lives at one time: a subscriber of a lasting module, and one of a module that joins and leaves with it."""
 
 _LISTEN = "zenoh:?mode=router&listen=tcp/127.0.0.1:0&scouting=off&network=soak"
 _QUEUE = 4096
@@ -36,14 +36,14 @@ _TICK = 0.01  # s
 
 
 class Numbered(r2p.Message):
-    """32 bytes; the number tells what is missing."""
+    """32 bytes; gaps in the numbers are losses."""
 
     number: r2p.u64 = 0
     rest: tuple[r2p.u64, r2p.u64, r2p.u64] = (0, 0, 0)
 
 
 class Account:
-    """What one subscriber got: how much, and how many numbers between its first and its last message it did not."""
+    """Counts what one subscriber received, and the numbers it missed between its first and its last message."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -51,7 +51,7 @@ class Account:
         self.disorder = 0
         self.last = 0
 
-    def take(self, number: int) -> None:
+    def add(self, number: int) -> None:
         self.received += 1
         if self.last:
             self.missing += max(0, number - self.last - 1)
@@ -60,22 +60,22 @@ class Account:
 
 
 def losses(module: r2p.Module) -> dict[str, int]:
-    """What all links of a module have lost, by reason."""
+    """Return the losses of all links of a module, by reason."""
     return dict(sum((each.losses for each in module.links), Counter[str]()))
 
 
 def connect(port: int) -> str:
-    """The URL of those that subscribe."""
+    """Return the URL for subscribers."""
     return f"zenoh:tcp/127.0.0.1:{port}?scouting=off&network=soak"
 
 
 async def _asked(pipe: Connection) -> Any:
-    """What the parent says; its end is the end."""
+    """Wait for a request of the parent; EOFError when that has ended."""
     return await asyncio.to_thread(pipe.recv)
 
 
 def quietly(target: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
-    """Run the main of a process; what it would log comes hundreds of times a second."""
+    """Run the main of a process without its log, which would have hundreds of lines a second."""
     logging.disable()
     run_on("uvloop", target(*args))
 
@@ -115,7 +115,7 @@ def robot(pipe: Connection, port: int, rate: float) -> None:
 
 
 async def _robot(pipe: Connection, port: int, rate: float) -> None:
-    """Publish `rate` messages a second, 0: as many as are taken."""
+    """Publish `rate` messages per second, 0: as fast as possible."""
     going = asyncio.Event()
     going.set()
     publisher: r2p.Publisher[Numbered] | None = None
@@ -151,7 +151,7 @@ async def _robot(pipe: Connection, port: int, rate: float) -> None:
                 )
 
 
-# The PC that stays
+# The PC
 
 
 def pc(pipe: Connection, port: int) -> None:
@@ -166,7 +166,7 @@ async def _pc(pipe: Connection, port: int) -> None:
         nonlocal subscriber
         subscriber = node.subscribe(TOPIC, Numbered, queue=_QUEUE)
         async for message in subscriber:
-            account.take(message.number)
+            account.add(message.number)
 
     async with r2p.Module("PC", via=connect(port), watchdog=False) as module:
         module.start(count)
@@ -190,11 +190,11 @@ async def _pc(pipe: Connection, port: int) -> None:
                 )
 
 
-# Subscribers that come and go
+# Short-lived subscribers
 
 
 class Lives:
-    """What all that came and went have counted."""
+    """The counters of all short-lived subscribers."""
 
     def __init__(self) -> None:
         self.lives = 0
@@ -202,7 +202,7 @@ class Lives:
         """Lives without a message."""
         self.received = 0
         self.missing = 0
-        """Messages between first and last of a life that it neither got nor counted: lost before they reached it."""
+        """Messages between first and last of a life that it neither received nor counted: lost on the way to it."""
         self.disorder = 0
         self.worst = ""
         self._most = 0
@@ -224,7 +224,7 @@ def churn(pipe: Connection, port: int) -> None:
 
 
 async def _churn(pipe: Connection, port: int) -> None:
-    """Modules, and subscribers of one module, that stay for LIFE."""
+    """Run modules, and subscribers of one module, that exist for LIFE."""
     lives = Lives()
     async with r2p.Module("CHURN", via=connect(port), watchdog=False) as module, node_in(module) as node:
         pipe.send(os.getpid())
@@ -258,13 +258,13 @@ async def _modules(url: str, lives: Lives) -> None:
 
 
 async def _live(node: r2p.Node) -> tuple[Account, int]:
-    """One life: what it got, and what it lost itself."""
+    """Run one subscriber; return what it received, and what it lost itself."""
     account = Account()
     async with node.subscribe(TOPIC, Numbered, queue=_QUEUE) as subscriber:
         with suppress(TimeoutError):
             async with asyncio.timeout(LIFE):
                 async for message in subscriber:
-                    account.take(message.number)
+                    account.add(message.number)
         return account, subscriber.lost
 
 
@@ -272,7 +272,7 @@ async def _live(node: r2p.Node) -> tuple[Account, int]:
 
 
 def hostile(pipe: Connection, port: int, seed: int) -> None:
-    """Garbage, half lines, floods of management, and reconnects, until the pipe ends; the gateway must not care."""
+    """Send garbage, half lines and floods of management messages, and reconnect, until the pipe ends."""
     pipe.send(os.getpid())
     rng = random.Random(seed)
     connections = 0
@@ -314,10 +314,10 @@ def _broken_line(rng: random.Random) -> bytes:
 
 
 def _flood(rng: random.Random) -> bytes:
-    return b"".join(_line(_order(rng)) for _ in range(rng.randrange(1, 50)))
+    return b"".join(_line(_random_message(rng)) for _ in range(rng.randrange(1, 50)))
 
 
-def _order(rng: random.Random) -> management.Management:
+def _random_message(rng: random.Random) -> management.Management:
     name = _name(rng)
     return rng.choice(
         (

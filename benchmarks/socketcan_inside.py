@@ -1,6 +1,6 @@
 """Inside the user-mode kernel: `python -m benchmarks.socketcan_inside FILE` writes frames a second as JSON.
 
-Bursts go into the socket's queue while the loop stands still; what is timed is how they come out of it.
+Bursts go into the socket's queue while the loop is blocked; the time to drain it is measured.
 """
 
 import asyncio
@@ -52,20 +52,20 @@ def send(sock: socket.socket, message: int, data: bytes) -> None:
         sock.send(_FRAME.pack(identifier, len(part), part))
 
 
-async def bursts(sender: socket.socket, come: Callable[[int], Awaitable[object]]) -> float:
-    """Frames a second; `come(count)` waits until so many have arrived in all."""
+async def bursts(sender: socket.socket, arrived: Callable[[int], Awaitable[object]]) -> float:
+    """Frames a second; `arrived(count)` waits until `count` have arrived in total."""
     spent = 0.0
     for burst in range(1, BURSTS + 1):
         for _ in range(BURST):
             send(sender, _MESSAGE, _DATA)
         began = time.perf_counter()
-        await come(burst * BURST)
+        await arrived(burst * BURST)
         spent += time.perf_counter() - began
     return BURST * BURSTS / spent
 
 
 class Counter:
-    """Counts, and wakes up who waits for a count."""
+    """Counts, and wakes up waiters for a count."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -85,19 +85,19 @@ class Counter:
 
 
 async def bare() -> float:
-    """A loop that drains the socket, and takes frames apart."""
+    """A loop that drains the socket, and decodes frames."""
     counter, loop = Counter(), asyncio.get_running_loop()
     with raw() as sock, raw() as sender:
 
         def drain() -> None:
-            taken = 0
+            count_read = 0
             try:
                 for _ in range(64):
                     _FRAME.unpack(sock.recv(16))
-                    taken += 1
+                    count_read += 1
             except BlockingIOError:
                 pass
-            counter.add(taken)
+            counter.add(count_read)
 
         loop.add_reader(sock, drain)
         result = await bursts(sender, counter.reached)
@@ -130,7 +130,7 @@ async def ours() -> float:
         async with r2p.Module("PC", via=f"rtcan:{NAME},profile=firmware-2014", watchdog=False) as module:
             module.start(consume)
             await publish(peer)
-            while not subscribed():  # noqa: ASYNC110 - of the kernel, which tells nobody
+            while not subscribed():  # noqa: ASYNC110 - the kernel does not notify
                 await asyncio.sleep(0.001)
             result = await bursts(peer, counter.reached)
             await module.stop()
@@ -138,12 +138,12 @@ async def ours() -> float:
 
 
 async def publish(peer: socket.socket) -> None:
-    """Be a firmware module with the topic, until somebody has subscribed it."""
+    """Be a firmware module with the topic, until it has a subscriber."""
     params = _MESSAGE.to_bytes(2, "little").ljust(10, b"\0")
     size = len(_DATA)
-    await heard(peer, management.Alive)
+    await wait_for(peer, management.Alive)
     send(peer, 0, management.encode(management.Advertise("eight", size)))
-    await heard(peer, management.SubscribeRequest)
+    await wait_for(peer, management.SubscribeRequest)
     send(peer, 0, management.encode(management.SubscribeResponse("eight", size, 5, params)))
 
 
@@ -152,7 +152,7 @@ def subscribed() -> bool:
     return f"{_MESSAGE << 7:07x}" in Path("/proc/net/can/rcvlist_fil").read_text(encoding="ascii").lower()
 
 
-async def heard(peer: socket.socket, kind: type) -> None:
+async def wait_for(peer: socket.socket, kind: type) -> None:
     """Wait for a management message."""
     loop, parts = asyncio.get_running_loop(), b""
     while True:

@@ -19,7 +19,7 @@ COMMAND = str(Path(sys.executable).with_name("r2p"))
 
 
 def seconds(*command: str) -> float:
-    """Seconds that a process takes, start to end, when its modules are compiled (as those of an installed package)."""
+    """Seconds from start to end of a process when its modules are compiled (as those of an installed package)."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 
     def once() -> float:

@@ -48,7 +48,7 @@ def connect(port: int) -> str:
 
 
 def port_of(module: r2p.Module) -> int:
-    """The port where it takes connections."""
+    """The port where it accepts connections."""
     ((_, address),) = module.addresses
     return int(address.rpartition(":")[2])
 
@@ -71,7 +71,7 @@ def _drive_r2p(port: int, pipe: Connection) -> Result:
 
 @contextmanager
 def bare_listener() -> Iterator[tuple[zenoh.Session, int]]:
-    """A session, and the port where it takes connections."""
+    """A session, and the port where it accepts connections."""
     with zenoh.open(_config("peer", "listen", 0)) as session:
         answers = [each.ok for each in session.get(f"@/{session.zid()}/*") if each.ok is not None]
         (locator,) = [each for answer in answers for each in json.loads(answer.payload.to_bytes()).get("locators", [])]
@@ -178,7 +178,7 @@ def _populate(pipe: Connection) -> None:
 
 
 def _list_topics() -> tuple[float, int]:
-    """Seconds that `r2p topic list` takes, and the topics that it finds."""
+    """Duration of `r2p topic list` in seconds, and the topics that it finds."""
     with process(_populate) as network:
         via = connect(network.recv())
         command = [sys.executable, "-c", "from r2p.tools.main import main; main()", "topic", "list", "--via", via]

@@ -22,7 +22,7 @@ class Marker(r2p.Message):
 
 
 async def camera(node: r2p.Node) -> None:
-    # latch: whoever subscribes later gets the last marker at once
+    # latch: a later subscriber gets the last marker at once
     markers = node.advertise("markers", Marker, latch=True)
     stamp = r2p.Timestamp.from_ns(node.now())
     await markers.publish(Marker(stamp, id=7, name="dock", position=(1.5, 0.0, 0.25)))

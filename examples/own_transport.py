@@ -30,7 +30,7 @@ class Udp(Transport, asyncio.DatagramProtocol, Carrier):
             opened()  # the module's `async with` waits for this
             await loop.create_future()
         finally:
-            self._link.close()  # says good-bye, and closes the carrier
+            self._link.close()  # announces the end, and closes the carrier
             hub.detach(self._link)
 
     def datagram_received(self, data: bytes, addr: object) -> None:

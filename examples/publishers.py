@@ -1,6 +1,6 @@
-"""The three classes of publisher, and what each does about a message that somebody has no room for.
+"""The three classes of publisher, and what each does with a message that does not fit into a subscriber's queue.
 
-`reader` is slow on purpose: it takes one message of each topic every half second.
+`reader` is slow on purpose: it reads one message of each topic every half second.
 """
 
 import itertools
@@ -16,18 +16,18 @@ def read_encoder() -> Encoder:
     return Encoder(delta=float(next(readings)))
 
 
-def tell(missed: r2p.Missed) -> None:
-    """Called for each miss, where the miss is found: keep it short."""
+def report(missed: r2p.Missed) -> None:
+    """Called for each miss, where the miss is detected: keep it short."""
     print("missed:", missed)
 
 
 async def sensors(node: r2p.Node) -> None:
     # Time-triggered: published by the clock, 20 times a second; it has no publish().
     encoder = node.advertise("encoder", Encoder, r2p.Periodic(period=0.05, fill=read_encoder))
-    # Event-triggered: publish() returns at once; what is not in every queue after 20 ms is given up.
-    setpoint = node.advertise("setpoint", Setpoint, r2p.Sporadic(deadline=0.020, on_missed=tell))
-    # Non real-time: publish() waits for room, at most `stall` seconds.
-    notes = node.advertise("notes", Text, r2p.NonRealTime(stall=1.0, on_missed=tell))
+    # Event-triggered: publish() returns at once; a message that is not in every queue after 20 ms is dropped.
+    setpoint = node.advertise("setpoint", Setpoint, r2p.Sporadic(deadline=0.020, on_missed=report))
+    # Non real-time: publish() waits for space, at most `stall` seconds.
+    notes = node.advertise("notes", Text, r2p.NonRealTime(stall=1.0, on_missed=report))
 
     async for _ in node.every(0.25):
         await setpoint.publish(Setpoint(ticks=setpoint.sent))

@@ -1,4 +1,4 @@
-"""A robot at a serial cable: blink an LED, and tell what happens to the cable.
+"""A robot at a serial cable: blink an LED, and report when the cable is pulled and plugged in.
 
 python serial_cable.py /dev/ttyUSB0
 

@@ -37,13 +37,14 @@ def single_keys() -> Iterator[None]:
 
 
 def typed() -> str:
-    """What was typed since the last time."""
+    """Return what was typed since the last call."""
     ready, _, _ = select.select([sys.stdin], [], [], 0)
     return os.read(sys.stdin.fileno(), 100).decode(errors="ignore") if ready else ""
 
 
-def show(told: Odometry) -> None:
-    print(f"\rx {told.pose.x:6.2f} m   y {told.pose.y:6.2f} m   heading {told.pose.w:6.2f} rad ", end="", flush=True)
+def show(odometry: Odometry) -> None:
+    pose = odometry.pose
+    print(f"\rx {pose.x:6.2f} m   y {pose.y:6.2f} m   heading {pose.w:6.2f} rad ", end="", flush=True)
 
 
 async def keys(node: r2p.Node) -> None:

@@ -1,6 +1,6 @@
 """Stop the wheels when commands stop coming: `timeout` guards against silence, `max_age` against what is too old.
 
-The joystick falls silent after two seconds; the wheels stop 300 ms later, and not because anybody told them to.
+The joystick falls silent after two seconds; the wheels stop 300 ms later, without a command.
 """
 
 import r2p

@@ -46,7 +46,7 @@ def jitter(summary: Summary, still: Summary, path: Path) -> None:
 
 
 def latencies(summary: Summary, path: Path) -> None:
-    """Figure 4.14: how long events take."""
+    """Figure 4.14: the latency of events."""
     spreads = {f"S_{kind.name}": summary.kinds[kind.name].latency for kind in SRT}
     highest = max(_share(spread) for spread in spreads.values())
     labels = ("from the event to the end of its last frame, ms", "% of events in 0.5 ms")

@@ -29,7 +29,7 @@ TIMING = timing()
 NODES = ("1", "2", "3")
 _FIRST_ID8 = 10
 _LATENCY = 4_000  # ns, nominal: from a timer's instant to the start of frame, and from the end of a frame to its stamp
-_APART = 0.06  # s, between what is done while the network comes up
+_APART = 0.06  # s, between two steps while the network starts
 _LISTENED = 1.8  # s, until the last node has its id8 for sure
 _SETTLED = 3 * SECOND
 
@@ -67,7 +67,7 @@ RESERVED = sum(len(NODES) * TIMING.slots // each.period for each in HRT) + 1
 class Scenario(msgspec.Struct, frozen=True, kw_only=True):
     """What is run. `load`: events, as a share of the free slots; `drop`: what is overdue is given up.
 
-    `duration` in s, after the network has come up; `jitter`: of each latency, in ns either way; `ppm`: how far off the
+    `duration` in s, after the network has started; `jitter`: of each latency, in ns either way; `ppm`: how far off the
     clocks are at most. `hrt`: there are hard real-time messages; `kinds`: of the events.
     """
 
@@ -128,7 +128,7 @@ class Events(msgspec.Struct):
 
 
 class Outcome(msgspec.Struct):
-    """What came of a scenario. `hrt` is by node and message, `owners` says to whom a slot of the cycle belongs.
+    """The result of a scenario. `hrt` is by node and message, `owners` has the owner of each slot of the cycle.
 
     `strays`: hard real-time messages that went without a slot; `payload`: bits of whole messages carried; `busy`: the
     share of time in which the bus was occupied.
@@ -291,7 +291,7 @@ class Listener:
 
 
 async def simulate(scenario: Scenario) -> Outcome:
-    """Let the network come up, then watch it for the scenario's duration."""
+    """Start the network, then watch it for the scenario's duration."""
     asyncio.get_running_loop().set_exception_handler(_failed)
     shared = SimCan(seed=scenario.seed)
     bus = shared.bus
@@ -325,7 +325,7 @@ def simulated(scenario: Scenario) -> Outcome:
 
 
 async def _come_up(group: asyncio.TaskGroup, nodes: list[Node], scenario: Scenario) -> list[asyncio.Task[None]]:
-    """One node after the other; then the messages, those of the shortest period first: they need the most room."""
+    """One node after the other; then the messages, those of the shortest period first: they need the most slots."""
     running = []
     for node in nodes:
         running.append(group.create_task(node.run(), name=f"node {node.name}"))
@@ -338,7 +338,7 @@ async def _come_up(group: asyncio.TaskGroup, nodes: list[Node], scenario: Scenar
     await asyncio.sleep(_SETTLED / SECOND - asyncio.get_running_loop().time())
     wanted = len(HRT) if scenario.hrt else 0
     if any(len(node.grants) != wanted or not node.engine.ready for node in nodes):
-        raise RuntimeError("the network has not come up")
+        raise RuntimeError("the network has not started")
     return running
 
 

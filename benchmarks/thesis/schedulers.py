@@ -1,6 +1,6 @@
 """Figure 4.11 of the thesis: the same events on the same bus, by fixed priorities and by least laxity.
 
-A frame is to take 10 units of time. With 12.5 kbit/s it takes about 10 ms; so a unit is a millisecond, and laxity is as
+A frame should last 10 units of time. At 12.5 kbit/s it lasts about 10 ms; so a unit is a millisecond, and laxity is as
 exact as on a fast bus. Each node tries its oldest event, and at the end of every frame it tries anew.
 """
 

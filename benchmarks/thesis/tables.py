@@ -12,7 +12,7 @@ EVENTS = {"A": (4121, 0.0160, 4.33), "B": (1594, 0.0552, 5.13), "C": (784, 0.052
 CLAIMED = 150_900
 """Bit/s of events in the thesis."""
 THROUGHPUT = 378_000
-"""Bit/s that the thesis says can be carried."""
+"""The capacity in bit/s according to the thesis."""
 
 
 def periods(summary: Summary, still: Summary) -> Iterator[str]:

@@ -1,20 +1,19 @@
-"""For the tests of programs that use r2p: a pytest plugin, found by pytest by itself.
+"""Test programs that use r2p: a pytest plugin, which pytest finds by itself.
 
-Mark a test, a class or a module, and its `async def` tests run under virtual time; nothing else has to be configured:
+Mark a test, a class or a module, and its `async def` tests run under virtual time, without further configuration:
 
     @pytest.mark.virtual_time
     async def test_the_lease_ends() -> None:
         ...
         await asyncio.sleep(3600)       # takes no time
 
-`@pytest.mark.virtual_time(seed=7)` gives `r2p.clock.random_of()` another seed. A test that can't go on fails within
-about a second with `r2p.Deadlock`, which lists what each task waits for; where nodes wake each other for ever, give it
-a `limit=` in seconds of virtual time. An exception that nobody awaits, in a
-callback or in a forgotten task, fails the test. Works with hypothesis, and next to the plugins of anyio and of
-pytest-asyncio.
+`@pytest.mark.virtual_time(seed=7)` sets the seed of `r2p.clock.random_of()`. A test that can't make progress fails
+within about a second with `r2p.Deadlock`, which lists what each task waits for; if nodes wake each other forever, set a
+`limit=` in seconds of virtual time. An unhandled exception in a callback, or in a task that is not awaited, fails the
+test. The plugin works with hypothesis, and next to the plugins of anyio and pytest-asyncio.
 
 The fixture `r2p_network` is an in-memory network (`r2p.testing.network.Network`) for the modules of a robot, with
-faults on demand, and with nodes for the test to speak through:
+faults on demand, and with nodes for the test itself:
 
     @pytest.mark.virtual_time
     async def test_blink(r2p_network: Network) -> None:

@@ -1,4 +1,4 @@
-"""Robots in tests: modules on an in-memory network, and nodes that a test itself speaks through."""
+"""Robots in tests: modules on an in-memory network, and nodes with which the test itself publishes and subscribes."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -9,29 +9,29 @@ from r2p.transports.memory import MemoryLink, MemoryNetwork
 
 
 class Network(MemoryNetwork):
-    """An in-memory network and the modules on it; what the fixture `r2p_network` gives.
+    """An in-memory network for modules: the fixture `r2p_network`.
 
     Its faults (`loss`, `duplicate`, `reorder`: probabilities; `delay`, `jitter`: seconds) can be set while it runs,
-    and `counts` tells what happened.
+    and `counts` has what happened.
     """
 
     def module(self, name: str, *, remap: dict[str, str] | None = None, observer: bool = False) -> Module:
-        """A module on this network, as `r2p.Module`; open it with `async with`."""
+        """Return a module on this network, an `r2p.Module`; open it with `async with`."""
         return Module(name, via=self.transport(), remap=remap, observer=observer, watchdog=False)
 
     @asynccontextmanager
     async def node(self, module: str, *, name: str = "test", priority: int = 0) -> AsyncIterator[Node]:
-        """A node for the test to speak through, in a module of its own."""
+        """Open a node for the test, in a module of its own."""
         async with self.module(module) as host, node_in(host, name=name, priority=priority) as node:
             yield node
 
     def disconnect(self, module: Module) -> None:
-        """Pull a module's plug: it hears nobody, nobody hears it, and its link says so."""
+        """Disconnect a module: it neither sends nor receives, and its link goes down."""
         for link in self._links(module):
             link.disconnect()
 
     def connect(self, module: Module) -> None:
-        """Plug it in again."""
+        """Connect a module again."""
         for link in self._links(module):
             link.connect()
 
@@ -41,12 +41,12 @@ class Network(MemoryNetwork):
 
 @asynccontextmanager
 async def node_in(module: Module, *, name: str = "test", priority: int = 0) -> AsyncIterator[Node]:
-    """A node of an open module that does nothing by itself: the test advertises and subscribes with it.
+    """Open a node of an open module for the test, which advertises and subscribes with it.
 
-    What it opened is closed with it.
+    Its publishers and subscribers are closed with it.
     """
     node = module.start(_idle, name=name, priority=priority)
-    await asyncio.sleep(0)  # it runs
+    await asyncio.sleep(0)  # let it start
     try:
         yield node
     finally:
@@ -54,5 +54,5 @@ async def node_in(module: Module, *, name: str = "test", priority: int = 0) -> A
 
 
 async def _idle(_node: Node) -> None:
-    """Live until cancelled."""
+    """Run until cancelled."""
     await asyncio.get_running_loop().create_future()

@@ -1,6 +1,6 @@
 """The pytest plugin behind `@pytest.mark.virtual_time` and the fixture `r2p_network` (see `r2p.testing`).
 
-pytest loads it in every session of an environment that has r2p: so it imports what it needs when a test needs it.
+pytest loads it in every session of an environment that has r2p: so it imports r2p only when a test needs it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def r2p_network() -> Network:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run a marked async test; leave all others to pytest."""
+    """Run a marked async test; leave other tests to pytest."""
     marker = pyfuncitem.get_closest_marker("virtual_time")
     if marker is None:
         return None
@@ -49,7 +49,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
         _run(functools.partial(test, *positional, **named), marker)
 
     if hypothesis is not None:
-        hypothesis.inner_test = under_virtual_time  # one run of the loop for each example
+        hypothesis.inner_test = under_virtual_time  # a run of the loop for each example
         return None
     arguments = inspect.signature(test).parameters
     under_virtual_time(**{name: value for name, value in pyfuncitem.funcargs.items() if name in arguments})
@@ -57,7 +57,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def _async_function(function: object) -> AsyncFunction | None:
-    """The async function itself, also when pytest-asyncio, or this plugin the last time, has wrapped it."""
+    """Return the async function itself, even if pytest-asyncio, or this plugin in an earlier run, has wrapped it."""
     for candidate in (function, getattr(function, "__wrapped__", None)):
         if inspect.iscoroutinefunction(candidate):
             return candidate
@@ -69,17 +69,17 @@ def _run(test: Callable[[], Coroutine[Any, Any, object]], marker: pytest.Mark) -
 
     from r2p.sim import run
 
-    lost: list[Exception] = []
+    unhandled: list[Exception] = []
 
     def keep(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         loop.default_exception_handler(context)
         if isinstance(error := context.get("exception"), Exception):
-            lost.append(error)
+            unhandled.append(error)
 
     async def main() -> None:
         asyncio.get_running_loop().set_exception_handler(keep)
         await test()
 
     run(main, *marker.args, **marker.kwargs)
-    if lost:
-        raise ExceptionGroup("exceptions in callbacks, or in tasks that nobody awaited", lost)
+    if unhandled:
+        raise ExceptionGroup("exceptions in callbacks, or in tasks that were not awaited", unhandled)

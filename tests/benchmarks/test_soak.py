@@ -10,7 +10,7 @@ from benchmarks.soak_roles import Account, Lives
 
 def test_a_short_run_adds_up() -> None:
     lines: list[str] = []
-    verdict = soak(2.0, rate=500.0, say=lines.append)
+    verdict = soak(2.0, rate=500.0, report=lines.append)
     assert verdict.troubles == []
     assert verdict.published >= verdict.received > 0
     assert verdict.lives > 0
@@ -53,7 +53,7 @@ def test_a_hop_that_does_not_add_up_is_bad() -> None:
 def test_what_one_that_came_and_went_missed_has_to_be_in_a_counter() -> None:
     account, lives = Account(), Lives()
     for number in (5, 6, 9, 8, 12):
-        account.take(number)
+        account.add(number)
     assert (account.received, account.missing, account.disorder) == (5, 5, 1)
     lives.add(account, 5, {})
     assert lives.missing == 0
