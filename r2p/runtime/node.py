@@ -139,7 +139,7 @@ class Node:
         shape = layout(type)
         name = self._resolve(topic)
         check_class(name, klass)
-        _check_links(self._space, self.log, name, shape.size, klass, strict=strict)
+        self._check_links(name, shape.size, klass, strict=strict)
         where = self._space.open(name, shape)
         publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
         try:
@@ -362,6 +362,21 @@ class Node:
             raise InvalidName(f"topic {name} is reserved for management messages: choose another name")
         return name
 
+    def _check_links(
+        self, topic: str, size: int, klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool
+    ) -> None:
+        """Warn of links that can't send the topic; `strict`: raise TransportError for those that give less."""
+        for link in self._space.links:
+            reason = link.refusal(size)
+            if reason and not strict:
+                self.log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
+            elif strict and link.best_effort(klass.publisher_class):
+                reason = link.guarantee(topic, klass.publisher_class)
+            elif strict and isinstance(klass, Periodic):
+                reason = link.inadmissible(size, klass.period)
+            if reason and strict:
+                raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
+
     async def _serve(self) -> bool:
         served = False
         for subscriber in self._with_callback():
@@ -384,25 +399,3 @@ class Node:
 
     def _with_callback(self) -> list[Subscriber[Any]]:
         return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
-
-
-def _check_links(
-    space: TopicSpace,
-    log: NodeLogger,
-    topic: str,
-    size: int,
-    klass: NonRealTime | Sporadic | Periodic[Any],
-    *,
-    strict: bool,
-) -> None:
-    """Warn of links that can't send the topic; `strict` raises TransportError where one gives less than its class."""
-    for link in space.links:
-        reason = link.refusal(size)
-        if reason and not strict:
-            log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
-        elif strict and link.best_effort(klass.publisher_class):
-            reason = link.guarantee(topic, klass.publisher_class)
-        elif strict and isinstance(klass, Periodic):
-            reason = link.inadmissible(size, klass.period)
-        if reason and strict:
-            raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
