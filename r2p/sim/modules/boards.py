@@ -21,7 +21,7 @@ from r2p.sim.physics.world import RangeFinder, RangeSpec
 from r2p.transports.link import Transport
 
 Via = str | Transport | Iterable[str | Transport] | None
-Look = Callable[[int], float]
+DistanceTo = Callable[[int], float]
 """Returns the distance in mm to what sensor 0 to 3 sees, or infinity."""
 
 _ADC = 4095  # counts of 12 bits
@@ -131,14 +131,14 @@ class MotorModule(Board):
 class RangeArray:
     """Four sensors of the same kind, and their inputs of the A/D converter."""
 
-    def __init__(self, look: Look, noise: random.Random, spec: RangeSpec | None = None) -> None:
-        self._look = look
+    def __init__(self, distance_to: DistanceTo, noise: random.Random, spec: RangeSpec | None = None) -> None:
+        self._distance_to = distance_to
         self._sensors = [RangeFinder(spec or RangeSpec(), noise) for _ in range(4)]
 
     def read(self) -> Proximity:
         """Read all four, corrected, in mm."""
         one, two, three, four = (
-            sensor.millimetres(sensor.read(self._look(number))) for number, sensor in enumerate(self._sensors)
+            sensor.millimetres(sensor.read(self._distance_to(number))) for number, sensor in enumerate(self._sensors)
         )
         return Proximity(ranges=(one, two, three, four))
 
@@ -157,7 +157,7 @@ class ProximityModule(Board):
         self,
         name: str = "PROX1",
         *,
-        look: Look,
+        distance_to: DistanceTo,
         noise: random.Random,
         spec: RangeSpec | None = None,
         topic: str = "proximity",
@@ -166,7 +166,7 @@ class ProximityModule(Board):
         remap: dict[str, str] | None = None,
     ) -> None:
         """`period` in seconds: the sensors need 40 ms for a measurement."""
-        self.sensors = RangeArray(look, noise, spec)
+        self.sensors = RangeArray(distance_to, noise, spec)
         node = functools.partial(proximity, sensors=self.sensors, topic=topic, period=period)
         super().__init__(name, via=via, remap=remap, nodes={"prox": node})
 

@@ -90,7 +90,7 @@ class Hardware:
         """Return the random numbers for a part."""
         return random.Random(f"{self.seed}/{part}")
 
-    def look(self, angle: float) -> float:
+    def distance_to_wall(self, angle: float) -> float:
         """Return the distance (mm) to the nearest wall in a range finder's beam; `angle` in degrees from ahead."""
         at = self.body.w + math.radians(angle)
         x = self.body.x + _SENSORS_AT * math.cos(at)
@@ -208,11 +208,11 @@ class Triskar2:
     def _proximity(self, name: str, topic: str) -> ProximityModule:
         ahead = triskar2.SIDES[topic]
 
-        def look(number: int) -> float:
-            return self.hardware.look(ahead + triskar2.BEARINGS[number])
+        def distance_to(number: int) -> float:
+            return self.hardware.distance_to_wall(ahead + triskar2.BEARINGS[number])
 
         return ProximityModule(
-            name, look=look, noise=self.hardware.noise(name), spec=RangeSpec(), topic=topic, via=self.via
+            name, distance_to=distance_to, noise=self.hardware.noise(name), spec=RangeSpec(), topic=topic, via=self.via
         )
 
     def _start_nodes(self, board: Board) -> None:

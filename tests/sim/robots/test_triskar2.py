@@ -143,8 +143,8 @@ async def test_beside_a_wall_it_passes() -> None:
 
 def test_a_sensor_sees_what_is_in_its_beam_beside_the_axis() -> None:
     hardware = Hardware(world=World([((0.5, 0.02), (0.5, 0.06))]))
-    assert hardware.look(0.0) == pytest.approx(380 / math.cos(math.radians(8)))
-    assert hardware.look(180.0) == math.inf
+    assert hardware.distance_to_wall(0.0) == pytest.approx(380 / math.cos(math.radians(8)))
+    assert hardware.distance_to_wall(180.0) == math.inf
 
 
 async def test_a_blocked_robot_still_turns() -> None:
