@@ -15,7 +15,7 @@ from r2p.codecs.management import ManagementType
 from r2p.protocols.rtcan.events import NEVER, Action, Done, Fate, Profile
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import PublisherHandle, Topic
+from r2p.runtime.topic import PublisherHandle
 from r2p.transports.link import LinkSubscriber
 from r2p.transports.rtcan.driver import EngineDriver
 from r2p.transports.rtcan.slots import SlottedTopics
@@ -47,16 +47,6 @@ class ResponseHandle(msgspec.Struct, eq=False):
     """A SUBSCRIBE_RESPONSE in the engine."""
 
     sent: bool = False
-
-
-def publisher_of(topic: Topic, sample: Sample) -> PublisherHandle | None:
-    """The publisher of this module that published a sample. None: the sample came by another link."""
-    if sample.source.link:
-        return None
-    for publisher in topic.publishers:
-        if publisher.node.name == sample.source.node and publisher.publisher_class == sample.publisher_class:
-            return publisher
-    return None
 
 
 class TxAccounting:
@@ -133,7 +123,7 @@ class Transmitter:
     def send(self, subscriber: LinkSubscriber | None, topic: str, high: int, sample: Sample) -> Sequence[Action]:
         """Send a sample of a topic, which has this high byte, and a `subscriber` if this module has the topic."""
         now, drop = self._now(), sample.drop_late
-        publisher = publisher_of(subscriber.topic, sample) if subscriber is not None else None
+        publisher = subscriber.topic.publisher_of(sample) if subscriber is not None else None
         deadline = NEVER if sample.publisher_class == _NRT else now + self._time_left(topic, sample, publisher)
         handle = self._accounting.add(publisher, sample, deadline)
         return self._engine.publish(now, high, sample.data, deadline=deadline, drop=drop, handle=handle)
