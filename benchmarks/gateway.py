@@ -45,7 +45,7 @@ class Sent(r2p.Message):
     at: r2p.u64 = 0
 
 
-# How much passes
+# Throughput
 
 
 async def _gateway(pipe: Connection, out: str) -> None:
@@ -123,7 +123,7 @@ def _through(out: str) -> tuple[float, int, float]:
             return received / max(seconds, 1e-9), MESSAGES - received, (gateway.recv() - before) / MESSAGES
 
 
-# How long it takes: each message carries the instant at which it was sent, by the monotonic clock of both processes
+# Latency: each message carries the instant at which it was sent, by the monotonic clock of both processes
 
 
 async def _tick(send: Callable[[bytes], object]) -> None:
@@ -209,7 +209,7 @@ def _pc(robot: Connection) -> list[float]:
     async def receive(node: r2p.Node) -> None:
         subscriber = node.subscribe("sent", Sent, queue=64)
         await subscriber.wait_publisher()
-        await asyncio.sleep(2.5)  # the gateway has made sure that it is alone
+        await asyncio.sleep(2.5)  # the gateway has found that there is no other one
         robot.send(None)
         with contextlib.suppress(TimeoutError):
             while len(delays) < PACED:

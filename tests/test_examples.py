@@ -1,4 +1,4 @@
-"""The examples: short, whole programs that do what they say.
+"""The examples: short, complete programs that do what their docstring says.
 
 They run under virtual time, on a network in memory; `serial_cable.py` at a pseudo terminal, in real time.
 """
@@ -50,7 +50,7 @@ def test_it_is_short_and_says_what_it_is_for(file: Path) -> None:
 
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
 def test_the_command_runs_its_nodes(file: Path) -> None:
-    """Those that take a node and nothing else; their names fit."""
+    """The functions with a node as their only parameter, and a valid name."""
     functions = inspect.getmembers(SimpleNamespace(**runpy.run_path(str(file))), inspect.iscoroutinefunction)
     nodes = [name for name, function in functions if list(inspect.signature(function).parameters) == ["node"]]
     assert nodes
@@ -139,7 +139,7 @@ async def test_square() -> None:
 
 @pytest.mark.virtual_time
 async def test_gateway(capsys: pytest.CaptureFixture[str]) -> None:
-    """What the robot has reaches the PC, but for the log; and an empty battery is told."""
+    """The robot's topics reach the PC, except the log; and a low battery is reported."""
     gateway = asyncio.create_task(_example("gateway")["main"]("memory:robot", "memory:lan"))
     async with Triskar2("memory:robot") as robot, r2p.Module("PC1", via="memory:lan") as pc:
         robot.hardware.battery.charge = 0.1

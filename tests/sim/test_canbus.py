@@ -389,7 +389,7 @@ async def test_a_node_hears_in_order_however_late() -> None:
 
 
 class Busy:
-    """A node that always wants to send, and writes down what it hears."""
+    """A node that always wants to send, and records what it receives."""
 
     def __init__(self, controller: CanController, trace: Any) -> None:
         self.controller = controller

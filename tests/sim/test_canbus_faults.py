@@ -26,7 +26,7 @@ def bits(frame: Frame) -> int:
 
 
 class Watch(can_watch.Watch):
-    """Writes down what its controllers hear, and what its bus did."""
+    """Records the callbacks of its controllers, and the frames of its bus."""
 
     def __init__(self, **settings: Any) -> None:
         self.bus = CanBus(asyncio.get_running_loop(), **settings)

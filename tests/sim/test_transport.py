@@ -148,7 +148,7 @@ def test_one_seed_one_course_of_events() -> None:
 
 
 class WallClock(VirtualClock):
-    """Looks real to those who ask; and each time somebody does, time has gone on."""
+    """A clock that is not virtual, and that advances each time it is read."""
 
     virtual = False
 

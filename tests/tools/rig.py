@@ -48,23 +48,23 @@ async def tool(*, verbose: int = 0, types: dict[str, str] | None = None) -> Asyn
 
 
 class Firmware:
-    """A module that says what it is told to say, and no HELLO; open it inside of the loop."""
+    """A module that sends what the test asks for, and no HELLO; make it inside the loop."""
 
     def __init__(self, name: str = "IMU") -> None:
         self._network = network("lab")
         self._port = self._network.new_address()
         self._name = name
 
-    def say(self, message: management.Management) -> None:
+    def send(self, message: management.Management) -> None:
         self._network.send(Datagram(self._port, b"R2P", management.encode(message)))
 
     def alive(self) -> None:
-        self.say(management.Alive(self._name, 0))
+        self.send(management.Alive(self._name, 0))
 
     def advertise(self, topic: str, size: int) -> None:
-        """Announce a topic, and answer who subscribes it."""
-        self.say(management.Advertise(topic, size))
-        self.say(management.SubscribeResponse(topic, size))
+        """Announce a topic, and answer subscribers."""
+        self.send(management.Advertise(topic, size))
+        self.send(management.SubscribeResponse(topic, size))
 
     def publish(self, topic: str, data: bytes) -> None:
         self._network.send(Datagram(self._port, topic.encode(), data))

@@ -1,4 +1,4 @@
-"""`r2p gateway` without processes: what it shows, publishes and takes as options."""
+"""`r2p gateway` without processes: its output, its counters as messages, and its options."""
 
 from __future__ import annotations
 

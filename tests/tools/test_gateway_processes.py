@@ -1,4 +1,4 @@
-"""`r2p gateway` as a process: how it ends, and what it says of mistakes. See test_main_job.py for what it is for."""
+"""`r2p gateway` as a process: how it ends, and its errors. test_main_job.py tests its purpose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`r2p module`: who is listed, and when an order counts as carried out."""
+"""`r2p module`: which modules are listed, and when a command is done."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ async def test_stop_and_reboot_an_r2p_module(capsys: pytest.CaptureFixture[str])
 
 
 async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A module that has been rebooted before and ignores the order does not look as if it obeyed."""
+    """A module that has been rebooted before and ignores the command does not seem to obey."""
     async with robot(hold) as bot, tool() as session:
         await bot.reboot()
         await asyncio.sleep(1)

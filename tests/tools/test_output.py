@@ -1,4 +1,4 @@
-"""What tools print, and what happens when nobody or a slow somebody reads it."""
+"""What commands print, and what happens when the reader is gone or slow."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RECORD = {"stamp": {"sec": 5, "nsec": 0}, "value": [1.5, -2.0], "name": "on", "p
 
 
 class Terminal(io.StringIO):
-    """A stream that people look at."""
+    """A stream at a terminal."""
 
     def isatty(self) -> bool:
         return True

@@ -1,4 +1,4 @@
-"""`r2p run`: what it loads, what it says when it can't, and how it ends."""
+"""`r2p run`: what it loads, its errors, and how it ends."""
 
 from __future__ import annotations
 

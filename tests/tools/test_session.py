@@ -227,7 +227,7 @@ async def test_it_settles_as_soon_as_the_others_have_told_everything(capsys: pyt
 @pytest.mark.virtual_time
 @pytest.mark.parametrize("late", [0.1, 0.8, 1.3])
 async def test_on_a_bus_it_waits_for_those_behind_a_gateway(late: float, capsys: pytest.CaptureFixture[str]) -> None:
-    """Who is new on the bus is told of them when the gateway repeats itself, each 1.5 s."""
+    """A new module on the bus learns of them when the gateway repeats itself, every 1.5 s."""
     names = {f"M{number}" for number in range(6)}
     async with contextlib.AsyncExitStack() as stack:
         options = r2p.BridgeOptions()

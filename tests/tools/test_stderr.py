@@ -1,4 +1,4 @@
-"""What tools tell people: texts of other modules in it do nothing to a terminal."""
+"""Messages for the user: texts of other modules in them can't control a terminal."""
 
 import logging
 

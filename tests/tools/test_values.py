@@ -22,7 +22,7 @@ from tests.messages.strategies import messages
 
 
 class Switch(r2p.Message):
-    """Names that YAML 1.1 takes for booleans."""
+    """Names that are booleans in YAML 1.1."""
 
     on: bool = False
     y: r2p.f32 = 0.0

@@ -42,7 +42,7 @@ def recorded_nodes(*, repeats: bool = True) -> FirmwareModule:
 
 
 class Line:
-    """Somebody at the other end of the line, who lets time pass."""
+    """The other end of the line, which advances the time."""
 
     def __init__(self, module: FirmwareModule, start: int = 0) -> None:
         self.module = module
@@ -68,7 +68,7 @@ class Line:
     def publish(self, topic: str, message: r2p.Message) -> None:
         self.send(debug.encode(topic.encode(), message.encode(), 0))
 
-    def told(self) -> list[Any]:
+    def received(self) -> list[Any]:
         """What was heard since the last call."""
         heard, self.heard = self.heard, []
         return [what for _, what in heard]
@@ -124,7 +124,7 @@ def calls(case: Case) -> int:
 @pytest.mark.golden
 @pytest.mark.parametrize("case", [case for case in RECORDED if calls(case) and "malformed" not in case.name], ids=str)
 def test_it_receives_what_firmware_received(case: Case) -> None:
-    """But for wrong checksums, which firmware does not look at."""
+    """Except for wrong checksums, which firmware does not check."""
     module = replayed(case).module
     assert module.received["cmd"] == calls(case) - module.drops["checksum"]
 
@@ -139,16 +139,16 @@ def test_the_first_bytes_are_the_boot_marker(case: Case) -> None:
 
 
 def booted(module: FirmwareModule | None = None) -> Line:
-    """A module whose nodes are up, with what it said so far forgotten."""
+    """A module whose nodes are up, and what it has sent so far discarded."""
     line = Line(module or recorded_nodes())
     line.until(500)
-    line.told()
+    line.received()
     return line
 
 
 def alive(line: Line) -> list[int]:
-    """The flags of the ALIVE messages since the last look."""
-    return [what.flags for what in line.told() if isinstance(what, management.Alive)]
+    """The flags of the ALIVE messages since the last call."""
+    return [what.flags for what in line.received() if isinstance(what, management.Alive)]
 
 
 def test_flags_of_its_lives() -> None:
@@ -179,7 +179,7 @@ def test_it_is_deaf_while_it_restarts() -> None:
     line = booted()
     line.say(management.Reboot("IMU1"), management.SubscribeRequest("leds", 5, 1))
     line.until(509)
-    assert line.told() == []
+    assert line.received() == []
 
 
 def test_nothing_flows_before_the_handshake() -> None:
@@ -203,9 +203,9 @@ def test_after_stop_nothing_flows_any_more() -> None:
     line.say(management.Stop("IMU1"))
     line.publish("cmd", Velocity3())
     line.say(management.SubscribeRequest("leds", 5, 1), management.Advertise("cmd", 12))
-    line.told()
+    line.received()
     line.until(9000)
-    assert all(isinstance(what, management.Alive) for what in line.told()[2:])
+    assert all(isinstance(what, management.Alive) for what in line.received()[2:])
     assert (line.module.sent, line.module.received) == ({}, {})
 
 
@@ -225,7 +225,7 @@ def test_a_queue_of_nothing_halts_it_until_its_power_is_cut() -> None:
     line.send(debug.encode(b"R2P", bytes(zero), 0))
     line.say(management.Reboot("IMU1"))
     line.until(9000)
-    assert line.told() == []
+    assert line.received() == []
     assert line.module.halted
     assert line.module.publish(line.now, "leds", Led()) == b""
     line.module.power_on(line.now)
@@ -236,7 +236,7 @@ def test_a_topic_of_no_size_overruns_its_buffers() -> None:
     line = booted()
     line.say(management.SubscribeRequest("leds", 0, 5))
     line.until(9000)
-    assert line.told() == []
+    assert line.received() == []
     assert "size 0" in line.module.fault
 
 
@@ -262,10 +262,10 @@ def test_a_stop_in_boot_mode_hangs_its_management() -> None:
     line = Line(recorded_nodes())
     line.say(management.Bootload("IMU1"))
     line.until(2000)
-    line.told()
+    line.received()
     line.say(management.Stop("IMU1"), management.Reboot("IMU1"))
     line.until(9000)
-    assert line.told() == []
+    assert line.received() == []
     assert "boot mode" in line.module.fault
     assert not line.module.halted
     line.module.power_on(line.now)
@@ -297,7 +297,7 @@ def test_bytes_may_come_one_by_one() -> None:
     request = debug.encode(b"R2P", management.encode(management.SubscribeRequest("leds", 5, 1)), 0)
     for i in range(len(request)):
         line.send(request[i : i + 1])
-    assert line.told() == [("SubscribeResponse", "leds", 5)]
+    assert line.received() == [("SubscribeResponse", "leds", 5)]
 
 
 def test_answers_are_published_at_once() -> None:
@@ -313,10 +313,10 @@ def test_answers_are_published_at_once() -> None:
     line.say(*(management.SubscribeResponse(topic, 0) for topic in ("cmd", "off")))
     line.say(management.SubscribeRequest("speed", 4, 1))
     line.until(550)
-    line.told()
+    line.received()
     line.publish("cmd", Velocity3(x=2.0))
     line.publish("off", Led())
-    assert line.told() == [("speed", Float32(2.0).encode())]
+    assert line.received() == [("speed", Float32(2.0).encode())]
     assert module.sent == {"speed": 1}
 
 

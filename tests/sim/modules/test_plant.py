@@ -8,7 +8,7 @@ from r2p.sim.modules.plant import Plant
 
 
 class Count:
-    """Adds up the time that it is told."""
+    """Adds up its steps."""
 
     def __init__(self) -> None:
         self.time = 0.0

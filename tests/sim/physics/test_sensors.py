@@ -1,4 +1,4 @@
-"""Battery, range finders and the world that they look at."""
+"""Battery, range finders and the world that they measure."""
 
 import math
 import random

@@ -1,4 +1,4 @@
-"""A robot under virtual time, and what the tests look at."""
+"""A robot under virtual time, and what the tests measure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot as a whole, under virtual time: it drives as it is told, and stops when it has to."""
+"""The robot as a whole, under virtual time: it follows commands, and stops when it must."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ async def forward(node: r2p.Node, speed: float = 0.5) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 async def test_the_square_closes(seed: int) -> None:
-    """A minute: after three laps odometry is within 2 % of the way, the robot within 3 % of where it was told to be."""
+    """A minute: after three laps odometry is within 2 % of the way, the robot within 3 % of the commanded position."""
     side, speed, laps = 1.5, 0.4, 3
     async with Triskar2(VIA, seed=seed) as robot, r2p.Module("PC1", via=VIA) as pc, odometry_of(pc) as odometry:
         pc.start(functools.partial(square, side=side, speed=speed, laps=laps, wait=WAIT), name="square")
@@ -287,7 +287,7 @@ async def test_odometry_survives_a_lost_encoder_message() -> None:
 
 
 async def test_odometry_makes_up_for_a_second_in_which_the_computer_was_busy() -> None:
-    """All that the encoders told comes at once, and counts."""
+    """All readings of the encoders arrive at once, and count."""
     async with r2p.Module("MOTOR2") as module, node_in(module) as node:
         module.start(triskar2.forward_kinematics, name="fwdkin")
         encoders = [node.advertise(f"encoder{wheel}", Encoder) for wheel in (1, 2, 3)]

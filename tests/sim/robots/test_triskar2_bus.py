@@ -131,7 +131,7 @@ def test_load_does_not_move_hard_real_time_by_a_nanosecond_and_does_move_the_res
 
 
 MANAGEMENT = 390
-"""Frames a second at most of what the robot and a PC say to stay known to each other, the start included."""
+"""The most frames per second with which the robot and a PC stay known to each other, including the start."""
 
 
 async def test_a_minute_of_squares() -> None:

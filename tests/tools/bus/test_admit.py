@@ -1,4 +1,4 @@
-"""`r2p bus admit`: what the master's calendar says of a plan."""
+"""`r2p bus admit`: the answer of the master's calendar to a plan."""
 
 from __future__ import annotations
 

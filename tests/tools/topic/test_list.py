@@ -55,7 +55,7 @@ async def test_list_of_firmware(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.virtual_time
 async def test_list_behind_a_gateway(capsys: pytest.CaptureFixture[str]) -> None:
-    """It answers at once, but with nothing but its name: what others have it tells once it may forward."""
+    """It answers at once, but only with its name: it announces what others have once it may forward."""
     inside = "memory:inside"
     async with r2p.Module("BOT", via=inside) as module, tool() as session:
         module.start(blink)

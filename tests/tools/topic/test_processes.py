@@ -82,7 +82,7 @@ def test_a_killed_peer_is_told_and_awaited(publisher: subprocess.Popen[str]) -> 
 
 
 def test_lines_from_a_pipe_to_a_pipe(publisher: subprocess.Popen[str]) -> None:
-    """What echo prints, pub takes."""
+    """`pub` accepts what `echo` prints."""
     with process("topic", "echo", "copy", "-n", "3", "--via", "tcp-listen:0") as sink:
         url = listening(sink)
         with (

@@ -17,7 +17,7 @@ from tests.tools.rig import robot, tool
 
 
 class Listener:
-    """A node that keeps what it hears, and when."""
+    """A node that keeps what it receives, and when."""
 
     def __init__(self, type: type[r2p.Message] = Led) -> None:
         self.heard: list[r2p.Message] = []
