@@ -143,6 +143,8 @@ class FirmwareModule:
 
     def poll(self, now: int) -> bytes:
         """Do what is due: call it at `next_deadline()`."""
+        if self.halted:
+            return b""
         if self._boot_at is not None and now >= self._boot_at:
             self._boot(self._boot_at, self.flags, _STEP)
         if self._nodes_at is not None and now >= self._nodes_at:

@@ -240,6 +240,17 @@ def test_a_topic_of_no_size_overruns_its_buffers() -> None:
     assert "size 0" in line.module.fault
 
 
+def test_a_halted_module_sends_nothing_even_if_it_is_polled() -> None:
+    line = booted()
+    line.say(management.SubscribeRequest("leds", 5, 1), management.SubscribeRequest("leds", 0, 5))
+    assert line.module.halted
+    assert line.module.sent == {}
+    for ms in range(500, 9000, 100):  # a step of repetition and a message of the publisher are due
+        assert line.module.poll(ms * MS) == b""
+    assert line.module.sent == {}
+    assert line.module.next_deadline() is None
+
+
 def test_queues_come_from_a_small_heap() -> None:
     module = FirmwareModule("IMU1", publishers=[Publishes("leds", Led), Publishes("text", Text)])
     line = booted(module)
