@@ -1,14 +1,19 @@
-"""The map of the code is true: the picture is drawn from the imports of today, and the functions on the walks exist."""
+"""The map of the code is true: the picture is that of the imports, and messages take the ways that the page shows."""
 
 import ast
+import asyncio
 import importlib.util
 import re
-from types import ModuleType
+import sys
+from types import FrameType, ModuleType
 
 import pytest
 
+import r2p
+from r2p.testing.network import node_in
 from tests.docs.blocks import ROOT
 
+GUARD = 30.0  # s
 PAGE = (ROOT / "docs" / "architecture.md").read_text()
 
 _FILE = re.compile(r"`([a-z_/]+(?:\.py|/))`")
@@ -71,3 +76,51 @@ def test_each_function_exists(path: str, name: str) -> None:
 def test_the_vocabulary_has_about_forty_entries() -> None:
     words = PAGE.partition("## Vocabulary")[2].count("\n| ") - 2
     assert 35 <= words <= 45
+
+
+def _walk(heading: str) -> list[tuple[str, str]]:
+    """The files and functions of the first table under a heading, in order."""
+    section = PAGE.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+    return _PLACE.findall(section.partition("\n| 1 | ")[2].partition("\n\n")[0])
+
+
+@pytest.fixture(scope="module")
+async def called() -> set[tuple[str, str]]:
+    """The functions that run while one message of a new type goes through TCP, from a publisher to a subscriber."""
+    seen: set[tuple[str, str]] = set()
+    root = f"{ROOT / 'r2p'}/"
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code.co_filename.startswith(root):
+            seen.add((frame.f_code.co_filename.removeprefix(root), frame.f_code.co_qualname))
+
+    sys.setprofile(note)
+    try:
+        await _send_one()
+    finally:
+        sys.setprofile(None)
+    return seen
+
+
+async def _send_one() -> None:
+    class Walker(r2p.Message):
+        steps: r2p.u32 = 0
+
+    async with asyncio.timeout(GUARD), r2p.Module("A", via="tcp-listen:127.0.0.1:0", watchdog=False) as a:
+        ((_, address),) = a.addresses
+        async with r2p.Module("B", via=f"tcp:{address}", watchdog=False) as b, node_in(a) as one, node_in(b) as other:
+            subscriber, publisher = one.subscribe("walks", Walker), other.advertise("walks", Walker)
+            await publisher.wait_subscriber()
+            await publisher.publish(Walker(9))
+            async for message in subscriber:
+                assert message == Walker(9)
+                break
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(("heading", "files"), [("A message in", 9), ("A message out", 8)])
+async def test_a_message_takes_that_way(called: set[tuple[str, str]], heading: str, files: int) -> None:
+    walk = _walk(heading)
+    assert len({path for path, _ in walk}) == files
+    functions = {each for each in walk if not each[1].rpartition(".")[2][0].isupper()}  # a class shows no call
+    assert functions - called == set()
