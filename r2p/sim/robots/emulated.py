@@ -10,6 +10,7 @@ power switch for each module.
 """
 
 import asyncio
+import contextlib
 import math
 import random
 from collections.abc import Iterable
@@ -18,6 +19,7 @@ from typing import Self
 
 from r2p.bridge import BridgeOptions
 from r2p.clock import check_timeout
+from r2p.errors import Error, InvalidName
 from r2p.msg import Speed3
 from r2p.runtime.publishers import AnyPublisher
 from r2p.sim.modules.boards import (
@@ -103,7 +105,7 @@ class Triskar2:
 
     `traffic` is the class of all messages of the command chain; None: the nodes' defaults. `modules`: the modules to
     run in this process; default: all. `outside`: the gateway's links for computers, with these `options`. Raises
-    TransportError for an invalid `via`.
+    InvalidName for a module that the robot does not have, and TransportError for an invalid `via`.
     """
 
     def __init__(
@@ -124,7 +126,9 @@ class Triskar2:
         self.modules: dict[str, Board] = {}
         """The modules that are switched on, by name."""
         self._traffic = traffic
-        self._names = list(modules or MODULES)
+        self._names = list(MODULES if modules is None else modules)
+        for name in self._names:
+            _check_name(name)
 
     @property
     def pose(self) -> Triple:
@@ -132,19 +136,24 @@ class Triskar2:
         return self.hardware.pose
 
     async def __aenter__(self) -> Self:
-        await self.hardware.plant.__aenter__()
-        try:
+        async with contextlib.AsyncExitStack() as opening:  # also when cancelled: without the block, nothing is closed
+            opening.push_async_exit(self)
+            await self.hardware.plant.__aenter__()
             for name in self._names:
                 await self.switch_on(name)
-        except BaseException:  # also when cancelled: without the block, __aexit__ is not called
-            await self._close()
-            raise
+            opening.pop_all()
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        await self._close()
+        """Switch off all modules, the last first, and stop the physics, also if one of them raises (NodeCrashed)."""
+        closing = contextlib.AsyncExitStack()
+        closing.push_async_exit(self.hardware.plant)
+        for name, board in self.modules.items():
+            closing.push_async_exit(board)
+            closing.callback(self.modules.pop, name)
+        await closing.__aexit__(kind, error, trace)
 
     async def ready(self, timeout: float | None = None) -> None:
         """Wait until the network has admitted all publishers and has settled (with an elected master, on RTCAN).
@@ -170,20 +179,28 @@ class Triskar2:
         return [publisher for node in nodes for publisher in node.publishers]
 
     async def switch_on(self, name: str) -> Board:
-        """Switch on the power of a module."""
-        board = await self._make(name).__aenter__()
-        self.modules[name] = board
-        self._start_nodes(board)
+        """Switch on the power of a module. Raises InvalidName, and Error if it is on."""
+        _check_name(name)
+        if name in self.modules:
+            raise Error(f"module {name} is on: switch it off first")
+        async with contextlib.AsyncExitStack() as opening:
+            board = self.modules[name] = self._make(name)
+            opening.callback(self.modules.pop, name)
+            await opening.enter_async_context(board)
+            self._start_nodes(board)
+            opening.pop_all()
         return board
 
     async def switch_off(self, name: str) -> None:
-        """Switch off the power of a module. Its nodes are cancelled in order, and it announces that it leaves."""
-        await self.modules.pop(name).__aexit__(None, None, None)
+        """Switch off the power of a module. Its nodes are cancelled in order, and it announces that it leaves.
 
-    async def _close(self) -> None:
-        for name in reversed(list(self.modules)):
-            await self.switch_off(name)
-        await self.hardware.plant.__aexit__(None, None, None)
+        Raises InvalidName, Error if it is off, and NodeCrashed if nodes of it have crashed.
+        """
+        _check_name(name)
+        board = self.modules.pop(name, None)
+        if board is None:
+            raise Error(f"module {name} is off: switch it on first")
+        await board.__aexit__(None, None, None)
 
     def _make(self, name: str) -> Board:
         if name in MOTORS:
@@ -227,3 +244,8 @@ class Triskar2:
                 board.start(triskar2.obstacle_avoidance, *traffic, name="obstacle")
             case "PS":
                 board.start(triskar2.battery_monitor, name="battery")
+
+
+def _check_name(name: str) -> None:
+    if name not in MODULES:
+        raise InvalidName(f"Triskar2 has no module {name!r}: use {', '.join(MODULES)}")

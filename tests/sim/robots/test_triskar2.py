@@ -23,6 +23,7 @@ from r2p.transports.memory import network
 from tests.sim.robots.rig import WAIT, lap_time, odometry_of, until_at_rest, until_driving
 
 if TYPE_CHECKING:
+    from r2p.sim.modules import Board
     from r2p.transports.memory import Datagram
 
 pytestmark = pytest.mark.virtual_time
@@ -161,6 +162,83 @@ async def test_a_blocked_robot_still_turns() -> None:
         await asyncio.sleep(2)
         assert 0.3 < robot.pose[2] < 0.7
         assert robot.pose[:2] == pytest.approx((0, 0), abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["MOTOR4", "ps", ""])
+async def test_a_module_that_it_does_not_have_is_refused(name: str) -> None:
+    with pytest.raises(r2p.InvalidName, match=r"no module .*MOTOR1, MOTOR2, .*GW"):
+        Triskar2(VIA, modules=["PS", name])
+    async with Triskar2(VIA, modules=[]) as robot:
+        assert not robot.modules
+        for switch in (robot.switch_on, robot.switch_off):
+            with pytest.raises(r2p.InvalidName, match="no module"):
+                await switch(name)
+        assert not robot.modules
+
+
+async def test_a_module_is_switched_on_and_off_once() -> None:
+    async with Triskar2(VIA, modules=["PS"]) as robot:
+        board = robot.modules["PS"]
+        with pytest.raises(r2p.Error, match="PS is on"):
+            await robot.switch_on("PS")
+        assert robot.modules == {"PS": board}
+        await robot.switch_off("PS")
+        with pytest.raises(r2p.Error, match="PS is off"):
+            await robot.switch_off("PS")
+        starts = await asyncio.gather(robot.switch_on("PS"), robot.switch_on("PS"), return_exceptions=True)
+        assert [isinstance(each, r2p.Error) for each in starts] == [False, True]
+    assert not board.nodes["power"].running
+    with pytest.raises(r2p.Error, match="PS is on"):
+        await Triskar2(VIA, modules=["PS", "PS"]).__aenter__()
+
+
+async def crash(node: r2p.Node) -> None:
+    raise LookupError(node.name)
+
+
+async def test_when_a_module_fails_to_close_the_others_and_the_physics_end_all_the_same() -> None:
+    robot = await Triskar2(VIA).__aenter__()
+    boards = list(robot.modules.values())
+    robot.modules["PS"].start(crash)
+    await asyncio.sleep(1)
+    with pytest.raises(r2p.NodeCrashed, match="module PS"):
+        await robot.__aexit__(None, None, None)
+    assert not robot.modules
+    assert not any(supervisor.running for board in boards for supervisor in board.nodes.values())
+    steps = robot.hardware.plant.steps
+    await asyncio.sleep(1)
+    assert robot.hardware.plant.steps == steps
+
+
+async def test_an_error_in_its_block_gets_notes_of_nodes_that_crashed() -> None:
+    robot = await Triskar2(VIA).__aenter__()
+    for name in ("PS", "MOTOR1"):
+        robot.modules[name].start(crash)
+    await asyncio.sleep(1)
+    error = ZeroDivisionError()
+    await robot.__aexit__(ZeroDivisionError, error, None)
+    assert not robot.modules
+    assert len([note for note in error.__notes__ if "LookupError" in note]) == 2
+
+
+async def test_a_module_that_does_not_open_leaves_nothing_running(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Triskar2(VIA)
+    boards: list[Board] = []
+
+    def start_nodes(board: Board) -> None:
+        boards.append(board)
+        if board.name == "PS":
+            raise OSError("no nodes")
+
+    monkeypatch.setattr(robot, "_start_nodes", start_nodes)
+    with pytest.raises(OSError, match="no nodes"):
+        await robot.__aenter__()
+    assert not robot.modules
+    assert boards[-1].name == "PS"
+    assert not any(supervisor.running for board in boards for supervisor in board.nodes.values())
+    steps = robot.hardware.plant.steps
+    await asyncio.sleep(1)
+    assert robot.hardware.plant.steps == steps
 
 
 @pytest.mark.parametrize("name", MOTORS)
