@@ -25,6 +25,7 @@ from r2p.protocols.rtcan.events import Mailbox, Outcome
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.url import parse
+from r2p.units import SECOND
 
 if TYPE_CHECKING:
     from r2p.transports.can.port import CanPort
@@ -46,7 +47,6 @@ __all__ = [
 QUEUE = 8192
 """Frames that wait for the iteration at most; then the oldest are dropped, and counted."""
 
-_SECOND = 1_000_000_000
 
 # After a period, frames of it may still have to be read. These decide when there are none left.
 _CHECK_INTERVAL = 10_000_000  # ns
@@ -160,7 +160,7 @@ class BusMonitor:
         MessageError for what is not a number of seconds.
         """
         check_seconds("the period of loads", period, least=SHORTEST)
-        length = round(period * _SECOND)
+        length = round(period * SECOND)
         end = self._now()
         self._monitor.begin(end, length)
         while True:
@@ -182,10 +182,10 @@ class BusMonitor:
     async def _sleep(self, duration: int) -> int:
         """Sleep for so many ns. Returns by how many ns it woke up late."""
         due = self._now() + duration
-        await asyncio.sleep(duration / _SECOND)
+        await asyncio.sleep(duration / SECOND)
         late = self._now() - due
         if late > _STALL_REPORTED:
-            self._report(f"this program stood still for {late / _SECOND:.1f} s: frames that were not kept are missing")
+            self._report(f"this program stood still for {late / SECOND:.1f} s: frames that were not kept are missing")
         return late
 
     async def cycles(self, count: int, timeout: float) -> bool:

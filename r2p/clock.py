@@ -22,6 +22,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from r2p.errors import MessageError
+from r2p.units import MILLISECOND, SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,13 +35,10 @@ SHORTEST: Final = 1e-6
 LONGEST: Final = 1e9
 """Seconds of the longest one: 30 years, which fit a timer of any event loop."""
 
-_SECOND: Final = 1_000_000_000
-_SET_BACK_WARNING: Final = (
-    _SECOND // 10
-)  # ns that UTC may be set back before the log says so: less is daily work of NTP
+_SET_BACK_WARNING: Final = SECOND // 10  # ns that UTC may be set back before the log says so: less is daily work of NTP
 _SHORTEST_PERIOD: Final = 1_000  # ns; SHORTEST as an integer
 _NO_TIMERFD: Final = (OSError, AttributeError)  # AttributeError: a C library, or a Python, without it
-_RETRY: Final = 1_000_000  # ns; uvloop's timers have whole milliseconds, and may go off half a one early
+_RETRY: Final = MILLISECOND  # ns; uvloop's timers have whole milliseconds, and may go off half a one early
 _UNITS: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
 
 
@@ -104,8 +102,8 @@ def _warn_set_back(ahead: int) -> None:
     logger.warning(
         "the computer's clock was set back by %.1f s: r2p's goes on at half speed for %.0f s, until both agree again; "
         "meanwhile what other computers stamp looks too old here (max_age= drops and counts it)",
-        ahead / _SECOND,
-        2 * ahead / _SECOND,
+        ahead / SECOND,
+        2 * ahead / SECOND,
     )
 
 
@@ -181,10 +179,10 @@ class Alarm:
     def _arm(self, deadline: int, delay: int) -> None:
         self._armed = deadline
         if self._clock.virtual:  # the instant itself: a sum of floats may miss it by a nanosecond
-            self._timer = self._loop.call_at(deadline / _SECOND, self._fire)
+            self._timer = self._loop.call_at(deadline / SECOND, self._fire)
             in_background(self._timer, self._background)
         else:
-            self._timer = self._loop.call_later(delay / _SECOND, self._fire)
+            self._timer = self._loop.call_later(delay / SECOND, self._fire)
 
     def _disarm(self) -> None:
         self._armed = None
@@ -354,7 +352,7 @@ else:
 
     def _set_timerfd(fd: int, first: int, period: int) -> None:
         ctypes, libc = _ctypes()
-        times = (ctypes.c_long * 4)(*divmod(period, _SECOND), *divmod(first, _SECOND))  # struct itimerspec
+        times = (ctypes.c_long * 4)(*divmod(period, SECOND), *divmod(first, SECOND))  # struct itimerspec
         libc.timerfd_settime(fd, 1, times, None)  # 1: TFD_TIMER_ABSTIME
 
 

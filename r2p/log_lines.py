@@ -8,7 +8,7 @@ loggers made by `get_logger` show each character that would move the cursor as a
 import logging
 import unicodedata
 
-_SECOND = 1_000_000_000
+from r2p.units import SECOND
 
 
 def printable(text: str, allowed: str = "") -> str:
@@ -49,7 +49,7 @@ def get_logger(name: str) -> logging.Logger:
 class LineLimit:
     """At most `rate` lines of one kind in `period` ns; the first line after that says how many were left out."""
 
-    def __init__(self, rate: int = 10, period: int = _SECOND) -> None:
+    def __init__(self, rate: int = 10, period: int = SECOND) -> None:
         self._rate = rate
         self._period = period
         self._lines: dict[str, list[int]] = {}

@@ -25,11 +25,11 @@ from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
+from r2p.units import SECOND
 
 ROUNDS = 5
 """Looks at what has changed in a second, at most."""
 
-_SECOND = 1_000_000_000
 _REPEAT = 1_500_000_000  # ns in which everything is repeated, if there is little of it
 _REPEAT_MOST = 20_000_000_000  # ns; a HELLO is believed for 65 s at most
 _REPEATED = 4_000  # messages a second that only repeat what is known
@@ -201,7 +201,7 @@ class DirectoryRelay:
             self._rounds.append(now)
             self._look(now)
             took = self._clock.monotonic() - now
-            oldest = self._rounds[0] + _SECOND if len(self._rounds) == ROUNDS else 0
+            oldest = self._rounds[0] + SECOND if len(self._rounds) == ROUNDS else 0
             self._next_round_at = max(oldest, now + _REST * took)
         period = self._period()
         for port in list(self._ports.values()):
@@ -238,7 +238,7 @@ class DirectoryRelay:
     def _period(self) -> int:
         """The time (ns) in which everything is repeated."""
         count = len(self._sources) * max(len(self._ports) - 1, 1)
-        return min(max(_REPEAT, count * _SECOND // _REPEATED), _REPEAT_MOST)
+        return min(max(_REPEAT, count * SECOND // _REPEATED), _REPEAT_MOST)
 
     def _meet(self, port: BridgePort) -> None:
         """See whether a peer is new there, which is to get everything."""

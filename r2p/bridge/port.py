@@ -6,8 +6,9 @@ from collections.abc import Callable
 import msgspec
 
 from r2p.log_lines import LineLimit
-from r2p.protocols.bridge.ports import FOREVER, PortState, TreePort
+from r2p.protocols.bridge.ports import PortState, TreePort
 from r2p.transports.link import Link
+from r2p.units import LONG_AGO
 
 _REFUSAL_LINES = 1  # of the log in a second on one link about orders that do not pass
 
@@ -31,7 +32,7 @@ class BridgePort:
         self.dropped: Counter[str] = Counter()
         """Messages that came in, or were published here, while nothing was forwarded."""
         self.demand = link.discovery.demand()
-        self.denied_at = -FOREVER
+        self.denied_at = LONG_AGO
         """When it was answered last that an order does not pass (monotonic ns)."""
         self.refusal_lines = LineLimit(_REFUSAL_LINES)
         """For the lines of the log that say so."""

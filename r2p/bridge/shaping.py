@@ -13,10 +13,10 @@ from r2p.bridge.options import ClassOf
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import SlotPublisher
+from r2p.units import SECOND
 
-_SECOND = 1_000_000_000
-_UNKNOWN_PERIOD = _SECOND // 20  # ns until a deadline while the period is not known
-_LONGEST_PERIOD = 10 * _SECOND  # a longer pause is none: the publisher starts again
+_UNKNOWN_PERIOD = SECOND // 20  # ns until a deadline while the period is not known
+_LONGEST_PERIOD = 10 * SECOND  # a longer pause is none: the publisher starts again
 _SURE = 8  # intervals after which a period counts as known
 
 
@@ -88,7 +88,7 @@ class Shaper:
     ) -> None:
         self.reserved: RelayedPeriodic | None = None
         self._reserve = reserve
-        self._gap = None if rate is None else round(_SECOND / rate)
+        self._gap = None if rate is None else round(SECOND / rate)
         self._class = klass
         self._soften = soften
         self._free_at = 0
@@ -148,7 +148,7 @@ class Shaper:
             # The shortest interval counts, as messages may be lost; a publisher that slows down is followed by steps.
             known.period = since if not known.period else min(since, known.period + known.period // 8)
             if known.count == _SURE and self._reserve is not None:
-                self.reserved = self._reserve(known.size, known.period / _SECOND)
+                self.reserved = self._reserve(known.size, known.period / SECOND)
         return known.period or _UNKNOWN_PERIOD
 
 
@@ -162,5 +162,5 @@ class _PublisherPeriod(msgspec.Struct):
 
 
 def _classed(sample: Sample, klass: ClassOf) -> Sample:
-    deadline = sample.stamp + round(klass.time * _SECOND) if klass.time else 0
+    deadline = sample.stamp + round(klass.time * SECOND) if klass.time else 0
     return msgspec.structs.replace(sample, publisher_class=klass.publisher_class, deadline=deadline, drop_late=False)

@@ -16,6 +16,7 @@ from typing import TypeAlias
 import msgspec
 
 from r2p.errors import DecodeError, MessageError
+from r2p.units import MILLISECOND
 
 FRAME_MAX = 8  # bytes in a frame
 PAYLOAD_MAX = 1024  # bytes in a message: 128 fragments
@@ -47,7 +48,6 @@ CYCLE_MASK = 0xFF  # a sync frame carries these bits of the cycle counter
 INTERMISSION = 3  # bits between two frames
 TAIL = 10  # bits after the CRC, never stuffed: CRC delimiter, ACK slot, ACK delimiter, end of frame
 
-_MILLISECOND = 1_000_000
 _ALL_SLOTS = (1 << SLOTS_MAX) - 1
 
 
@@ -140,7 +140,7 @@ def id8_of(message: int) -> int:
 
 def srt_laxity(remaining: int) -> int:
     """The laxity of a soft real-time message with `remaining` ns to its deadline, which may be over: 1..62."""
-    laxity = remaining // _MILLISECOND
+    laxity = remaining // MILLISECOND
     if laxity < SRT_MIN:
         return SRT_MIN
     if laxity > SRT_MAX:

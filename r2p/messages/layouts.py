@@ -26,6 +26,7 @@ import msgspec
 from r2p.errors import DecodeError, MessageError
 from r2p.messages.packing import functions
 from r2p.messages.shapes import BOOL, Array, Chars, Field, Len, Nested, Scalar, Shape, show, u32
+from r2p.units import SECOND
 
 SIZE_MAX = 1024
 """Bytes of the longest message: 128 RTCAN fragments of 8. The debug line carries 255."""
@@ -95,12 +96,12 @@ class Timestamp(Message):
     @property
     def ns(self) -> int:
         """Nanoseconds since 1970."""
-        return self.sec * 1_000_000_000 + self.nsec
+        return self.sec * SECOND + self.nsec
 
     @classmethod
     def from_ns(cls, ns: int) -> Self:
         """The time stamp of an instant in ns since 1970. Raises MessageError outside of 1970 to 2106."""
-        sec, nsec = divmod(ns, 1_000_000_000)
+        sec, nsec = divmod(ns, SECOND)
         if not 0 <= sec < 1 << 32:
             raise MessageError(f"{show(ns)} ns is not between 1970 and 2106, the years of a Timestamp")
         return cls(sec, nsec)

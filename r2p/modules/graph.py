@@ -16,8 +16,7 @@ from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.sample import PublisherClass
 from r2p.runtime.topic import Topic
 from r2p.transports.link import Link
-
-_SECOND = 1_000_000_000
+from r2p.units import SECOND
 
 
 class Endpoint(msgspec.Struct, frozen=True, order=True):
@@ -116,7 +115,7 @@ class NetworkView:
 
 def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:
     state = _state(info.flags, observer=info.observer)
-    age = (now - info.last_heard) / _SECOND
+    age = (now - info.last_heard) / SECOND
     return ModuleView(info.name, state, bool(info.flags & FLAG_REBOOTED), age, link.name, info.instance)
 
 
@@ -154,7 +153,7 @@ def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
         if info.requested_at is not None:
             _add(view.subscribed_on, link.name)
         announced = max(info.advertised_at or 0, info.requested_at or 0)
-        age = (now - announced) / _SECOND
+        age = (now - announced) / SECOND
         view.age = age if view.age is None else min(view.age, age)
     names = {info.instance: info.name for info in link.discovery.modules.values()}
     for endpoint in link.discovery.endpoints.values():

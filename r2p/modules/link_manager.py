@@ -33,16 +33,16 @@ from r2p.runtime.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import Link, is_booting
 from r2p.transports.stats import LinkStats
+from r2p.units import SECOND
 
 logger = get_logger("r2p.module")
 
-_SECOND = 1_000_000_000
 _CONFLICT_CONFIRMED = 2.0  # seconds in which an r2p module that lives is heard again
 _PROMPT = 1.0  # seconds in which a tool's link may come up without a line of the log
-_DENIAL_EXPECTED = 5 * _SECOND  # ns after a command in which gateways may answer that they do not pass it on
+_DENIAL_EXPECTED = 5 * SECOND  # ns after a command in which gateways may answer that they do not pass it on
 _MISMATCH_LINES = 1  # of the log in a second about one topic whose types differ
 _ACCEPTED_AFTER = 3.0  # seconds that a connection lasts which the other end did not refuse: it would have said so
-_REFUSED_APART = 60 * _SECOND  # ns between two lines about connections that one URL refuses, or that are refused
+_REFUSED_APART = 60 * SECOND  # ns between two lines about connections that one URL refuses, or that are refused
 
 _DENIED = {
     DENIED_READ_ONLY: "it is read-only there",
@@ -254,7 +254,7 @@ class LinkManager:
         """Report that a module on the link itself is gone, while the link is up; without a good-bye it is trouble."""
         info = event.info
         if link.up and not info.observer and not info.hops:
-            silence = f": nothing heard of it for {info.lease / _SECOND:.0f} s; does it hang?" if event.silent else ""
+            silence = f": nothing heard of it for {info.lease / SECOND:.0f} s; does it hang?" if event.silent else ""
             level = logging.WARNING if event.silent else logging.INFO
             self._log_limited(link, level, "gone", f"module {info.name} is gone{silence}")
         self._events.emit(event)
@@ -312,7 +312,7 @@ class LinkManager:
             refused.timer.cancel()
         if refused.since is not None and link.up:
             outage = self.space.clock.monotonic() - refused.since
-            self._report_up(link, outage / _SECOND, refused.lost)
+            self._report_up(link, outage / SECOND, refused.lost)
 
     # Name conflicts between modules that can't hear each other, as they are on different links
 

@@ -8,13 +8,13 @@ from r2p.msg import Log
 from r2p.names import NODE_MAX
 from r2p.runtime.node import Node
 from r2p.runtime.topic import TopicSpace
+from r2p.units import SECOND
 
 TOPIC = "log"
 
 RATE = 50
 """Records a second, and records that may come at once: an eighth of a CAN bus of 1 Mbit/s."""
 
-_SECOND = 1_000_000_000
 _TEXT_MAX = 128  # characters of `Log.text`
 
 
@@ -57,7 +57,7 @@ class LogTopic:
 
     def _within_rate(self) -> bool:
         now = self._space.clock.monotonic()
-        self._credit = min(float(RATE), self._credit + (now - self._credited_at) * RATE / _SECOND)
+        self._credit = min(float(RATE), self._credit + (now - self._credited_at) * RATE / SECOND)
         self._credited_at = now
         if self._credit < 1.0:
             return False

@@ -33,6 +33,7 @@ from r2p.runtime.topic import TopicSpace
 from r2p.transports.link import Link, Transport
 from r2p.transports.stats import LinkStats
 from r2p.transports.url import open_transport
+from r2p.units import SECOND
 
 logger = get_logger("r2p.module")
 
@@ -40,7 +41,6 @@ CLEANUP_WARNING_AFTER = 1.0
 """Seconds after which the log names the nodes whose clean-up the module still waits for."""
 
 _COMMAND_LINES = 1  # of the log in a second about one kind of command
-_SECOND = 1_000_000_000
 
 
 class Module:
@@ -402,6 +402,6 @@ class CommandHandler:
 
     def _log(self, level: int, text: str, detail: str = "") -> None:
         """Log what other modules can make happen any number of times a second."""
-        suffix = self._limit.suffix(text, int(asyncio.get_running_loop().time() * _SECOND))
+        suffix = self._limit.suffix(text, int(asyncio.get_running_loop().time() * SECOND))
         if suffix is not None:
             logger.log(level, "%s%s%s", text, detail, suffix)

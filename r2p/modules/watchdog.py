@@ -22,10 +22,10 @@ from types import FrameType
 
 from r2p.clock import clock_of
 from r2p.log_lines import LineLimit
+from r2p.units import SECOND
 
 logger = logging.getLogger("r2p.watchdog")
 
-_SECOND = 1_000_000_000
 LIMIT = 0.1
 """Seconds that the loop may be blocked."""
 
@@ -126,11 +126,11 @@ class Watchdog:
 
     def _was_stopped(self, since: int, used: float, limit: float) -> bool:
         """Whether this thread's wait was late by more than `limit` seconds, while this process used no processor."""
-        passed = (self._clock.monotonic() - since) / _SECOND
+        passed = (self._clock.monotonic() - since) / SECOND
         return passed > 2 * limit and _used() - used < _IDLE * passed
 
     def _log_stopped(self, since: int) -> None:
-        passed = (self._clock.monotonic() - since) / _SECOND
+        passed = (self._clock.monotonic() - since) / SECOND
         logger.warning(STOPPED, passed)
 
     def _report(self) -> bool:

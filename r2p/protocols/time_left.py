@@ -7,10 +7,11 @@ a gateway that was stopped. What every message takes alike can't be told from th
 counted.
 """
 
-_SECOND = 1_000_000_000
+from r2p.units import SECOND
+
 _DRIFT = 2_000  # two clocks drift apart by less than 1/2000
-_LATE_MAX = 5 * _SECOND  # ns for which all of a publisher's messages can be late: no link holds them up for longer
-_DOUBT = 60 * _SECOND  # ns in which a clock that was set back may run slowly until it is right
+_LATE_MAX = 5 * SECOND  # ns for which all of a publisher's messages can be late: no link holds them up for longer
+_DOUBT = 60 * SECOND  # ns in which a clock that was set back may run slowly until it is right
 
 
 class TimeLeft:

@@ -21,13 +21,12 @@ from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
 from r2p.runtime.queues import checkpoint
 from r2p.runtime.subscriber import Callback, Keep, Subscriber, SubscriberOptions
 from r2p.runtime.topic import TopicSpace
+from r2p.units import SECOND
 
 M = TypeVar("M", bound=Message)
 
 QUEUE = 16
 """Messages that a subscriber's queue holds unless it says otherwise."""
-
-_SECOND = 1_000_000_000
 
 
 class Tick(NamedTuple):
@@ -281,7 +280,7 @@ class Node:
             if waiter is not None and not waiter.done():
                 waiter.set_result(None)
 
-        ticker = Ticker(loop, round(period * _SECOND), on_tick)
+        ticker = Ticker(loop, round(period * SECOND), on_tick)
         self._tickers.add(ticker)
         ticker.start()
         try:
@@ -289,7 +288,7 @@ class Node:
                 if not due:
                     waiter = loop.create_future()
                     await waiter
-                tick = Tick(due, (clock.monotonic() - due) / _SECOND, skipped)
+                tick = Tick(due, (clock.monotonic() - due) / SECOND, skipped)
                 due = skipped = 0
                 yield tick
         finally:

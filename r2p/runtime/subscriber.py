@@ -19,13 +19,12 @@ from r2p.runtime.qos import check_count
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, SubscriberQueue, checkpoint
 from r2p.runtime.sample import Sample
 from r2p.runtime.topic import Topic, TopicSpace
+from r2p.units import SECOND
 
 T = TypeVar("T")
 
 Callback = Callable[[T], object]
 Keep = Literal["newest", "oldest"]
-
-_SECOND = 1_000_000_000
 
 
 class SubscriberOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -100,12 +99,12 @@ class Subscriber(Generic[T]):
         self._topic = topic
         self._layout = layout
         self._type = None if layout is None else layout.cls
-        self._max_age = None if options.max_age is None else round(options.max_age * _SECOND)
+        self._max_age = None if options.max_age is None else round(options.max_age * SECOND)
         self._on_timeout = options.on_timeout
         self._closed = False
         self._silent = False
         self._since_yield = 0
-        self._timeout = 0 if options.timeout is None else round(options.timeout * _SECOND)
+        self._timeout = 0 if options.timeout is None else round(options.timeout * SECOND)
         self._last_message = space.clock.monotonic()
         self._alarm = Alarm(space.loop, self._check_silence, background=self._is_idle)
         if options.timeout is not None:
@@ -348,4 +347,4 @@ class Subscriber(Generic[T]):
         self._last_message = now
         self._alarm.set(now + self._timeout)
         if (reader := self._sink.waiter) is not None and not reader.done():
-            reader.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / _SECOND} s"))
+            reader.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / SECOND} s"))

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias, TypeVar, Type
 from r2p.clock import SystemClock, check_timeout
 from r2p.errors import Deadlock
 from r2p.modules.unwinding import frames
+from r2p.units import SECOND
 
 if TYPE_CHECKING:
     import contextvars
@@ -35,15 +36,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
-_SECOND: Final = 1_000_000_000
-_EPOCH: Final = 1_356_998_400 * _SECOND  # 2013-01-01T00:00:00Z
+_EPOCH: Final = 1_356_998_400 * SECOND  # 2013-01-01T00:00:00Z
 _HORIZON: Final = float(2**22)  # seconds, 48 days: up to here there are two floats for each nanosecond
-_END: Final = 2**22 * _SECOND  # the same in ns
+_END: Final = 2**22 * SECOND  # the same in ns
 _RESOLUTION: Final = 0.4e-9  # seconds: less than a nanosecond, and more than the rounding error at the horizon
-_IDLE_MIN: Final = 20 * _SECOND  # of virtual time with nothing but background timers, before a Deadlock...
-_IDLE_REAL_MIN: Final = _SECOND // 2  # ... which also takes this much real time...
-_IDLE_MAX: Final = 300 * _SECOND  # ... but never more virtual time than this
-_IDLE_CHECK: Final = 5 * _SECOND  # between two checks whether a task has been woken
+_IDLE_MIN: Final = 20 * SECOND  # of virtual time with nothing but background timers, before a Deadlock...
+_IDLE_REAL_MIN: Final = SECOND // 2  # ... which also takes this much real time...
+_IDLE_MAX: Final = 300 * SECOND  # ... but never more virtual time than this
+_IDLE_CHECK: Final = 5 * SECOND  # between two checks whether a task has been woken
 _BUSY: Final = 100_000  # iterations of the loop at one instant, after which the next timer runs anyway
 _AHEAD: Final = 1000  # events in one iteration of the loop: signals and real file descriptors wait for so long
 _POLL_EVERY: Final = 64  # iterations between two polls of asyncio's own descriptor, which signals wake
@@ -119,7 +119,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
     def time(self) -> float:
         """Return the virtual seconds since the start."""
-        return self.clock.elapsed / _SECOND
+        return self.clock.elapsed / SECOND
 
     def call_at(
         self,
@@ -136,7 +136,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             raise RuntimeError("Event loop is closed")
         if when < _HORIZON:
             instant = _nanoseconds(when)
-            when = instant / _SECOND
+            when = instant / SECOND
             if instant < self._limit:
                 self._limit = instant
         timer = _VirtualTimer(when, next(self._timer_numbers), callback, args, self, context)
@@ -220,7 +220,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
                 self._with_tasks("virtual time is over: the next timer is more than 48 days after the start")
             )
         text = f"virtual time is over: its limit of {self._end:g} s is reached"
-        self._end = min(self._end + _IDLE_MAX / _SECOND, _HORIZON)  # for clean-up
+        self._end = min(self._end + _IDLE_MAX / SECOND, _HORIZON)  # for clean-up
         raise Deadlock(self._with_tasks(text))
 
     def _check_progress(self, instant: int) -> None:
@@ -325,7 +325,7 @@ class _Task(asyncio.Task[Any]):
 
 def _nanoseconds(seconds: float) -> int:
     whole = int(seconds)  # separate from the fraction, which is exact, and small enough to be multiplied
-    return whole * _SECOND + round((seconds - whole) * _SECOND)
+    return whole * SECOND + round((seconds - whole) * SECOND)
 
 
 def _where(awaitable: object) -> str:

@@ -20,15 +20,15 @@ from r2p.clock import random_of
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
 from r2p.sim.can.controller import ignore
 from r2p.transports.can.port import CanPort, CanPortListener, PortAlarm
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.transport import OPTIONS, RtcanOptions, apply_options, run_link
 from r2p.transports.url import Url, duration
+from r2p.units import NEVER, SECOND
 
-_SECOND = 1_000_000_000
 _NO_POWER = "no power"
 _MAILBOXES = (Mailbox.HRT, *[Mailbox.SRT] * (rtcan.NRT - 1), Mailbox.NRT)  # by laxity
 _SENT, _LOST, _LATE = Outcome.SENT, Outcome.LOST, Outcome.LATE  # Python 3.11 is slow to look up a member of an enum
@@ -231,8 +231,8 @@ class SimTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         options = self._options
         shared = self._shared or can_bus(self._name, bitrate=options.bitrate, noise=self._noise, seed=self._seed)
-        if shared.bus.bit * options.bitrate != _SECOND:
-            raise TransportError(f"sim:{self._name} has {_SECOND // shared.bus.bit} bit/s, not {options.bitrate}")
+        if shared.bus.bit * options.bitrate != SECOND:
+            raise TransportError(f"sim:{self._name} has {SECOND // shared.bus.bit} bit/s, not {options.bitrate}")
         node = CanNode(hub.space.module, **{"one_shot": True} | self._node)
         port = SimPort(shared, node)
         try:
@@ -276,7 +276,7 @@ def from_url(url: Url) -> SimTransport:
 
 
 def _nanoseconds(text: str) -> int:
-    return round(duration(text) * _SECOND)
+    return round(duration(text) * SECOND)
 
 
 def _share(text: str) -> float:

@@ -26,6 +26,7 @@ from r2p.tools.options import Format, Quiet, Verbose
 from r2p.tools.output import Output
 from r2p.tools.session import UsageError, execute, settings
 from r2p.transports.can.netlink import ARPHRD_CAN, Interface, has_socketcan, list_interfaces
+from r2p.units import MILLISECOND
 
 EXTRAS = {"can": "python-can", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
 """The extras of r2p, and the package of each."""
@@ -33,9 +34,9 @@ EXTRAS = {"can": "python-can", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
 _ROOT = Path("/")
 _UP = 1  # IFF_UP
 _PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttyS*", "rfcomm*", "cu.usb*")
-_TICK = 1_000_000  # ns
+_TICK = MILLISECOND  # ns
 _SAMPLE = 0.2  # seconds
-_LATE = 1_000_000  # ns; a 99th percentile above this is too much for periods of a few milliseconds
+_LATE = MILLISECOND  # ns; a 99th percentile above this is too much for periods of a few milliseconds
 
 
 class Check(msgspec.Struct, frozen=True):

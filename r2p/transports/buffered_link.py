@@ -22,9 +22,10 @@ from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, LinkSubscriber
 from r2p.transports.receive_backpressure import LinkBackpressure
+from r2p.units import SECOND
 
 _MANAGEMENT = MANAGEMENT.encode()
-_EARLY = 1_000_000_000  # ns by which a message may come before the answer to its subscription
+_EARLY = SECOND  # ns by which a message may come before the answer to its subscription
 _MOST_EARLY = 256  # of those
 _NOT_SUBSCRIBED = "not subscribed"
 

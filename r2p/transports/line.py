@@ -29,6 +29,7 @@ from r2p.runtime.topic import PublisherHandle, Topic
 from r2p.transports.announcement import NOTHING
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, is_booting
+from r2p.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,7 +43,6 @@ OPENING = b"\r\n\r\n"
 _MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
 _MOST_URGENT = 96  # urgent messages that wait, whatever else does: another 8 KiB
 _CLOSING = 0.5  # seconds for the other end to read what is still buffered
-_SECOND = 1_000_000_000
 _NO_DEADLINE = 0x7FFFFFFF  # us after the stamp, where there is none: as firmware does it
 _MANAGEMENT = MANAGEMENT.encode()
 _NRT = PublisherClass.NON_REAL_TIME
@@ -301,7 +301,7 @@ class LineLink(BufferedLink):
     def _begin_grace(self) -> None:
         if self._subscribers.keys() - self._lapsed:
             self._limit = -1
-            self._grace = self._space.loop.call_later(GRACE / _SECOND, self._end_grace)
+            self._grace = self._space.loop.call_later(GRACE / SECOND, self._end_grace)
 
     def _end_grace(self) -> None:
         if self._grace is not None:
@@ -376,7 +376,7 @@ class LineLink(BufferedLink):
             topic, sample = unsent
             late = self._clock.now() - sample.deadline
             if sample.deadline and late > 0 and (publisher := self._publisher(topic, sample)) is not None:
-                publisher.link_late(self.name, "sent late", late / _SECOND)
+                publisher.link_late(self.name, "sent late", late / SECOND)
 
     def _lose_unsent(self) -> None:
         unsent, self._unsent = self._unsent, None

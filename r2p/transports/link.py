@@ -39,11 +39,10 @@ from r2p.runtime.sample import PublisherClass, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
 from r2p.transports.announcement import NOTHING, Announcement, announce, announcement_of
 from r2p.transports.stats import RETRY_AFTER_ERROR, LinkStats, LoggedCounter
+from r2p.units import SECOND
 
 MESSAGES_PER_TURN = 64
 """Messages that a link delivers before it lets the event loop run once."""
-
-_SECOND = 1_000_000_000
 
 
 class Hub(Protocol):
@@ -179,7 +178,7 @@ class Link(abc.ABC):
 
     def on_up(self) -> None:
         """The other end can be reached: announce everything."""
-        outage = (self._clock.monotonic() - self._down_at) / _SECOND
+        outage = (self._clock.monotonic() - self._down_at) / SECOND
         lost = self.stats.lost[LINK_DOWN] - self._lost_at_down
         self.up = True
         self._unreachable = ""

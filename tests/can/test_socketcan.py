@@ -13,9 +13,10 @@ import pytest
 
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can import netlink, socketcan
 from r2p.transports.can.socketcan import SocketCanPort
+from r2p.units import NEVER
 from tests.can.rig import Candump, RecordingListener, add, cangen, cansend, ip, new_name, now, port_on
 
 if TYPE_CHECKING:

@@ -19,7 +19,6 @@ from r2p.protocols.bridge.mesh import PortId
 from r2p.protocols.bridge.ports import (
     APART,
     DEAD,
-    FOREVER,
     LEASE,
     LISTEN,
     SETTLE,
@@ -30,12 +29,13 @@ from r2p.protocols.bridge.ports import (
     is_late,
     pack_acks,
 )
+from r2p.units import LONG_AGO, NEVER, SECOND
 
 TWIN_MEMORY = 7_000_000_000
 """Ns after which two links that led to one network are not believed to do so any more, unless it shows again."""
 
-_SUSPICION = 1_000_000_000  # ns in which it shows by which link our own messages came back
-_LINGER = 1_000_000_000  # ns for which LEAF goes on after its use has ended: gateways may be waiting for an answer
+_SUSPICION = SECOND  # ns in which it shows by which link our own messages came back
+_LINGER = SECOND  # ns for which LEAF goes on after its use has ended: gateways may be waiting for an answer
 
 
 class CandidateLink(msgspec.Struct, eq=False):
@@ -52,10 +52,10 @@ class CandidateLink(msgspec.Struct, eq=False):
     gateways: dict[PortId, Neighbour] = {}
     twins: dict[int, int] = {}
     loops: dict[int, int] = {}
-    sent_at: int = -FOREVER
+    sent_at: int = LONG_AGO
     something_new: bool = False
     asks: bool = False
-    suspected_at: int = FOREVER
+    suspected_at: int = NEVER
     echoes: bool = False
     remote: int | None = None
 
@@ -69,7 +69,7 @@ class CandidateLink(msgspec.Struct, eq=False):
     @property
     def consent_until(self) -> int:
         """Until when all gateways there have consented to the use of the link beside others."""
-        return min((each.acked_at for each in self.gateways.values()), default=FOREVER) + LEASE
+        return min((each.acked_at for each in self.gateways.values()), default=NEVER) + LEASE
 
     def is_contested(self, now: int) -> bool:
         """Whether gateways may join its network to others."""
@@ -86,11 +86,11 @@ class LinkChoice:
     def __init__(self, without: frozenset[int]) -> None:
         self.without = without
         self.used: frozenset[int] = frozenset()
-        self.consent_until = FOREVER
+        self.consent_until = NEVER
         """Until when the gateways have consented to the use of more than one contested link."""
         self._contested: frozenset[int] = frozenset()
         self._barred: dict[int, int] = {}  # number -> until when another link, or a lack of consent, barred its use
-        self._closed_at = -FOREVER  # when a contested link was given up
+        self._closed_at = LONG_AGO  # when a contested link was given up
 
     def forget(self, number: int) -> None:
         """The link is down."""
@@ -115,9 +115,9 @@ class LinkChoice:
         links = [link for link in links if link.number not in self.without]
         candidates, barred = self._candidates(now, links)
         contested = [link for link in candidates if link.is_contested(now)]
-        self.consent_until = min(link.consent_until for link in contested) if len(contested) > 1 else FOREVER
+        self.consent_until = min(link.consent_until for link in contested) if len(contested) > 1 else NEVER
         if now >= self.consent_until:  # one contested link needs no consent: keep the one that is in use
-            self.consent_until = FOREVER
+            self.consent_until = NEVER
             first = next((link for link in contested if link.number in self.used), contested[0])
             barred += [link for link in contested if link is not first]
             candidates = [link for link in candidates if link not in barred]
@@ -132,11 +132,11 @@ class LinkChoice:
     def next_deadline(self, now: int) -> int:
         """When to choose again, if nothing else happens."""
         dues = [self.consent_until, self._closed_at + SETTLE, *(at + SETTLE for at in self._barred.values())]
-        return min((due for due in dues if due > now), default=FOREVER)
+        return min((due for due in dues if due > now), default=NEVER)
 
     def _bar(self, now: int, numbers: set[int]) -> None:
-        ended = {number: now for number, at in self._barred.items() if at == FOREVER and number not in numbers}
-        self._barred |= ended | dict.fromkeys(numbers, FOREVER)
+        ended = {number: now for number, at in self._barred.items() if at == NEVER and number not in numbers}
+        self._barred |= ended | dict.fromkeys(numbers, NEVER)
 
     def _candidates(self, now: int, links: list[CandidateLink]) -> tuple[list[CandidateLink], list[CandidateLink]]:
         """Those that may be used together, if the gateways consent, and those that have to stand by for them."""
@@ -167,7 +167,7 @@ class LinkChoice:
         """Whether what was sent by the link that was used before has arrived by now."""
         if link.number in self.used:
             return True
-        since = self._barred.get(link.number, -FOREVER)
+        since = self._barred.get(link.number, LONG_AGO)
         if link.is_contested(now):
             since = max(since, self._closed_at)
         return now >= since + SETTLE
@@ -183,11 +183,11 @@ class LinkSelection:
     def __init__(self, instance: int) -> None:
         self.by_number: dict[int, CandidateLink] = {}
         self.changes = 0
-        self.consent_until = FOREVER
+        self.consent_until = NEVER
         """The instant (monotonic ns) at which a choice ends by itself: it must not be used after that."""
         self._instance = instance or 1
         self._choices: dict[frozenset[int], LinkChoice] = {}
-        self._needed_at = -FOREVER
+        self._needed_at = LONG_AGO
         self._sent = SentMessages(self._instance)
         self._updated_at = 0
         self._messages: list[tuple[int, Leaf | None]] = []
@@ -199,7 +199,7 @@ class LinkSelection:
     @property
     def needs_consent(self) -> bool:
         """Whether more links are used than without the consent of gateways, until `consent_until`."""
-        return self.consent_until < FOREVER
+        return self.consent_until < NEVER
 
     @property
     def may_announce(self) -> bool:
@@ -283,8 +283,8 @@ class LinkSelection:
                 dues += [each.heard_at + DEAD for each in link.gateways.values()]
                 dues += [at + TWIN_MEMORY for at in (*link.twins.values(), *link.loops.values())]
                 dues += [link.known_at] if now < link.known_at else []
-        due = min(dues, default=FOREVER)
-        return due if due < FOREVER // 2 else None  # half: some dues are a little less or more than FOREVER
+        due = min(dues, default=NEVER)
+        return due if due < NEVER // 2 else None  # half: some dues are a little less or more than NEVER
 
     # What comes in
 
@@ -332,7 +332,7 @@ class LinkSelection:
         if link is None or len(self.by_number) < 2 or link.echoes:
             return False
         if link.twins or link.loops or link.is_contested(now):
-            link.suspected_at = FOREVER
+            link.suspected_at = NEVER
         else:
             link.suspected_at = min(link.suspected_at, now)
         for each in self.by_number.values():  # any of them may have sent it: what they send now shows which
@@ -369,7 +369,7 @@ class LinkSelection:
             if choice.choose(now, links):
                 self._needed_at = now
             self.changes += choice.used != before
-        self.consent_until = min((choice.consent_until for choice in self._choices.values()), default=FOREVER)
+        self.consent_until = min((choice.consent_until for choice in self._choices.values()), default=NEVER)
 
     def _forget_remote(self, instance: int) -> None:
         self._links_to[instance] -= 1
@@ -403,7 +403,7 @@ class LinkSelection:
         elif link.asks:
             return now
         else:
-            return FOREVER
+            return NEVER
         return link.sent_at + (APART if link.something_new else tick)
 
     def _send_leaf(self, now: int, link: CandidateLink) -> None:

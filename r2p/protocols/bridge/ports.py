@@ -15,26 +15,25 @@ import msgspec
 
 from r2p.codecs.management import BRIDGE_ACKS, Bridge, Leaf, Mesh, decode_acks, encode_acks
 from r2p.protocols.bridge.mesh import PortId
+from r2p.units import LONG_AGO, MILLISECOND, NEVER
 
-_MS = 1_000_000
-
-TICK = 80 * _MS
+TICK = 80 * MILLISECOND
 """Ns between two BRIDGE where there are other gateways: seven fit into a lease, so some may be lost."""
-TICK_ALONE = 200 * _MS
-TICK_LISTENING = 50 * _MS
-LEASE = 600 * _MS
+TICK_ALONE = 200 * MILLISECOND
+TICK_LISTENING = 50 * MILLISECOND
+LEASE = 600 * MILLISECOND
 """How long an acknowledgement holds, from the instant at which the message that it acknowledges was sent."""
-DEAD = 650 * _MS
+DEAD = 650 * MILLISECOND
 """A gateway that is silent for this long is gone. More than a lease: what it was granted has run out by then."""
-LISTEN = 800 * _MS
+LISTEN = 800 * MILLISECOND
 """A new port forwards nothing for this long. More than a lease: an old gateway that is stuck has stopped by then."""
-SETTLE = 300 * _MS
+SETTLE = 300 * MILLISECOND
 """Between agreement and forwarding; no message may take longer from its publisher to the last gateway."""
-PROBE = 2_000 * _MS
+PROBE = 2_000 * MILLISECOND
 """Between two probes for loops through gateways that do not know this protocol."""
-PROBE_MEMORY = 7_000 * _MS
+PROBE_MEMORY = 7_000 * MILLISECOND
 """A loop is believed in for this long after a probe showed it: two of three probes may be lost."""
-PROBE_PROVEN = 300 * _MS
+PROBE_PROVEN = 300 * MILLISECOND
 """A gateway of which only a probe was heard for this long is not on this network itself."""
 STRANGE_PROBES = 256
 """Probes of gateways outside the mesh that are kept for each port: they may be forged."""
@@ -50,13 +49,11 @@ FIRST_CLIENT = 1000
 
 FLAPS = 8
 """Neighbours that may go before newcomers have to wait."""
-FLAP_FORGIVEN = 10_000 * _MS
+FLAP_FORGIVEN = 10_000 * MILLISECOND
 """Ns after which one of those is forgotten."""
 
-APART = 10 * _MS
+APART = 10 * MILLISECOND
 """Ns between two messages out of turn at least."""
-FOREVER = 1 << 62
-"""An instant (monotonic ns) that never comes; negative: one that never was."""
 MOST_LEAVES = 32  # on one network; all modules beyond these use one link only
 
 _NO_ACKS = encode_acks((), BRIDGE_ACKS)
@@ -189,7 +186,7 @@ class TreePort(msgspec.Struct, eq=False):
     view: object = None
     agreement: int = 0
     agreed_since: int | None = None
-    sent_at: int = -FOREVER
+    sent_at: int = LONG_AGO
     send_at: int = 0
     probe_at: int = 0
     echoes: bool = False
@@ -346,7 +343,7 @@ class ClientPorts:
     def next_deadline(self) -> int:
         """When to call `poll`."""
         if not self.ports:
-            return FOREVER
+            return NEVER
         dues = [self._send_at]
         if self._listening:
             dues.append(self._listening[0].opened_at + LISTEN)
@@ -369,7 +366,7 @@ class ClientPorts:
         self._set_state(port, state)
 
     def _set_state(self, port: TreePort, state: PortState) -> None:
-        port.forwards_until = FOREVER if state is PortState.ALONE else 0
+        port.forwards_until = NEVER if state is PortState.ALONE else 0
         if state is not port.state:
             port.state = state
             port.in_tree = state not in _REFUSED and (port.in_tree or state is PortState.ALONE)

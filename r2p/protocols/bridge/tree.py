@@ -23,7 +23,6 @@ from r2p.protocols.bridge.ports import (
     DEAD,
     FLAP_FORGIVEN,
     FLAPS,
-    FOREVER,
     LEASE,
     LISTEN,
     PROBE,
@@ -46,6 +45,7 @@ from r2p.protocols.bridge.ports import (
     is_late,
     pack_acks,
 )
+from r2p.units import NEVER
 
 _RECORDS_A_TICK = 16  # records of other gateways that are repeated with each BRIDGE while there is no agreement
 
@@ -99,9 +99,9 @@ class SpanningTree:
 
     def next_deadline(self) -> int | None:
         """When to call `poll`."""
-        due = min((self._due(port) for port in self.ports.values()), default=FOREVER)
+        due = min((self._due(port) for port in self.ports.values()), default=NEVER)
         due = min(due, self.clients.next_deadline())
-        return due if due < FOREVER else None
+        return due if due < NEVER else None
 
     def poll(self, now: int) -> None:
         """Send what is due, and see which neighbours have been silent for too long."""
@@ -324,7 +324,7 @@ class SpanningTree:
     def _forwards_until(self, port: TreePort, state: PortState) -> int:
         if state is PortState.ALONE:
             # Another gateway that comes listens for longer than a lease: by then it has heard us, or we are stuck.
-            return FOREVER if port.private else port.sent_at + LEASE
+            return NEVER if port.private else port.sent_at + LEASE
         if state is not PortState.FORWARDING:
             return 0
         acked = [each.acked_at for (gateway, _), each in port.neighbours.items() if gateway != self.gateway]

@@ -24,13 +24,13 @@ from r2p.protocols.discovery.events import (
 )
 from r2p.protocols.discovery.negotiation import SubscriptionNegotiation
 from r2p.protocols.timers import KeyedTimers
+from r2p.units import SECOND
 
-_SECOND = 1_000_000_000
-_REPORT_INTERVAL = 5 * _SECOND
+_REPORT_INTERVAL = 5 * SECOND
 """Ns between two reports of one conflict, or of an echo."""
 _REPORTED_MAX = 64
 """Names with a conflict that are remembered; further ones are counted only."""
-_ECHO_INTERVAL = 10 * _SECOND
+_ECHO_INTERVAL = 10 * SECOND
 """Ns after an echo in which the line is expected to echo again."""
 _SWAPS_OF_TWO = 3
 """A name that goes back and forth between two instances this often belongs to two modules."""

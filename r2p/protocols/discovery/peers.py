@@ -10,11 +10,12 @@ import msgspec
 
 from r2p.protocols.discovery.directory import FOR_EVER
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined, TopicType
+from r2p.units import SECOND
 
 MOST = 4096
 """Peers on one link."""
 
-_RESPONSE_LOST = 1_000_000_000
+_RESPONSE_LOST = SECOND
 """Ns after which a response has arrived or was lost: less than a round of repetition."""
 
 

@@ -10,27 +10,28 @@ from enum import Enum, auto
 
 import msgspec
 
-_SECOND = 1_000_000_000
-_STEP = _SECOND // 2
+from r2p.units import SECOND
+
+_STEP = SECOND // 2
 """Ns between two steps at most, when there is little to repeat."""
-_ROUND = 3 * _SECOND // 2
+_ROUND = 3 * SECOND // 2
 """Ns in which the ring turns once, if the rate allows. The shortest lease is three turns, so two may be lost."""
 SLOW_ROUNDS = 4
 """Turns of the ring in which the slow ring turns once."""
-_PRESENCE_INTERVAL = _SECOND // 10
+_PRESENCE_INTERVAL = SECOND // 10
 """Ns between two presences (HELLO and ALIVE) at least, however many modules ask."""
-_PRESENCE_EACH = _SECOND // 100
+_PRESENCE_EACH = SECOND // 100
 """The same, for each module on the link."""
 _PRESENCE_SHARE = 8
 """The same in message times: on a slow line, presences would leave no room for anything else."""
-_QUIET_MAX = _SECOND
+_QUIET_MAX = SECOND
 """Ns that a step waits at most for a line to be quiet."""
 _ITEM_MESSAGES = 2
 """Messages of one item at most: an announcement, and the type before it."""
-_NEWCOMER_EACH = _SECOND // 20
+_NEWCOMER_EACH = SECOND // 20
 """Ns for each module on the link between two full repetitions for new modules. Those that start meanwhile share one, so
 that the start of n modules costs each a few repetitions, not n."""
-_TOOL_INTERVAL = _SECOND // 5
+_TOOL_INTERVAL = SECOND // 5
 """Ns between two full repetitions for a tool, which shows what it hears to a user."""
 
 
@@ -60,7 +61,7 @@ class TokenBucket:
     """A token bucket in integer ns: in any span of t seconds at most `burst + rate * t` messages."""
 
     def __init__(self, rate: float, burst: int) -> None:
-        self.gap = max(1, round(_SECOND / rate))
+        self.gap = max(1, round(SECOND / rate))
         self._slack = burst * self.gap
         self._full_at = 0
 
@@ -88,11 +89,11 @@ class Schedule:
         self._owed = 0  # steps owed to the slow ring, in parts of one
         self._step_at = 0
         self._presence_at = 0
-        self._presence_sent = -_SECOND
+        self._presence_sent = -SECOND
         self._repeated_at = -_ROUND
         self._repeat_at: int | None = None
         self._tool_waits = False
-        self._traffic_at = -_SECOND
+        self._traffic_at = -SECOND
 
     def set_pace(self, rate: float, burst: int, quiet: int) -> None:
         """Change the rate, the burst and the quiet time (ns)."""

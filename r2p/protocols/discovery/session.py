@@ -35,11 +35,11 @@ from r2p.protocols.discovery.liveness import PeerLiveness
 from r2p.protocols.discovery.negotiation import SubscriptionNegotiation
 from r2p.protocols.discovery.schedule import ItemKind, Schedule
 from r2p.protocols.timers import KeyedTimers
+from r2p.units import SECOND
 
-_SECOND = 1_000_000_000
-_SUSPENDED = _SECOND
+_SUSPENDED = SECOND
 """Ns by which `poll` is late only when this program did not run: its computer slept, or a debugger held it."""
-_HEARD_AGAIN = 2 * _SECOND
+_HEARD_AGAIN = 2 * SECOND
 """Ns in which every live peer repeats itself."""
 
 
@@ -64,7 +64,7 @@ class Discovery(DiscoveryProtocol):
     ) -> None:
         self.counts = Counter() if counts is None else counts
         self._outbox = Outbox()
-        self._schedule = Schedule(rate, burst, round(quiet * _SECOND))
+        self._schedule = Schedule(rate, burst, round(quiet * SECOND))
         self._timers = KeyedTimers()
         self._directory = Directory(self._timers, self.counts)
         self.modules = self._directory.modules
@@ -186,7 +186,7 @@ class Discovery(DiscoveryProtocol):
 
     def set_pace(self, rate: float, burst: int, quiet: float) -> None:
         """Change the pace: for links that learn only in use how much the others can take."""
-        self._schedule.set_pace(rate, burst, round(quiet * _SECOND))
+        self._schedule.set_pace(rate, burst, round(quiet * SECOND))
 
     def link_up(self, now: int) -> list[Event]:
         """Introduce this module to the other end, query it, and announce everything."""

@@ -37,18 +37,18 @@ from r2p.protocols.discovery.events import (
 from r2p.protocols.liveliness.matching import Matching
 from r2p.protocols.liveliness.modules import ModuleRegistry
 from r2p.protocols.liveliness.tokens import DeclaredTopic, TokenSet
+from r2p.units import SECOND
 
 TOKENS_MAX = 4 * MOST
 """Tokens of other modules that are kept."""
 
-_SECOND = 1_000_000_000
-_MARK_EVERY = _SECOND // 2
+_MARK_EVERY = SECOND // 2
 """Ns after which what has a token is marked as heard once more."""
 
-_FIRST_PAUSE = 5 * _SECOND
+_FIRST_PAUSE = 5 * SECOND
 """Ns from when there is room for refused tokens until they are queried; twice as long each time."""
 
-_LONGEST_PAUSE = 300 * _SECOND
+_LONGEST_PAUSE = 300 * SECOND
 """Ns that this pause may become, and ns without a query after which it is short again."""
 
 

@@ -4,8 +4,9 @@ from collections import Counter
 from collections.abc import Hashable, Iterator
 
 from r2p.protocols.rtcan.cycle import Cycle, timing
-from r2p.protocols.rtcan.events import NEVER, Action, Done, EngineSettings, Fate
+from r2p.protocols.rtcan.events import Action, Done, EngineSettings, Fate
 from r2p.protocols.timers import KeyedTimers
+from r2p.units import NEVER
 
 
 class Timers(KeyedTimers):

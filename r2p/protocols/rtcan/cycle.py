@@ -17,6 +17,7 @@ import msgspec
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import CYCLE_MASK, Frame
+from r2p.units import SECOND
 
 HOLDOVER = 3
 """Cycles without a sync that a slave bridges."""
@@ -27,7 +28,6 @@ _IN_TIME = 8_000  # ns between plan and stamp of a sync: two calibrated latencie
 _AMBIGUOUS = 128  # cycles: half of what the 8 bits of a sync tell apart
 _DELAYED = 16  # cycles that a sync may be ahead of NETWORK, which waits for a free slot
 _MICROSECOND = 1000
-_SECOND = 1_000_000_000
 
 
 class Timing(msgspec.Struct, frozen=True):
@@ -46,7 +46,7 @@ class Timing(msgspec.Struct, frozen=True):
 def timing(slots: int = 60, nominal: int = 10_000_000, bit_rate: int = 1_000_000) -> Timing:
     """The slots of a nominal cycle (ns): whole microseconds each. Raises ValueError when no frame fits in."""
     slot = nominal // slots // _MICROSECOND * _MICROSECOND
-    bit = _SECOND // bit_rate
+    bit = SECOND // bit_rate
     longest = (rtcan.frame_bits_max(rtcan.FRAME_MAX) + rtcan.INTERMISSION) * bit
     if slot < longest:
         raise ValueError(f"slots of {slot // 1000} us are too short for frames of up to {longest // 1000} us")

@@ -34,7 +34,6 @@ from r2p.codecs.rtcan import HIGH_MAX, HIGH_SHIFT, ID8_MAX, MANAGEMENT, MESSAGE_
 from r2p.errors import DecodeError, MessageError
 from r2p.protocols.rtcan.context import EngineContext
 from r2p.protocols.rtcan.events import (
-    NEVER,
     Action,
     Done,
     Due,
@@ -55,6 +54,7 @@ from r2p.protocols.rtcan.plan import PeriodicMessage
 from r2p.protocols.rtcan.queue import QueuedMessage
 from r2p.protocols.rtcan.reassembly import Reassembly
 from r2p.protocols.rtcan.transmitter import Mode, SlotTransmitter
+from r2p.units import NEVER
 
 _NOTHING: tuple[Action, ...] = ()
 # Python 3.11 takes its time to find a member of an enum.

@@ -11,11 +11,7 @@ import msgspec
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import MESSAGE_MAX, MESSAGE_SHIFT, Frame
-
-NEVER = 1 << 62
-"""An instant that does not come."""
-LONG_AGO = -NEVER
-"""An instant before all others."""
+from r2p.units import NEVER
 
 
 class Profile(enum.Enum):

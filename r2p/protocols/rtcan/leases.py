@@ -11,11 +11,12 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.management import NO_PHASE, Grant, Refuse, Renew, Renewed, Reserve
 from r2p.protocols.rtcan.calendar import Calendar, Reason, Refusal, Reservation
 from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import LONG_AGO, SlotsGranted, SlotsLost, SlotsRefused
+from r2p.protocols.rtcan.events import SlotsGranted, SlotsLost, SlotsRefused
 from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
+from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
 LEASE = 3_000_000_000  # ns, as the next two: two renewals may be lost
-_RENEWAL = 1_000_000_000
+_RENEWAL = SECOND
 _RETRY = 250_000_000
 _SERIALS = 256  # the serial of a request is a byte
 _AHEAD = 1  # cycles from a grant to its first slot: by then all nodes have the new mask
@@ -57,14 +58,14 @@ class SlotGrants:
         self._timers.set(("granted", wanted.message), now + LEASE)
         period, phase, fragments = outcome.period, outcome.phase, outcome.fragments
         start = self._cycle.counter + (0 if outcome == held else _AHEAD)  # what it had is in all masks already
-        return Grant(wanted.message, wanted.serial, fragments, period, phase, start, epoch, LEASE // 1_000_000)
+        return Grant(wanted.message, wanted.serial, fragments, period, phase, start, epoch, LEASE // MILLISECOND)
 
     def renew(self, now: int, wanted: Renew, id8: int) -> Renewed:
         """A module still needs its slots: prolong their leases. Those without a grant are missing in the answer."""
         held = [high for high in wanted.highs if high and self.calendar.get(rtcan.message_id(high, id8)) is not None]
         for high in held:
             self._timers.set(("granted", rtcan.message_id(high, id8)), now + LEASE)
-        return Renewed(id8, wanted.serial, LEASE // 1_000_000, bytes(held).ljust(management.RENEW_MAX, b"\0"))
+        return Renewed(id8, wanted.serial, LEASE // MILLISECOND, bytes(held).ljust(management.RENEW_MAX, b"\0"))
 
     def remove(self, message: int) -> None:
         """The slots of a message come free: its owner gave them back, or did not renew the lease."""
@@ -243,4 +244,4 @@ class SlotRequests:
         """The lease runs on; answers may come out of order."""
         if asked >= self._confirmed.get(periodic.high, LONG_AGO):
             self._confirmed[periodic.high] = asked
-            self._timers.set(("lease", periodic.high), asked + lease_ms * 1_000_000)
+            self._timers.set(("lease", periodic.high), asked + lease_ms * MILLISECOND)

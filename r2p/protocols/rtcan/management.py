@@ -11,7 +11,7 @@ from typing import Any
 
 from r2p.codecs import management, rtcan
 from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Fate, Profile
+from r2p.protocols.rtcan.events import Fate, Profile
 from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.network import Detector, NetworkMembership
@@ -19,11 +19,12 @@ from r2p.protocols.rtcan.node_id import NodeId
 from r2p.protocols.rtcan.plan import PeriodicMessage
 from r2p.protocols.rtcan.queue import QueuedMessage
 from r2p.protocols.rtcan.transmitter import SlotTransmitter
+from r2p.units import LONG_AGO, MILLISECOND, NEVER
 
 # Deadlines, in ns.
 _DEADLINE = 50_000_000
 _CONTROL = 10_000_000  # of what keeps the network: slots must not wait for all that discovery has to say
-_URGENT = 1_000_000
+_URGENT = MILLISECOND
 
 QUIET = 33_000_000
 """Among firmware: ns without management on the bus before any is sent."""

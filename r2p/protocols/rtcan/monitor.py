@@ -14,8 +14,8 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame, Identifier, OtherFrame
 from r2p.errors import DecodeError
 from r2p.protocols.rtcan.cycle import Timing
-from r2p.protocols.rtcan.events import NEVER
 from r2p.protocols.rtcan.reassembly import Reassembly
+from r2p.units import NEVER
 
 _SYNC = -1  # in place of a message id
 _OTHER = -2

@@ -20,13 +20,14 @@ from r2p.codecs import management
 from r2p.codecs.rtcan import CYCLE_MASK, Frame
 from r2p.protocols.rtcan.context import EngineContext
 from r2p.protocols.rtcan.cycle import Alignment, Cycle, CycleState
-from r2p.protocols.rtcan.events import LONG_AGO, LostSync, NewMaster, ParameterMismatch, ParametersMatch, Profile
+from r2p.protocols.rtcan.events import LostSync, NewMaster, ParameterMismatch, ParametersMatch, Profile
 from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
 from r2p.protocols.rtcan.master import Election, MasterRole, Role
 from r2p.protocols.rtcan.node_id import NodeId, Stage
 from r2p.protocols.rtcan.transmitter import SlotTransmitter
+from r2p.units import LONG_AGO, SECOND
 
-REPEAT = 1_000_000_000
+REPEAT = SECOND
 """NETWORK is sent this often (ns)."""
 FORGOTTEN = 3_000_000_000
 """A master without NETWORK for this long is gone (ns): two may be lost."""

@@ -11,18 +11,19 @@ from collections.abc import Callable
 
 from r2p.codecs.management import CLAIM_FIXED, Claim
 from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import LONG_AGO, IdConflict
+from r2p.protocols.rtcan.events import IdConflict
+from r2p.units import LONG_AGO, SECOND
 
 # All in ns.
 OBJECTION = 250_000_000
 """How long others may object to a claim."""
 REPEAT = 3_000_000_000
 """Claims are repeated this often."""
-_YIELDS = 1_000_000_000  # a node that has claimed our id8 with a higher number has this long to yield
+_YIELDS = SECOND  # a node that has claimed our id8 with a higher number has this long to yield
 _APART = 100_000_000  # between two claims of ours
 _INSISTING = 4_000_000_000  # a node that has a better claim repeats it within this: REPEAT, and room for a full bus
 _FIRMWARE = 500_000_000  # a node that uses our id8 for this long after our claim, without one of its own, is firmware
-_NOTICE = 1_000_000_000  # between two `IdConflict`
+_NOTICE = SECOND  # between two `IdConflict`
 _SPREAD = 50_000_000  # nodes that are switched on together don't claim together
 
 

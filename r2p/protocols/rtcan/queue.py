@@ -15,9 +15,8 @@ import msgspec
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, MESSAGE_SHIFT, NRT, SRT_MAX, Frame
-from r2p.protocols.rtcan.events import LONG_AGO, NEVER
+from r2p.units import LONG_AGO, MILLISECOND, NEVER
 
-_MILLISECOND = 1_000_000
 _FIRST = 1 << 62  # more than any count of messages: taken off the order of management, which goes before the others
 
 
@@ -272,4 +271,4 @@ def _same_laxity_until(deadline: int, now: int) -> int:
     if deadline == NEVER:
         return NEVER
     laxity = rtcan.srt_laxity(deadline - now)
-    return NEVER if laxity == SRT_MAX else now + (laxity + 1) * _MILLISECOND
+    return NEVER if laxity == SRT_MAX else now + (laxity + 1) * MILLISECOND

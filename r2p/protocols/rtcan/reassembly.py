@@ -11,7 +11,8 @@ import msgspec
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import FRAME_MAX, LEFT_MASK, MESSAGE_MAX, MESSAGE_SHIFT, Frame
-from r2p.protocols.rtcan.events import NEVER, Received
+from r2p.protocols.rtcan.events import Received
+from r2p.units import NEVER
 
 TIMEOUT = 100_000_000
 """ns from one frame of a message to the next."""

@@ -14,11 +14,10 @@ from typing import TypeVar
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.protocols.rtcan.events import LONG_AGO
+from r2p.units import LONG_AGO, SECOND
 
 _COUNT = rtcan.HIGH_MAX + 1 - rtcan.FIRST_TOPIC
-_SECOND = 1_000_000_000
-_LEASE = 20 * _SECOND  # at least
+_LEASE = 20 * SECOND  # at least
 _ROUNDS = 2  # that may be missed on a slow bus
 _MESSAGES = 2  # of one topic in a round: its type and its ADVERTISE
 K = TypeVar("K")
@@ -48,7 +47,7 @@ class TopicIdAllocator:
 
     def set_rate(self, rate: float) -> None:
         """Modules on this bus make so many announcements a second: a lease lasts until the longest round has ended."""
-        self._lease = max(_LEASE, round(_ROUNDS * _MESSAGES * _COUNT / rate * _SECOND))
+        self._lease = max(_LEASE, round(_ROUNDS * _MESSAGES * _COUNT / rate * SECOND))
 
     def pick(self, topic: str) -> int | None:
         """The high byte of our topic, the same at each call. None: all are in use."""

@@ -17,9 +17,10 @@ from r2p.codecs.management import type_of
 from r2p.codecs.rtcan import FRAME_MAX, INTERMISSION, LAXITY_SHIFT, Frame
 from r2p.protocols.rtcan.context import EngineContext
 from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, CycleState
-from r2p.protocols.rtcan.events import LONG_AGO, NEVER, Due, Fate, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.events import Due, Fate, Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
 from r2p.protocols.rtcan.queue import LaxityQueue, QueuedMessage
+from r2p.units import LONG_AGO, NEVER
 
 _ERRORS = 8  # bus errors after which a message is given up
 _PAUSE = 500_000  # ns after a bus error, before the same topic is tried again

@@ -21,8 +21,8 @@ from r2p.runtime.qos import Missed, Periodic
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import SlotPublisher, Topic, TopicSpace
+from r2p.units import SECOND
 
-_SECOND = 1_000_000_000
 _LATE_SHARE = 2  # a message is late by more than 1/2 of its period: it is nearer to the next one
 
 
@@ -55,7 +55,7 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         self._own_period = klass.period
         self._slot_link: object = None
         self._waiting: _PeriodDelivery[M] | None = None
-        self._ticker = Ticker(space.loop, round(klass.period * _SECOND), self.tick, background=True)
+        self._ticker = Ticker(space.loop, round(klass.period * SECOND), self.tick, background=True)
 
     def start(self) -> None:
         """Start the clock: the first message is due one period from now."""
@@ -100,11 +100,11 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         self._give_up(NO_ROOM)  # before `fill`: a link without room loses the old message, not the new one
         if self._encode == self._closed or self.node.ending:
             return None
-        if skipped or late > self.period * _SECOND / _LATE_SHARE:
+        if skipped or late > self.period * SECOND / _LATE_SHARE:
             self.late += 1
             self.skipped += skipped
             reason = f"{skipped} period(s) skipped, the next one late" if skipped else "late"
-            self._report(Missed(self.topic, reason, late=late / _SECOND, count=skipped), self._on_late)
+            self._report(Missed(self.topic, reason, late=late / SECOND, count=skipped), self._on_late)
         try:
             message = self._fill()
             if message is None or self._encode == self._closed:  # fill may have closed it
@@ -138,9 +138,9 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         late = self._clock.monotonic() - delivery.since
         if reason:
             self._miss(delivery.sample.sequence, reason, [sink])
-        elif late > self.period * _SECOND / _LATE_SHARE:
+        elif late > self.period * SECOND / _LATE_SHARE:
             self.late += 1
-            self._report(Missed(self.topic, "sent late", where([sink]), late / _SECOND), self._on_late)
+            self._report(Missed(self.topic, "sent late", where([sink]), late / SECOND), self._on_late)
 
     def _give_up(self, reason: str) -> None:
         """Withdraw what still waits from the period before: it is stale."""

@@ -10,8 +10,8 @@ from r2p.runtime.qos import Missed, Sporadic
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, checkpoint
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic, TopicSpace
+from r2p.units import SECOND
 
-_SECOND = 1_000_000_000
 _TOO_LATE = "no room by the deadline"
 
 
@@ -27,7 +27,7 @@ class SporadicPublisher(BasePublisher[M]):
         self, space: TopicSpace, node: EndpointOwner, topic: Topic, layout: Layout[M], klass: Sporadic, *, latch: bool
     ) -> None:
         super().__init__(space, node, topic, layout, klass, latch=latch)
-        self._deadline = round(klass.deadline * _SECOND)
+        self._deadline = round(klass.deadline * SECOND)
         self._limit = klass.pending
         self._send_late = klass.late == "send"
         self._pending: list[_EventDelivery[M]] = []
@@ -90,7 +90,7 @@ class SporadicPublisher(BasePublisher[M]):
             if self._send_late:
                 event.overdue = True
                 self.late += 1
-                late = (now - event.due) / _SECOND
+                late = (now - event.due) / SECOND
                 self._report(Missed(self.topic, _TOO_LATE, where(event.remaining), late), self._on_late)
             else:
                 self._give_up(event, _TOO_LATE)
@@ -102,7 +102,7 @@ class SporadicPublisher(BasePublisher[M]):
             without = event.withdraw()
             for sink in without:
                 sink.count_lost(GIVEN_UP)
-            late = max(0, self._clock.monotonic() - event.due) / _SECOND
+            late = max(0, self._clock.monotonic() - event.due) / SECOND
             self._miss(event.sample.sequence, reason, without, late)
 
 

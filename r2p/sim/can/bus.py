@@ -17,7 +17,8 @@ from r2p.sim.can.controller import CanController
 from r2p.sim.can.faults import RECESSIVE_BITS, bits_until_noticed, error_frame_bits, first_difference, flip
 from r2p.sim.can.node import CanNode, ControllerState, ErrorKind, FrameRecord
 from r2p.sim.can.statistics import Statistics
-from r2p.sim.can.timeline import NEVER, Timeline
+from r2p.sim.can.timeline import Timeline
+from r2p.units import NEVER, SECOND
 
 if TYPE_CHECKING:
     import asyncio
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from r2p.codecs.rtcan import Frame
     from r2p.sim.can.controller import ControllerMailboxes, Request
 
-_SECOND: Final = 1_000_000_000
 _SUSPEND: Final = 8  # bits that an error passive sender waits longer before its next frame
 _BITS_AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge slot
 _RECOVERY_SEQUENCES: Final = 128  # times 11 recessive bits, until a controller leaves bus-off
@@ -63,7 +63,7 @@ class CanBus:
 
         Each node has its own random numbers, which follow from `seed` and its name.
         """
-        bit, rest = divmod(_SECOND, bitrate)
+        bit, rest = divmod(SECOND, bitrate)
         if rest:
             raise ValueError(f"at {bitrate} bit/s a bit does not take whole nanoseconds")
         self.timeline = Timeline(loop)

@@ -15,7 +15,8 @@ from r2p.codecs.rtcan import FRAME_MAX, IDENTIFIER_BITS
 from r2p.errors import MessageError
 from r2p.sim.can.faults import RECESSIVE_BITS, Confinement
 from r2p.sim.can.node import ControllerState, ErrorKind
-from r2p.sim.can.timeline import NEVER, LocalAlarm, LocalClock
+from r2p.sim.can.timeline import LocalAlarm, LocalClock
+from r2p.units import NEVER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

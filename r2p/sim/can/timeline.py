@@ -9,21 +9,17 @@ runs late still has its own instant, `now()`.
 from __future__ import annotations
 
 from bisect import insort
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from r2p.clock import Alarm, clock_of
 from r2p.sim.loop import VirtualLoop
+from r2p.units import NEVER, SECOND
 
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
     from r2p.sim.loop import Event
-
-NEVER: Final = 1 << 63
-"""An instant after all others, ns."""
-
-_SECOND: Final = 1_000_000_000
 
 
 class TimelineTimer:
@@ -132,7 +128,7 @@ class LocalClock:
         self._source = timeline.source
         self._offset = offset
         self._drift = round(drift_ppm * 1000)  # ns per second
-        self._second = _SECOND + self._drift  # local ns in a true second
+        self._second = SECOND + self._drift  # local ns in a true second
         self._true = self._local = -1  # the latest conversion: at one instant it is needed again and again
 
     def monotonic(self) -> int:
@@ -150,7 +146,7 @@ class LocalClock:
         """Return what this clock shows at a true instant."""
         if true != self._true:
             self._true = true
-            self._local = true + self._offset + true * self._drift // _SECOND
+            self._local = true + self._offset + true * self._drift // SECOND
         return self._local
 
     def true(self, local: int) -> int:

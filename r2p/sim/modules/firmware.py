@@ -21,19 +21,18 @@ from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import DecodeError, Error
 from r2p.messages import Layout, Message, layout
 from r2p.names import MANAGEMENT, module_name, topic_name
+from r2p.units import MILLISECOND, SECOND
 
 # All durations in ns, as measured in recordings of the firmware.
-_MS = 1_000_000
-_SECOND = 1_000_000_000
-_BOOT = 10 * _MS  # from REBOOT to the boot marker
-_NODES = 500 * _MS  # from the boot marker to the nodes' first announcements
-_FIRST_STEP = 496 * _MS  # from power on to the first step of repetition
-_STEP = 528 * _MS  # between two steps on a silent line
-_STEP_AFTER_TRAFFIC = 500 * _MS  # ... and if a management message came in between
-_QUIET = 33 * _MS  # without management messages before a step
+_BOOT = 10 * MILLISECOND  # from REBOOT to the boot marker
+_NODES = 500 * MILLISECOND  # from the boot marker to the nodes' first announcements
+_FIRST_STEP = 496 * MILLISECOND  # from power on to the first step of repetition
+_STEP = 528 * MILLISECOND  # between two steps on a silent line
+_STEP_AFTER_TRAFFIC = 500 * MILLISECOND  # ... and if a management message came in between
+_QUIET = 33 * MILLISECOND  # without management messages before a step
 _MARKER = b"\r\n\r\n"
 _NO_DEADLINE = 0x7FFFFFFF  # us: what firmware puts into a line for "no deadline"
-_RESPONSE_DELAY = 50 * _MS  # until a response takes effect: its management thread has the lowest priority
+_RESPONSE_DELAY = 50 * MILLISECOND  # until a response takes effect: its management thread has the lowest priority
 
 HEAP = 20_000
 """Bytes of RAM for the queues of a module."""
@@ -372,7 +371,7 @@ class _FirmwarePublisher:
         self.line = debug.encoder(self.advertisement.topic.encode())
         self.joined = False
         self.next: int | None = None
-        self._period = round(what.period * _SECOND) if what.period is not None and what.fill is not None else None
+        self._period = round(what.period * SECOND) if what.period is not None and what.fill is not None else None
         self._fill = what.fill
 
     def start(self, now: int) -> None:

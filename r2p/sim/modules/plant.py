@@ -6,8 +6,8 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from r2p.clock import Ticker
+from r2p.units import SECOND
 
-_SECOND = 1_000_000_000
 _CATCH_UP = 1.0
 """Seconds of physics to make up for after the loop was blocked; after a long sleep of the computer, more would hang."""
 
@@ -30,7 +30,7 @@ class Plant:
         self._ticker: Ticker | None = None
 
     async def __aenter__(self) -> Self:
-        self._ticker = Ticker(asyncio.get_running_loop(), round(self.dt * _SECOND), self._tick, background=True)
+        self._ticker = Ticker(asyncio.get_running_loop(), round(self.dt * SECOND), self._tick, background=True)
         self._ticker.start()
         return self
 

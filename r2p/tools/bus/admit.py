@@ -15,9 +15,9 @@ from r2p.tools.bus.picture import Cell
 from r2p.tools.options import Format, hertz, seconds
 from r2p.tools.output import Output, Record
 from r2p.tools.session import execute
+from r2p.units import SECOND
 
 _MESSAGE = re.compile(r"(?P<name>[^:@]+):(?P<size>\d+)@(?P<rate>.+)")
-_SECOND = 1_000_000_000
 _CYCLE = 0.010  # s, as in the thesis
 _SHORTEST, _LONGEST = 1e-9, 1e9  # s; representable in ns, and above it surely a typing error
 
@@ -66,7 +66,7 @@ def grid(slots: int, cycle: float | None, bitrate: int) -> Timing:
     if cycle is not None and cycle > _LONGEST:
         raise typer.BadParameter(f"a cycle of {cycle:g} s is too long")
     try:
-        return timing(slots, round((cycle or _CYCLE) * _SECOND), bitrate)
+        return timing(slots, round((cycle or _CYCLE) * SECOND), bitrate)
     except ValueError as error:
         raise typer.BadParameter(f"{error}: fewer --slots, a longer --cycle, or a higher --bitrate") from error
 
@@ -82,7 +82,7 @@ def parse(text: str) -> Wanted:
     period = _period(match["rate"])
     if not _SHORTEST <= period <= _LONGEST:
         raise typer.BadParameter(f"{text!r}: a period of {period:g} s is out of range")
-    return Wanted(match["name"], size, round(period * _SECOND))
+    return Wanted(match["name"], size, round(period * SECOND))
 
 
 def _period(text: str) -> float:
@@ -133,7 +133,7 @@ def _row(wanted: Wanted, result: Reservation | Refusal, grid: Timing) -> Record:
         "name": wanted.name,
         "bytes": wanted.size,
         "slots": rtcan.fragment_count(wanted.size),
-        "wanted_hz": round(_SECOND / wanted.interval, 3),
+        "wanted_hz": round(SECOND / wanted.interval, 3),
         "hz": None,
         "period": None,
         "phase": None,
@@ -143,7 +143,7 @@ def _row(wanted: Wanted, result: Reservation | Refusal, grid: Timing) -> Record:
     if isinstance(result, Refusal):
         return row | {"refused": result.text}
     return row | {
-        "hz": round(_SECOND / (result.period * grid.slot), 3),
+        "hz": round(SECOND / (result.period * grid.slot), 3),
         "period": result.period,
         "phase": result.phase,
         "in_cycle": result.fragments * max(1, grid.slots // result.period),
@@ -168,7 +168,7 @@ def summary(calendar: Calendar, grid: Timing) -> str:
     """Return a line about what is reserved and what is left, on average over all cycles."""
     reserved = 1 + sum(each.fragments * grid.slots / each.period for each in calendar)
     left = grid.slots - reserved
-    frames = left / grid.cycle * _SECOND
+    frames = left / grid.cycle * SECOND
     return (
         f"{reserved:g} of {grid.slots} slots reserved (including the sync), {left:g} left for other traffic: "
         f"{frames:.0f} frames/s, {frames * 64 / 1000:.1f} kbit/s of data"

@@ -6,10 +6,11 @@ import typer
 
 from r2p.bus import FrameKind, SeenFrame
 from r2p.names import topic_name
-from r2p.tools.bus.load import SECOND, listen
+from r2p.tools.bus.load import listen
 from r2p.tools.options import Count, Format, Quiet, Timeout, Verbose, Via
 from r2p.tools.output import Output
 from r2p.tools.session import execute, patience
+from r2p.units import SECOND
 
 Kinds = Annotated[
     list[FrameKind] | None, typer.Option("--kind", help="Only frames of this kind (repeatable).", show_default=False)

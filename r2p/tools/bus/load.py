@@ -8,11 +8,10 @@ from r2p.bus import BusLoad, BusMonitor
 from r2p.tools.options import Count, Format, Once, Quiet, Timeout, Verbose, Via
 from r2p.tools.output import Output, aligned, notify
 from r2p.tools.session import UsageError, check_urls, execute, patience, settings
+from r2p.units import SECOND
 
 CROWDED = 0.8
 """Share of the free slots above which events wait long (thesis 4.4)."""
-
-SECOND = 1_000_000_000  # ns
 
 _PERIOD = 1.0  # s
 

@@ -13,10 +13,10 @@ from r2p.clock import clock_of
 from r2p.messages import Message
 from r2p.msg import Encoder, Led, StampedIMURaw9, StampedVelocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
+from r2p.units import SECOND
 
 _WINDOW = 2_000_000_000  # ns, of the rate
 _LATENCIES = 10_000  # the newest are kept
-_SECOND = 1_000_000_000
 _GRAVITY = 1000  # counts of 1 mg
 _POLL = 0.02  # seconds
 _IN_FLIGHT = 1.0  # seconds to wait for messages that were sent
@@ -139,7 +139,7 @@ class Robot:
     def _measure(self, time: int) -> StampedIMURaw9 | None:
         if self._over:
             return None
-        angle = 0.2 * math.sin(time / _SECOND)
+        angle = 0.2 * math.sin(time / SECOND)
         return StampedIMURaw9(
             r2p.Timestamp.from_ns(self.clock.now()),
             acc_x=round(_GRAVITY * math.sin(angle)),
@@ -149,7 +149,7 @@ class Robot:
     def _turn(self, time: int) -> Encoder | None:
         if self._over:
             return None
-        return Encoder(0.1 * math.sin(time / _SECOND))
+        return Encoder(0.1 * math.sin(time / SECOND))
 
     def _switch(self, led: Led) -> list[tuple[str, r2p.Message]]:
         now = self.clock.now()
@@ -171,7 +171,7 @@ class Robot:
                 return
             stamp = r2p.Timestamp.from_ns(node.now())
             self.counters["velocity_cmd"].sent += 1
-            await commands.publish(StampedVelocity3(stamp, x=0.5, w=round(math.sin(tick.due / _SECOND), 2)))
+            await commands.publish(StampedVelocity3(stamp, x=0.5, w=round(math.sin(tick.due / SECOND), 2)))
 
     async def _blink(self, node: r2p.Node) -> None:
         commands = node.advertise("led_cmd", Led)

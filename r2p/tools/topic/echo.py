@@ -15,11 +15,10 @@ from r2p.tools.session import Session, UsageError, patience
 from r2p.tools.topic.watching import Topics, TypeName, received_samples
 from r2p.tools.types import Types, suggestion
 from r2p.tools.values import META, pick, to_plain
+from r2p.units import SECOND
 
 QUEUE = 1024
 """Messages that wait for a slow terminal or pipe; beyond that the oldest are lost, and counted."""
-
-_SECOND = 1_000_000_000
 
 
 async def echo(
@@ -136,7 +135,7 @@ class _TopicReader:
         now = self._session.node.now()
         if now < self._next_look_up:
             return
-        self._next_look_up = now + _SECOND
+        self._next_look_up = now + SECOND
         view = self._session.module.network.topics().get(self.topic, r2p.TopicView(self.topic))
         self._cls = await self._types.learn(self._session, view)
         if self._cls is None and not self._reported:

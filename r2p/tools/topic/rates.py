@@ -20,11 +20,11 @@ from r2p.tools.output import Output
 from r2p.tools.session import Session, patience
 from r2p.tools.topic.watching import Topic, TypeName, received_samples
 from r2p.tools.types import Types
+from r2p.units import SECOND
 
 QUEUE = 4096
 """Messages that wait for this tool; beyond that the oldest are lost, and counted."""
 
-_SECOND = 1_000_000_000
 _GAP = 2.0  # times the usual period: the publisher has paused
 _SMOOTHING = 1 / 16  # weight of a new period in the usual one
 _MISSING_MAX = 65536  # missing sequence numbers that are remembered: they may still arrive
@@ -192,7 +192,7 @@ class _Rate:
             self._numbered = True
             follows = self._sequences.setdefault(source, _Sequences()).add(sample.sequence)
         if follows:
-            self._add_period((sample.stamp - self._stamps[source]) / _SECOND, source)
+            self._add_period((sample.stamp - self._stamps[source]) / SECOND, source)
         self._stamps[source] = sample.stamp
 
     def restart(self) -> None:
@@ -285,7 +285,7 @@ class _Delay:
         if origin in self._origins or len(self._origins) < _ORIGINS:
             self._origins[origin] = None
         self._error = None if sample.clock is None else sample.clock.error
-        self._delays.append((now - sample.stamp) / _SECOND)
+        self._delays.append((now - sample.stamp) / SECOND)
 
     def restart(self) -> None:
         self._delays.clear()
@@ -306,8 +306,8 @@ class _Delay:
         }
         text = f"{_ms(record['mean'])}, {_spread_text(record)}; from {record['from']} to {record['to']}, {clocks}"
         if self._error is not None:
-            record["clock_error"] = self._error / _SECOND
-            text += f"; network time is UTC within +-{_ms(self._error / _SECOND)}"
+            record["clock_error"] = self._error / SECOND
+            text += f"; network time is UTC within +-{_ms(self._error / SECOND)}"
         return record, text
 
 
@@ -321,7 +321,7 @@ def _origin(sample: r2p.Sample) -> str:
 
 def _per_second(arrivals: Sequence[int], amount: int) -> float | None:
     """Return the amount per second between the first and the last arrival; None if no time has passed."""
-    span = (arrivals[-1] - arrivals[0]) / _SECOND if arrivals else 0.0
+    span = (arrivals[-1] - arrivals[0]) / SECOND if arrivals else 0.0
     return amount / span if span > 0 else None
 
 

@@ -21,6 +21,7 @@ from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome
 from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface, PortAlarm
+from r2p.units import SECOND
 
 if TYPE_CHECKING:
     import can
@@ -31,7 +32,7 @@ ECHO_ON_REQUEST = frozenset({"kvaser", "neovi", "nixnet", "pcan", "vector", "vir
 ECHO_ALWAYS = frozenset({"udp_multicast"})
 """Interfaces that return own frames in any case. On all others a frame counts as sent when the driver has it."""
 
-CONFIRM_TIMEOUT_NS = 1_000_000_000
+CONFIRM_TIMEOUT_NS = SECOND
 """Ns until a confirmation is given up."""
 
 QUEUE_MAX = 4096
@@ -41,7 +42,6 @@ _BATCH = 64  # frames that one turn of the event loop handles
 _SEND_TIMEOUT = 0.5  # seconds
 _READ_TIMEOUT = 0.1  # seconds; closing takes as long
 _STAMP_AGE_MAX = 10.0  # seconds; a stamp that seems older is by another clock than the computer's
-_SECOND = 1_000_000_000
 _LONGEST_WAIT = 2.0  # seconds between attempts to open the interface
 _LATENCY = 300_000  # ns that two changes of thread take, about
 
@@ -97,7 +97,7 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
         """Open the interface. Returns why it can't be opened now; raises TransportError when it never can."""
         try:
             await bus.open(self._make)
-        except _NEVER as error:
+        except _PERMANENT_ERRORS as error:
             raise TransportError(f"rtcan:{self.name}: {_explain(error)}") from error
         except (self._can.CanError, OSError) as error:
             return _explain(error)
@@ -111,7 +111,7 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
         return bus
 
 
-_NEVER = (NotImplementedError, ValueError, TypeError)
+_PERMANENT_ERRORS = (NotImplementedError, ValueError, TypeError)
 """What python-can raises where waiting does not help: the driver is not installed, or there can't be such a channel or
 bit rate. Other errors may pass, such as those of an adapter that is not plugged in.
 """
@@ -186,7 +186,7 @@ class _PythonCanBus(OpenInterface):
             message, read_at = self._queue.popleft()
             age = utc - message.timestamp  # python-can stamps in UTC, but some adapters from when they were plugged in
             try:
-                self._receive(message, now - round(age * _SECOND) if 0.0 <= age < _STAMP_AGE_MAX else read_at)
+                self._receive(message, now - round(age * SECOND) if 0.0 <= age < _STAMP_AGE_MAX else read_at)
             except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
                 self._listener.internal_error(error)
         while self._reported < self._dropped:

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from r2p.codecs.rtcan import Frame
+from r2p.units import SECOND
 
 BATCH = 64
 """Frames that one call returns at most."""
@@ -30,8 +31,7 @@ FLAGS = ERROR | DATA | socket.CAN_RTR_FLAG
 ReceivedFrame = tuple[int, bytes, int, int]
 """Identifier with FLAGS, up to 8 bytes, flags of the message such as OWN, and stamp (ns of the monotonic clock)."""
 
-_SECOND = 1_000_000_000
-_OLDEST = 10 * _SECOND  # ns; a stamp that seems older was made before the computer's clock was set
+_OLDEST = 10 * SECOND  # ns; a stamp that seems older was made before the computer's clock was set
 _RECEIVE_BUFFER = 1 << 19  # bytes: some hundred frames, tens of ms of a saturated bus
 _KIND = DATA | socket.CAN_RTR_FLAG  # flags that filters look at, too; with ERROR they would be for error frames
 _FILTERS_MAX = 512  # CAN_RAW_FILTER_MAX
@@ -171,7 +171,7 @@ class _Batch:
         flags = self._flags[:count].tolist()
         oldest = now - _OLDEST
         for (identifier, length, data), flag, control in zip(frames, flags, controls, strict=True):
-            stamp = control[3] * _SECOND + control[4] - offset
+            stamp = control[3] * SECOND + control[4] - offset
             if not oldest < stamp < now:
                 stamp = now
             received.append((identifier, data if length == 8 else data[:length], flag, stamp))

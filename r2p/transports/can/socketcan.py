@@ -21,11 +21,12 @@ from r2p.protocols.rtcan.events import Mailbox, Outcome
 from r2p.transports.can import errorframes, netlink, rawsocket
 from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface, PortAlarm
 from r2p.transports.can.rawsocket import RawSocket
+from r2p.units import SECOND
 
 PRIORITIES = {Mailbox.HRT: 6, Mailbox.SRT: 0, Mailbox.NRT: 2}
 """SO_PRIORITY of each class: the first, second and third band of the queue that CAN interfaces have (pfifo_fast)."""
 
-CONFIRM_TIMEOUT_NS = 1_000_000_000
+CONFIRM_TIMEOUT_NS = SECOND
 """Ns until a confirmation is given up: a frame may wait for a busy bus, and for an acknowledge."""
 
 CONFIRM_TIMEOUT_ONE_SHOT_NS = 20_000_000

@@ -10,7 +10,8 @@ A frame that waits can be withdrawn; one that was handed over can't, and is neve
 from collections.abc import Callable
 
 from r2p.codecs.rtcan import Frame
-from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit
+from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
+from r2p.units import NEVER
 
 RETRY_INTERVAL = 500_000
 """Ns until the next try when the driver's queue is full: no interface reports that it has room again."""

@@ -15,21 +15,21 @@ from r2p.errors import DecodeError
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress
 from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import LONG_AGO, Mailbox, Profile, Received
+from r2p.protocols.rtcan.events import Mailbox, Profile, Received
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.rtcan.driver import EngineDriver
 from r2p.transports.rtcan.status import UtcEstimator
+from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
 FIRMWARE = 0
 """The address of all firmware modules of 2014."""
 R2P = 256
 """The address of all r2p modules on a bus with firmware of 2014; other modules have their id8 as address, 1 to 255."""
 
-_MILLISECOND = 1_000_000
 _OFFSET_VALID = 10_000_000  # ns for which the offset of UTC from the monotonic clock is not read again
-_LINGER = 1_000_000_000  # ns in which what still comes from a publisher that has left is counted as lost
+_LINGER = SECOND  # ns in which what still comes from a publisher that has left is counted as lost
 _CLASSES = {
     Mailbox.HRT: PublisherClass.PERIODIC,
     Mailbox.SRT: PublisherClass.SPORADIC,
@@ -147,7 +147,7 @@ class SampleBuilder:
         stamp = self._offset + started
         source = self._senders.source(topic, arrival.message)
         laxity = received.laxity  # ms that were left; SRT_MAX stands for more, too, so it gives no deadline
-        deadline = stamp + laxity * _MILLISECOND if rtcan.HRT < laxity < rtcan.SRT_MAX else 0
+        deadline = stamp + laxity * MILLISECOND if rtcan.HRT < laxity < rtcan.SRT_MAX else 0
         sender = self._discovery.modules.get(source.module)
         return Sample(
             arrival.data,

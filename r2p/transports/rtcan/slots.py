@@ -18,8 +18,7 @@ from r2p.protocols.rtcan.events import Done, Due, Fate, SlotsGranted, SlotsLost,
 from r2p.runtime.topic import SlotPublisher, Topic
 from r2p.transports.link import Link
 from r2p.transports.rtcan.driver import EngineDriver
-
-_SECOND = 1_000_000_000
+from r2p.units import SECOND
 
 
 class SlottedTopic(msgspec.Struct, eq=False):
@@ -67,7 +66,7 @@ class SlottedTopic(msgspec.Struct, eq=False):
 
 def inadmissible(timing: Timing, size: int, period: float) -> str | None:
     """Why there can never be slots for messages of `size` bytes each `period` seconds. None: there may be."""
-    wanted = round(period * _SECOND) // timing.slot
+    wanted = round(period * SECOND) // timing.slot
     fragments = rtcan.fragment_count(size)
     any_message = rtcan.message_id(rtcan.FIRST_TOPIC, 0)
     answer = Calendar(timing.slots).admit(any_message, wanted, fragments, round_down=True)
@@ -160,7 +159,7 @@ class SlottedTopics:
     def _payload(self, each: SlottedTopic, due: Due) -> bytes | None:
         """Have the publisher make the message of this slot."""
         if not each.is_clock:  # its first slot: until here its own clock went on
-            each.is_clock = each.publisher.use_slot_clock(self._link, each.interval / _SECOND)
+            each.is_clock = each.publisher.use_slot_clock(self._link, each.interval / SECOND)
             each.clock_elsewhere = not each.is_clock
             self.wake_waiters()
             if each.clock_elsewhere:
@@ -178,7 +177,7 @@ class SlottedTopics:
 
     def _reserve(self, each: SlottedTopic) -> None:
         self.by_topic[each.topic.name] = self._by_high[each.high] = each
-        interval, lead = round(each.publisher.period * _SECOND), round(each.publisher.lead * _SECOND)
+        interval, lead = round(each.publisher.period * SECOND), round(each.publisher.lead * SECOND)
         engine, now = self._driver.engine, self._driver.now()
         self._driver.carry_out(engine.reserve(now, each.high, each.publisher.size, interval, lead=lead, handle=each))
 

@@ -17,6 +17,7 @@ from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.link import RtcanLink
 from r2p.transports.url import Url, duration
+from r2p.units import SECOND
 
 # fmt: off
 INTERFACES = frozenset({
@@ -31,7 +32,6 @@ of these names is `rtcan:socketcan:NAME`.
 
 _SLOT_MIN_COARSE = 500_000  # ns of the shortest slot that a port holds which can't hit an instant exactly
 _CAPACITY = 1024  # messages in the engine's queue: more than a link passes to it
-_SECOND = 1_000_000_000
 _DRAIN_TIMEOUT = 0.5  # seconds for the last messages: subscribers accept none after the announced end of the link
 _LEAVE_TIMEOUT = 0.5  # seconds for the announcement of the end
 
@@ -65,11 +65,11 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def utc_error(self) -> int | None:
         """`utc` in ns."""
-        return None if self.utc is None else round(self.utc * _SECOND)
+        return None if self.utc is None else round(self.utc * SECOND)
 
     @property
     def _cycle(self) -> int:
-        return round(self.cycle * _SECOND)
+        return round(self.cycle * SECOND)
 
     def settings(self, number: int, port: CanPort) -> EngineSettings:
         """The settings of an engine on this port. `number`: 64 random bits."""
@@ -199,7 +199,7 @@ def _int_or_none(text: str) -> int | None:
 
 def _bitrate(text: str) -> int:
     value = _int_or_none(text)
-    if value is None or value <= 0 or _SECOND % value:
+    if value is None or value <= 0 or SECOND % value:
         raise ValueError("a bit must take whole nanoseconds, as with 1000000, 500000, 250000 or 125000")
     return value
 

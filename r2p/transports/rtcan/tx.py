@@ -12,7 +12,7 @@ import msgspec
 from r2p.clock import Clock
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import ManagementType
-from r2p.protocols.rtcan.events import NEVER, Action, Done, Fate, Profile
+from r2p.protocols.rtcan.events import Action, Done, Fate, Profile
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import PublisherHandle
@@ -20,6 +20,7 @@ from r2p.transports.link import LinkSubscriber
 from r2p.transports.rtcan.driver import EngineDriver
 from r2p.transports.rtcan.slots import SlottedTopics
 from r2p.transports.stats import LinkStats
+from r2p.units import NEVER, SECOND
 
 NRT_FRAMES_MAX = 128
 """Frames of non real-time messages in the engine, before their publishers wait: some 20 ms of the bus."""
@@ -29,7 +30,6 @@ SRT_MESSAGES_MAX = 128
 that bulk data never keeps an event out.
 """
 
-_SECOND = 1_000_000_000
 _DEFAULT_DEADLINE = 50_000_000  # ns; of real-time messages without one: those from other links, and latched ones
 _NRT = PublisherClass.NON_REAL_TIME
 _SENT = (Fate.SENT, Fate.UNKNOWN)
@@ -93,7 +93,7 @@ class TxAccounting:
             self._missed(handle, done)
 
     def _missed(self, handle: SampleHandle, done: Done) -> None:
-        publisher, late = handle.publisher, max(0, done.at - handle.deadline) / _SECOND
+        publisher, late = handle.publisher, max(0, done.at - handle.deadline) / SECOND
         if done.fate in _SENT:
             if publisher is not None:
                 publisher.link_late(self._link, "sent after its deadline", late)
@@ -166,4 +166,4 @@ class Transmitter:
         if left > 0 or (sample.deadline and not (publisher is not None and publisher.latch)):
             return left
         slotted = self._slotted.by_topic.get(topic)
-        return round(slotted.publisher.period * _SECOND) if slotted is not None else _DEFAULT_DEADLINE
+        return round(slotted.publisher.period * SECOND) if slotted is not None else _DEFAULT_DEADLINE

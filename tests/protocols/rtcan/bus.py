@@ -11,7 +11,6 @@ from r2p.codecs import rtcan
 from r2p.codecs.rtcan import INTERMISSION, Frame
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import (
-    NEVER,
     Action,
     Due,
     EngineSettings,
@@ -22,6 +21,7 @@ from r2p.protocols.rtcan.events import (
     Transmit,
     Withdraw,
 )
+from r2p.units import NEVER
 
 MS = 1_000_000
 SECOND = 1_000_000_000

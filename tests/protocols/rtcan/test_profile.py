@@ -7,9 +7,10 @@ import pytest
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import NEVER, EngineSettings, Profile, Received
+from r2p.protocols.rtcan.events import EngineSettings, Profile, Received
 from r2p.protocols.rtcan.management import QUIET, RateLimiter
 from r2p.protocols.rtcan.network import Detector
+from r2p.units import NEVER
 from tests.protocols.rtcan.networks import current_cycle
 
 MS = 1_000_000

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from r2p.codecs import rtcan
 from r2p.errors import MessageError
-from r2p.protocols.rtcan.events import NEVER
 from r2p.protocols.rtcan.queue import LaxityQueue, QueuedMessage
+from r2p.units import NEVER
 from tests.can_vectors import CanCase, can_cases, payload
 
 MS = 1_000_000

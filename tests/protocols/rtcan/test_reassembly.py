@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import MessageError
-from r2p.protocols.rtcan.events import NEVER, Mailbox, Received
+from r2p.protocols.rtcan.events import Mailbox, Received
 from r2p.protocols.rtcan.reassembly import TIMEOUT, Reassembly
+from r2p.units import NEVER
 from tests.can_vectors import CanCase, arriving, can_cases
 
 A, B = 0x020A, 0x020B  # one topic, two sources

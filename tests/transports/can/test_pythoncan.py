@@ -12,11 +12,12 @@ import pytest
 
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import NEVER, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can import pythoncan
 from r2p.transports.can.pythoncan import PythonCanPort
 from r2p.transports.rtcan.transport import INTERFACES
 from r2p.transports.url import open_transport
+from r2p.units import NEVER
 from tests.can.rig import GUARD, RecordingListener, now, using
 from tests.faults import once
 

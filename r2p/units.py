@@ -1,0 +1,9 @@
+"""Units of time, and instants that no clock shows. Instants and durations are nanoseconds, as `int`."""
+
+MILLISECOND = 1_000_000
+SECOND = 1_000_000_000
+
+NEVER = 1 << 62
+"""An instant after all others: it does not come."""
+LONG_AGO = -NEVER
+"""An instant before all others."""
