@@ -386,7 +386,7 @@ class DirectoryRelay:
         messages: list[Relayed] = []
         if info.r2p and info.instance is not None:
             flags = management.HELLO_TOOL if info.observer else 0
-            lease = min(max(info.lease, 3 * self._period()) // 1_000_000, 0xFFFF)
+            lease = min(max(info.lease, 3 * self._period()) // 1_000_000, management.LEASE_MS_MAX)
             messages.append(management.Hello(link_name, info.instance, flags, info.hops + 1, lease))
         if not info.observer:
             messages.append(management.Alive(link_name, info.flags))

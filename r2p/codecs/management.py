@@ -95,6 +95,9 @@ HELLO_QUERY = 1  # asks all modules to repeat what they have: this one is new
 HELLO_TOOL = 2  # an observer, which sends no ALIVE
 HELLO_LEAVING = 4
 
+LEASE_MS_MAX = 0xFFFF
+"""The longest lease that a Hello can carry (ms)."""
+
 # TypeInfo.role and Endpoint.role
 ROLE_PUBLISHES = 1
 ROLE_SUBSCRIBES = 2
@@ -147,6 +150,10 @@ _PIECE = 22  # characters of Name.piece
 BRIDGE_ACKS = 2  # acks in a Bridge
 LEAF_ACKS = 3  # acks in a Leaf
 MESH_HEARD = 3  # entries in Mesh.heard
+PARTS_MAX = 16
+"""Parts of a Name or a Mesh: the number of a part has four bits."""
+_PART_BITS = 4
+_SERIALS = 0x10000  # counts of Bridge and Leaf, and serials of Mesh, start again at 0 after this many
 _ACK = struct.Struct("<IH")
 _HEARD = struct.Struct("<BIB")
 _MARK = b"r2p"
@@ -287,12 +294,13 @@ class Name(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def number(self) -> int:
-        return self.part >> 4
+        """The number of this piece."""
+        return _part_number(self.part)
 
     @property
     def last(self) -> int:
         """The number of the last piece."""
-        return self.part & 15
+        return _last_part(self.part)
 
 
 class Bridge(msgspec.Struct, frozen=True, gc=False):
@@ -321,6 +329,16 @@ class Mesh(msgspec.Struct, frozen=True, gc=False):
     serial: int
     part: int
     heard: bytes
+
+    @property
+    def number(self) -> int:
+        """The number of this part."""
+        return _part_number(self.part)
+
+    @property
+    def last(self) -> int:
+        """The number of the last part."""
+        return _last_part(self.part)
 
 
 class Leaf(msgspec.Struct, frozen=True, gc=False):
@@ -531,7 +549,35 @@ def alias_messages(name: str) -> list[Name]:
     if alias == name:
         return []
     pieces = [name[at : at + _PIECE] for at in range(0, len(name), _PIECE)]
-    return [Name(alias, number << 4 | len(pieces) - 1, piece) for number, piece in enumerate(pieces)]
+    return [Name(alias, make_part(number, len(pieces) - 1), piece) for number, piece in enumerate(pieces)]
+
+
+def make_part(number: int, last: int) -> int:
+    """The `part` of a Name or a Mesh: the number of this part, and of the last one."""
+    return number << _PART_BITS | last
+
+
+def _part_number(part: int) -> int:
+    return part >> _PART_BITS
+
+
+def _last_part(part: int) -> int:
+    return part & PARTS_MAX - 1
+
+
+def next_serial(serial: int) -> int:
+    """The count of a Bridge or a Leaf, or the serial of a Mesh, that follows this one."""
+    return (serial + 1) % _SERIALS
+
+
+def is_newer_serial(serial: int, last: int) -> bool:
+    """Whether such a number comes after `last`: at most half the range ahead of it."""
+    return 0 < (serial - last) % _SERIALS < _SERIALS // 2
+
+
+def leaf_port(number: int) -> int:
+    """The `port` of a Leaf for the link with this number: its low byte, as the field has one byte."""
+    return number & 0xFF
 
 
 def encode_acks(acks: Iterable[tuple[int, int]], places: int) -> bytes:

@@ -197,3 +197,31 @@ def test_acks_and_what_gateways_hear_fill_their_fields() -> None:
 def test_an_order_has_the_type_of_its_bytes(order: m.Order) -> None:
     assert m.order_type(order) == m.type_of(m.encode(order))
     assert m.order_type(order) in m.ORDER_TYPES
+
+
+@given(st.integers(0, m.PARTS_MAX - 1), st.integers(0, m.PARTS_MAX - 1))
+def test_a_part_says_its_number_and_the_last_one(number: int, last: int) -> None:
+    part = m.make_part(number, last)
+    for message in (m.Mesh(9, 1, part, bytes(18)), m.Name("alias", part, "piece")):
+        decoded = m.decode(m.encode(message))
+        assert isinstance(decoded, m.Mesh | m.Name)
+        assert (decoded.number, decoded.last) == (number, last)
+
+
+@given(st.integers(0, 0xFFFF), st.integers(1, 0x7FFF))
+def test_serials_start_again_and_keep_their_order(serial: int, steps: int) -> None:
+    later = (serial + steps) % 0x10000
+    assert m.is_newer_serial(later, serial)
+    assert not m.is_newer_serial(serial, later)
+    assert not m.is_newer_serial(serial, serial)
+    assert m.next_serial(0xFFFF) == 0
+
+
+def test_a_leaf_names_its_link_by_one_byte() -> None:
+    assert m.leaf_port(0x1FE) == 0xFE
+    assert m.encode(m.Leaf(7, m.leaf_port(0x1FE), 1, bytes(18)))
+
+
+def test_a_hello_carries_the_longest_lease() -> None:
+    message = m.Hello("PC1", 7, lease_ms=m.LEASE_MS_MAX)
+    assert m.decode(m.encode(message)) == message

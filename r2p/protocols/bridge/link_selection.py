@@ -13,7 +13,7 @@ from collections import Counter
 
 import msgspec
 
-from r2p.codecs.management import LEAF_ACKS, Bridge, Leaf
+from r2p.codecs.management import LEAF_ACKS, Bridge, Leaf, leaf_port
 from r2p.codecs.probes import PORT_MODULUS
 from r2p.protocols.bridge.mesh import PortId
 from r2p.protocols.bridge.ports import (
@@ -309,9 +309,9 @@ class LinkSelection:
         link = self.by_number.get(number)
         if link is None:
             return
-        link.echoes = message.port == number & 0xFF  # the number has one byte on the wire
+        link.echoes = message.port == leaf_port(number)
         for other in self.by_number:
-            if other != number and other & 0xFF == message.port:
+            if other != number and leaf_port(other) == message.port:
                 link.twins = link.twins | {other: now}
         self._update(now)
 
@@ -407,9 +407,9 @@ class LinkSelection:
         return link.sent_at + (APART if link.something_new else tick)
 
     def _send_leaf(self, now: int, link: CandidateLink) -> None:
-        count = self._sent.number(now)
+        count = self._sent.next_number(now)
         for packed in pack_acks(link.gateways, LEAF_ACKS):
-            self._messages.append((link.number, Leaf(self._instance, link.number & 0xFF, count, packed)))
+            self._messages.append((link.number, Leaf(self._instance, leaf_port(link.number), count, packed)))
         if link.asks:
             self._messages.append((link.number, None))
         link.sent_at = now

@@ -11,7 +11,16 @@ from hashlib import blake2b
 
 import msgspec
 
-from r2p.codecs.management import MESH_HEARD, Mesh, decode_heard, encode_heard
+from r2p.codecs.management import (
+    MESH_HEARD,
+    PARTS_MAX,
+    Mesh,
+    decode_heard,
+    encode_heard,
+    is_newer_serial,
+    make_part,
+    next_serial,
+)
 
 PortId = tuple[int, int]
 """A port: gateway, and the number of the port there."""
@@ -21,10 +30,9 @@ Adjacency = tuple[int, int, int]
 
 Edge = tuple[PortId, PortId]
 
-_MOST_PARTS = 16  # the number of a part has four bits
 _UNFINISHED = 64  # records of which parts are missing: forged, or of gateways that died in the middle
 
-MOST_HEARD = MESH_HEARD * _MOST_PARTS
+MOST_HEARD = MESH_HEARD * PARTS_MAX
 """Adjacencies that a gateway can announce; with more it can't agree with any other one, and forwards nothing."""
 
 MOST_RECORDS = 256
@@ -45,7 +53,7 @@ def mesh_messages(gateway: int, serial: int, heard: Iterable[Adjacency]) -> list
     adjacencies = sorted(heard)[:MOST_HEARD]
     pieces = [adjacencies[at : at + MESH_HEARD] for at in range(0, len(adjacencies), MESH_HEARD)] or [[]]
     last = len(pieces) - 1
-    return [Mesh(gateway, serial, number << 4 | last, encode_heard(piece)) for number, piece in enumerate(pieces)]
+    return [Mesh(gateway, serial, make_part(number, last), encode_heard(piece)) for number, piece in enumerate(pieces)]
 
 
 class MeshAssembler:
@@ -56,11 +64,10 @@ class MeshAssembler:
 
     def add(self, message: Mesh) -> frozenset[Adjacency] | None:
         """Whom the gateway hears, once all parts with this serial are there."""
-        number, last = message.part >> 4, message.part & 15
         key = (message.gateway, message.serial)
         pieces = self._pieces.setdefault(key, {})
-        pieces[number] = frozenset(decode_heard(message.heard))
-        if set(pieces) != set(range(last + 1)):
+        pieces[message.number] = frozenset(decode_heard(message.heard))
+        if set(pieces) != set(range(message.last + 1)):
             while len(self._pieces) > _UNFINISHED:
                 del self._pieces[next(iter(self._pieces))]
             return None
@@ -178,14 +185,14 @@ class MeshMap:
         if heard == self._heard:
             return False
         self._heard = heard
-        self._serial = (self._serial + 1) & 0xFFFF
+        self._serial = next_serial(self._serial)
         self._recompute()
         return True
 
     def receive(self, now: int, message: Mesh) -> bool:
         """Enter what another gateway announces; says whether that is new, and complete."""
         known = self._records.get(message.gateway)
-        if known is not None and not 0 < (message.serial - known.serial) & 0xFFFF < 0x8000:
+        if known is not None and not is_newer_serial(message.serial, known.serial):
             known.updated_at = now
             return False
         record = self._record(now, message.gateway, known)

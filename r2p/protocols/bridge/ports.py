@@ -13,7 +13,16 @@ from collections.abc import Mapping
 
 import msgspec
 
-from r2p.codecs.management import BRIDGE_ACKS, Bridge, Leaf, Mesh, decode_acks, encode_acks
+from r2p.codecs.management import (
+    BRIDGE_ACKS,
+    Bridge,
+    Leaf,
+    Mesh,
+    decode_acks,
+    encode_acks,
+    is_newer_serial,
+    next_serial,
+)
 from r2p.protocols.bridge.mesh import PortId
 from r2p.units import LONG_AGO, MILLISECOND, NEVER
 
@@ -130,9 +139,9 @@ class SentMessages:
         self._sender = sender
         self._sent: deque[tuple[int, int]] = deque()  # number, instant
 
-    def number(self, now: int) -> int:
-        """The number of a message that is sent now."""
-        self.count = (self.count + 1) & 0xFFFF
+    def next_number(self, now: int) -> int:
+        """Number a message that is sent now."""
+        self.count = next_serial(self.count)
         self._sent.append((self.count, now))
         while now - self._sent[0][1] > LEASE:
             self._sent.popleft()
@@ -147,8 +156,8 @@ class SentMessages:
 
 
 def is_late(count: int, last: int) -> bool:
-    """Whether a message was overtaken by the one with the number `last` (serial arithmetic on 16 bits)."""
-    return (count - last) & 0xFFFF >= 0x8000
+    """Whether the message numbered `count` was overtaken by the one numbered `last`; parts of one message share it."""
+    return count != last and not is_newer_serial(count, last)
 
 
 def pack_acks(heard: Mapping[PortId, Neighbour], each: int) -> list[bytes]:
@@ -380,4 +389,4 @@ class ClientPorts:
         port.send_at = now + TICK
 
     def _bridge(self, now: int, acks: bytes) -> Bridge:
-        return Bridge(self._gateway, CLIENTS, self._sent.number(now), 0, self._root, acks)
+        return Bridge(self._gateway, CLIENTS, self._sent.next_number(now), 0, self._root, acks)

@@ -349,7 +349,7 @@ class SpanningTree:
     # What goes out
 
     def _send_bridge(self, now: int, port: TreePort) -> None:
-        count = self._sent.number(now)
+        count = self._sent.next_number(now)
         for packed in pack_acks(port.neighbours | port.leaves, BRIDGE_ACKS):
             bridge = Bridge(self.gateway, port.number, count, port.agreement, self.root, packed)
             self._actions.append(SendToPort(port.number, bridge))

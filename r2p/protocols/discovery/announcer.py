@@ -119,7 +119,7 @@ class Announcer:
         if isinstance(message, management.Hello):
             # On a slow link the next one comes late: its module must not seem gone until then.
             lease = max(message.lease_ms, 3 * self._schedule.relay_time // 1_000_000)
-            message = msgspec.structs.replace(message, lease_ms=min(lease, 0xFFFF))
+            message = msgspec.structs.replace(message, lease_ms=min(lease, management.LEASE_MS_MAX))
         self._relayed[key] = message
         self._schedule.relay(Item(ItemKind.RELAY, key, once=True))
 

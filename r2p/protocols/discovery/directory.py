@@ -21,7 +21,7 @@ MOST = 4096
 LEASE = 5_000_000_000
 """Ns that an r2p module may be silent at least, whatever its HELLO says: three rounds of repetition, and some more."""
 
-FOR_EVER = 0xFFFF * 1_000_000
+FOR_EVER = management.LEASE_MS_MAX * 1_000_000
 """The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
 
 _UNFINISHED_MAX = 256
