@@ -24,7 +24,7 @@ from r2p.transports.link import MESSAGES_PER_TURN
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh import threads
 from r2p.transports.zenoh.config import is_network_name, plain_text
-from r2p.transports.zenoh.threads import OutboundThread
+from r2p.transports.zenoh.threads import OutboundThread, as_exception
 
 T = TypeVar("T")
 
@@ -244,8 +244,8 @@ class ZenohSession:
                 complete = query()
             except zenoh.ZError:  # the session is closed
                 pass
-            except Exception as error:  # noqa: BLE001 - counted and logged in the loop
-                queue.failed(error)
+            except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: counted and logged in the loop
+                queue.failed(as_exception(error))
             finally:
                 queue.put(complete)
 
@@ -294,8 +294,8 @@ class ZenohSession:
                     return
                 try:
                     put(item)
-                except Exception as error:  # noqa: BLE001 - counted and logged in the loop; the next one follows
-                    queue.failed(error)
+                except BaseException as error:  # noqa: BLE001 - a panic, too: counted in the loop; the next one follows
+                    queue.failed(as_exception(error))
 
         self._declared.append(declared)
         threads.start(listen)
@@ -434,9 +434,9 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
     def work() -> None:
         try:
             result = function()
-        except Exception as error:  # noqa: BLE001 - raised again where it is awaited
+        except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: raised again where it is awaited
             with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(fail, error)
+                loop.call_soon_threadsafe(fail, as_exception(error))
             return
         try:
             loop.call_soon_threadsafe(succeed, result)

@@ -33,11 +33,24 @@ _JOIN_TIMEOUT_S = 2.0
 _threads: "WeakSet[threading.Thread]" = WeakSet()
 
 
-def start(function: Callable[[], object]) -> None:
+def start(function: Callable[[], object]) -> threading.Thread:
     """Call it in a thread of its own, which does not keep the program from ending."""
     thread = threading.Thread(target=function, name="r2p zenoh", daemon=True)
     _threads.add(thread)
     thread.start()
+    return thread
+
+
+def as_exception(error: BaseException) -> Exception:
+    """Return what a thread caught as an error that may be raised, or counted, in the event loop.
+
+    A panic in zenoh's Rust is pyo3's PanicException, which is no Exception: it would pass by all who count errors.
+    """
+    if isinstance(error, Exception):
+        return error
+    wrapped = RuntimeError(f"{type(error).__name__}: {error}")
+    wrapped.__cause__ = error
+    return wrapped
 
 
 @atexit.register
@@ -57,7 +70,7 @@ class OutboundThread:
         self._loop = loop
         self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._many_tokens = False
-        self._running = False
+        self._thread: threading.Thread | None = None
         self._submitted = 0
         self._done = 0
         self.failed: Callable[[Exception], object] = lambda _error: None
@@ -115,16 +128,13 @@ class OutboundThread:
 
     def finish(self) -> None:
         """Wait for all calls, and end the thread. Not to be called in the loop, which must submit nothing any more."""
-        if self._running:
-            over: queue.SimpleQueue[None] = queue.SimpleQueue()
-            self._submit(lambda: over.put(None))
+        if self._thread is not None:
             self._jobs.put(None)
-            over.get()
+            self._thread.join()
 
     def _submit(self, job: Callable[[], object]) -> None:
-        if not self._running:
-            self._running = True
-            start(self._work)
+        if self._thread is None:
+            self._thread = start(self._work)
         self._submitted += 1
         self._jobs.put(job)
 
@@ -132,9 +142,10 @@ class OutboundThread:
         while (job := self._jobs.get()) is not None:
             try:
                 job()
-            except Exception as error:  # noqa: BLE001 - reported in the loop; the next one follows
-                self._call_in_loop(self.failed, error)
-            self._done += 1
+            except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: without the thread all calls would stop
+                self._call_in_loop(self.failed, as_exception(error))
+            finally:
+                self._done += 1
 
     def _call_in_loop(self, function: Callable[[Any], object], value: object) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed

@@ -14,7 +14,9 @@ from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.sample import Sample, Source
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.publish import PublisherCache, TxStream
+from r2p.transports.zenoh.session import _in_thread
 from r2p.transports.zenoh.threads import MANY_TOKENS, WAITING_MAX_URGENT, OutboundThread
+from tests.transports.cables import GUARD
 from tests.transports.zenoh.test_publish import ORIGIN
 
 pytestmark = pytest.mark.anyio
@@ -125,6 +127,34 @@ async def test_what_fails_in_the_thread_is_told_and_the_next_call_is_made() -> N
     assert await answer is None
     await asyncio.to_thread(out.finish)
     assert busy.calls == ["next"]
+
+
+class Panic(BaseException):
+    """As pyo3's PanicException, which is no Exception either."""
+
+
+def panic() -> None:
+    raise Panic("poisoned")
+
+
+async def test_a_panic_of_zenoh_does_not_end_the_thread() -> None:
+    out, busy = outbound(), Busy()
+    failed: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
+    out.failed = failed.set_result
+    busy.free.set()
+    out.set_token_count(MANY_TOKENS)
+    out.call(panic)
+    out.call(busy.call, "next")
+    async with asyncio.timeout(GUARD):
+        assert str(await failed) == "Panic: poisoned"
+        await asyncio.to_thread(out.finish)
+    assert (busy.calls, out.waiting) == (["next"], 0)
+
+
+async def test_a_panic_of_zenoh_is_raised_where_its_result_is_awaited() -> None:
+    async with asyncio.timeout(GUARD):
+        with pytest.raises(RuntimeError, match="Panic: poisoned"):
+            await _in_thread(panic)
 
 
 async def test_it_takes_half_the_crowd_to_go_back() -> None:
