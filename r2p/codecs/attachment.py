@@ -60,7 +60,8 @@ _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
 _NAMES = re.compile(rf"((?:{MODULE_PATH})?)/([A-Za-z0-9_]{{0,8}})".encode())
 _MODULE = re.compile(MODULE_PATH)
 _CLASSES = (1, 2, 3)
-_REMEMBERED_MAX = 4096  # origins that a reader keeps
+_REMEMBERED_MAX = 4096  # origins that a reader keeps; an even number
+_SHOWN_MAX = 40  # bytes of a wrong name that an error shows
 
 
 class ClockOffset(msgspec.Struct, frozen=True, gc=False):
@@ -148,8 +149,19 @@ class HeaderReader(Generic[T]):
 
     def __init__(self, remember: Callable[[Origin], T]) -> None:
         self._make = remember
-        self.known: dict[bytes, T] = {}
-        """By the bytes of the origin."""
+        self._recent: dict[bytes, T] = {}
+        """By the bytes of the origin, those that were new or used since `_older` was replaced."""
+        self._older: dict[bytes, T] = {}
+
+    @property
+    def known(self) -> dict[bytes, T]:
+        """What is remembered, by the bytes of the origin: a copy."""
+        return self._older | self._recent
+
+    def forget(self, key: bytes) -> None:
+        """Forget an origin: `remember` is called again should it come back."""
+        self._recent.pop(key, None)
+        self._older.pop(key, None)
 
     def read(self, data: bytes) -> tuple[T, int, int, tuple[int, ...], int, int, bool, ClockOffset | None]:
         """Return the result of `remember` for the origin, serial and sequence of the first message, the stamps of all,
@@ -164,7 +176,7 @@ class HeaderReader(Generic[T]):
         if version != VERSION:
             raise UnknownType(f"version {version} of the header")
         if len(data) < _FIXED.size:
-            raise DecodeError(f"a header of {len(data)} bytes")
+            raise DecodeError(f"header too short: {len(data)} bytes, at least {_FIXED.size} needed")
         at = _FIXED.size
         clock = None
         if flags & FLAG_CLOCK:
@@ -179,16 +191,20 @@ class HeaderReader(Generic[T]):
         if sequence + more > _SEQUENCE_MAX:
             raise DecodeError("the sequence ends in this packet")
         tail = data[at:]  # the key of what is known: the origin of a known publisher is not decoded again
-        known = self.known.get(tail)
+        known = self._recent.get(tail)
         if known is None:
             known = self._remember(tail)
         return known, serial, sequence, stamps, deadline, hops, not flags & FLAG_RESTAMPED, clock
 
     def _remember(self, tail: bytes) -> T:
-        origin = _decode_origin(tail)
-        if len(self.known) >= _REMEMBERED_MAX:
-            self.known.clear()  # forged origins can fill it; those in use are decoded once more
-        known = self.known[tail] = self._make(origin)
+        known = self._older.pop(tail, None)
+        if known is None:
+            known = self._make(_decode_origin(tail))
+        if len(self._recent) >= _REMEMBERED_MAX // 2:
+            # Forged origins can fill both. An origin that is evicted loses what recognises duplicates of its messages,
+            # so it must not be one in use: only one that did not come while 2048 others did.
+            self._older, self._recent = self._recent, {}
+        self._recent[tail] = known
         return known
 
 
@@ -220,10 +236,11 @@ def encode_credit(credit: Credit) -> bytes:
 
 def decode_credit(data: bytes) -> Credit:
     """Decode a credit. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
-    if data[:1] != bytes((VERSION,)):
-        raise UnknownType(f"version {data[:1]!r} of a credit")
+    _check_version(data, "credit")
+    if len(data) < _CREDIT.size:
+        raise DecodeError(f"credit too short: {len(data)} bytes, at least {_CREDIT.size + 1} needed")
     if _TOPIC.fullmatch(data, _CREDIT.size) is None:
-        raise DecodeError("a credit for no topic")
+        raise DecodeError(f"credit for {data[_CREDIT.size :][:_SHOWN_MAX]!r}, which is not a valid topic")
     _, publisher_class, session, serial = _CREDIT.unpack_from(data)
     leaving = bool(publisher_class & _LEAVING)
     return Credit(session, publisher_class & ~_LEAVING, serial, data[_CREDIT.size :].decode(), leaving)
@@ -236,10 +253,9 @@ def encode_sender(session: int) -> bytes:
 
 def decode_sender(data: bytes) -> int:
     """Return the session. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
-    if data[:1] not in (b"", bytes((VERSION,))):
-        raise UnknownType(f"version {data[:1]!r} of a sender")
+    _check_version(data, "sender")
     if len(data) != _SENDER.size:
-        raise DecodeError(f"a sender of {len(data)} bytes")
+        raise DecodeError(f"sender of {len(data)} bytes, {_SENDER.size} needed")
     session: int = _SENDER.unpack(data)[1]
     return session
 
@@ -250,6 +266,11 @@ def name_for(module: str) -> str:
         if len(name) <= MODULE_PATH_MAX and _MODULE.fullmatch(name):
             return name
     return ""
+
+
+def _check_version(data: bytes, what: str) -> None:
+    if data and data[0] != VERSION:  # without any bytes it is too short, of whatever version
+        raise UnknownType(f"version {data[0]} of the {what}")
 
 
 def _itself(origin: Origin) -> Origin:
@@ -279,8 +300,8 @@ def _encode_origin(origin: Origin) -> bytes:
 def _decode_origin(data: bytes) -> Origin:
     names = _NAMES.fullmatch(data, _ORIGIN.size)
     if names is None or len(names[1]) > MODULE_PATH_MAX:
-        raise DecodeError("the header ends in no `module/node`")
+        raise DecodeError(f"header ends in {data[_ORIGIN.size :][:_SHOWN_MAX]!r}, which is not a valid `module/node`")
     publisher_class, sender, instance, fingerprint = _ORIGIN.unpack_from(data)
     if publisher_class not in _CLASSES:
-        raise DecodeError(f"no class has the number {publisher_class}")
+        raise DecodeError(f"{publisher_class} is not a publisher class")
     return Origin(publisher_class, sender, instance, fingerprint, names[1].decode(), names[2].decode())

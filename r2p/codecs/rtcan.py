@@ -85,7 +85,8 @@ class Sync(msgspec.Struct, frozen=True, gc=False):
 def encode_identifier(laxity: int, message: int, left: int = 0) -> int:
     """The identifier of a frame. Raises `MessageError` when a part does not fit its field."""
     if not (0 <= laxity <= NRT and 0 <= message <= MESSAGE_MAX and 0 <= left <= LEFT_MASK):
-        raise MessageError(f"laxity {laxity}, message id {message:#x}, {left} fragments left: no identifier has room")
+        parts = f"laxity {laxity} (0..{NRT}), message id {message:#x} (0..{MESSAGE_MAX:#x})"
+        raise MessageError(f"does not fit the identifier: {parts}, {left} fragments left (0..{LEFT_MASK})")
     return laxity << LAXITY_SHIFT | message << MESSAGE_SHIFT | left
 
 
@@ -226,7 +227,7 @@ def other_frame_bits(frame: OtherFrame) -> int:
     if frame.remote is None:
         return frame_bits(frame.id, frame.data, extended=frame.extended)
     if frame.id >> (IDENTIFIER_BITS if frame.extended else 11) or not 0 <= frame.remote <= 0xF:
-        raise MessageError(f"identifier {frame.id:#x}, {frame.remote} bytes asked for: no frame has room")
+        raise MessageError(f"does not fit a frame: identifier {frame.id:#x}, {frame.remote} bytes asked for (0..15)")
     bits = (_arbitration(frame.id) if frame.extended else frame.id) << 7 | _REMOTE | frame.remote
     count = (_HEADER if frame.extended else _STANDARD_HEADER) + _CRC
     return count + (_stuff(_START, bits << _CRC | _crc(bits.to_bytes(5, "big")), count) >> 3) + TAIL
@@ -283,8 +284,10 @@ def _stuffed(bits: int, count: int) -> int:
 @lru_cache(maxsize=4096)
 def _header(identifier: int, size: int, extended: bool) -> tuple[_Row, int, int]:
     """What the bits before the data leave: state of the stuffing, CRC as if all data were 0, bits so far."""
-    if identifier >> (IDENTIFIER_BITS if extended else 11) or size > FRAME_MAX:
-        raise MessageError(f"identifier {identifier:#x} with {size} bytes: no frame has room")
+    width = IDENTIFIER_BITS if extended else 11
+    if identifier >> width or size > FRAME_MAX:
+        parts = f"identifier {identifier:#x} ({width} bits), {size} bytes (0..{FRAME_MAX})"
+        raise MessageError(f"does not fit a frame: {parts}")
     bits = _arbitration(identifier) << 7 | size if extended else identifier << 7 | size
     count = _HEADER if extended else _STANDARD_HEADER
     step = _stuff(_START, bits, count)

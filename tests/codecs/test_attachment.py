@@ -1,5 +1,7 @@
 """The header of messages on zenoh."""
 
+from collections.abc import Callable
+
 import msgspec
 import pytest
 from hypothesis import given
@@ -126,6 +128,28 @@ def test_a_liar_does_not_fill_the_memory() -> None:
     assert len(reader.known) < 4097
 
 
+def test_an_origin_in_use_is_not_forgotten_when_many_others_come() -> None:
+    """With it the serial, the sequence and the stamp of its last message would go, and duplicates would pass."""
+    made: list[Origin] = []
+
+    def remember(origin: Origin) -> int:
+        made.append(origin)
+        return len(made)
+
+    reader = HeaderReader(remember)
+    data = attachment.encode(HEADER)
+    for sender in range(10_000):
+        origin = msgspec.structs.replace(ORIGIN, sender=sender)
+        reader.read(attachment.encode(msgspec.structs.replace(HEADER, origin=origin)))
+        if sender % 1000 == 0:
+            reader.read(data)
+    reader.read(data)
+    assert made.count(ORIGIN) == 1
+    for key in reader.known:
+        reader.forget(key)
+    assert not reader.known
+
+
 @given(st.binary(max_size=120))
 def test_any_bytes_are_a_header_or_counted(data: bytes) -> None:
     try:
@@ -170,7 +194,7 @@ def test_names_that_are_none(tail: bytes) -> None:
 
 def test_a_class_that_does_not_exist() -> None:
     header = msgspec.structs.replace(HEADER, origin=msgspec.structs.replace(ORIGIN, publisher_class=4))
-    with pytest.raises(DecodeError, match="class"):
+    with pytest.raises(DecodeError, match="4 is not a publisher class"):
         attachment.decode(attachment.encode(header))
 
 
@@ -179,6 +203,30 @@ def test_a_class_that_does_not_exist() -> None:
 )
 def test_credits(credit: Credit) -> None:
     assert attachment.decode_credit(attachment.encode_credit(credit)) == credit
+
+
+@pytest.mark.parametrize("decode", [attachment.decode, attachment.decode_credit, attachment.decode_sender])
+def test_without_bytes_there_is_no_version_to_ignore(decode: Callable[[bytes], object]) -> None:
+    with pytest.raises(DecodeError) as caught:
+        decode(b"")
+    assert caught.type is DecodeError
+    with pytest.raises(UnknownType, match="version 2"):
+        decode(b"\2")
+
+
+@pytest.mark.parametrize(
+    ("decode", "data", "text"),
+    [
+        (attachment.decode, b"\1" * 7, "header too short: 7 bytes, at least 32 needed"),
+        (attachment.decode_credit, b"\1" * 7, "credit too short: 7 bytes, at least 11 needed"),
+        (attachment.decode_credit, b"\1" * 10 + b"a b", "credit for b'a b', which is not a valid topic"),
+        (attachment.decode_sender, b"\1" * 7, "sender of 7 bytes, 5 needed"),
+    ],
+)
+def test_an_error_says_what_is_wrong(decode: Callable[[bytes], object], data: bytes, text: str) -> None:
+    with pytest.raises(DecodeError) as caught:
+        decode(data)
+    assert str(caught.value) == text
 
 
 @given(st.binary(max_size=7) | st.integers(0, 2**32 - 1).map(attachment.encode_sender))

@@ -114,9 +114,9 @@ class RxStream:
         if sender in self.senders:
             self.senders.discard(sender)
             self.topic.remote_publishers -= 1
-            known = self._headers.known
-            for key in [key for key, publisher in known.items() if publisher.origin.sender == sender]:
-                del known[key]
+            for key, publisher in self._headers.known.items():
+                if publisher.origin.sender == sender:
+                    self._headers.forget(key)
         for (session, _), window in self.windows.items():
             if session == sender:
                 window.restart()
