@@ -15,7 +15,9 @@ import contextlib
 from array import array
 from bisect import bisect_right
 from collections import deque
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import msgspec
 
 from r2p.codecs import debug
 from r2p.codecs.management import FLAG_BOOT, ROLE_PUBLISHES
@@ -103,6 +105,17 @@ class Connection(Carrier):
         await self.ended.wait()
 
 
+class _NewStamp(msgspec.Struct, frozen=True, gc=False):
+    """Stands among the lines that wait to be delivered: those behind it came in at `received_at` (UTC, ns).
+
+    Bytes hardly ever come while lines wait, so a mark before them is cheaper than a stamp on each line.
+    """
+
+    received_at: int
+    topic: bytes = b""  # no line has an empty topic, so `BufferedLink` leaves the mark to `receive_other`
+    data: bytes = b""
+
+
 class LineLink(BufferedLink):
     """A link over the debug line.
 
@@ -121,7 +134,7 @@ class LineLink(BufferedLink):
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
         self._publishers = PublisherLookup(self.discovery, self.name)
         self._received_at = 0
-        """When the bytes that are being read came in (UTC, ns)."""
+        """When the bytes of the line that is delivered next came in (UTC, ns)."""
         self._carrier: Carrier | None = None
         self._urgent: deque[bytes] = deque()
         self._management: deque[bytes] = deque()
@@ -172,12 +185,16 @@ class LineLink(BufferedLink):
     def fed(self, data: bytes | memoryview) -> None:
         """Bytes came in."""
         self.stats.bytes_received += len(data)
-        self._received_at = self._clock.now()
+        received_at = self._clock.now()
         try:
             lines = self._reader.feed(bytes(data))
         except Exception as error:  # noqa: BLE001 - counted and logged; the other lines follow
             self.stats.lost.internal_error(error)
             lines = self._readable_lines(bytes(data))
+        if self._arrivals:  # lines of an earlier connection, say: they keep their stamp
+            self.receive([_NewStamp(received_at)])
+        else:
+            self._received_at = received_at
         self.receive(lines)
 
     def _readable_lines(self, data: bytes) -> list[debug.Line]:
@@ -255,6 +272,12 @@ class LineLink(BufferedLink):
 
     def sample(self, topic: str, arrival: debug.Line) -> Sample:
         return Sample(arrival.data, self._publishers.source_of(topic), self._received_at, stamped=False)
+
+    def receive_other(self, arrival: Any) -> None:
+        if isinstance(arrival, _NewStamp):
+            self._received_at = arrival.received_at
+        else:
+            super().receive_other(arrival)
 
     def discard(self) -> int:
         discarded = len(self._samples)

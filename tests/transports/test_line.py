@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -646,3 +647,25 @@ async def test_a_flood_of_conflicts_does_not_fill_the_log(caplog: pytest.LogCapt
                 script.hear(manage(m.Hello(f"M{number}", 2 * number + swap % 2 + 1, 0, 0, 5000)))
         assert caplog.text.count("two modules carry the name") == 10
         assert script.link.losses["conflicts not told"] >= 136
+
+
+async def test_lines_that_wait_keep_the_stamp_of_their_reception(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new connection reads while lines of the old one are still being delivered."""
+    monkeypatch.setattr("r2p.transports.buffered_link.MESSAGES_PER_TURN", 1)
+    async with scripted() as (script, _, node):
+        subscriber = node.subscribe("leds", Led)
+        link, message = script.link, line("leds", Led().encode())
+        link.fed(manage(m.SubscribeResponse("leds", 5, 1)))
+        await asyncio.sleep(0.1)
+        received_at = link._clock.now()
+        link.fed(3 * message)
+        link.disconnected("pulled")
+        link.connected(script)
+        clock = SimpleNamespace(now=lambda: received_at + 1, monotonic=link._clock.monotonic)
+        monkeypatch.setattr(link, "_clock", clock)
+        link.fed(2 * message)
+        await asyncio.sleep(0.1)
+        assert [sample.stamp - received_at for sample in subscriber._sink.queue] == [0, 0, 0, 1, 1]
+        link.fed(message)
+        assert subscriber._sink.queue[-1].stamp == received_at + 1
+        assert link.losses == {}
