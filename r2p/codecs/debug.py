@@ -20,6 +20,12 @@ from r2p.names import TOPIC_MAX
 
 PAYLOAD_MAX = 255
 
+OPENING = b"\r\n\r\n"
+"""Ends whatever the reader at the other end has begun to read: the first bytes on a line."""
+
+NO_DEADLINE = 0x7FFFFFFF
+"""Microseconds after the stamp, where a message has no deadline: as firmware does it."""
+
 _HEX = b"0123456789ABCDEFabcdef"
 _PRINTABLE = bytes(range(0x20, 0x7F))
 _LINE_END = b"\r\n"

@@ -39,13 +39,9 @@ if TYPE_CHECKING:
 BUFFER = 64 * 1024
 """Bytes that wait for a connection that takes no more, before its publishers have to wait or lose."""
 
-OPENING = b"\r\n\r\n"
-"""Ends whatever the reader at the other end has begun to read."""
-
 _MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
 _MOST_URGENT = 96  # urgent messages that wait, whatever else does: another 8 KiB
 _CLOSING = 0.5  # seconds for the other end to read what is still buffered
-_NO_DEADLINE = 0x7FFFFFFF  # us after the stamp, where there is none: as firmware does it
 _MANAGEMENT = MANAGEMENT.encode()
 _NRT = PublisherClass.NON_REAL_TIME
 
@@ -169,7 +165,7 @@ class LineLink(BufferedLink):
         self._reader = debug.Reader(self.stats.lost)
         self._unconfirmed = UnconfirmedBytes()
         self._messages_given = self.stats.sent
-        self._send(OPENING)
+        self._send(debug.OPENING)
         if self._carrier is carrier:  # else it broke at the first bytes
             self._begin_grace()
             self.on_up()
@@ -234,7 +230,7 @@ class LineLink(BufferedLink):
 
     def write(self, topic: str, sample: Sample) -> None:
         due = sample.expires or sample.deadline
-        deadline = due // 1000 if due else sample.stamp // 1000 + _NO_DEADLINE
+        deadline = due // 1000 if due else sample.stamp // 1000 + debug.NO_DEADLINE
         try:
             encode = self._encoders[topic]
         except KeyError:
@@ -262,7 +258,7 @@ class LineLink(BufferedLink):
         if len(self._urgent) >= _MOST_URGENT if urgent else self._waiting >= self._limit + _MANAGEMENT_BUFFER:
             self.stats.lost["management, send buffer full"] += 1
             return
-        deadline = self._clock.now() // 1000 + _NO_DEADLINE
+        deadline = self._clock.now() // 1000 + debug.NO_DEADLINE
         line = debug.encode(_MANAGEMENT, data, deadline)
         if not (self._corked or self._blocked):
             self._send_at_once(line)

@@ -30,8 +30,6 @@ _FIRST_STEP = 496 * MILLISECOND  # from power on to the first step of repetition
 _STEP = 528 * MILLISECOND  # between two steps on a silent line
 _STEP_AFTER_TRAFFIC = 500 * MILLISECOND  # ... and if a management message came in between
 _QUIET = 33 * MILLISECOND  # without management messages before a step
-_MARKER = b"\r\n\r\n"
-_NO_DEADLINE = 0x7FFFFFFF  # us: what firmware puts into a line for "no deadline"
 _RESPONSE_DELAY = 50 * MILLISECOND  # until a response takes effect: its management thread has the lowest priority
 
 HEAP = 20_000
@@ -191,7 +189,7 @@ class FirmwareModule:
         for subscriber in self._subscribers.values():
             subscriber.opened_at = None
             subscriber.responses = 0
-        self._out.append(_MARKER)
+        self._out.append(debug.OPENING)
         self._send(now, management.Alive(self.name, flags))
         self._nodes_at = now + _NODES
         self._stepped = now
@@ -354,7 +352,7 @@ class FirmwareModule:
         self._out.append(debug.encode(MANAGEMENT.encode(), message, self._deadline(now)))
 
     def _deadline(self, now: int) -> int:
-        return (now - self._booted) // 1000 + _NO_DEADLINE
+        return (now - self._booted) // 1000 + debug.NO_DEADLINE
 
     def _drain(self) -> bytes:
         data = b"".join(self._out)
