@@ -1,8 +1,8 @@
 """The mesh of gateways and the spanning tree in it, worked out from who hears whom.
 
 A network (bus, zenoh network, line) has no name of its own: it is the set of gateway ports that hear each other. Only
-what both sides say counts. The functions here are pure; `MeshMap` keeps what one gateway knows, as the others tell by
-MESH, and what follows from that.
+what both sides say counts. The functions here are pure; `MeshMap` keeps what one gateway knows from the MESH of others,
+and what follows from that.
 """
 
 from collections import defaultdict, deque
@@ -33,14 +33,14 @@ Edge = tuple[PortId, PortId]
 _UNFINISHED = 64  # records of which parts are missing: forged, or of gateways that died in the middle
 
 MOST_HEARD = MESH_HEARD * PARTS_MAX
-"""Adjacencies that a gateway can announce; with more it can't agree with any other one, and forwards nothing."""
+"""Adjacencies that a gateway can announce. One with more could not agree with any other, and would not forward."""
 
 MOST_RECORDS = 256
-"""Gateways of which it is kept whom they hear."""
+"""Gateways of which a record is kept: whom each one hears."""
 CHANGES = 100
 """Changes that one gateway may announce in a row ..."""
 CHANGE_FORGIVEN = 5_000_000_000
-"""... and ns until it may announce one more: a new mesh each time would keep all others from agreeing."""
+"""... and ns until it may announce one more. One that always changes would keep all others from agreeing."""
 
 _KEPT = 5_000_000_000  # ns for which the record of a gateway outside the mesh is kept without being repeated
 
@@ -49,7 +49,7 @@ _KEPT = 5_000_000_000  # ns for which the record of a gateway outside the mesh i
 
 
 def mesh_messages(gateway: int, serial: int, heard: Iterable[Adjacency]) -> list[Mesh]:
-    """The messages that announce whom a gateway hears."""
+    """Make the messages that announce whom a gateway hears."""
     adjacencies = sorted(heard)[:MOST_HEARD]
     pieces = [adjacencies[at : at + MESH_HEARD] for at in range(0, len(adjacencies), MESH_HEARD)] or [[]]
     last = len(pieces) - 1
@@ -57,13 +57,13 @@ def mesh_messages(gateway: int, serial: int, heard: Iterable[Adjacency]) -> list
 
 
 class MeshAssembler:
-    """Puts the parts of MESH messages together."""
+    """The parts of MESH messages that are not complete yet."""
 
     def __init__(self) -> None:
         self._pieces: dict[tuple[int, int], dict[int, frozenset[Adjacency]]] = {}
 
     def add(self, message: Mesh) -> frozenset[Adjacency] | None:
-        """Whom the gateway hears, once all parts with this serial are there."""
+        """Enter a part; return whom the gateway hears once all parts with this serial are there."""
         key = (message.gateway, message.serial)
         pieces = self._pieces.setdefault(key, {})
         pieces[message.number] = frozenset(decode_heard(message.heard))
@@ -79,7 +79,7 @@ class MeshAssembler:
 
 
 def edges_from(gateway: int, heard: Mapping[int, Iterable[Adjacency]]) -> frozenset[Edge]:
-    """What both sides hear, as far as it is connected with `gateway`."""
+    """The pairs of ports that hear each other, in the part of the network that `gateway` is connected with."""
     mutual: dict[int, list[Edge]] = defaultdict(list)
     for here, adjacencies in heard.items():
         for port, there, its_port in adjacencies:
@@ -95,7 +95,7 @@ def edges_from(gateway: int, heard: Mapping[int, Iterable[Adjacency]]) -> frozen
 
 
 def spanning_tree(edges: Iterable[Edge]) -> frozenset[PortId]:
-    """The ports that forward: breadth first from the lowest gateway, each network and each gateway reached once."""
+    """The ports that forward: a breadth-first search from the lowest gateway reaches each network and gateway once."""
     networks = _networks(edges)
     ports: dict[int, list[PortId]] = defaultdict(list)
     for port in sorted(networks):  # every gateway must come to the same tree: nothing may depend on the order of a set
@@ -130,7 +130,7 @@ def _networks(edges: Iterable[Edge]) -> dict[PortId, set[PortId]]:
 
 
 def digest(*things: object) -> int:
-    """32 bits that tell two values apart."""
+    """A hash of 32 bits."""
     return int.from_bytes(blake2b(repr(things).encode(), digest_size=4).digest(), "little")
 
 
@@ -167,13 +167,13 @@ class MeshMap:
         self._expire_at = 0
 
     def others(self, turn: int, most: int) -> list[int]:
-        """Gateways of the mesh that have announced whom they hear: `most` of them, others each turn."""
+        """Up to `most` gateways of the mesh that have announced whom they hear; other ones each `turn`."""
         known = [gateway for gateway in self._records if self.concerns(gateway)]
         start = turn * most % len(known) if len(known) > most else 0
         return [*known[start:], *known[:start]][:most]
 
     def concerns(self, gateway: int) -> bool:
-        """Whether a gateway is in the mesh, or is heard by one that is: all others may be forged."""
+        """Whether a gateway is in the mesh, or a member hears it. Any other may be forged."""
         return gateway in self.members or gateway in self._heard_by_members
 
     def forwards(self, port: PortId) -> bool:
@@ -181,7 +181,7 @@ class MeshMap:
         return port in self._forwarding
 
     def set_heard(self, heard: frozenset[Adjacency]) -> bool:
-        """Enter whom this gateway hears now; says whether that has changed."""
+        """Enter whom this gateway hears now; return whether that has changed."""
         if heard == self._heard:
             return False
         self._heard = heard
@@ -190,7 +190,7 @@ class MeshMap:
         return True
 
     def receive(self, now: int, message: Mesh) -> bool:
-        """Enter what another gateway announces; says whether that is new, and complete."""
+        """Enter what another gateway announces; return whether it is new, and complete."""
         known = self._records.get(message.gateway)
         if known is not None and not is_newer_serial(message.serial, known.serial):
             known.updated_at = now
@@ -207,7 +207,7 @@ class MeshMap:
         return True
 
     def _record(self, now: int, gateway: int, known: _GatewayRecord | None) -> _GatewayRecord | None:
-        """The record in which to enter what a gateway announces; None: it has to wait."""
+        """Return the record of a gateway that announces a change; None if there is no room, or it changes too often."""
         if known is None:
             if len(self._records) >= MOST_RECORDS and not self._make_room(gateway):
                 return None
@@ -218,7 +218,7 @@ class MeshMap:
         return known if known.changes < CHANGES else None
 
     def _make_room(self, gateway: int) -> bool:
-        """Forget a gateway that does not concern us for one that does."""
+        """Make room for a gateway that concerns this one, by forgetting one that does not; False: there is no room."""
         if not self.concerns(gateway):
             return False
         idle = next((each for each in self._records if not self.concerns(each)), None)
@@ -235,7 +235,7 @@ class MeshMap:
                     del self._records[gateway]
 
     def messages(self, gateway: int) -> list[Mesh]:
-        """The messages that announce whom a gateway hears: this one, or one of the others."""
+        """Make the messages that announce whom this gateway hears, or another one of which there is a record."""
         if gateway == self._gateway:
             return mesh_messages(gateway, self._serial, self._heard)
         record = self._records[gateway]

@@ -131,7 +131,7 @@ class Neighbour(msgspec.Struct):
 
 
 class SentMessages:
-    """Numbers the messages of one sender, and remembers for a lease when each was sent."""
+    """The messages of one sender: gives each a number, and remembers for a lease when it was sent."""
 
     def __init__(self, sender: int) -> None:
         self.count = 0
@@ -148,7 +148,7 @@ class SentMessages:
         return self.count
 
     def acked_at(self, acks: bytes) -> int:
-        """When the message was sent that these acknowledge; 0: none of this sender that still counts."""
+        """When the message was sent that `acks` acknowledge; 0 if they name none, or one older than a lease."""
         for sender, count in decode_acks(acks):
             if sender == self._sender:
                 return next((at for each, at in reversed(self._sent) if each == count), 0)
@@ -160,12 +160,15 @@ def is_late(count: int, last: int) -> bool:
     return count != last and not is_newer_serial(count, last)
 
 
-def pack_acks(heard: Mapping[PortId, Neighbour], each: int) -> list[bytes]:
-    """The last message of each of these senders, `each` of them in one message of ours."""
+def pack_acks(heard: Mapping[PortId, Neighbour], places: int) -> list[bytes]:
+    """Acknowledge the last message of each sender in `heard`: the `acks` of as many messages as are needed.
+
+    One message has `places` for acknowledgements; there is always at least one message, even with none to send.
+    """
     latest = sorted(heard.items(), key=lambda item: item[1].heard_at)  # of several ports of a sender the last one heard
     acks = list({sender: neighbour.count for (sender, _), neighbour in latest}.items())
-    starts = range(0, max(len(acks), 1), each)
-    return [encode_acks(acks[at : at + each], each) for at in starts]
+    starts = range(0, max(len(acks), 1), places)
+    return [encode_acks(acks[at : at + places], places) for at in starts]
 
 
 # Ports
@@ -174,13 +177,14 @@ def pack_acks(heard: Mapping[PortId, Neighbour], each: int) -> list[bytes]:
 class TreePort(msgspec.Struct, eq=False):
     """A port of this gateway: what was heard at it, and what follows.
 
-    `forwards_until`: data may pass before this instant (monotonic ns). `in_tree`: whether it does, has done, or will
-    soon do so; demand travels by that. `neighbours` and `leaves` are the gateways and the modules with several links
-    that were heard on its network. `echoes`: it gives back what we send. `leaves_ready_since`: since when all `leaves`
-    know our root. `private`: a connection whose other end stays the same while it is up, so that no gateway can come
-    unheard, and no lease is needed while there is none. `resumes`: it was alone, and listens anew only because this
-    program stood still. `flaps`: how many neighbours have gone, `flapped_at` when that was counted. `lost` counts
-    messages of other gateways that were ignored, by reason.
+    `forwards_until`: data may pass before this instant (monotonic ns). `in_tree`: whether data passes, has passed until
+    the gateways began to converge, or will pass when they agree for SETTLE; demand travels where it is True.
+    `neighbours` and `leaves` are the gateways and the modules with several links that were heard on its network.
+    `echoes`: its link gives back what this gateway sends. `leaves_ready_since`: since when all `leaves` know the root.
+    `private`: a connection whose other end stays the same while it is up. No gateway can join it unheard, so it needs
+    no lease while there is none. `resumes`: it was ALONE, and listens anew only because this program stood still.
+    `flaps`: how many neighbours have gone, `flapped_at`: when that was counted. `lost` counts messages of other
+    gateways that were ignored, by reason.
     """
 
     number: int
@@ -215,10 +219,10 @@ class TreePort(msgspec.Struct, eq=False):
         self.send_at = min(self.send_at, max(now, self.sent_at + APART))
 
     def receive_leaf(self, now: int, message: Leaf, gateway: int, acked_at: int, rooted_at: int) -> bool:
-        """Enter what a module with several links says to this `gateway`; False: nothing changes.
+        """Enter a LEAF that came in at a port of this `gateway`; False: nothing changes.
 
-        `acked_at` is the instant of our message that it acknowledges, `rooted_at` that since when our root is what it
-        is. The module counts from when it knows our root, and has an answer at once: it waits for our consent.
+        `acked_at` is when the message was sent that it acknowledges, `rooted_at` when this gateway's root last changed.
+        The module is entered once it knows this root. It is answered at once: it waits for the gateway's consent.
         """
         leaf_id = (message.module, message.port)
         leaf = self.leaves.get(leaf_id)
@@ -237,7 +241,7 @@ class TreePort(msgspec.Struct, eq=False):
         return True
 
     def expire_leaves(self, now: int) -> None:
-        """Forget the modules that have been silent."""
+        """Forget modules that were silent for DEAD."""
         if any(now - each.heard_at >= DEAD for each in self.leaves.values()):
             self.leaves = {leaf_id: each for leaf_id, each in self.leaves.items() if now - each.heard_at < DEAD}
 
@@ -247,18 +251,18 @@ class TreePort(msgspec.Struct, eq=False):
             leaf.heard_at = now
 
     def invalidate_leaves(self, at: int) -> None:
-        """What the modules know of our root is wrong: nothing passes before they know better, or are gone."""
+        """Let nothing pass until the modules have acknowledged the new root, or are gone; send it `at` that instant."""
         self.leaves_ready_since = None
         self.send_at = at
 
     def check_leaves(self, now: int, rooted_at: int) -> None:
-        """See whether all modules know our root by now."""
+        """Note the instant from which on all modules know our root."""
         if self.leaves_ready_since is None and all(each.acked_at >= rooted_at for each in self.leaves.values()):
             self.leaves_ready_since = now
 
 
 def _may_hear(message: Leaf, gateway: int) -> bool:
-    """Whether the module hears the gateway, or may: one that does not has no consent of it any more."""
+    """Whether the module may hear the gateway. One that does not has lost its consent, and need not be waited for."""
     names = [name for name, _ in decode_acks(message.acks)]
     return gateway in names or 0 not in names  # with no free entry it may be one of those that did not fit
 
@@ -288,7 +292,7 @@ class ClientPorts:
         self._with_leaves: dict[int, TreePort] = {}
 
     def open(self, now: int, number: int) -> TreePort:
-        """A client has connected; `number` is FIRST_CLIENT or more."""
+        """Add a port for a client that connected; `number` is FIRST_CLIENT or more."""
         port = TreePort(number, now, private=True)
         if not self.ports:  # nothing was due while there were no clients
             self._send_at = now + TICK_ALONE
@@ -298,7 +302,7 @@ class ClientPorts:
         return port
 
     def close(self, number: int) -> None:
-        """The client's connection has ended."""
+        """Remove the port of a client whose connection ended."""
         port = self.ports.pop(number, None)
         if port is None:
             return
@@ -308,14 +312,14 @@ class ClientPorts:
         port.forwards_until = 0
 
     def refuse(self, port: TreePort, state: PortState) -> None:
-        """Let nothing pass: it is a gateway. `state` is REFUSED, or LOOP for one of firmware."""
+        """Let nothing pass for a client that is a gateway. `state` is REFUSED, or LOOP for a gateway of firmware."""
         if port.state not in _REFUSED:
             self._with_leaves.pop(port.number, None)
             port.leaves = {}
             self._set_state(port, state)
 
     def receive_leaf(self, now: int, port: TreePort, message: Leaf) -> None:
-        """A client has sent LEAF."""
+        """Enter a LEAF that came in from a client."""
         if not message.module or port.state in _REFUSED:
             return
         self._with_leaves[port.number] = port
@@ -323,7 +327,7 @@ class ClientPorts:
         self._update(now, port)
 
     def set_root(self, at: int, root: int) -> None:
-        """What clients know of our root is wrong from `at` on."""
+        """Announce another root from `at` on: nothing passes to modules with several links before they know it."""
         self._root, self._rooted_at = root, at
         for port in self._with_leaves.values():
             if port.leaves:
@@ -331,7 +335,7 @@ class ClientPorts:
                 self._update(at, port)
 
     def poll(self, now: int) -> None:
-        """Send what is due, and forget the modules that have been silent."""
+        """Send what is due, and forget modules that were silent for DEAD."""
         stood_still = now - self._polled_at > LEASE
         self._polled_at = now
         while self._listening and now >= self._listening[0].opened_at + LISTEN:
@@ -382,7 +386,7 @@ class ClientPorts:
             self._actions.append(PortChanged(port.number))
 
     def _send_bridge(self, now: int, port: TreePort) -> None:
-        """To one client, with acknowledgements for its modules."""
+        """Send BRIDGE to one client, with acknowledgements for its modules."""
         for packed in pack_acks(port.leaves, BRIDGE_ACKS):
             self._actions.append(SendToPort(port.number, self._bridge(now, packed)))
         port.sent_at = now

@@ -3,11 +3,20 @@
 `SpanningTree` receives BRIDGE, MESH and LEAF at each port and sends its own; `TreePort.forwards_until` is the instant
 before which data may pass. A gateway that was stopped for a while finds it in the past before it does anything else.
 
-    LISTENING --LISTEN--> ALONE                       no other gateway is on this network: forwards
-        |                   |
-        +--another is heard-+--> CONVERGING --all agree--> BLOCKED          not in the tree
-                                     |
-                                     +--all agree, SETTLE--> FORWARDING     in the tree, by leases
+A port's state follows from what is known now, not from the state before. Of these the first one that applies counts:
+
+    LOOP         a probe shows a loop through a gateway that sends no BRIDGE, and this port is the one that yields
+    LISTENING    the port is open for less than LISTEN: other gateways may be there that were not heard yet
+    CONVERGING   for less than SETTLE, all modules that send LEAF here know this gateway's root; or some do not yet
+    ALONE        no other gateway is on this network                                  forwards
+    CONVERGING   gateways on this network have not acknowledged the same mesh
+    BLOCKED      they have, and the tree does not contain the port
+    CONVERGING   they have, the tree contains the port, for less than SETTLE
+    FORWARDING   they have, the tree contains the port, for SETTLE or longer          forwards until a lease runs out
+
+So nearly any state can follow any other: a port that hears its first gateway goes from ALONE to CONVERGING, and back
+when the last one is silent. After a time in which the program stood still, ports are LISTENING again. REFUSED is set by
+the owner of the ports, for those beyond MOST_PORTS and for clients that turn out to be gateways (`ClientPorts`).
 
 The timings fit together: a gateway counts as dead (`DEAD`) only after what it was granted has run out (`LEASE`); a new
 one listens (`LISTEN`) for longer than an old one can be stuck and still forward.
@@ -51,7 +60,7 @@ _RECORDS_A_TICK = 16  # records of other gateways that are repeated with each BR
 
 
 class SpanningTree:
-    """The tree as one gateway knows it. Methods take `now` (monotonic ns); `pop_actions` says what to do about it.
+    """The tree as one gateway knows it. Methods take `now` (monotonic ns); `pop_actions` returns what to do.
 
     `gateway` is the number of this start of it; 0 is not a valid one.
     """
@@ -80,19 +89,19 @@ class SpanningTree:
     # Ports
 
     def open(self, now: int, number: int, *, private: bool = False) -> None:
-        """A link is up."""
+        """Add a port for a link that came up; `private`: see `TreePort`."""
         self.ports[number] = TreePort(number, now, send_at=now, probe_at=now, private=private)
         self._update(now)
 
     def close(self, now: int, number: int) -> None:
-        """A link is down."""
+        """Remove the port of a link that went down."""
         port = self.ports.pop(number, None)
         if port is not None:
             port.forwards_until = 0
         self._update(now)
 
     def pop_actions(self) -> list[Action]:
-        """What is to be done, once."""
+        """Return what is to be done, and forget it."""
         actions = self._actions.copy()
         self._actions.clear()  # the list itself is shared with `clients`
         return actions
@@ -104,7 +113,7 @@ class SpanningTree:
         return due if due < NEVER else None
 
     def poll(self, now: int) -> None:
-        """Send what is due, and see which neighbours have been silent for too long."""
+        """Send what is due, and forget neighbours that were silent for DEAD."""
         self._update(now)
         for port in self.ports.values():
             if port.send_at <= now:
@@ -125,7 +134,7 @@ class SpanningTree:
     # What comes in
 
     def receive_bridge(self, now: int, number: int, message: Bridge) -> None:
-        """A gateway has sent BRIDGE on the network of a port."""
+        """Enter a BRIDGE that came in at a port: its sender is a gateway on the port's network."""
         port = self.ports.get(number)
         sender = (message.gateway, message.port)
         if port is None or not message.gateway:
@@ -135,7 +144,7 @@ class SpanningTree:
             return
         neighbour = port.neighbours.get(sender)  # may be another port of ours on the same network
         if neighbour is None:
-            if not self._admits_neighbour(now, port):
+            if not self._admit_neighbour(now, port):
                 return
             neighbour = Neighbour(now, message.count, agreement=message.agreement)
             # It is on this network itself: its probes came straight, not through a loop of firmware.
@@ -150,9 +159,11 @@ class SpanningTree:
         neighbour.acked_at = max(neighbour.acked_at, self._sent.acked_at(message.acks))
         self._update(now, port)
 
-    def _admits_neighbour(self, now: int, port: TreePort) -> bool:
-        """Whether one more gateway may be heard there. While it is not, it hears us and lacks our consent, so it does
-        not forward; gateways that come and go would keep all others from it.
+    def _admit_neighbour(self, now: int, port: TreePort) -> bool:
+        """Decide whether to enter one more gateway as a neighbour; if not, count it as lost.
+
+        A gateway that is not entered forwards nothing: it hears this one, which does not acknowledge it. Were each one
+        entered at once, gateways that come and go would keep all others from agreeing, and so from forwarding.
         """
         if sum(len(each.neighbours) for each in self.ports.values()) >= MOST_HEARD:
             port.lost["too many gateways"] += 1
@@ -167,7 +178,7 @@ class SpanningTree:
         return True
 
     def receive_leaf(self, now: int, number: int, message: Leaf) -> None:
-        """A module with several links has sent LEAF."""
+        """Enter a LEAF that came in at a port: its sender is a module with several links."""
         port = self.ports.get(number)
         if port is None or not message.module:
             return
@@ -175,7 +186,7 @@ class SpanningTree:
             self._update(now, port)
 
     def receive_mesh(self, now: int, number: int, message: Mesh) -> None:
-        """A gateway has sent MESH: what is new is passed on at once."""
+        """Enter a MESH that came in at a port, and pass it on at the other ports if it is new."""
         if message.gateway in (0, self.gateway) or number not in self.ports:
             return
         if not self._mesh.receive(now, message):
@@ -187,7 +198,7 @@ class SpanningTree:
         self._update(now)
 
     def receive_probe(self, now: int, number: int, gateway: int, its_port: int) -> None:
-        """A probe came in, that this gateway or another one sent at `its_port` (modulo PORT_MODULUS)."""
+        """Enter a probe that came in at a port; `gateway` sent it at its port `its_port` (modulo PORT_MODULUS)."""
         port = self.ports.get(number)
         sender = gateway, its_port
         if port is not None and sender != (self.gateway, number % PORT_MODULUS) and gateway not in port.gateways:
@@ -198,8 +209,9 @@ class SpanningTree:
             self._update(now)
 
     def _admits_probe(self, port: TreePort, gateway: int) -> bool:
-        """Whether a probe of this gateway can be kept: of those outside the mesh, which may be forged, only some are,
-        as the gateway may join later.
+        """Whether there is room to keep a probe of `gateway`.
+
+        Always, if it is in the mesh. Others may be forged, or join later: STRANGE_PROBES of theirs are kept.
         """
         members = {self.gateway, *self._mesh.members}
         return gateway in members or sum(each not in members for each, _ in port.probes) < STRANGE_PROBES
@@ -207,8 +219,9 @@ class SpanningTree:
     # What follows
 
     def _update(self, now: int, changed: TreePort | None = None) -> None:
-        """Work out everything that follows from what was heard, and from the time; at the one port that has `changed`
-        only, if the mesh is as it was.
+        """Work out all that follows from what was heard, and from the time.
+
+        With `changed`, only for this port, unless the mesh changes, too.
         """
         if now - self._updated_at > LEASE:
             self._start_over(now)
@@ -222,12 +235,12 @@ class SpanningTree:
             for port in self.ports.values():
                 if port.neighbours:
                     self._send_mesh(port, self.gateway)
-        everywhere = changed is None or mesh != self._mesh.fingerprint
-        for port in list(self.ports.values()) if everywhere or changed is None else [changed]:
+        ports = list(self.ports.values()) if changed is None or mesh != self._mesh.fingerprint else [changed]
+        for port in ports:
             self._update_port(now, port)
 
     def _start_over(self, now: int) -> None:
-        """This program stood still for so long that others may have given this gateway up."""
+        """Listen anew at each port: this program stood still for so long that others may have given this gateway up."""
         for port in self.ports.values():
             port.send_at = now
             if port.private and not port.neighbours:  # no gateway can have come meanwhile
@@ -283,7 +296,7 @@ class SpanningTree:
         in_tree = self._in_tree(port, state)
         port.forwards_until = self._forwards_until(port, state)
         if state is not PortState.LISTENING or port.neighbours:
-            port.resumes = False
+            port.resumes = False  # listening is over, or the port will not be alone: hold no more samples for it
         if (state, in_tree) != (port.state, port.in_tree):
             port.state, port.in_tree = state, in_tree
             self._actions.append(PortChanged(port.number))
@@ -312,14 +325,14 @@ class SpanningTree:
         return PortState.FORWARDING if now >= port.agreed_since + SETTLE else PortState.CONVERGING
 
     def _in_tree(self, port: TreePort, state: PortState) -> bool:
-        """Unlike the state, the place stays while the gateways converge, and is known before data may pass."""
+        """Whether the port is in the tree, also at times when nothing may pass yet."""
         if state in (PortState.ALONE, PortState.FORWARDING):
             return True
         if state in (PortState.BLOCKED, PortState.LOOP):
             return False
         if port.neighbours and port.agreed_since is not None:
-            return self._is_chosen(port)
-        return port.in_tree
+            return self._is_chosen(port)  # before SETTLE is over: demand travels first, then data
+        return port.in_tree  # not agreed yet: the next tree may be the same, and then demand need not move
 
     def _forwards_until(self, port: TreePort, state: PortState) -> int:
         if state is PortState.ALONE:
@@ -334,8 +347,10 @@ class SpanningTree:
         return self._mesh.forwards((self.gateway, port.number))
 
     def _loops(self, now: int, port: TreePort) -> bool:
-        """Whether a gateway that sends no BRIDGE joins this network to another one of the mesh, and this end of that
-        loop is the one that yields: to a port of ours, or a gateway, with a lower number.
+        """Whether the port is part of a loop through a gateway that sends no BRIDGE, and is the end that yields.
+
+        A probe that came in proves the loop. Of two ports of one gateway the one with the higher number (modulo
+        PORT_MODULUS) yields, of two gateways the one with the higher number.
         """
         for (gateway, its_port), (first, _) in port.probes.items():
             if now - first < PROBE_PROVEN or gateway in port.gateways:
