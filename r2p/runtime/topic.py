@@ -110,6 +110,8 @@ class Topic:
         self.name = name
         self.layout: Layout[Any] | None = None
         self.publishers: list[PublisherHandle] = []
+        # Both lists are replaced at a change, never changed in place: a sink may call the user's code, as where a line
+        # breaks when it is written to, and that may close what is in them while a sample is on its way through them.
         self.queues: list[SubscriberQueue] = []
         """Of the subscribers of this module, by descending priority."""
         self.remote_subscribers: list[RemoteSubscriber] = []
@@ -166,7 +168,11 @@ class Topic:
                     waiter.set_result(None)
         if self.remote_subscribers and not sample.source.link:  # what came by a link goes to others by gateways only
             blocked = self._send(self.remote_subscribers, sample, blocked, slot_link)
-        return blocked
+        return blocked if blocked is None else self._remaining(blocked)
+
+    def _remaining(self, sinks: list[Sink]) -> list[Sink] | None:
+        """Those that have not left while a sample was on its way: nothing would ever make room in the others."""
+        return [sink for sink in sinks if sink in self.queues or sink in self.remote_subscribers] or None
 
     def _send(
         self, subscribers: list[RemoteSubscriber], sample: Sample, blocked: list[Sink] | None, slot_link: object
@@ -187,12 +193,11 @@ class Topic:
     def join(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
         """Add a subscriber or a link; publishers that latch send it their last value."""
         if isinstance(sink, SubscriberQueue):
-            self.queues.append(sink)
-            self.queues.sort(key=lambda queue: -queue.priority)
+            self.queues = sorted([*self.queues, sink], key=lambda queue: -queue.priority)
             for value in self.latched_values():
                 sink.offer_latched(value)
         elif sink not in self.remote_subscribers:
-            self.remote_subscribers.append(sink)
+            self.remote_subscribers = [*self.remote_subscribers, sink]
         self.resend_latched(sink)
 
     def latched_values(self) -> list[Sample]:
@@ -201,15 +206,15 @@ class Topic:
 
     def resend_latched(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
         """Let publishers send what they latch: for a subscriber that joins behind a link, or is back after a reboot."""
-        for publisher in self.publishers:
+        for publisher in list(self.publishers):  # one may be closed by what its message brings about
             publisher.subscriber_joined(sink)
 
     def leave(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
         """Remove a subscriber or a link."""
         if isinstance(sink, SubscriberQueue):
-            self.queues.remove(sink)
+            self.queues = [each for each in self.queues if each is not sink]
         else:
-            self.remote_subscribers.remove(sink)
+            self.remote_subscribers = [each for each in self.remote_subscribers if each is not sink]
         sink.wait_queue().drop_sink(sink)
 
     def publisher_of(self, sample: Sample) -> PublisherHandle | None:

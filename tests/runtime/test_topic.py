@@ -5,12 +5,20 @@ from __future__ import annotations
 import asyncio
 import gc
 import weakref
+from typing import TYPE_CHECKING
 
 import pytest
 
 import r2p
 from r2p.msg import Encoder, Led
+from r2p.runtime.backpressure import WaitQueue
+from r2p.runtime.topic import RemoteSubscriber
 from tests.bench import hold, joined, led, local, settle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from r2p.runtime.sample import Sample
 
 
 class Lamp(r2p.Message):
@@ -18,6 +26,30 @@ class Lamp(r2p.Message):
 
     led: r2p.u32 = 0
     value: r2p.u8 = 0
+
+
+class Line(RemoteSubscriber):
+    """The subscribers behind a link, where `event` happens at the first message."""
+
+    def __init__(self, name: str, event: Callable[[], object] | None = None, *, full: bool = False) -> None:
+        super().__init__(name, self, WaitQueue())
+        self.event = event
+        self.full = full
+        self.got: list[bytes] = []
+
+    def offer(self, sample: Sample) -> bool:
+        event, self.event = self.event, None
+        if event is not None:
+            event()
+        if not self.full:
+            self.got.append(sample.data)
+        return not self.full
+
+    def force(self, sample: Sample) -> None:
+        raise AssertionError(sample)
+
+    def refill(self) -> None:
+        raise AssertionError
 
 
 # Types
@@ -146,6 +178,66 @@ async def test_nothing_is_held_after_close() -> None:
         gc.collect()
         assert [each() for each in held] == [None] * 3
         assert len(full.queue) == 1
+
+
+# What happens while a message is on its way through the lists
+
+
+@pytest.mark.virtual_time
+async def test_a_link_that_leaves_while_it_is_written_to_hides_no_other_link() -> None:
+    async with local() as module:
+        publisher = module.start(hold).advertise("leds", Led)
+        topic = module.space.topics["leds"]
+        lines = [Line("a", lambda: topic.leave(lines[0])), Line("b"), Line("c")]
+        for line in lines:
+            topic.join(line)
+        await publisher.publish(led(1))
+        assert [len(line.got) for line in lines] == [1, 1, 1]
+        await publisher.publish(led(2))
+        assert [len(line.got) for line in lines] == [1, 2, 2]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("leaves", [0, 2])
+async def test_a_full_link_that_leaves_meanwhile_is_not_waited_for(leaves: int) -> None:
+    async with local() as module:
+        publisher = module.start(hold).advertise("leds", Led)
+        topic = module.space.topics["leds"]
+        lines = [Line("a", full=True), Line("b", lambda: topic.leave(lines[leaves])), Line("c", full=True)]
+        for line in lines:
+            topic.join(line)
+        sample = publisher._sample(led(1))
+        assert topic.deliver(sample) == [lines[2 - leaves]]
+        lines[2 - leaves].full = False
+        assert topic.deliver(sample) is None
+
+
+@pytest.mark.virtual_time
+async def test_a_full_subscriber_that_a_callback_closes_is_not_waited_for() -> None:
+    async with local() as module:
+        node, other = module.start(hold, name="a"), module.start(hold, name="b")
+        publisher = node.advertise("leds", Led)
+        leds = other.subscribe("leds", Led, queue=1)
+        module.space.topics["leds"].join(Line("a", leds.close))
+        assert publisher.publish_nowait(led(1))
+        leds = other.subscribe("leds", Led, queue=1)
+        await publisher.publish(led(2))
+        module.space.topics["leds"].join(Line("b", leds.close))
+        async with asyncio.timeout(0):
+            await publisher.publish(led(3))
+        assert publisher.missed == 0
+
+
+@pytest.mark.virtual_time
+async def test_a_publisher_that_its_own_latched_message_closes_hides_no_other_publisher() -> None:
+    async with local() as module:
+        first = module.start(hold, name="a").advertise("leds", Led, latch=True)
+        second = module.start(hold, name="b").advertise("leds", Led, latch=True)
+        await first.publish(led(1))
+        await second.publish(led(2))
+        line = Line("line", first.close)
+        module.space.topics["leds"].join(line)
+        assert line.got == [led(number).encode() for number in (1, 2)]
 
 
 # Waking
