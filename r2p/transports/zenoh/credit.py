@@ -118,6 +118,7 @@ class ZenohSubscriber(LinkSubscriber):
     def remove_session(self, session: int) -> int:
         """Remove a session; return how many messages it did not acknowledge, unless it left in order."""
         self._sender.credits.receive()  # its final credit may have come before its token went
+        self.silent_checks.pop(session, None)  # it may join again
         unacknowledged = sum([stream.window.remove(session) for stream in self._streams.values()])
         self.refill()
         return unacknowledged
@@ -135,8 +136,10 @@ class ZenohSubscriber(LinkSubscriber):
     def resend_latched(self) -> None:
         """Send what is latched, whether or not there is room."""
         self.resending = True
-        self.topic.resend_latched(self)
-        self.resending = False
+        try:
+            self.topic.resend_latched(self)
+        finally:  # its callers go on after an error: what is published later must wait for credit again
+            self.resending = False
 
     @property
     def awaits_credit(self) -> bool:
