@@ -109,13 +109,15 @@ async def test_what_waits_for_credit_when_the_link_goes_down_is_counted() -> Non
                 await publisher.publish(Led())
 
         sending = asyncio.create_task(send())
-        await until(
-            lambda: bool(publisher._topic.remote_subscribers[0].waiting.non_real_time)
-        )  # as its subscriber does not read
+        remote = publisher._topic.remote_subscribers[0]
+        assert isinstance(remote, ZenohSubscriber)
+        await until(lambda: len(subscriber.queue) == subscriber._sink.limit and not remote.unacknowledged())
+        await until(lambda: bool(remote.waiting.non_real_time))  # as its subscriber does not read: no credit comes
         await cable.cut()
         await sending
         assert link.losses["link down"] > 0
         assert link.stats.sent + link.losses["link down"] == publisher.sent
+        assert link.losses["unknown at disconnect"] == link.stats.sent - 1  # the first message is acknowledged at once
         assert subscriber.queue
         await cable.mend()
 
