@@ -54,7 +54,7 @@ async def test_measuring_leaves_it_alive(
     async with beside(imu()) as (power, session):
         await measure(session, topic, count=2)
         assert not power.module.fault
-        assert power.module.heap > 18_000
+        assert power.module.heap_free > 18_000
     assert len(printed(capsys)) == 2
 
 
@@ -95,7 +95,7 @@ async def test_all_that_is_published_arrives(behind_gateway: bool, age: float) -
 async def test_firmware_that_does_not_ask_again_gets_it_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     motor = FirmwareModule("MOTOR1", subscribers=[Subscribes("cmd", Velocity3)])
     async with beside(motor) as (power, session):
-        monkeypatch.setattr(motor, "_advertised", lambda _now, _topic: None)
+        monkeypatch.setattr(motor, "_on_advertise", lambda _now, _topic: None)
         monkeypatch.setattr(motor, "_repeats", False)
         await pub(session, "cmd", ["x=1"], type="Velocity3", count=3, rate=100.0)
         await asyncio.sleep(0.1)
@@ -111,4 +111,4 @@ async def test_a_gateway_asks_as_little_of_it() -> None:
             await hz(session, "text", count=2, timeout=10)
             await echo(session, ["leds"], count=2, timeout=10)
             assert not power.module.fault
-            assert power.module.heap > 18_000
+            assert power.module.heap_free > 18_000

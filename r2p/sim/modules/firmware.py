@@ -82,7 +82,7 @@ class FirmwareModule:
         """The flags of its ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
         self.fault = ""
         """Why it has failed; only `power_on` helps."""
-        self.heap = 0
+        self.heap_free = 0
         """Bytes that are free for queues."""
         self.sent: Counter[str] = Counter()
         """Messages by topic, since the object was made."""
@@ -94,9 +94,9 @@ class FirmwareModule:
         self._publishers = {topic_name(each.topic): _FirmwarePublisher(each) for each in publishers}
         self._subscribers = {topic_name(each.topic): _FirmwareSubscriber(each) for each in subscribers}
         self._repeats = repeats
-        self._memory = heap
+        self._heap = heap
         self._responses_needed = 2 if behind_gateway else 1
-        self._management_hangs = False  # its management
+        self._management_hangs = False
         self._reader = debug.Reader(self.drops)
         self._out: list[bytes] = []
         self._booted = 0
@@ -105,8 +105,8 @@ class FirmwareModule:
         self._step_at: int | None = None
         self._stepped = 0
         self._steps: list[bytes | None] = []
-        self._last_management = 0  # the last management message
-        self._running = False  # its nodes
+        self._last_management_at = 0
+        self._nodes_running = False
 
     @property
     def halted(self) -> bool:
@@ -133,9 +133,9 @@ class FirmwareModule:
         topic = line.topic.decode()
         if topic == MANAGEMENT:
             if not self._management_hangs:
-                self._manage(now, line.data)
+                self._receive_management(now, line.data)
         else:
-            self._deliver(now, topic, line.data)
+            self._receive_data(now, topic, line.data)
         return self._drain()
 
     def poll(self, now: int) -> bytes:
@@ -148,11 +148,11 @@ class FirmwareModule:
             self._start_nodes(now)
         if self._step_at is not None and now >= self._step_at:
             self._step(now)
-        for publisher in self._publishers.values():
+        for topic, publisher in self._publishers.items():
             if publisher.is_due(now):
-                message = publisher.filled(now, self._booted)
+                message = publisher.next_message(now, self._booted)
                 if message is not None:
-                    self._publish(now, publisher, message)
+                    self._publish(now, topic, message)
         return self._drain()
 
     def next_deadline(self) -> int | None:
@@ -161,16 +161,12 @@ class FirmwareModule:
             return None
         if self._boot_at is not None:
             return self._boot_at
-        times = [self._nodes_at, self._step_at, *(publisher.next for publisher in self._publishers.values())]
+        times = [self._nodes_at, self._step_at, *(publisher.next_at for publisher in self._publishers.values())]
         return min((time for time in times if time is not None), default=None)
 
     def publish(self, now: int, topic: str, message: Message) -> bytes:
         """Publish a message, if there is a subscriber. Raises Error if it has no publisher of this topic."""
-        publisher = self._publishers.get(topic)
-        if publisher is None:
-            raise Error(f"module {self.name} has no publisher of {topic}: give it one (publishers=[Publishes(...)])")
-        if self._running and not self.halted:
-            self._publish(now, publisher, message)
+        self._publish(now, topic, message)
         return self._drain()
 
     # Life
@@ -179,12 +175,12 @@ class FirmwareModule:
         self.flags = flags
         self._booted = now
         self._boot_at = None
-        self._running = False
+        self._nodes_running = False
         self._reader = debug.Reader(self.drops)
-        own = (_bytes(each.layout.size, each.request.queue) for each in self._subscribers.values())
-        self.heap = self._memory - sum(own)
+        own = (_queue_bytes(each.layout.size, each.request.queue) for each in self._subscribers.values())
+        self.heap_free = self._heap - sum(own)
         for publisher in self._publishers.values():
-            publisher.next = None
+            publisher.next_at = None
             publisher.joined = False
         for subscriber in self._subscribers.values():
             subscriber.opened_at = None
@@ -198,14 +194,14 @@ class FirmwareModule:
 
     def _start_nodes(self, now: int) -> None:
         self._nodes_at = None
-        self._running = True
+        self._nodes_running = True
         for publisher in self._publishers.values():
             publisher.start(now)
             self._send(now, publisher.advertisement)
         for subscriber in self._subscribers.values():
             self._send(now, subscriber.request)
 
-    def _stop(self, now: int) -> None:
+    def _on_stop(self, now: int) -> None:
         """Stop the nodes; of the round of repetition, what belongs to the current node is still sent."""
         if self.flags & FLAG_BOOT:
             self.fault = "STOP in boot mode: its management hangs"
@@ -214,14 +210,15 @@ class FirmwareModule:
             return
         self._end_nodes()
         self.flags |= FLAG_STOPPED
+        # Steps are taken from the end: the current node's message and the empty step after it, or only the latter.
         self._steps = self._steps[-1:] if self._steps and self._steps[-1] is None else self._steps[-2:]
         self._step_at = now + _STEP if self._repeats else None
 
     def _end_nodes(self) -> None:
-        self._running = False
+        self._nodes_running = False
         self._nodes_at = None
         for publisher in self._publishers.values():
-            publisher.next = None
+            publisher.next_at = None
 
     def _restart(self, now: int, flags: int) -> None:
         self._end_nodes()
@@ -231,8 +228,8 @@ class FirmwareModule:
 
     def _step(self, now: int) -> None:
         """Do one step of repetition: ALIVE, then what each node has, with an empty step between two nodes."""
-        if now < self._last_management + _QUIET:
-            self._step_at = self._last_management + _QUIET
+        if now < self._last_management_at + _QUIET:
+            self._step_at = self._last_management_at + _QUIET
             return
         self._stepped = now
         self._step_at = now + _STEP
@@ -244,7 +241,7 @@ class FirmwareModule:
 
     def _round(self) -> list[bytes | None]:
         """Return the steps between two ALIVE, last first; each publisher and subscriber counts as a node."""
-        if not self._running:
+        if not self._nodes_running:
             return []
         messages: list[management.Management] = [each.advertisement for each in self._publishers.values()]
         messages += [each.request for each in self._subscribers.values()]
@@ -252,8 +249,8 @@ class FirmwareModule:
 
     # Management
 
-    def _manage(self, now: int, data: bytes) -> None:
-        self._last_management = now
+    def _receive_management(self, now: int, data: bytes) -> None:
+        self._last_management_at = now
         if self._step_at is not None:
             self._step_at = min(self._step_at, self._stepped + _STEP_AFTER_TRAFFIC)
         try:
@@ -265,37 +262,37 @@ class FirmwareModule:
             return
         match message:
             case management.Advertise():
-                self._advertised(now, message.topic)
+                self._on_advertise(now, message.topic)
             case management.SubscribeRequest():
-                self._requested(now, message)
+                self._on_subscribe_request(now, message)
             case management.SubscribeResponse() if message.topic in self._subscribers:
-                self._opened(now, self._subscribers[message.topic])
+                self._on_subscribe_response(now, self._subscribers[message.topic])
             case management.Stop() if message.module == self.name:
-                self._stop(now)
+                self._on_stop(now)
             case management.Reboot() if message.module == self.name:
                 self._restart(now, FLAG_REBOOTED)
             case management.Bootload() if message.module == self.name:
                 self._restart(now, FLAG_REBOOTED | FLAG_BOOT)
 
-    def _advertised(self, now: int, topic: str) -> None:
+    def _on_advertise(self, now: int, topic: str) -> None:
         subscriber = self._subscribers.get(topic)
-        if subscriber is not None and self._running:
+        if subscriber is not None and self._nodes_running:
             self._send(now, subscriber.request)
 
-    def _opened(self, now: int, subscriber: "_FirmwareSubscriber") -> None:
+    def _on_subscribe_response(self, now: int, subscriber: "_FirmwareSubscriber") -> None:
         """Accept data of a publisher, from when on the response takes effect."""
         subscriber.responses += 1
-        if not self._running:
+        if not self._nodes_running:
             subscriber.opened_at = None
         elif subscriber.opened_at is None and subscriber.responses >= self._responses_needed:
             subscriber.opened_at = now + _RESPONSE_DELAY
 
-    def _requested(self, now: int, message: management.SubscribeRequest) -> None:
+    def _on_subscribe_request(self, now: int, message: management.SubscribeRequest) -> None:
         if not message.size:
             self.fault = f"SUBSCRIBE_REQUEST of {message.topic} with size 0: its buffers are overrun"
             return
         publisher = self._publishers.get(message.topic)
-        if publisher is None or not self._running:
+        if publisher is None or not self._nodes_running:
             return
         if not publisher.joined and not self._allocate(publisher, message):
             return
@@ -307,18 +304,19 @@ class FirmwareModule:
         if not message.queue:
             self.fault = f"SUBSCRIBE_REQUEST of {message.topic} with queue length 0: an assertion fails"
             return False
-        needed = _bytes(publisher.layout.size, message.queue)
-        if needed > self.heap:
-            self.fault = f"SUBSCRIBE_REQUEST of {message.topic}: {needed} bytes of {self.heap}, so it writes to NULL"
+        needed = _queue_bytes(publisher.layout.size, message.queue)
+        if needed > self.heap_free:
+            free = self.heap_free
+            self.fault = f"SUBSCRIBE_REQUEST of {message.topic}: {needed} bytes of {free}, so it writes to NULL"
             return False
-        self.heap -= needed
+        self.heap_free -= needed
         return True
 
     # Data
 
-    def _deliver(self, now: int, topic: str, data: bytes) -> None:
+    def _receive_data(self, now: int, topic: str, data: bytes) -> None:
         subscriber = self._subscribers.get(topic)
-        if subscriber is None or not subscriber.is_open(now) or not self._running:
+        if subscriber is None or not subscriber.is_open(now) or not self._nodes_running:
             self.drops["not subscribed"] += 1
         elif len(data) != subscriber.layout.size:
             self.drops["wrong size"] += 1
@@ -334,14 +332,17 @@ class FirmwareModule:
         topic = subscriber.request.topic
         self.received[topic] += 1
         self.last[topic] = message
-        for where, answer in (subscriber.answer and subscriber.answer(message)) or ():
-            self._out.append(self.publish(now, where, answer))
+        for answer_topic, answer in (subscriber.answer and subscriber.answer(message)) or ():
+            self._publish(now, answer_topic, answer)
 
-    def _publish(self, now: int, publisher: "_FirmwarePublisher", message: Message) -> None:
-        if publisher.joined:
+    def _publish(self, now: int, topic: str, message: Message) -> None:
+        publisher = self._publishers.get(topic)
+        if publisher is None:
+            raise Error(f"module {self.name} has no publisher of {topic}: give it one (publishers=[Publishes(...)])")
+        if publisher.joined and self._nodes_running and not self.halted:
             data = publisher.layout.encode(message)
             self._out.append(publisher.line(data, self._deadline(now)))
-            self.sent[publisher.advertisement.topic] += 1
+            self.sent[topic] += 1
 
     # Output
 
@@ -363,36 +364,36 @@ class FirmwareModule:
 class _FirmwarePublisher:
     """A publisher while its module runs."""
 
-    def __init__(self, what: Publishes) -> None:
-        self.layout: Layout[Any] = layout(what.type)
-        self.advertisement = management.Advertise(topic_name(what.topic), self.layout.size)
+    def __init__(self, options: Publishes) -> None:
+        self.layout: Layout[Any] = layout(options.type)
+        self.advertisement = management.Advertise(topic_name(options.topic), self.layout.size)
         self.line = debug.encoder(self.advertisement.topic.encode())
         self.joined = False
-        self.next: int | None = None
-        self._period = round(what.period * SECOND) if what.period is not None and what.fill is not None else None
-        self._fill = what.fill
+        self.next_at: int | None = None
+        self._period = None if options.period is None or options.fill is None else round(options.period * SECOND)
+        self._fill = options.fill
 
     def start(self, now: int) -> None:
-        self.next = None if self._period is None else now + self._period
+        self.next_at = None if self._period is None else now + self._period
 
     def is_due(self, now: int) -> bool:
-        return self.next is not None and now >= self.next
+        return self.next_at is not None and now >= self.next_at
 
-    def filled(self, now: int, booted: int) -> Message | None:
+    def next_message(self, now: int, booted: int) -> Message | None:
         """Return the message of this period, and schedule the next one; missed periods are skipped."""
-        if self.next is None or self._period is None or self._fill is None:
+        if self.next_at is None or self._period is None or self._fill is None:
             return None
-        self.next += ((now - self.next) // self._period + 1) * self._period
+        self.next_at += ((now - self.next_at) // self._period + 1) * self._period
         return self._fill(now - booted) if self.joined else None
 
 
 class _FirmwareSubscriber:
     """A subscriber while its module runs."""
 
-    def __init__(self, what: Subscribes) -> None:
-        self.layout: Layout[Any] = layout(what.type)
-        self.request = management.SubscribeRequest(topic_name(what.topic), self.layout.size, what.queue)
-        self.answer = what.answer
+    def __init__(self, options: Subscribes) -> None:
+        self.layout: Layout[Any] = layout(options.type)
+        self.request = management.SubscribeRequest(topic_name(options.topic), self.layout.size, options.queue)
+        self.answer = options.answer
         self.opened_at: int | None = None
         self.responses = 0
 
@@ -400,6 +401,6 @@ class _FirmwareSubscriber:
         return self.opened_at is not None and now >= self.opened_at
 
 
-def _bytes(size: int, queue: int) -> int:
+def _queue_bytes(size: int, queue: int) -> int:
     """Return the heap that a queue uses."""
     return queue * (size + management.QUEUE_ENTRY)
