@@ -1,4 +1,7 @@
-"""The state of CAN interfaces, and when it changes, as the kernel reports it by rtnetlink. Read-only."""
+"""What the kernel has for CAN: interfaces with their state, and when it changes, by rtnetlink. Read-only.
+
+This file can be imported on any system, other than `socketcan`: `r2p doctor` needs it everywhere.
+"""
 
 import asyncio
 import contextlib
@@ -52,6 +55,7 @@ class Interface(msgspec.Struct, frozen=True):
 
     @property
     def one_shot(self) -> bool:
+        """Whether the controller tries each frame once, instead of again after a lost arbitration or an error."""
         return "one-shot" in self.modes
 
     @property
@@ -85,21 +89,21 @@ def list_interfaces() -> list[Interface]:
     with _rtnetlink() as netlink:
         netlink.send(request)
         while True:
-            for kind, body in messages(netlink.recv(_READ_MAX)):
+            for kind, body in _split_messages(netlink.recv(_READ_MAX)):
                 if kind == _DUMP_DONE:
                     return found
                 if kind == _ERROR:
-                    raise OSError(-int.from_bytes(body[:4], "little", signed=True), "rtnetlink")
-                interface = parse(body) if kind == _NEWLINK else None
+                    raise OSError(_errno(body), "rtnetlink")
+                interface = _parse_interface(body) if kind == _NEWLINK else None
                 if interface is not None:
                     found.append(interface)
 
 
-def _rtnetlink() -> socket.socket:
-    return socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE)
+def _rtnetlink(flags: int = 0) -> socket.socket:
+    return socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC | flags, socket.NETLINK_ROUTE)
 
 
-def messages(data: bytes) -> Iterator[tuple[int, bytes]]:
+def _split_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Split what a netlink socket received into the types and contents of its messages."""
     while len(data) >= _HEADER.size:
         length, kind, *_ = _HEADER.unpack_from(data)
@@ -109,7 +113,13 @@ def messages(data: bytes) -> Iterator[tuple[int, bytes]]:
         data = data[_aligned(length) :]
 
 
-def parse(body: bytes) -> Interface | None:
+def _errno(body: bytes) -> int:
+    """The error number in an error message, which has the byte order of this machine, as all of netlink has."""
+    error: int = struct.unpack_from("=i", body)[0]
+    return -error
+
+
+def _parse_interface(body: bytes) -> Interface | None:
     """Parse the interface that a link message describes. None if it is not for CAN."""
     _, kind, _, flags, _ = _LINK.unpack_from(body)
     if kind != ARPHRD_CAN:
@@ -118,7 +128,7 @@ def parse(body: bytes) -> Interface | None:
     info = _attributes(link.get(_LINKINFO, b""))
     can = _attributes(info.get(_DATA, b""))
     bitrate, state = _u32(can.get(_BITTIMING)), _u32(can.get(_STATE))
-    modes = _u32(can.get(_CTRLMODE), index=1) or 0  # struct can_ctrlmode: a mask, then the flags
+    modes = _u32(can.get(_CTRLMODE), index=1) or 0  # struct can_ctrlmode: at 0 is a mask, for requests
     errors = can.get(_BERR_COUNTER, b"")
     return Interface(
         name=_text(link.get(_IFNAME, b"")),
@@ -168,9 +178,7 @@ class InterfaceWatch:
 
     async def __aenter__(self) -> Self:
         with contextlib.suppress(OSError):  # without netlink, `wait` always takes its whole time-out
-            self._netlink = socket.socket(
-                socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.NETLINK_ROUTE
-            )
+            self._netlink = _rtnetlink(socket.SOCK_NONBLOCK)
             self._netlink.bind((0, _LINK_GROUP))
             asyncio.get_running_loop().add_reader(self._netlink, self._readable, self._netlink)
         return self

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import socket
 import struct
 import sys
 
@@ -10,7 +12,8 @@ import pytest
 if sys.platform != "linux":
     pytest.skip("rtnetlink is Linux's", allow_module_level=True)
 
-from r2p.transports.can.netlink import CTRLMODES, Interface, messages, parse
+from r2p.transports.can import netlink
+from r2p.transports.can.netlink import CTRLMODES, Interface, _parse_interface, _split_messages
 
 
 def attribute(kind: int, content: bytes) -> bytes:
@@ -54,23 +57,23 @@ def test_a_controller() -> None:
         restart_ms=100,
         errors=(96, 3),
     )
-    assert parse(body) == interface
+    assert _parse_interface(body) == interface
     assert interface.one_shot
     assert interface.problem == ""
 
 
 def test_what_is_not_reported() -> None:
-    assert parse(link("vcan0", can(kind=b"vcan\0"))) == Interface("vcan0", "vcan", up=True)
-    assert parse(link("odd0", up=False)) == Interface("odd0", "", up=False)
-    assert parse(
+    assert _parse_interface(link("vcan0", can(kind=b"vcan\0"))) == Interface("vcan0", "vcan", up=True)
+    assert _parse_interface(link("odd0", up=False)) == Interface("odd0", "", up=False)
+    assert _parse_interface(
         link("slcan0", can(attribute(1, words(0xFFFF_FFFF, 0, 0, 0, 0, 0, 0, 0)), kind=b"slcan\0"))
     ) == Interface("slcan0", "slcan", up=True)
-    assert parse(link("eth0", kind=1)) is None
+    assert _parse_interface(link("eth0", kind=1)) is None
 
 
 @pytest.mark.parametrize("bit", CTRLMODES)
 def test_modes(bit: int) -> None:
-    interface = parse(link("can0", can(attribute(5, words(0, bit | 0x8000_0000)))))
+    interface = _parse_interface(link("can0", can(attribute(5, words(0, bit | 0x8000_0000)))))
     assert interface is not None
     assert interface.modes == {CTRLMODES[bit]}
 
@@ -78,7 +81,7 @@ def test_modes(bit: int) -> None:
 def test_a_cut_message_is_no_disaster() -> None:
     body = link("can0", can(attribute(4, words(3))))
     for end in range(16, len(body)):
-        interface = parse(body[:end])
+        interface = _parse_interface(body[:end])
         assert interface is not None
         assert interface.state in ("", "bus-off")
 
@@ -110,6 +113,16 @@ def test_messages_one_after_the_other() -> None:
         struct.pack("=IHHII", 16 + len(body), kind, 0, 1, 0) + body + bytes(-len(body) % 4)
         for kind, body in [(16, b"abc"), (3, b""), (2, b"defgh")]
     )
-    assert list(messages(data)) == [(16, b"abc"), (3, b""), (2, b"defgh")]
-    assert list(messages(data[:10])) == []
-    assert list(messages(bytes(20))) == []
+    assert list(_split_messages(data)) == [(16, b"abc"), (3, b""), (2, b"defgh")]
+    assert list(_split_messages(data[:10])) == []
+    assert list(_split_messages(bytes(20))) == []
+
+
+def test_an_error_of_the_kernel_is_an_os_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, kernel = socket.socketpair()
+    body = struct.pack("=i", -errno.EPERM)  # in the byte order of the machine, like all numbers of netlink
+    kernel.send(struct.pack("=IHHII", 16 + len(body), 2, 0, 1, 0) + body)
+    monkeypatch.setattr(netlink, "_rtnetlink", lambda: ours)
+    with kernel, pytest.raises(OSError, match="rtnetlink") as refused:
+        netlink.list_interfaces()
+    assert refused.value.errno == errno.EPERM
