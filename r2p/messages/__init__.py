@@ -18,16 +18,17 @@ is rounded to its 24 bits; NaN and infinities pass. A bool has to be a bool, an 
 instance of exactly its class. When a message is unpacked, any byte but 0 is True, and a text ends at its first NUL:
 firmware leaves rubbish behind it.
 
-`layouts` has the classes and compiles them, `shapes` is what a layout is made of, `packing` generates the functions,
-and `schemas` builds a class from its schema.
+`shapes` is what layouts and fields are made of, `packing` generates the functions, `layouts` has the classes and
+compiles them, and `schemas` builds a class from its schema.
 """
 
-from r2p.messages.layouts import SIZE_MAX, Layout, Message, Timestamp, layout
+from r2p.messages.layouts import SIZE_MAX, Message, Timestamp, layout
 from r2p.messages.schemas import message_type
 from r2p.messages.shapes import (
     Array,
     Chars,
     Field,
+    Layout,
     Len,
     Nested,
     Scalar,

@@ -1,4 +1,4 @@
-"""Message classes, and the layout that is compiled from their annotations at first use.
+"""Message classes, and how a layout is compiled from their annotations at first use.
 
 A layout is kept in its class, not in a table: so a class that a tool has built from a schema can be collected, with its
 layout.
@@ -6,13 +6,12 @@ layout.
 
 import keyword
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from hashlib import blake2b
 from typing import (
     Annotated,
     Any,
     ClassVar,
-    Generic,
     Self,
     TypeVar,
     dataclass_transform,
@@ -25,7 +24,7 @@ import msgspec
 
 from r2p.errors import DecodeError, MessageError
 from r2p.messages.packing import functions
-from r2p.messages.shapes import BOOL, Array, Chars, Field, Len, Nested, Scalar, Shape, show, u32
+from r2p.messages.shapes import BOOL, Array, Chars, Field, Layout, Len, Nested, Scalar, Shape, show, u32
 from r2p.units import SECOND
 
 SIZE_MAX = 1024
@@ -52,31 +51,6 @@ class Message(msgspec.Struct, frozen=True, gc=False):
 
 
 M = TypeVar("M", bound=Message)
-
-
-class Layout(msgspec.Struct, Generic[M], frozen=True, eq=False):
-    """How the messages of one class are laid out in bytes.
-
-    `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with their path where
-    they are nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` is its BLAKE2b-64 (8 bytes). `encode`
-    raises MessageError, which names the field; `decode` raises DecodeError.
-    """
-
-    cls: type[M]
-    fields: tuple[Field, ...]
-    size: int
-    schema: str
-    fingerprint: bytes
-    encode: Callable[[M], bytes]
-    decode: Callable[[bytes], M]
-
-    @property
-    def zero(self) -> M:
-        """The message of zero bytes, made anew: a class that kept an instance of itself would never be collected."""
-        return self.decode(bytes(self.size))
-
-    def __repr__(self) -> str:
-        return f"<Layout of {self.cls.__name__}, {self.size} bytes: {self.schema}>"
 
 
 def layout(cls: type[M]) -> Layout[M]:

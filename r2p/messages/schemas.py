@@ -1,7 +1,12 @@
 """Message classes built from their schema, for tools that find a topic whose type they don't have.
 
-A schema comes from the network, so it may be anything. It is parsed leniently, within bounds; then the schema of the
-new class is compared with it, which finds whatever was wrong.
+A schema lists the leaves of a message in wire order, each with its path: "stamp.sec:u32 stamp.nsec:u32 wheels[0]:f32".
+`_SchemaReader` turns this list back into the tree: leaves that share the first part of their path are one field, and
+what is left of their paths says what the field is, in the same way. An array is built from its first element alone.
+
+A schema comes from the network, so it may be anything: elements that differ, fields in pieces, a leaf twice. None of
+this is checked on the way, where only size and depth are limited. Instead `message_type` compares the schema of the new
+class with the one it was given, which finds whatever was wrong.
 """
 
 import keyword
@@ -18,7 +23,7 @@ SCHEMA_MAX = 32_768
 """Characters of the longest schema that is read."""
 
 _DEPTH_MAX = 16  # parts of a path
-_CLASSES_MAX = 64  # different nested messages
+_CLASSES_MAX = 64  # different nested messages, without Timestamp
 
 _Leaf: TypeAlias = tuple[tuple[str, ...], str]  # ("wheels", "[0]", ".speed"), "f32"
 
@@ -55,40 +60,46 @@ class _SchemaReader:
     """Groups leaves by the first part of their path, and each group by the next part."""
 
     def __init__(self) -> None:
-        self.classes: dict[tuple[_Leaf, ...], type[Message]] = {
+        self._nested: dict[tuple[_Leaf, ...], type[Message]] = {
             (((".sec",), "u32"), ((".nsec",), "u32")): Timestamp,
         }
+        """The class of each nested message, by its leaves: equal ones share one."""
 
     def message(self, name: str, leaves: tuple[_Leaf, ...]) -> type[Message]:
+        """Make the class of a message that has these leaves."""
         fields: dict[str, list[_Leaf]] = {}
         for parts, kind in leaves:
             head = "".join(parts[:1]).removeprefix(".")
             fields.setdefault(head, []).append((parts[1:], kind))
         for field in fields:
             check_field_name(f"{name}.{show(field)}", field)
-        hints = [(field, self.hint(f"{name}_{field}", tuple(inner))) for field, inner in fields.items()]
+        hints = [(field, self._field_type(f"{name}_{field}", tuple(inner))) for field, inner in fields.items()]
         made: Any = msgspec.defstruct(name, hints, bases=(Message,), module=__name__, frozen=True, gc=False)
         return cast("type[Message]", made)
 
-    def hint(self, name: str, leaves: tuple[_Leaf, ...]) -> Any:
+    def _field_type(self, name: str, leaves: tuple[_Leaf, ...]) -> Any:
+        """The annotation of a field that has these leaves; `name` is for its class, if it is a message."""
         parts, kind = leaves[0]
         if not parts:
-            return _hint(kind)
+            return _leaf_type(kind)
         if not parts[0].startswith("["):
-            return self.nested(name, leaves)
-        items = tuple((rest[1:], kind) for rest, kind in leaves if rest[:1] == parts[:1])
+            return self._nested_class(name, leaves)
+        # An array: `[0]` says what its elements are, and as many follow as there are different indices. Whether the
+        # others are like it, and in order, shows when the schemas are compared.
+        first = tuple((rest[1:], kind) for rest, kind in leaves if rest[:1] == parts[:1])
         count = len({rest[:1] for rest, _ in leaves})
-        return _array(self.hint(name, items), count)
+        return _array(self._field_type(name, first), count)
 
-    def nested(self, name: str, leaves: tuple[_Leaf, ...]) -> type[Message]:
-        if leaves not in self.classes:
-            if len(self.classes) > _CLASSES_MAX:
+    def _nested_class(self, name: str, leaves: tuple[_Leaf, ...]) -> type[Message]:
+        if leaves not in self._nested:
+            if len(self._nested) - 1 >= _CLASSES_MAX:  # 1: Timestamp is always there
                 raise MessageError(f"more than {_CLASSES_MAX} different messages in one")
-            self.classes[leaves] = self.message(name, leaves)
-        return self.classes[leaves]
+            self._nested[leaves] = self.message(name, leaves)
+        return self._nested[leaves]
 
 
-def _hint(kind: str) -> Any:
+def _leaf_type(kind: str) -> Any:
+    """The annotation of a leaf of this kind, such as `u32`, `char[8]` or `f32[3]`."""
     found = _KIND.fullmatch(kind)
     base, count = found.groups() if found else ("", None)
     if base == "char" and count:

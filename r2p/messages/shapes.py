@@ -1,4 +1,6 @@
-"""Shapes: what fields are made of. Packing is generated from them, and tools use them to turn text into fields.
+"""Shapes: what fields are made of, and layouts: what message classes are made of.
+
+Packing is generated from them, and tools use them to turn text into fields.
 
 A field is a number, a text, an array of one shape, or a message. Each shape has its `kind` (as in schemas), the
 `format` and `size` (bytes) that it packs to, and the values that are `allowed`, in words. A tool walks the tree with
@@ -11,12 +13,10 @@ A field is a number, a text, an array of one shape, or a message. Each shape has
 """
 
 import struct
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_args
+from collections.abc import Callable
+from typing import Annotated, Any, Generic, TypeAlias, TypeVar, get_args
 
 import msgspec
-
-if TYPE_CHECKING:
-    from r2p.messages.layouts import Layout
 
 UNFIT = (struct.error, ArithmeticError, AttributeError, TypeError, ValueError)
 """The errors that packing raises for a value that does not fit."""
@@ -133,6 +133,34 @@ class Field(msgspec.Struct, frozen=True):
 
     name: str
     shape: Shape
+
+
+S = TypeVar("S", bound=msgspec.Struct)  # a message class; these are defined on top of this file
+
+
+class Layout(msgspec.Struct, Generic[S], frozen=True, eq=False):
+    """How the messages of one class are laid out in bytes.
+
+    `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with their path where
+    they are nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` is its BLAKE2b-64 (8 bytes). `encode`
+    raises MessageError, which names the field; `decode` raises DecodeError.
+    """
+
+    cls: type[S]
+    fields: tuple[Field, ...]
+    size: int
+    schema: str
+    fingerprint: bytes
+    encode: Callable[[S], bytes]
+    decode: Callable[[bytes], S]
+
+    @property
+    def zero(self) -> S:
+        """The message of zero bytes, made anew: a class that kept an instance of itself would never be collected."""
+        return self.decode(bytes(self.size))
+
+    def __repr__(self) -> str:
+        return f"<Layout of {self.cls.__name__}, {self.size} bytes: {self.schema}>"
 
 
 class Len(msgspec.Struct, frozen=True):
