@@ -67,7 +67,9 @@ class BufferedLink(Link):
         self._arrivals: deque[Any] = deque()
         self._delivering = False
         self._paused = False
-        self._backpressure = LinkBackpressure(self, self._space.loop)
+        self._backpressure = LinkBackpressure(
+            self._space.loop, self.stats.lost, self._deliver_rest, lambda: self.flow_controlled
+        )
         self._early: dict[tuple[bytes, Hashable], tuple[Arrival, int]] = {}
         """The last message of each publisher that is not announced yet, and when it came (ns)."""
 
@@ -84,7 +86,7 @@ class BufferedLink(Link):
 
     @abc.abstractmethod
     def sample(self, topic: str, arrival: Any) -> Sample:
-        """The sample that came in."""
+        """Make a sample of what came in."""
 
     def takes(self, sample: Sample) -> bool:
         """Whether there is room for this very sample now; asked before each `write`."""
@@ -111,9 +113,9 @@ class BufferedLink(Link):
     # Out
 
     def made_room(self) -> None:
-        """Give the room to the samples that wait, in order; to be called whenever `takes` may answer differently."""
+        """Send samples that wait, in order, while there is room. Call it whenever `takes` may answer differently."""
         while not self.stats.lost.guard(self.wait_queue.serve):
-            pass  # the sample that raised waits no more
+            pass  # the sample that raised is out of the queue: go on with the others
         if not self.full:
             self.wait_queue.recover()
 
@@ -201,7 +203,7 @@ class BufferedLink(Link):
     def _deliver(self) -> None:
         self._delivering = True
         arrivals, received, lost = self._arrivals, self._received, self.stats.lost
-        # All in one loop, as this is done for each message. What nobody subscribes costs one look into a dictionary.
+        # All in one loop, as this is done for each message. One without a subscriber costs one look into a dictionary.
         for _ in range(MESSAGES_PER_TURN):
             if not arrivals:
                 self._delivering = False
@@ -240,12 +242,12 @@ class BufferedLink(Link):
             self._paused = False
             self.resume()
 
-    def room_found(self) -> None:
-        """The message that had no room has been delivered, or given up: go on with those behind it."""
+    def _deliver_rest(self) -> None:
+        """Go on behind the message that had no room: it has been delivered, or given up."""
         if not self._closed:
             self._deliver()
 
-    # In: a message may overtake the answer that announces its publisher, and a latched one would not come again
+    # In: a message may overtake the answer that announces its publisher; kept, as a latched one does not come again
 
     def _receive_unexpected(self, arrival: Arrival) -> None:
         self.stats.lost[_NOT_SUBSCRIBED] += 1

@@ -1,9 +1,9 @@
 """A link: one line, connection or bus as a module sees it, and the discovery that runs on it.
 
 A transport, which a URL names, opens links and keeps them up. The link's discovery decides what flows: nothing is sent
-that no module at the other end subscribes, and nothing is received that no node here subscribes. `Link` holds what all
-links share: discovery, announcements, state and counters. How messages are sent and received is up to its two kinds:
-`BufferedLink`, with one send buffer for all topics, and zenoh's, with a stream for each topic.
+that no module at the other end subscribes to, and nothing is received that no node here subscribes to. `Link` holds
+what all links share: discovery, announcements, state and counters. How messages are sent and received is up to its two
+kinds: `BufferedLink`, with one send buffer for all topics, and zenoh's, with a stream for each topic.
 """
 
 import abc
@@ -64,28 +64,28 @@ class Hub(Protocol):
         """For jitter; seeded under virtual time."""
 
     def attach(self, link: "Link") -> None:
-        """A link exists from now on."""
+        """Add a link to the module."""
 
     def detach(self, link: "Link") -> None:
-        """A link does not exist any more."""
+        """Remove a link from the module."""
 
     def link_waits(self, link: "Link", reason: str) -> None:
-        """The other end of a link can't be reached yet."""
+        """Report that the other end of a link can't be reached yet, and why."""
 
     def listening(self, url: str, address: str) -> None:
-        """A transport accepts connections at an address."""
+        """Report the address at which a transport accepts connections."""
 
     def connection_refused(self, url: str, reason: str) -> None:
-        """A transport that accepts connections has refused one."""
+        """Report that a transport that accepts connections has refused one, and why."""
 
     def link_changed(self, link: "Link", reason: str, outage: float, lost: int) -> None:
-        """A link went up or down; on the way up: seconds that it was down, and messages lost by that."""
+        """Report that a link went down (`reason`), or up (after `outage` seconds; `lost` messages were lost)."""
 
     def link_notice(self, link: "Link", kind: str, text: str, *, trouble: bool) -> None:
-        """Something is worth telling the user, who need not do anything about it unless it is `trouble`."""
+        """Report something to the user, who need not do anything about it unless it is `trouble`."""
 
     def discovered(self, link: "Link", event: Event) -> None:
-        """The discovery of a link found something that concerns the module."""
+        """Handle what the discovery of a link has found."""
 
 
 class GatewayHooks(Protocol):
@@ -109,7 +109,7 @@ class GatewayHooks(Protocol):
         """The name of the module that published a message, as it is on the link's network."""
 
     def discovery_changed(self) -> None:
-        """Discovery may have found something."""
+        """Look at what discovery knows: it may have changed."""
 
 
 class Transport(abc.ABC):
@@ -177,7 +177,7 @@ class Link(abc.ABC):
     # For the transport that owns the link
 
     def on_up(self) -> None:
-        """The other end can be reached: announce everything."""
+        """Begin to send, and announce everything: the other end can be reached."""
         outage = (self._clock.monotonic() - self._down_at) / SECOND
         lost = self.stats.lost[LINK_DOWN] - self._lost_at_down
         self.up = True
@@ -190,13 +190,13 @@ class Link(abc.ABC):
         self._apply(self.discovery.link_up(self._clock.monotonic()))
 
     def unreachable(self, reason: str) -> None:
-        """The other end can't be reached yet: tell the user, once for each reason."""
+        """Report that the other end can't be reached yet, once for each reason."""
         if reason != self._unreachable:
             self._unreachable = reason
             self._hub.link_waits(self, reason)
 
     def on_down(self, reason: str) -> None:
-        """The other end is gone. What waits to be sent is discarded and counted: no stale command ever arrives late."""
+        """Stop sending, and discard and count what waits: no stale command ever arrives late. The other end is gone."""
         if not self.up:
             return
         self.up = False
@@ -262,7 +262,7 @@ class Link(abc.ABC):
         return False
 
     def module_changed(self, module: str) -> None:
-        """A module at the other end came, went, or changed its state."""
+        """Adapt to a module at the other end that came, went, or changed its state."""
 
     # For publishers and the module
 
@@ -337,7 +337,7 @@ class Link(abc.ABC):
         self._apply(self.discovery.set_flags(self._clock.monotonic(), flags))
 
     def topic_changed(self, topic: Topic) -> None:
-        """A publisher or a subscriber of this module came or went: announce it."""
+        """Announce what this module publishes and subscribes of a topic: it may have changed."""
         now = self._clock.monotonic()
         known = self._announced.pop(topic.name, NOTHING)
         desired = announcement_of(topic)
@@ -419,7 +419,7 @@ class Link(abc.ABC):
 
 
 class LinkSubscriber(RemoteSubscriber):
-    """One topic on its way out by one link, for all who subscribe it at the other end.
+    """One topic on its way out by one link, for all modules at the other end that subscribe to it.
 
     Publishers do not wait for a link that is down: what it is given then is lost and counted.
     """

@@ -1,50 +1,41 @@
-"""What becomes of a message from a link that finds a queue full.
+"""How a message that came by a link waits for room in a full queue.
 
-A `BlockedMessage` waits for room for some turns of the event loop. What happens then is up to the kind of link: to
-`LinkBackpressure` for links with one way in, and on zenoh to each topic (`r2p.transports.zenoh.backlog`).
+A `BlockedMessage` waits for some turns of the event loop. Then its owner decides: `LinkBackpressure` on links with one
+way in, and on zenoh the `Backlog` of the topic (`r2p.transports.zenoh.backlog`).
 
 A slow reader must not stop a line that others share, and a fast one should lose nothing. So a full queue gets
-FULL_QUEUE_TURNS turns of the event loop to make room; one that does not is lossy, for this link, until it has plenty.
-What a gateway passes on from an end with flow control gets LONGEST_STALL seconds, as what is published here does: so
-backpressure reaches from end to end.
+FULL_QUEUE_TURNS turns of the event loop to make room. If it makes none, this link treats it as lossy (puts messages in
+by force, which drops older ones) until it has plenty of room again. Where a gateway passes messages on to a link
+without room, and the sender waits while nothing is read, the line stands still instead, for LONGEST_STALL seconds at
+most: so backpressure reaches from end to end.
 """
 
 import abc
 import asyncio
 import functools
-from typing import Protocol
+from collections.abc import Callable
 
 from r2p.runtime.backpressure import INTERNAL_ERROR, PendingDelivery, Sink
 from r2p.runtime.sample import Sample
 from r2p.runtime.topic import RemoteSubscriber
-from r2p.transports.stats import LinkStats, LoggedCounter
+from r2p.transports.stats import LoggedCounter
 
 FULL_QUEUE_TURNS = 4
 """Turns of the event loop that a link waits for a full queue before it goes on without it."""
 
 LONGEST_STALL = 1.0
-"""Seconds for which a line stands still, at most, as another link has no room."""
+"""Seconds that a line stands still, at most, while another link has no room."""
 
 SHORTEST_STALL = 0.05
-"""... and right after that was in vain: where many topics have no room, the line must not stand still once for each. It
-grows with the time that has passed since."""
+"""Seconds that it stands still, at most, right after a stall that has not helped.
 
-
-class ReceivingLink(Protocol):
-    """The link whose messages are delivered. While one waits for room, the link delivers no other."""
-
-    stats: LinkStats
-
-    @property
-    def flow_controlled(self) -> bool:
-        """Whether the other end waits while nothing is read, and nothing is lost by that."""
-
-    def room_found(self) -> None:
-        """The message that had no room has been delivered, or given up: go on with those behind it."""
+Where many topics have no room, the line would otherwise stand still for LONGEST_STALL once for each of them. The limit
+grows with the time since that stall, up to LONGEST_STALL. 0.05 is a choice: 20 blocked topics cost a second.
+"""
 
 
 class ReceiveBackpressure(abc.ABC):
-    """What delivers messages from a link one after the other, and waits for room when one finds none."""
+    """The owner of a `BlockedMessage`: delivers what comes by a link in order, and decides how long a message waits."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, lost: LoggedCounter) -> None:
         self.loop = loop
@@ -52,11 +43,11 @@ class ReceiveBackpressure(abc.ABC):
 
     @abc.abstractmethod
     def delivered(self) -> None:
-        """No sink lacks the message any more; called in a turn of the loop of its own."""
+        """Go on with the next message: every sink has this one or has given it up. Called in a turn of its own."""
 
     @abc.abstractmethod
     def expired(self, message: "BlockedMessage") -> None:
-        """Some sinks have made no room within FULL_QUEUE_TURNS turns."""
+        """Decide about the sinks that have made no room within FULL_QUEUE_TURNS turns."""
 
 
 class BlockedMessage(PendingDelivery):
@@ -81,7 +72,7 @@ class BlockedMessage(PendingDelivery):
         sink.wait_queue().remove(sink, self)
         self.remaining.remove(sink)
 
-    def completed(self, sink: Sink, refusal: str) -> None:
+    def completed(self, sink: Sink, reason: str) -> None:
         if self._holds and not self.remaining:
             self._owner.loop.call_soon(self._owner.delivered)  # after the work of the reader that made room
 
@@ -92,7 +83,7 @@ class BlockedMessage(PendingDelivery):
         self._look()
 
     def _offer(self, sink: Sink) -> bool:
-        """Whether the sink is not waited for any more: it has the message, or has raised."""
+        """Offer the message to a sink. Returns True if its wait is over: it has the message, or has raised."""
         try:
             return sink.offer(self.sample)
         except Exception as error:  # noqa: BLE001 - counted and logged; the others follow
@@ -110,11 +101,22 @@ class BlockedMessage(PendingDelivery):
 
 
 class LinkBackpressure(ReceiveBackpressure):
-    """How long one link waits for the sinks of the message that it delivers."""
+    """What waits for room on a link with one way in. While a message waits, the link delivers no other.
 
-    def __init__(self, link: ReceivingLink, loop: asyncio.AbstractEventLoop) -> None:
-        super().__init__(loop, link.stats.lost)
-        self._link = link
+    `resume` is called when the message has been delivered or given up. `flow_controlled` says whether the other end
+    waits while nothing is read, and nothing is lost by that.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        lost: LoggedCounter,
+        resume: Callable[[], None],
+        flow_controlled: Callable[[], bool],
+    ) -> None:
+        super().__init__(loop, lost)
+        self._resume = resume
+        self._flow_controlled = flow_controlled
         self._lossy: set[Sink] = set()
         """Sinks that were waited for in vain, and have not had plenty of room since."""
         self._stalled: BlockedMessage | None = None
@@ -124,7 +126,7 @@ class LinkBackpressure(ReceiveBackpressure):
         self._closed = False
 
     def wait(self, sample: Sample, blocked: list[Sink]) -> bool:
-        """Wait for room in these sinks: `room_found` of the link follows. Returns False if none is worth it."""
+        """Wait for room in these sinks: `resume` is called later. Returns False if none of them is worth a wait."""
         for sink in self._lossy.intersection(blocked):
             self.lost.guard(sink.force, sample)
         waiting = [sink for sink in blocked if sink not in self._lossy]
@@ -133,7 +135,7 @@ class LinkBackpressure(ReceiveBackpressure):
         return bool(waiting)
 
     def close(self) -> None:
-        """Let the line stand still no more."""
+        """End a stall, and begin no other."""
         self._closed = True
         if self._stalled is not None:
             self._stalled.withdraw()
@@ -141,11 +143,11 @@ class LinkBackpressure(ReceiveBackpressure):
 
     def delivered(self) -> None:
         self._end_stall()
-        self._link.room_found()
+        self._resume()
 
     def expired(self, message: BlockedMessage) -> None:
         # Only other links stall the line: a slow reader in this module loses messages, so that other topics go on.
-        may_stall = self._link.flow_controlled and not self._closed
+        may_stall = self._flow_controlled() and not self._closed
         rest = [sink for sink in message.remaining if not (may_stall and isinstance(sink, RemoteSubscriber))]
         for sink in rest:
             message.leave(sink)
@@ -156,9 +158,9 @@ class LinkBackpressure(ReceiveBackpressure):
         if message.remaining:
             self._begin_stall(message)
         else:
-            self._link.room_found()
+            self._resume()
 
-    # Stall: the line stands still until the links that the message goes out by have room, or had none for too long
+    # Stall: the line stands still until there is room on the links that the message goes out by, or the time is over
 
     def _begin_stall(self, message: BlockedMessage) -> None:
         message.hold()
@@ -172,12 +174,12 @@ class LinkBackpressure(ReceiveBackpressure):
             self._stall.cancel()
             self._stall = None
 
-    def _give_up(self, message: BlockedMessage, refusal: str) -> None:
+    def _give_up(self, message: BlockedMessage, reason: str) -> None:
         guard = self.lost.guard
         for sink in list(message.remaining):
             guard(sink.refill)  # a last attempt
         for sink in list(message.remaining):
-            if not guard(sink.become_lossy, refusal):
+            if not guard(sink.become_lossy, reason):
                 sink.wait_queue().remove(sink, message)
                 message.complete(sink, INTERNAL_ERROR)  # else the line would stand still for ever
             self._in_vain_at = self.loop.time()
