@@ -6,6 +6,7 @@ What they share, in the order in which to read it:
     announcement, stats   what the other ends know of a topic; what is counted
     buffered_link         links with one send buffer and one way in
     receive_backpressure  what becomes of a message that finds a queue full
+    senders               who sent what comes in
     line                  the debug line over any carrier of bytes
 
 The transports: `memory`, `tcp`, `serial`, and the packages `rtcan` (on the CAN controllers of `can`) and `zenoh`. `url`

@@ -5,8 +5,7 @@ the carrier (TCP connection, serial port) takes no more, lines wait here, where 
 of real-time publishers never wait: each is sent at once, before all that wait, or its publisher keeps it and watches
 the time. A carrier is attached while it lives. The link outlasts it, and so do its subscriptions and counters.
 
-`PublisherLookup` finds out who sent what comes in, and `UnconfirmedBytes` how many messages a broken connection may
-have lost.
+`UnconfirmedBytes` finds out how many messages a broken connection may have lost.
 """
 
 import abc
@@ -20,17 +19,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import msgspec
 
 from r2p.codecs import debug
-from r2p.codecs.management import FLAG_BOOT, ROLE_PUBLISHES
+from r2p.codecs.management import FLAG_BOOT
 from r2p.errors import MessageError
 from r2p.names import LOADER_PREFIX, MANAGEMENT
-from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.negotiation import GRACE
 from r2p.runtime.backpressure import LINK_DOWN
-from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import PublisherHandle, Topic
 from r2p.transports.announcement import NOTHING
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, is_booting
+from r2p.transports.senders import SenderLookup
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -128,7 +127,7 @@ class LineLink(BufferedLink):
         super().__init__(name, hub, management_rate=management_rate)
         self._reader = debug.Reader(self.stats.lost)
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
-        self._publishers = PublisherLookup(self.discovery, self.name)
+        self._senders = SenderLookup(self.discovery, self.name)
         self._received_at = 0
         """When the bytes of the line that is delivered next came in (UTC, ns)."""
         self._carrier: Carrier | None = None
@@ -267,7 +266,7 @@ class LineLink(BufferedLink):
         (self._urgent if urgent else self._management).append(line)
 
     def sample(self, topic: str, arrival: debug.Line) -> Sample:
-        return Sample(arrival.data, self._publishers.source_of(topic), self._received_at, stamped=False)
+        return Sample(arrival.data, self._senders.source(topic), self._received_at, stamped=False)
 
     def receive_other(self, arrival: Any) -> None:
         if isinstance(arrival, _NewStamp):
@@ -445,43 +444,6 @@ class LineLink(BufferedLink):
         if module == self._space.module:
             return bool(self.discovery.flags & FLAG_BOOT)
         return is_booting(self, module)
-
-
-class PublisherLookup:
-    """The source of what comes in by a line, by topic; looked up anew when discovery has learnt something.
-
-    Lines do not carry it: r2p modules announce which of their nodes publish a topic. A topic that none has announced
-    comes from the only module at the other end, if there is only one.
-    """
-
-    def __init__(self, discovery: DiscoveryProtocol, link: str) -> None:
-        self._discovery = discovery
-        self._link = link
-        self._sources: dict[str, Source] = {}
-        self._generation = -1
-
-    def source_of(self, topic: str) -> Source:
-        """Empty names for what is not known, and for what may be one or another."""
-        if self._generation != self._discovery.generation:
-            self._generation = self._discovery.generation
-            self._sources.clear()
-        source = self._sources.get(topic)
-        if source is None:
-            source = self._sources[topic] = self._find(topic)
-        return source
-
-    def _find(self, topic: str) -> Source:
-        modules = self._discovery.modules.values()
-        names = {info.instance: info.name for info in modules if info.r2p}
-        publishers = {
-            (names.get(each.instance, ""), each.node)
-            for each in self._discovery.endpoints.values()
-            if each.topic == topic and each.role == ROLE_PUBLISHES
-        }
-        candidates = {module for module, _ in publishers} or {info.name for info in modules if not info.observer}
-        module = candidates.pop() if len(candidates) == 1 else ""
-        node = publishers.pop()[1] if len(publishers) == 1 else ""
-        return Source(module, node, self._link)
 
 
 _RECENT = 64

@@ -2,12 +2,14 @@
 
 Each publisher class has room of its own (see `tx`), so bulk data never keeps an event out. Nothing is announced before
 the node has an id8, and everything is announced again when it gets another one. A remote publisher is known by its
-16-bit message id, which its SUBSCRIBE_RESPONSE announces (see `rx`).
+16-bit message id, which its SUBSCRIBE_RESPONSE announces (see `message_ids`).
 """
 
 from collections import Counter
 from collections.abc import Hashable, Sequence
 from typing import Any, ClassVar
+
+import msgspec
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.attachment import ClockOffset
@@ -22,6 +24,7 @@ from r2p.protocols.rtcan.events import (
     Due,
     EngineSettings,
     IdConflict,
+    Mailbox,
     ParameterMismatch,
     ParametersMatch,
     Profile,
@@ -39,11 +42,13 @@ from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, unique_name
 from r2p.transports.rtcan.driver import EngineDriver
-from r2p.transports.rtcan.rx import FIRMWARE, MessageIdMap, ReceivedMessage, SampleBuilder, address_of, publisher_in
+from r2p.transports.rtcan.message_ids import FIRMWARE, R2P, MessageIdMap, address_of, publisher_in
 from r2p.transports.rtcan.slots import SlottedTopic, SlottedTopics, inadmissible
 from r2p.transports.rtcan.status import LinkStatus, UtcEstimator
 from r2p.transports.rtcan.tx import ResponseHandle, SampleHandle, Transmitter, TxAccounting
+from r2p.transports.senders import SenderLookup
 from r2p.transports.stats import LoggedCounter
+from r2p.units import LONG_AGO, MILLISECOND
 
 _MANAGEMENT = MANAGEMENT.encode()
 _LOSSES = ("undecodable", "management dropped")  # what the engine counts as lost without a publisher of this module
@@ -53,6 +58,22 @@ _RATE = 100.0  # messages a second: a fifteenth of a bus of 1 Mbit/s, and the sa
 _BURST, _BURST_MIN = 8, 4  # messages at once, on a bus of 1 Mbit/s and on the slowest ones
 _BIT = 1000  # ns at 1 Mbit/s
 _FIRMWARE_RATE, _FIRMWARE_QUIET = 12.0, 0.033  # a second, and s: all modules have one id, so none may send at once
+
+_OFFSET_VALID = 10 * MILLISECOND  # for which the offset of UTC from the monotonic clock is not read again
+_CLASSES = {
+    Mailbox.HRT: PublisherClass.PERIODIC,
+    Mailbox.SRT: PublisherClass.SPORADIC,
+    Mailbox.NRT: PublisherClass.NON_REAL_TIME,
+}
+
+
+class ReceivedMessage(msgspec.Struct, frozen=True, gc=False):
+    """A whole message that came in."""
+
+    topic: bytes
+    data: bytes
+    message_id: int
+    received: Received
 
 
 class RtcanLink(BufferedLink):
@@ -77,7 +98,10 @@ class RtcanLink(BufferedLink):
         self._utc_error = utc_error
         self._utc = UtcEstimator(self.driver, self._clock)
         self._topic_ids = TopicIdAllocator()
-        self._samples = SampleBuilder(self.driver, discovery, name, self._clock, self._utc)
+        self._senders = SenderLookup(discovery, name, shared=(FIRMWARE, R2P))
+        self._utc_offset = 0
+        """UTC minus the monotonic clock (ns), and until when it is used."""
+        self._utc_offset_until = LONG_AGO
         self._message_ids = MessageIdMap(self.engine, self, self._space, self.stats.lost)
         self._slotted = SlottedTopics(self, self.driver, self._clock, self._has_subscribers)
         self._status = LinkStatus(self.driver, settings)
@@ -162,22 +186,51 @@ class RtcanLink(BufferedLink):
     # In
 
     def sample(self, topic: str, arrival: ReceivedMessage) -> Sample:
+        """The sample of a message of this topic. Its stamp is the start of the message's first frame."""
         self.stats.bytes_received += len(arrival.data)
-        return self._samples.build(topic, arrival)
+        received = arrival.received
+        now = self.driver.now()
+        if now >= self._utc_offset_until:  # two clocks of one computer: not worth two system calls per message
+            self._utc_offset = self._clock.now() - self._clock.monotonic()
+            self._utc_offset_until = now + _OFFSET_VALID
+        stamp = self._utc_offset + self.driver.port.monotonic(self._started(received))
+        source = self._senders.source(topic, rtcan.id8_of(arrival.message_id))
+        # A laxity is the time to the deadline (ms), where there is one. SRT_MAX stands for more, too, so it gives none.
+        laxity = received.laxity
+        deadline = stamp + laxity * MILLISECOND if rtcan.HRT < laxity < rtcan.SRT_MAX else 0
+        sender = self.discovery.modules.get(source.module)
+        return Sample(
+            arrival.data,
+            source,
+            stamp,
+            deadline,
+            0,
+            _CLASSES[received.mailbox],
+            stamped=False,
+            drop_late=sender is not None and sender.r2p,  # firmware gives 50 ms to everything, which means nothing
+            clock=self._utc.offset(now),
+        )
+
+    def _started(self, received: Received) -> int:
+        """When the first frame began. A coarse port does not know that to the bit: don't spend time counting bits."""
+        bit = self.engine.timing.bit
+        if self.driver.port.coarse:
+            return received.stamp - rtcan.frame_bits_max(min(len(received.payload), rtcan.FRAME_MAX)) * bit
+        return received.started(bit)
 
     def sender(self, arrival: ReceivedMessage) -> Hashable:
-        return arrival.message
+        return arrival.message_id
 
     def receive_other(self, arrival: Any) -> None:
         """Handle management: nothing else comes in unless it is subscribed."""
-        data, message = arrival.data, arrival.message
-        source = rtcan.id8_of(message)
-        if message == rtcan.FIRMWARE_MANAGEMENT:
+        data, message_id = arrival.data, arrival.message_id
+        source = rtcan.id8_of(message_id)
+        if message_id == rtcan.FIRMWARE_MANAGEMENT:
             source = address_of(data, self.discovery.modules)
             data = management.unmark(data)
         publisher = publisher_in(data, source)
         if publisher is not None:
-            firmware = source == FIRMWARE and message == rtcan.FIRMWARE_MANAGEMENT
+            firmware = source == FIRMWARE and message_id == rtcan.FIRMWARE_MANAGEMENT
             now, id8 = self._clock.monotonic(), self.engine.id8 or 0
             self._renumber(self._topic_ids.on_announced(now, *publisher, id8, firmware=firmware))
         if self.up:  # before, only the message ids of others matter

@@ -3,7 +3,7 @@
 from r2p.codecs import management as m
 from r2p.protocols.discovery.session import Discovery
 from r2p.runtime.sample import Source
-from r2p.transports.line import PublisherLookup
+from r2p.transports.senders import SenderLookup
 from tests.protocols.discovery.wire import PC2, PEER, S, hear, run
 
 
@@ -14,38 +14,38 @@ def publisher(node: str, *, gone: bool = False) -> m.Endpoint:
 def test_a_publisher_that_is_replaced_by_another() -> None:
     discovery = Discovery("PC1", 1)
     discovery.link_up(0)
-    sources = PublisherLookup(discovery, "lab")
-    assert sources.source_of("leds") == Source("", "", "lab")
+    sources = SenderLookup(discovery, "lab")
+    assert sources.source("leds") == Source("", "", "lab")
     hear(discovery, S, PC2, publisher("blink"))
-    assert sources.source_of("leds") == Source("PC2", "blink", "lab")
+    assert sources.source("leds") == Source("PC2", "blink", "lab")
     hear(discovery, S, publisher("blink", gone=True), publisher("wink"))
-    assert sources.source_of("leds") == Source("PC2", "wink", "lab")
+    assert sources.source("leds") == Source("PC2", "wink", "lab")
     hear(discovery, S, publisher("blink"))
-    assert sources.source_of("leds") == Source("PC2", "", "lab"), "one of two"
+    assert sources.source("leds") == Source("PC2", "", "lab"), "one of two"
     for now in range(4 * S, 24 * S, 4 * S):
-        assert sources.source_of("leds") == Source("PC2", "", "lab")
+        assert sources.source("leds") == Source("PC2", "", "lab")
         hear(discovery, now, PC2, publisher("blink"))
         run(discovery, now, now + 4 * S)
-    assert sources.source_of("leds") == Source("PC2", "blink", "lab"), "the other one was not repeated"
+    assert sources.source("leds") == Source("PC2", "blink", "lab"), "the other one was not repeated"
 
 
 def test_what_is_only_repeated_is_not_worked_out_again() -> None:
     discovery = Discovery("PC1", 1)
     discovery.link_up(0)
-    sources = PublisherLookup(discovery, "lab")
+    sources = SenderLookup(discovery, "lab")
     hear(discovery, S, PC2, publisher("blink"))
-    found = sources.source_of("leds")
+    found = sources.source("leds")
     hear(discovery, 2 * S, PC2, m.Alive("PC2"), publisher("blink"))
-    assert sources.source_of("leds") is found
+    assert sources.source("leds") is found
 
 
 def test_firmware_is_known_where_it_is_alone() -> None:
     discovery = Discovery("PC1", 1)
     discovery.link_up(0)
-    sources = PublisherLookup(discovery, "lab")
+    sources = SenderLookup(discovery, "lab")
     hear(discovery, S, m.Alive("IMU1"))
-    assert sources.source_of("leds") == Source("IMU1", "", "lab")
+    assert sources.source("leds") == Source("IMU1", "", "lab")
     hear(discovery, S, m.Alive("IMU2"))
-    assert sources.source_of("leds") == Source("", "", "lab")
+    assert sources.source("leds") == Source("", "", "lab")
     discovery.link_down(2 * S)
-    assert sources.source_of("leds") == Source("", "", "lab")
+    assert sources.source("leds") == Source("", "", "lab")

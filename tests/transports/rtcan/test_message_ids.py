@@ -15,7 +15,8 @@ from r2p.codecs.management import (
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.protocols.discovery.session import Discovery
 from r2p.runtime.sample import Source
-from r2p.transports.rtcan.rx import FIRMWARE, R2P, SenderLookup, address_of
+from r2p.transports.rtcan.message_ids import FIRMWARE, R2P, address_of
+from r2p.transports.senders import SenderLookup
 
 
 def test_what_r2p_says_among_firmware_is_marked() -> None:
@@ -48,26 +49,26 @@ def hear(discovery: Discovery, message: management.Management, source: int) -> N
 def test_the_source_of_data_follows_from_the_id8() -> None:
     discovery = Discovery("ME", 1)
     discovery.link_up(0)
-    senders = SenderLookup(discovery, "bus")
-    assert senders.source("leds", 0x4221) == Source("", "", "bus")
+    senders = SenderLookup(discovery, "bus", shared=(FIRMWARE, R2P))
+    assert senders.source("leds", 0x21) == Source("", "", "bus")
     hear(discovery, Hello("A", 2), 0x21)
     hear(discovery, Hello("B", 3), 0x22)
-    assert senders.source("leds", 0x4221) == Source("A", "", "bus")
+    assert senders.source("leds", 0x21) == Source("A", "", "bus")
     hear(discovery, Endpoint(ROLE_PUBLISHES, 2, "blink", "leds", CLASS_NRT), 0x21)
     hear(discovery, Endpoint(ROLE_PUBLISHES, 3, "other", "leds", CLASS_NRT), 0x22)
-    assert senders.source("leds", 0x4221) == Source("A", "blink", "bus")
-    assert senders.source("leds", 0x4222) == Source("B", "other", "bus")
+    assert senders.source("leds", 0x21) == Source("A", "blink", "bus")
+    assert senders.source("leds", 0x22) == Source("B", "other", "bus")
     hear(discovery, Endpoint(ROLE_PUBLISHES, 2, "second", "leds", CLASS_NRT), 0x21)
-    assert senders.source("leds", 0x4221) == Source("A", "", "bus")
+    assert senders.source("leds", 0x21) == Source("A", "", "bus")
     hear(discovery, Hello("A", 2), 0x23)  # it has another id8 now
-    assert senders.source("leds", 0x4223) == Source("A", "", "bus")
+    assert senders.source("leds", 0x23) == Source("A", "", "bus")
 
 
 def test_of_firmware_the_only_module_that_it_can_be() -> None:
     discovery = Discovery("ME", 1)
     discovery.link_up(0)
-    senders = SenderLookup(discovery, "bus")
+    senders = SenderLookup(discovery, "bus", shared=(FIRMWARE, R2P))
     hear(discovery, Alive("IMU1"), FIRMWARE)
-    assert senders.source("leds", 0x1828) == Source("IMU1", "", "bus")
+    assert senders.source("leds", 0x28) == Source("IMU1", "", "bus")
     hear(discovery, Alive("IMU2"), FIRMWARE)
-    assert senders.source("leds", 0x1828) == Source("", "", "bus")
+    assert senders.source("leds", 0x28) == Source("", "", "bus")
