@@ -20,6 +20,7 @@ serials and sequences count on from those in the header. Credit and the sender o
 | the rest | origin: `u8 class; u32 sender; u32 instance; u8 fingerprint[8]`, then `module/node` in ASCII |
 """
 
+import enum
 import functools
 import re
 import struct
@@ -59,9 +60,19 @@ PACKET_MAX = 256
 _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
 _NAMES = re.compile(rf"((?:{MODULE_PATH})?)/([A-Za-z0-9_]{{0,8}})".encode())
 _MODULE = re.compile(MODULE_PATH)
-_CLASSES = (1, 2, 3)
 _REMEMBERED_MAX = 4096  # origins that a reader keeps; an even number
 _SHOWN_MAX = 40  # bytes of a wrong name that an error shows
+
+
+class PublisherClass(enum.IntEnum):
+    """The real-time class of a publisher (thesis 5.3.6)."""
+
+    NON_REAL_TIME = 1
+    SPORADIC = 2
+    PERIODIC = 3
+
+
+_CLASSES = frozenset(PublisherClass)
 
 
 class ClockOffset(msgspec.Struct, frozen=True, gc=False):

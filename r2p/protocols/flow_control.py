@@ -8,6 +8,8 @@ it back. Missing serials also show what was lost on the way.
 
 import msgspec
 
+from r2p.codecs.attachment import SERIAL_WRAP
+
 NO_LIMIT = 1 << 62
 """A serial that is never reached: no subscriber has a window."""
 
@@ -16,8 +18,7 @@ SHARE = 1024
 of unknown fate, beside those that were on the way.
 """
 
-_WRAP = 0xFFFFFFFF  # serials have 32 bits on the wire
-_HALF = 0x80000000  # a distance of more than this is one backwards
+_HALF = SERIAL_WRAP // 2 + 1  # a distance of this or more is one backwards
 
 
 class _SubscriberWindow(msgspec.Struct):
@@ -74,7 +75,7 @@ class SendWindow:
         known = self.subscribers.get(session)
         if known is None:
             return
-        behind = (self.serial - serial) & _WRAP
+        behind = (self.serial - serial) & SERIAL_WRAP
         if behind < _HALF:  # else it was never sent: a credit of an earlier run, or a forged one
             known.acknowledged = max(known.acknowledged, self.serial - behind)  # one credit may overtake another
             known.answered = known.waited_for = True
@@ -114,10 +115,10 @@ class ReceiveWindow:
 
     def advance(self, serial: int) -> int:
         """Expect what follows this serial; return how many are missing before it, or -1 for one that came before."""
-        ahead = (serial - self.next_serial) & _WRAP if self.next_serial >= 0 else 0
+        ahead = (serial - self.next_serial) & SERIAL_WRAP if self.next_serial >= 0 else 0
         if ahead >= _HALF:
             return -1
-        self.next_serial = (serial + 1) & _WRAP
+        self.next_serial = (serial + 1) & SERIAL_WRAP
         return ahead
 
     def resize(self, size: int) -> None:

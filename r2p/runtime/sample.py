@@ -4,20 +4,11 @@ It carries the message both as the object that was published and as packed bytes
 link sends the bytes, and a gateway never needs the type.
 """
 
-import enum
-
 import msgspec
 
 from r2p.codecs.attachment import ClockOffset
+from r2p.codecs.attachment import PublisherClass as PublisherClass  # a part of each sample: imported from here
 from r2p.messages import Message
-
-
-class PublisherClass(enum.IntEnum):
-    """The real-time class of a publisher (thesis 5.3.6)."""
-
-    NON_REAL_TIME = 1
-    SPORADIC = 2
-    PERIODIC = 3
 
 
 class Source(msgspec.Struct, frozen=True):
