@@ -89,7 +89,6 @@ class ZenohLink(Link):
         """Take part in the network; all its keys begin with the prefix."""
         self._session = session
         self._prefix = prefix
-        session.outbound.failed = self.stats.lost.internal_error
         self.sender.connect(session, prefix)
         self.receiver.connect(session, prefix)
         for name, announced in self._announced.items():

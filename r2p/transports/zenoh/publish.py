@@ -226,7 +226,7 @@ class PublisherCache:
         if answer is None and topic not in self._asked:
             self._asked.add(topic)
             answered = functools.partial(self._answered, topic)
-            outbound.call_with_result(lambda: all(_reaches(publisher) for publisher in publishers), answered)
+            outbound.submit(lambda: all(_reaches(publisher) for publisher in publishers), then=answered)
         return bool(answer)
 
     def _answered(self, topic: str, reached: bool | None) -> None:
@@ -234,12 +234,20 @@ class PublisherCache:
         self._answers[topic] = bool(reached)
 
     def put(self, topic: str, publisher_class: int) -> Put:
-        """Return what sends packets of the topic."""
+        """Return what sends packets of the topic. It raises BlockingIOError if too many wait already."""
         publisher = self._publisher(topic, publisher_class)
         if publisher is None or self._session is None:
             return put_nowhere
         most = WAITING_MAX if publisher_class == PublisherClass.NON_REAL_TIME else WAITING_MAX_URGENT
-        return functools.partial(self._session.outbound.put, publisher.put, most)
+        outbound, send = self._session.outbound, publisher.put
+
+        def put(data: bytes, *, attachment: bytes) -> None:
+            if outbound.uses_thread:
+                outbound.submit(lambda: send(data, attachment=attachment), max_pending=most)
+            else:  # no `call`: this is the way of each packet
+                send(data, attachment=attachment)
+
+        return put
 
     def _publisher(self, topic: str, publisher_class: int) -> zenoh.Publisher | None:
         key = topic, publisher_class

@@ -112,7 +112,7 @@ class SubscriptionReader:
         self._closed = False
         self._resume_thread = threading.Lock()
         self._resume_thread.acquire()
-        threads.start(self._run)
+        threads.start_thread(self._run, "reader")
 
     def receive(self) -> zenoh.Sample | None:
         """Return the next sample that waits, or None."""
@@ -173,10 +173,13 @@ class SubscriptionReader:
             self.wait()
 
 
-async def open_session(config: zenoh.Config) -> "ZenohSession":
-    """Open a session. Raises Unreachable where that may work later, TransportError where it can't."""
+async def open_session(config: zenoh.Config, on_error: Callable[[Exception], object]) -> "ZenohSession":
+    """Open a session; `on_error` gets what its calls raise in a thread.
+
+    Raises Unreachable where that may work later, TransportError where it can't.
+    """
     try:
-        return ZenohSession(await _in_thread(lambda: zenoh.open(config), _close))
+        return ZenohSession(await _in_thread(lambda: zenoh.open(config), _close), on_error)
     except zenoh.ZError as error:
         text = plain_text(error)
         if text.startswith("Unable to connect"):
@@ -187,9 +190,9 @@ async def open_session(config: zenoh.Config) -> "ZenohSession":
 class ZenohSession:
     """An open session, as the loop uses it. Declarations last until they are undeclared, or the session is closed."""
 
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session: zenoh.Session, on_error: Callable[[Exception], object]) -> None:
         self._session = session
-        self.outbound = OutboundThread(asyncio.get_running_loop())
+        self.outbound = OutboundThread(asyncio.get_running_loop(), on_error)
         self._declared: list[Any] = []
         """Kept, as zenoh undeclares what Python collects."""
         self._publishers: set[zenoh.Publisher] = set()
@@ -249,7 +252,7 @@ class ZenohSession:
             finally:
                 queue.put(complete)
 
-        threads.start(run)
+        threads.start_thread(run, "token query")
 
     def listen(self, key: str, queue: LoopQueue) -> None:
         """Report each message of a key: (its attachment, payload), either of them empty if it is too long to be ours.
@@ -298,7 +301,7 @@ class ZenohSession:
                     queue.failed(as_exception(error))
 
         self._declared.append(declared)
-        threads.start(listen)
+        threads.start_thread(listen, "listener")
 
     def subscribe(self, key: str, most: int, arrived: Callable[[zenoh.Sample], None]) -> "SubscriptionReader":
         """Call `arrived` in the loop with the first sample that comes; those behind it are received from the reader.
@@ -335,24 +338,26 @@ class ZenohSession:
         """Send something of the protocol's own. `final`: nothing makes up for it if it is lost, so where zenoh has no
         room for it a thread waits, and what is sent afterwards waits behind it.
         """
-        call = self.outbound.call_in_thread if final else self.outbound.call
+        call = self.outbound.submit if final else self.outbound.call
         call(
-            self._session.put,
-            key,
-            data,
-            attachment=attachment,
-            priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
-            congestion_control=zenoh.CongestionControl.BLOCK if final else zenoh.CongestionControl.DROP,
-            express=True,
-            allowed_destination=zenoh.Locality.REMOTE,
+            functools.partial(
+                self._session.put,
+                key,
+                data,
+                attachment=attachment,
+                priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
+                congestion_control=zenoh.CongestionControl.BLOCK if final else zenoh.CongestionControl.DROP,
+                express=True,
+                allowed_destination=zenoh.Locality.REMOTE,
+            )
         )
 
     def declare_token(self, key: str) -> None:
         """Declare a liveliness token."""
-        self.outbound.call(self._declare_token, key)
+        self.outbound.call(functools.partial(self._declare_token, key))
 
     def undeclare_token(self, key: str) -> None:
-        self.outbound.call(self._undeclare_token, key)
+        self.outbound.call(functools.partial(self._undeclare_token, key))
 
     def _declare_token(self, key: str) -> None:
         self._tokens[key] = self._session.liveliness().declare_token(key)
@@ -425,7 +430,7 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
         if not future.cancelled():
             future.set_result(result)
         elif abandoned is not None:
-            threads.start(functools.partial(abandoned, result))
+            threads.start_thread(functools.partial(abandoned, result), "clean-up")
 
     def fail(error: Exception) -> None:
         if not future.cancelled():
@@ -444,7 +449,7 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
             if abandoned is not None:
                 abandoned(result)
 
-    threads.start(work)
+    threads.start_thread(work, "request")
     return await future
 
 

@@ -30,12 +30,12 @@ WAITING_MAX_URGENT = 16
 _JOIN_TIMEOUT_S = 2.0
 """Seconds for which the end of the program waits for a thread: one that connects in vain may take longer."""
 
-_threads: "WeakSet[threading.Thread]" = WeakSet()
+_threads: WeakSet[threading.Thread] = WeakSet()
 
 
-def start(function: Callable[[], object]) -> threading.Thread:
-    """Call it in a thread of its own, which does not keep the program from ending."""
-    thread = threading.Thread(target=function, name="r2p zenoh", daemon=True)
+def start_thread(function: Callable[[], object], name: str) -> threading.Thread:
+    """Call it in a thread of its own, which does not keep the program from ending. `name` says what the thread does."""
+    thread = threading.Thread(target=function, name=f"r2p zenoh {name}", daemon=True)
     _threads.add(thread)
     thread.start()
     return thread
@@ -63,17 +63,17 @@ def _join() -> None:
 class OutboundThread:
     """Makes the calls of one session that may wait for zenoh, in order: at once, or in a thread.
 
-    `failed` gets what they raise in the thread.
+    `on_error` gets, in the loop, what they raise in the thread.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, on_error: Callable[[Exception], object]) -> None:
         self._loop = loop
+        self._on_error = on_error
         self._jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._many_tokens = False
         self._thread: threading.Thread | None = None
         self._submitted = 0
         self._done = 0
-        self.failed: Callable[[Exception], object] = lambda _error: None
 
     def set_token_count(self, tokens: int) -> None:
         """Note how many tokens there are; in any thread."""
@@ -94,37 +94,30 @@ class OutboundThread:
         """Whether too many calls wait already to add what can be sent later, or not at all."""
         return self.waiting >= WAITING_MAX
 
-    def put(self, send: Callable[..., object], most: int, data: bytes, *, attachment: bytes) -> None:
-        """Send a packet of messages. Raises BlockingIOError if `most` calls wait already."""
-        if not self.uses_thread:
-            send(data, attachment=attachment)
-        elif self.waiting >= most:
+    def call(self, function: Callable[[], object]) -> None:
+        """Call it: now, or in the thread while that makes the calls."""
+        if self.uses_thread:
+            self.submit(function)
+        else:
+            function()
+
+    def submit(
+        self,
+        function: Callable[[], T],
+        *,
+        then: Callable[[T | None], object] | None = None,
+        max_pending: int | None = None,
+    ) -> None:
+        """Have the thread call it. `then` gets, in the loop, what it returns, or None if it raises.
+
+        Raises BlockingIOError if `max_pending` calls wait already.
+        """
+        if max_pending is not None and self.waiting >= max_pending:
             raise BlockingIOError
-        else:
-            self._submit(lambda: send(data, attachment=attachment))
-
-    def call(self, function: Callable[..., object], *args: Any, **kwargs: Any) -> None:
-        """Call it, now or later."""
-        if not self.uses_thread:
-            function(*args, **kwargs)
-        else:
-            self.call_in_thread(function, *args, **kwargs)
-
-    def call_in_thread(self, function: Callable[..., object], *args: Any, **kwargs: Any) -> None:
-        """Call it in the thread: it may take long."""
-        self._submit(lambda: function(*args, **kwargs))
-
-    def call_with_result(self, function: Callable[[], T], then: Callable[[T | None], object]) -> None:
-        """Call it in the thread, and `then` with what it returns in the loop; with None if it raises."""
-
-        def answer() -> None:
-            result: T | None = None
-            try:
-                result = function()
-            finally:
-                self._call_in_loop(then, result)
-
-        self._submit(answer)
+        if self._thread is None:
+            self._thread = start_thread(self._work, "calls")
+        self._submitted += 1
+        self._jobs.put(function if then is None else lambda: self._answer(function, then))
 
     def finish(self) -> None:
         """Wait for all calls, and end the thread. Not to be called in the loop, which must submit nothing any more."""
@@ -132,18 +125,19 @@ class OutboundThread:
             self._jobs.put(None)
             self._thread.join()
 
-    def _submit(self, job: Callable[[], object]) -> None:
-        if self._thread is None:
-            self._thread = start(self._work)
-        self._submitted += 1
-        self._jobs.put(job)
+    def _answer(self, function: Callable[[], T], then: Callable[[T | None], object]) -> None:
+        result: T | None = None
+        try:
+            result = function()
+        finally:
+            self._call_in_loop(then, result)
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
             try:
                 job()
             except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: without the thread all calls would stop
-                self._call_in_loop(self.failed, as_exception(error))
+                self._call_in_loop(self._on_error, as_exception(error))
             finally:
                 self._done += 1
 

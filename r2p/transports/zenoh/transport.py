@@ -91,7 +91,7 @@ class ZenohTransport(Transport):
 
         while True:
             try:
-                return await open_session(config)
+                return await open_session(config, link.stats.lost.internal_error)
             except TransportError as error:
                 if use_any_port(config, self._options):
                     continue

@@ -171,7 +171,7 @@ async def test_what_raises_does_not_stop_what_comes_behind_it() -> None:
     assert (taken, losses) == ([2, 5, 10], {"internal error": 2})
 
     channel, nothing = Channel(), None
-    session = ZenohSession(nothing)  # type: ignore[arg-type]
+    session = ZenohSession(nothing, losses.internal_error)  # type: ignore[arg-type]
     session._forward(channel, lambda item: queue.put(len(item)), queue)
     channel.put_all(["12345", 7, "1234567890"])
     await ended.wait()
@@ -207,7 +207,7 @@ async def test_publishers_are_undeclared_before_their_session_is_closed() -> Non
     """Otherwise zenoh's memory grows with each session."""
     bare = Zenoh()
     stand_in: Any = bare
-    session = ZenohSession(stand_in)
+    session = ZenohSession(stand_in, LoggedCounter().internal_error)
     session.declare_publisher("stays", 1)
     session.undeclare_publisher(session.declare_publisher("ended", 2))
     await session.close()

@@ -5,13 +5,14 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from r2p.protocols.flow_control import SendWindow
-from r2p.runtime.sample import Sample, Source
+from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.publish import PublisherCache, TxStream
 from r2p.transports.zenoh.session import _in_thread
@@ -37,8 +38,20 @@ class Busy:
         return what
 
 
-def outbound() -> OutboundThread:
-    return OutboundThread(asyncio.get_running_loop())
+def unexpected(error: Exception) -> None:
+    raise error
+
+
+def outbound(on_error: Callable[[Exception], object] = unexpected) -> OutboundThread:
+    return OutboundThread(asyncio.get_running_loop(), on_error)
+
+
+def putting(out: OutboundThread, busy: Busy) -> Callable[..., None]:
+    """What sends the packets of events."""
+    session: Any = SimpleNamespace(outbound=out, declare_publisher=lambda *_: SimpleNamespace(put=busy.call))
+    publishers = PublisherCache()
+    publishers.connect(session, "r2p/lab/topic/")
+    return publishers.put("leds", PublisherClass.SPORADIC)
 
 
 async def idle(out: OutboundThread) -> None:
@@ -50,8 +63,8 @@ async def test_with_few_tokens_every_call_is_made_at_once() -> None:
     out, busy = outbound(), Busy()
     busy.free.set()
     out.set_token_count(MANY_TOKENS - 1)
-    out.call(busy.call, 1)
-    out.put(busy.call, 1, b"2", attachment=b"")
+    out.call(partial(busy.call, 1))
+    putting(out, busy)(b"2", attachment=b"")
     out.finish()
     assert busy.calls == [1, b"2"]
     assert busy.threads == {threading.get_ident()}
@@ -59,12 +72,12 @@ async def test_with_few_tokens_every_call_is_made_at_once() -> None:
 
 async def test_what_may_take_long_is_called_by_the_thread_and_what_follows_stays_behind_it() -> None:
     out, busy = outbound(), Busy()
-    out.call_in_thread(busy.call, 1)
-    out.call(busy.call, 2)
+    out.submit(partial(busy.call, 1))
+    out.call(partial(busy.call, 2))
     assert busy.calls == []
     busy.free.set()
     await idle(out)
-    out.call(busy.call, 3)
+    out.call(partial(busy.call, 3))
     out.finish()
     assert busy.calls == [1, 2, 3]
     assert len(busy.threads) == 2
@@ -75,18 +88,18 @@ async def test_with_many_a_thread_makes_them_in_order_and_the_loop_goes_on() -> 
     out.set_token_count(MANY_TOKENS)
     answer: asyncio.Future[object] = asyncio.get_running_loop().create_future()
     for number in range(3):
-        out.call(busy.call, number)
-    out.put(busy.call, 9, b"data", attachment=b"")
-    out.call_with_result(lambda: busy.call("asked"), answer.set_result)
+        out.call(partial(busy.call, number))
+    putting(out, busy)(b"data", attachment=b"")
+    out.submit(lambda: busy.call("asked"), then=answer.set_result)
     out.set_token_count(0)
-    out.call(busy.call, "behind them")
+    out.call(partial(busy.call, "behind them"))
     assert (busy.calls, out.waiting) == ([], 6)
     busy.free.set()
     assert await answer == "asked"
     await idle(out)
     assert busy.calls == [0, 1, 2, b"data", "asked", "behind them"]
     assert threading.get_ident() not in busy.threads
-    out.call(busy.call, "at once")
+    out.call(partial(busy.call, "at once"))
     assert busy.calls[-1] == "at once"
     await asyncio.to_thread(out.finish)
 
@@ -95,7 +108,7 @@ async def test_what_does_not_fit_is_counted() -> None:
     out, busy, stats = outbound(), Busy(), LinkStats()
     out.set_token_count(MANY_TOKENS)
     stream = TxStream(SendWindow(), urgent=True)
-    stream.prepare(Source("PC1", "talk"), ORIGIN, _putting(out, busy))
+    stream.prepare(Source("PC1", "talk"), ORIGIN, putting(out, busy))
     for sequence in range(1, WAITING_MAX_URGENT + 4):
         stream.window.serial += 1
         stream.waiting.append(Sample(b"x", Source("PC1", "talk"), 1, sequence=sequence))
@@ -107,22 +120,14 @@ async def test_what_does_not_fit_is_counted() -> None:
     assert len(busy.calls) == WAITING_MAX_URGENT
 
 
-def _putting(out: OutboundThread, busy: Busy) -> Callable[..., None]:
-    def put(data: bytes, *, attachment: bytes) -> None:
-        out.put(busy.call, WAITING_MAX_URGENT, data, attachment=attachment)
-
-    return put
-
-
 async def test_what_fails_in_the_thread_is_told_and_the_next_call_is_made() -> None:
-    out, busy = outbound(), Busy()
     failed: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
+    out, busy = outbound(failed.set_result), Busy()
     answer: asyncio.Future[object] = asyncio.get_running_loop().create_future()
-    out.failed = failed.set_result
     busy.free.set()
     out.set_token_count(MANY_TOKENS)
-    out.call_with_result(lambda: [][0], answer.set_result)
-    out.call(busy.call, "next")
+    out.submit(lambda: [][0], then=answer.set_result)
+    out.call(partial(busy.call, "next"))
     assert isinstance(await failed, IndexError)
     assert await answer is None
     await asyncio.to_thread(out.finish)
@@ -138,13 +143,12 @@ def panic() -> None:
 
 
 async def test_a_panic_of_zenoh_does_not_end_the_thread() -> None:
-    out, busy = outbound(), Busy()
     failed: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
-    out.failed = failed.set_result
+    out, busy = outbound(failed.set_result), Busy()
     busy.free.set()
     out.set_token_count(MANY_TOKENS)
     out.call(panic)
-    out.call(busy.call, "next")
+    out.call(partial(busy.call, "next"))
     async with asyncio.timeout(GUARD):
         assert str(await failed) == "Panic: poisoned"
         await asyncio.to_thread(out.finish)
@@ -162,10 +166,10 @@ async def test_it_takes_half_the_crowd_to_go_back() -> None:
     busy.free.set()
     out.set_token_count(MANY_TOKENS)
     out.set_token_count(MANY_TOKENS - 1)
-    out.call(busy.call, "by the thread")
+    out.call(partial(busy.call, "by the thread"))
     await idle(out)
     out.set_token_count(MANY_TOKENS // 2 - 1)
-    out.call(busy.call, "at once")
+    out.call(partial(busy.call, "at once"))
     await asyncio.to_thread(out.finish)
     assert len(busy.threads) == 2
 
@@ -202,7 +206,7 @@ class Publisher:
 PROGRAM = """
 import sys
 from r2p.transports.zenoh import threads
-threads.start(lambda: print(sys.stdin.read()))
+threads.start_thread(lambda: print(sys.stdin.read()), "test")
 """
 
 
