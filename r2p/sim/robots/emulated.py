@@ -11,11 +11,12 @@ power switch for each module.
 
 import asyncio
 import contextlib
+import functools
 import math
 import random
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Any, Self
 
 from r2p.bridge import BridgeOptions
 from r2p.clock import check_timeout
@@ -39,6 +40,9 @@ from r2p.sim.robots import triskar2
 from r2p.sim.robots.latest import Traffic
 from r2p.transports.link import Transport
 
+if TYPE_CHECKING:
+    from r2p.modules.supervisor import NodeFunction
+
 STEP = 0.002
 """Seconds of the physics, and of the control of the motors."""
 FREQUENCY, DAMPING = 20.0, 0.8
@@ -55,20 +59,6 @@ _POLL, _SETTLED = 0.02, 0.5  # seconds
 _ELECTRONICS = 0.25  # A: the current of the modules
 
 
-class Supply:
-    """Draws the current of motors and modules from the battery."""
-
-    def __init__(self, battery: Battery, motors: Iterable[Motor]) -> None:
-        self._battery = battery
-        self._motors = list(motors)
-
-    def step(self, dt: float) -> None:
-        """Advance by `dt` seconds."""
-        power = sum(motor.voltage * motor.current for motor in self._motors)
-        self._battery.current = _ELECTRONICS + power / self._battery.voltage
-        self._battery.step(dt)
-
-
 class Hardware:
     """The body, its motors and its battery in the world: everything that is not a module."""
 
@@ -81,12 +71,13 @@ class Hardware:
         self.gains: Gains = speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING)
         self.drives = [Drive(motor, self.gains) for motor in self.motors]
         self.battery = Battery(triskar2.BATTERY)
-        self.plant = Plant([*self.drives, self.body, Supply(self.battery, self.motors)], dt=STEP)
+        self.plant = Plant([*self.drives, self.body, self], dt=STEP)
 
-    @property
-    def pose(self) -> Triple:
-        """The true pose: x and y in m, heading in rad, since the start."""
-        return self.body.x, self.body.y, self.body.w
+    def step(self, dt: float) -> None:
+        """Draw the current of motors and modules from the battery for `dt` seconds, after drives and body."""
+        power = sum(motor.voltage * motor.current for motor in self.motors)
+        self.battery.current = _ELECTRONICS + power / self.battery.voltage
+        self.battery.step(dt)
 
     def noise(self, part: str) -> random.Random:
         """Return the random numbers for a part."""
@@ -125,7 +116,17 @@ class Triskar2:
         self.hardware = Hardware(seed, world)
         self.modules: dict[str, Board] = {}
         """The modules that are switched on, by name."""
-        self._traffic = traffic
+        chain: dict[str, Any] = {} if traffic is None else {"traffic": traffic}
+        self._boards: dict[str, tuple[Callable[[str], Board], dict[str, NodeFunction]]] = {
+            "MOTOR1": (self._motor, {"invkin": functools.partial(triskar2.inverse_kinematics, **chain)}),
+            "MOTOR2": (self._motor, {"fwdkin": triskar2.forward_kinematics}),
+            "MOTOR3": (self._motor, {}),
+            "PROX1": (self._proximity, {"obstacle": functools.partial(triskar2.obstacle_avoidance, **chain)}),
+            "PROX2": (self._proximity, {}),
+            "PS": (self._power_supply, {"battery": triskar2.battery_monitor}),
+            "GW": (self._gateway, {}),
+        }
+        """How to make each module, and the robot's nodes on it, as in the thesis (figure 8.3)."""
         self._names = list(MODULES if modules is None else modules)
         for name in self._names:
             _check_name(name)
@@ -133,7 +134,8 @@ class Triskar2:
     @property
     def pose(self) -> Triple:
         """The true pose: x and y in m, heading in rad, since the start."""
-        return self.hardware.pose
+        body = self.hardware.body
+        return body.x, body.y, body.w
 
     async def __aenter__(self) -> Self:
         async with contextlib.AsyncExitStack() as opening:  # also when cancelled: without the block, nothing is closed
@@ -184,10 +186,12 @@ class Triskar2:
         if name in self.modules:
             raise Error(f"module {name} is on: switch it off first")
         async with contextlib.AsyncExitStack() as opening:
-            board = self.modules[name] = self._make(name)
+            make, nodes = self._boards[name]
+            board = self.modules[name] = make(name)
             opening.callback(self.modules.pop, name)
             await opening.enter_async_context(board)
-            self._start_nodes(board)
+            for node, function in nodes.items():
+                board.start(function, name=node)
             opening.pop_all()
         return board
 
@@ -202,16 +206,14 @@ class Triskar2:
             raise Error(f"module {name} is off: switch it on first")
         await board.__aexit__(None, None, None)
 
-    def _make(self, name: str) -> Board:
-        if name in MOTORS:
-            return self._motor(name, MOTORS.index(name))
-        if name in PROXIMITY:
-            return self._proximity(name, PROXIMITY[name])
-        if name == "GW":
-            return GatewayModule(name, via=self.via, outside=self.outside, options=self._options)
+    def _gateway(self, name: str) -> GatewayModule:
+        return GatewayModule(name, via=self.via, outside=self.outside, options=self._options)
+
+    def _power_supply(self, name: str) -> PowerModule:
         return PowerModule(name, battery=self.hardware.battery, topic="power", via=self.via)
 
-    def _motor(self, name: str, wheel: int) -> MotorModule:
+    def _motor(self, name: str) -> MotorModule:
+        wheel = MOTORS.index(name)
         ticks = triskar2.MOTOR.ticks_per_radian
         config = MotorConfig(
             setpoints=Setpoints("speed", Speed3, lambda speeds: speeds.value[wheel] * ticks),
@@ -222,7 +224,8 @@ class Triskar2:
         )
         return MotorModule(name, drive=self.hardware.drives[wheel], config=config, via=self.via)
 
-    def _proximity(self, name: str, topic: str) -> ProximityModule:
+    def _proximity(self, name: str) -> ProximityModule:
+        topic = PROXIMITY[name]
         ahead = triskar2.SIDES[topic]
 
         def distance_to(number: int) -> float:
@@ -231,19 +234,6 @@ class Triskar2:
         return ProximityModule(
             name, distance_to=distance_to, noise=self.hardware.noise(name), spec=RangeSpec(), topic=topic, via=self.via
         )
-
-    def _start_nodes(self, board: Board) -> None:
-        """Start the robot's nodes, on the modules as in the thesis (figure 8.3)."""
-        traffic = () if self._traffic is None else (self._traffic,)
-        match board.name:
-            case "MOTOR1":
-                board.start(triskar2.inverse_kinematics, *traffic, name="invkin")
-            case "MOTOR2":
-                board.start(triskar2.forward_kinematics, name="fwdkin")
-            case "PROX1":
-                board.start(triskar2.obstacle_avoidance, *traffic, name="obstacle")
-            case "PS":
-                board.start(triskar2.battery_monitor, name="battery")
 
 
 def _check_name(name: str) -> None:

@@ -23,6 +23,7 @@ from r2p.transports.memory import network
 from tests.sim.robots.rig import WAIT, lap_time, odometry_of, until_at_rest, until_driving
 
 if TYPE_CHECKING:
+    from r2p.modules.supervisor import NodeFunction
     from r2p.sim.modules import Board
     from r2p.transports.memory import Datagram
 
@@ -224,13 +225,15 @@ async def test_an_error_in_its_block_gets_notes_of_nodes_that_crashed() -> None:
 async def test_a_module_that_does_not_open_leaves_nothing_running(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Triskar2(VIA)
     boards: list[Board] = []
+    start = r2p.Module.start
 
-    def start_nodes(board: Board) -> None:
+    def start_or_fail(board: Board, function: NodeFunction, *, name: str) -> r2p.Node:
         boards.append(board)
-        if board.name == "PS":
+        if name == "battery":
             raise OSError("no nodes")
+        return start(board, function, name=name)
 
-    monkeypatch.setattr(robot, "_start_nodes", start_nodes)
+    monkeypatch.setattr(r2p.Module, "start", start_or_fail)
     with pytest.raises(OSError, match="no nodes"):
         await robot.__aenter__()
     assert not robot.modules
