@@ -179,7 +179,7 @@ def decode_sync(frame: Frame) -> Sync:
 
 
 def is_sync(identifier: int) -> bool:
-    """Whether it is of a sync: laxity 0, high byte 0, no fragments left. Firmware may send management like that."""
+    """Whether a frame is a sync: laxity 0, high byte 0, no fragments left. Firmware may send management like that."""
     return not identifier & NOT_SYNC
 
 
@@ -223,7 +223,7 @@ def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
 
 
 def other_frame_bits(frame: OtherFrame) -> int:
-    """The bits of a frame that RTCAN does not use, and errors, as for `frame_bits`."""
+    """The bits of a frame that RTCAN does not use. Counts and raises as `frame_bits` does."""
     if frame.remote is None:
         return frame_bits(frame.id, frame.data, extended=frame.extended)
     if frame.id >> (IDENTIFIER_BITS if frame.extended else 11) or not 0 <= frame.remote <= 0xF:

@@ -155,7 +155,7 @@ class LineLink(BufferedLink):
     # For the carrier
 
     def connected(self, carrier: Carrier) -> None:
-        """Bytes flow from now on."""
+        """Use this carrier from now on: its connection is up."""
         if self._closed:
             carrier.close()
             return
@@ -170,7 +170,7 @@ class LineLink(BufferedLink):
             self.on_up()
 
     def disconnected(self, reason: str) -> None:
-        """Bytes do not flow any more."""
+        """Give up the carrier: its connection has ended."""
         self._count_unknown()
         self._carrier = None
         self._end_grace()
@@ -178,7 +178,7 @@ class LineLink(BufferedLink):
         self._lose_unsent()
 
     def fed(self, data: bytes | memoryview) -> None:
-        """Bytes came in."""
+        """Deliver the messages in bytes that came in."""
         self.stats.bytes_received += len(data)
         received_at = self._clock.now()
         try:
@@ -205,11 +205,11 @@ class LineLink(BufferedLink):
         return lines
 
     def carrier_full(self) -> None:
-        """The carrier holds bytes that it could not send."""
+        """Give the carrier no more: it holds bytes that it could not send."""
         self._blocked = True
 
     def carrier_ready(self) -> None:
-        """The carrier has sent all that it held."""
+        """Go on with what waits: the carrier has sent all that it held."""
         self._blocked = False
         self.stats.lost.guard(self._unsent_is_sent)
         self.made_room()  # before the bytes that wait fill the carrier again
@@ -447,7 +447,7 @@ class LineLink(BufferedLink):
 
 
 _RECENT = 64
-"""Pieces sent last of which each is known."""
+"""The pieces sent last; the position of each is known."""
 
 _STEP = 4096
 """Bytes between two marks before those, for the last 512 kB at least."""

@@ -109,7 +109,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
         self.opened(self._transport, f"tcp:{_address(peer[0], peer[1])}")
 
     def opened(self, transport: asyncio.Transport, peer: str) -> None:
-        """The other end is there."""
+        """Connect the link: the other end is there."""
         self.link = self.open_link(peer)
         self.link.connected(self)
 
