@@ -127,7 +127,7 @@ class BridgedTopic(Topic):
         now = self._monotonic()
         port = self._ports[link]
         if now >= port.tree_port.forwards_until:
-            if not (port.resumes and self._held.hold(sample, functools.partial(self.deliver, sample))):
+            if not (port.resumes and self._held.hold(sample, functools.partial(self._deliver_held, port, sample))):
                 port.count_dropped("converging")
             return None
         # A latched value comes again, unchanged, for each new subscriber.
@@ -146,6 +146,12 @@ class BridgedTopic(Topic):
         for route in routes:
             blocked = self._forward(route, sample, now, blocked)
         return blocked
+
+    def _deliver_held(self, port: BridgePort, sample: Sample) -> list[Sink] | None:
+        if self._ports.get(port.name) is port:
+            return self.deliver(sample)
+        port.count_dropped("converging")  # its link is gone
+        return None
 
     def _forward(self, route: Route, sample: Sample, now: int, blocked: list[Sink] | None) -> list[Sink] | None:
         port = route.port

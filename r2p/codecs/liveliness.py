@@ -39,6 +39,7 @@ _TOPIC = re.compile(
     rf"({_HEX32})/(pub|sub)/([A-Za-z0-9_]{{1,16}}(?:%[A-Za-z0-9_]{{1,16}})?)/({_HEX32}|-)/([A-Za-z0-9_]{{1,8}}|-)"
     r"/([0-9]{1,3})/([0-9]{1,6})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
 )
+_CLASS_MAX = 0xFF
 _OBSERVER = 0x80
 FLAGS = 0x7F
 """The flags of ALIVE that a token can hold."""
@@ -111,7 +112,7 @@ def decode(key: str) -> Token:
             bool(bits & _OBSERVER),
             int(hops),
         )
-    if (found := _TOPIC.fullmatch(rest)) and int(found[7]) <= SIZE_MAX:
+    if (found := _TOPIC.fullmatch(rest)) and int(found[6]) <= _CLASS_MAX and int(found[7]) <= SIZE_MAX:
         session, role, topic, instance, node, publisher_class, size, fingerprint, window, hops = found.groups()
         return TopicToken(
             int(session, 16),
@@ -119,7 +120,7 @@ def decode(key: str) -> Token:
             topic.replace("%", "/"),
             _instance(instance),
             "" if node == _NONE else node,
-            int(publisher_class) & 0xFF,
+            int(publisher_class),
             int(size),
             ANY_TYPE if fingerprint == _NONE else bytes.fromhex(fingerprint),
             int(window),

@@ -16,7 +16,7 @@ import functools
 from collections.abc import Callable
 
 from r2p.runtime.backpressure import INTERNAL_ERROR, PendingDelivery, Sink
-from r2p.runtime.sample import Sample
+from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import RemoteSubscriber
 from r2p.transports.stats import LoggedCounter
 
@@ -148,11 +148,15 @@ class LinkBackpressure(ReceiveBackpressure):
     def expired(self, message: BlockedMessage) -> None:
         # Only other links stall the line: a slow reader in this module loses messages, so that other topics go on.
         may_stall = self._flow_controlled() and not self._closed
-        rest = [sink for sink in message.remaining if not (may_stall and isinstance(sink, RemoteSubscriber))]
+        slow = [sink for sink in message.remaining if not (may_stall and isinstance(sink, RemoteSubscriber))]
+        # Events and periodic messages stall nothing: they would be stale. The other link is no less waited for later.
+        stalls = message.sample.publisher_class == PublisherClass.NON_REAL_TIME
+        rest = slow if stalls else list(message.remaining)
         for sink in rest:
             message.leave(sink)
         for sink in rest:
             self.lost.guard(sink.force, message.sample)
+        for sink in slow:
             self._lossy.add(sink)
             sink.wait_queue().recoveries.append(functools.partial(self._lossy.discard, sink))
         if message.remaining:

@@ -235,6 +235,24 @@ async def test_what_a_gateway_kept_is_dropped_where_another_one_forwards() -> No
         assert gw.links[0].losses["converging"] == 1
 
 
+async def test_what_a_gateway_kept_of_a_link_that_is_gone_is_counted() -> None:
+    async with gateway(networks="abc") as gw, node("A", "a") as a, node("B", "b") as b:
+        leds, far = a.advertise("leds", Led), b.subscribe("leds", Led, queue=100)
+        await leds.wait_subscriber()
+        await asyncio.sleep(0.1)
+        bridge = gw._link_manager.bridge if gw._link_manager is not None else None
+        assert bridge is not None
+        stand_still(gw, 0.7)
+        await leds.publish(Led(led=1))
+        await asyncio.sleep(0.01)
+        first, *others = gw.links
+        bridge.detach(first)
+        await asyncio.sleep(CONVERGED)
+        assert (drain(far), first.losses["converging"]) == ([], 1)
+        assert [link.losses["internal error"] for link in others] == [0, 0]
+        bridge.attach(first)  # the module itself detaches it at its end
+
+
 async def test_a_line_without_a_gateway_goes_on_at_once() -> None:
     one, other = Peer(), Peer()
     async with r2p.Module("GW", via=[one, other], bridge=True) as gw:

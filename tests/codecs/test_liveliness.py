@@ -69,6 +69,7 @@ def test_keys_as_people_see_them() -> None:
         "1/ab/pub/leds/ab/blink/1/-5/-/0/0",
         "1/ab/pub/leds/ab/blink/1/1025/-/0/0",
         "1/ab/sub/leds/ab/blink/1/100000/-/0/0",
+        "1/ab/pub/leds/ab/blink/257/5/-/0/0",
         "1/ab/module/PC\n/ab/0/0",
     ],
 )

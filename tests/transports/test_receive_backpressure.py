@@ -11,7 +11,7 @@ import pytest
 from r2p.clock import clock_of
 from r2p.runtime.backpressure import WaitQueue
 from r2p.runtime.queues import WakeScheduler
-from r2p.runtime.sample import Sample, Source
+from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
 from r2p.transports.buffered_link import Arrival, BufferedLink
 from r2p.transports.receive_backpressure import FULL_QUEUE_TURNS, LONGEST_STALL
@@ -59,6 +59,7 @@ class End(BufferedLink):
 
     flow_controlled = False
     full = False
+    publisher_class = PublisherClass.NON_REAL_TIME
 
     def __init__(self, *, flow_controlled: bool) -> None:
         space = TopicSpace("A", asyncio.get_running_loop(), clock_of())
@@ -68,7 +69,7 @@ class End(BufferedLink):
         self.reads = True
 
     def sample(self, topic: str, arrival: Arrival) -> Sample:
-        return Sample(arrival.data, Source(link="line"), 0)
+        return Sample(arrival.data, Source(link="line"), 0, publisher_class=self.publisher_class)
 
     def receive_other(self, arrival: Arrival) -> None:
         raise AssertionError(arrival)
@@ -115,6 +116,24 @@ async def test_a_link_that_hangs_holds_it_up_once() -> None:
     end.receive(LINES)
     await asyncio.sleep(LONGEST_STALL * 1.5)
     assert (other.taken, other.lost, other.waits, end.reads) == ([], len(LINES), False, True)
+
+
+@pytest.mark.parametrize("publisher_class", [PublisherClass.SPORADIC, PublisherClass.PERIODIC])
+async def test_what_expires_does_not_hold_it_up(publisher_class: PublisherClass) -> None:
+    """And the other link is waited for as before when a message comes that does not expire."""
+    end, other = gateway(flow_controlled=True)
+    end.publisher_class = publisher_class
+    end.receive(LINES)
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert (other.taken, other.lost, end.reads) == ([], len(LINES), True)
+    end.publisher_class = PublisherClass.NON_REAL_TIME
+    end.receive(LINES[:1])
+    await asyncio.sleep(LONGEST_STALL / 2)
+    other.space = 1
+    other.refill()
+    await asyncio.sleep(0.1)
+    assert (other.taken, other.lost, end.reads) == (ALL[:1], len(LINES), True)
 
 
 async def test_many_topics_without_room_hold_it_up_hardly_longer_than_one() -> None:
