@@ -1,6 +1,6 @@
 """A gateway joins the links of a module, so that they are one network.
 
-A gateway has no topics of its own. On each link it publishes what is published elsewhere, and subscribes what is
+A gateway has no topics of its own. On each link it publishes what is published elsewhere, and subscribes to what is
 subscribed elsewhere; so subscriptions travel through it, also from gateway to gateway, and only what is subscribed is
 sent. It never decodes a message. Where it forwards at all is agreed with the other gateways (`r2p.protocols.bridge`).
 

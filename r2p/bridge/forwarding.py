@@ -165,7 +165,7 @@ class BridgedTopic(Topic):
             return _offer(route, sample, blocked)
         if sample.hops >= MOST_HOPS:
             route.dropped["too many hops"] += 1
-        elif sample.deadline and sample.drop_late and port.now() > (sample.expires or sample.deadline):
+        elif sample.deadline and sample.drop_late and port.now() > sample.due:
             route.dropped["late"] += 1
         elif shaper is None:
             return _offer(route, sample, blocked)

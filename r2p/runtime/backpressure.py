@@ -105,14 +105,14 @@ class PendingDelivery(abc.ABC):
             sink.wait_queue().add(sink, self)
 
     @abc.abstractmethod
-    def completed(self, sink: Sink, reason: str) -> None:
+    def on_completed(self, sink: Sink, reason: str) -> None:
         """Called when the sink has the sample, or has lost it, and counted that, for this reason."""
 
     def complete(self, sink: Sink, reason: str = "") -> None:
         """Take the sink off the list: it has the sample, or has lost it for this reason."""
         if sink in self.remaining:  # a callback of another sink may have withdrawn the delivery meanwhile
             self.remaining.remove(sink)
-            self.completed(sink, reason)
+            self.on_completed(sink, reason)
 
     def withdraw(self) -> list[Sink]:
         """Wait no more; returns the sinks that do not have the sample."""
@@ -127,7 +127,7 @@ class _LatchedDelivery(PendingDelivery):
 
     __slots__ = ()
 
-    def completed(self, sink: Sink, reason: str) -> None:
+    def on_completed(self, sink: Sink, reason: str) -> None:
         """The publisher does not wait for it."""
 
 

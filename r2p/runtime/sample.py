@@ -54,3 +54,8 @@ class Sample(msgspec.Struct, gc=False):
     hops: int = 0
     clock: ClockOffset | None = None
     expires: int = 0
+
+    @property
+    def due(self) -> int:
+        """The deadline by the clock here; 0: none."""
+        return self.expires or self.deadline

@@ -228,7 +228,7 @@ class Topic:
 
     @property
     def unused(self) -> bool:
-        """Whether no node of this module publishes or subscribes it."""
+        """Whether no node of this module publishes or subscribes to it."""
         return not (self.publishers or self.queues)
 
     @property

@@ -88,7 +88,7 @@ class BufferedLink(Link):
     def sample(self, topic: str, arrival: Any) -> Sample:
         """Make a sample of what came in."""
 
-    def takes(self, sample: Sample) -> bool:
+    def has_room_for(self, sample: Sample) -> bool:
         """Whether there is room for this very sample now; asked before each `write`."""
         return not self.full
 
@@ -113,7 +113,7 @@ class BufferedLink(Link):
     # Out
 
     def made_room(self) -> None:
-        """Send samples that wait, in order, while there is room. Call it whenever `takes` may answer differently."""
+        """Send samples that wait, in order, while there is room. Call it when `has_room_for` may answer differently."""
         while not self.stats.lost.guard(self.wait_queue.serve):
             pass  # the sample that raised is out of the queue: go on with the others
         if not self.full:
@@ -291,7 +291,7 @@ class BufferedSubscriber(LinkSubscriber):
                 return False  # its publisher signals each sample; that of others has signalled the outage
             self.force(sample)
             return True
-        if not link.takes(sample):
+        if not link.has_room_for(sample):
             return False
         link.write(self.topic.name, sample)
         return True

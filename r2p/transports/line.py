@@ -222,13 +222,13 @@ class LineLink(BufferedLink):
     def full(self) -> bool:
         return self._waiting >= self._limit
 
-    def takes(self, sample: Sample) -> bool:
+    def has_room_for(self, sample: Sample) -> bool:
         if sample.publisher_class == _NRT:
             return self._waiting < self._limit
         return not self._blocked and self._limit >= 0
 
     def write(self, topic: str, sample: Sample) -> None:
-        due = sample.expires or sample.deadline
+        due = sample.due
         deadline = due // 1000 if due else sample.stamp // 1000 + debug.NO_DEADLINE
         try:
             encode = self._encoders[topic]

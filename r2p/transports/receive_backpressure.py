@@ -72,7 +72,7 @@ class BlockedMessage(PendingDelivery):
         sink.wait_queue().remove(sink, self)
         self.remaining.remove(sink)
 
-    def completed(self, sink: Sink, reason: str) -> None:
+    def on_completed(self, sink: Sink, reason: str) -> None:
         if self._holds and not self.remaining:
             self._owner.loop.call_soon(self._owner.delivered)  # after the work of the reader that made room
 

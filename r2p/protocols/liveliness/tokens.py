@@ -53,7 +53,7 @@ class TokenSet:
         self._dirty.add(_MODULE)
 
     def set_topic(self, topic: str, role: int, own: DeclaredTopic) -> None:
-        """Declare that the module publishes or subscribes a topic."""
+        """Declare that the module publishes or subscribes to a topic."""
         self._topics[topic, role] = own
         self._dirty.add((topic, role))
 
@@ -63,7 +63,7 @@ class TokenSet:
         self._dirty.add((topic, role))
 
     def add_node(self, topic: str, role: int, node: str, publisher_class: int) -> None:
-        """Add a node that publishes or subscribes the topic; each has a token of its own."""
+        """Add a node that publishes or subscribes to the topic; each has a token of its own."""
         self._nodes.setdefault((topic, role), {})[node] = publisher_class
         self._dirty.add((topic, role))
 

@@ -114,7 +114,7 @@ class _WaitingDelivery(PendingDelivery):
         self.reason = ""
         super().__init__(sample, sinks)
 
-    def completed(self, sink: Sink, reason: str) -> None:
+    def on_completed(self, sink: Sink, reason: str) -> None:
         if reason:
             self.failed.append(sink)
             self.reason = reason

@@ -162,5 +162,5 @@ class _PeriodDelivery(PendingDelivery, Generic[M]):
         self.since = since
         super().__init__(sample, sinks)
 
-    def completed(self, sink: Sink, reason: str) -> None:
+    def on_completed(self, sink: Sink, reason: str) -> None:
         self.publisher.delivery_completed(self, sink, reason)

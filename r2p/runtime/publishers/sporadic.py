@@ -117,5 +117,5 @@ class _EventDelivery(PendingDelivery, Generic[M]):
         self.overdue = False
         super().__init__(sample, sinks)
 
-    def completed(self, sink: Sink, reason: str) -> None:
+    def on_completed(self, sink: Sink, reason: str) -> None:
         self.publisher.delivery_completed(self, sink, reason)

@@ -109,7 +109,7 @@ def hint(session: Session, text: str, topic: str, fits: Callable[[r2p.TopicView]
 
 
 async def wait_until_passed_on(session: Session, topic: str) -> None:
-    """Wait until firmware at the end of a line, which subscribes the topic, receives its messages.
+    """Wait until firmware at the end of a line, which subscribes to the topic, receives its messages.
 
     It may be a gateway of firmware, which forwards messages only after a second request (PROTOCOL.md 4).
     """

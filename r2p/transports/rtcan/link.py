@@ -262,7 +262,7 @@ class RtcanLink(BufferedLink):
     def full(self) -> bool:
         return self._accounting.full
 
-    def takes(self, sample: Sample) -> bool:
+    def has_room_for(self, sample: Sample) -> bool:
         return self._accounting.has_room(sample)
 
     def write(self, topic: str, sample: Sample) -> None:

@@ -162,7 +162,7 @@ class Transmitter:
     def _time_left(self, topic: str, sample: Sample, publisher: PublisherHandle | None) -> int:
         """Ns until the deadline. A latched value that is sent once more gets a new one."""
         # A sample from another computer has `expires`, its deadline by the clock here.
-        left = (sample.expires or sample.deadline) - self._clock.now() if sample.deadline else 0
+        left = sample.due - self._clock.now() if sample.deadline else 0
         if left > 0 or (sample.deadline and not (publisher is not None and publisher.latch)):
             return left
         slotted = self._slotted.by_topic.get(topic)

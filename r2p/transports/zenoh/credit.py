@@ -96,11 +96,11 @@ class ZenohSubscriber(LinkSubscriber):
             pass  # the one that raised waits no more
         self.waiting.recover()
 
-    def become_lossy(self, refusal: str) -> None:
+    def become_lossy(self, reason: str) -> None:
         """Go on without the subscribers that have no room; the others are waited for as before."""
         self._streams[_NRT].window.skip_full()
         self._sender.credits.wait()
-        self.waiting.reject(self, refusal)
+        self.waiting.reject(self, reason)
 
     # For the sender
 
