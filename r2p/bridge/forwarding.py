@@ -200,7 +200,7 @@ class BridgedTopic(Topic):
             if port is not None:
                 port.count_dropped("converging")
             return None
-        waits = subscriber.wait_queue().line_of(sample) or not subscriber.offer(sample)
+        waits = subscriber.get_wait_queue().line_of(sample) or not subscriber.offer(sample)
         return [subscriber] if waits else None
 
     # Subscribers
@@ -319,9 +319,9 @@ def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sin
     if subscriber is None:  # it has left while the message was on its way through the routes
         return blocked
     route.forwarded += 1
-    if not subscriber.wait_queue().line_of(sample) and subscriber.offer(sample):
+    if not subscriber.get_wait_queue().line_of(sample) and subscriber.offer(sample):
         return blocked
-    if not subscriber.waits and sample.publisher_class == PublisherClass.NON_REAL_TIME:
+    if not subscriber.blocks_publishers and sample.publisher_class == PublisherClass.NON_REAL_TIME:
         subscriber.force(sample)  # it had no room for long: one slow link must not hold up all the others
         return blocked
     return [subscriber] if blocked is None else [*blocked, subscriber]

@@ -37,11 +37,11 @@ INTERNAL_ERROR = "internal error"
 class Sink(abc.ABC):
     """Accepts samples: the queue of a subscriber, or one topic on its way out by a link."""
 
-    __slots__ = ("lost", "waits")
+    __slots__ = ("blocks_publishers", "lost")
 
     def __init__(self) -> None:
         self.lost = 0
-        self.waits = True
+        self.blocks_publishers = True
         """Whether publishers wait while it is full; False while it is considered lossy."""
 
     @property
@@ -67,7 +67,7 @@ class Sink(abc.ABC):
         self.lost += 1
 
     @abc.abstractmethod
-    def wait_queue(self) -> "WaitQueue":
+    def get_wait_queue(self) -> "WaitQueue":
         """The queue of what waits for room in it."""
 
     @abc.abstractmethod
@@ -76,7 +76,7 @@ class Sink(abc.ABC):
 
     def offer_latched(self, sample: Sample) -> None:
         """Accept a value that its publisher latches, as soon as there is room."""
-        queue = self.wait_queue()
+        queue = self.get_wait_queue()
         if not self.reachable:
             self.force(sample)
         elif queue.line_of(sample) or not self.offer(sample):  # never past what waits already
@@ -84,12 +84,12 @@ class Sink(abc.ABC):
 
     def become_lossy(self, reason: str) -> None:
         """Stop making publishers wait, until it has plenty of room again: it made none in time."""
-        self.waits = False
-        self.wait_queue().reject(self, reason)
-        self.wait_queue().recoveries.append(self._recover)
+        self.blocks_publishers = False
+        self.get_wait_queue().reject(self, reason)
+        self.get_wait_queue().recoveries.append(self._recover)
 
     def _recover(self) -> None:
-        self.waits = True
+        self.blocks_publishers = True
 
 
 class PendingDelivery(abc.ABC):
@@ -102,7 +102,7 @@ class PendingDelivery(abc.ABC):
         self.remaining = sinks
         """The sinks that do not have it yet."""
         for sink in sinks:
-            sink.wait_queue().add(sink, self)
+            sink.get_wait_queue().add(sink, self)
 
     @abc.abstractmethod
     def on_completed(self, sink: Sink, reason: str) -> None:
@@ -118,7 +118,7 @@ class PendingDelivery(abc.ABC):
         """Wait no more; returns the sinks that do not have the sample."""
         without, self.remaining = self.remaining, []
         for sink in without:
-            sink.wait_queue().remove(sink, self)
+            sink.get_wait_queue().remove(sink, self)
         return without
 
 

@@ -111,8 +111,8 @@ class SubscriberQueue(Sink):
         "priority",
         "publisher_waiters",
         "queue",
+        "wait_queue",
         "waiter",
-        "waiting",
     )
 
     def __init__(
@@ -125,13 +125,13 @@ class SubscriberQueue(Sink):
         self.priority = node.priority
         self.keep_oldest = keep_oldest
         self.lossy = lossy
-        self.waits = not lossy
+        self.blocks_publishers = not lossy
         self.queue: deque[Sample] = deque()
         self.waiter: asyncio.Future[None] | None = None
         """The reader's future, while it waits for a message."""
         self.publisher_waiters: list[asyncio.Future[None]] = []
         """The futures of those that wait for a publisher."""
-        self.waiting: WaitQueue | None = None
+        self.wait_queue: WaitQueue | None = None
         """Set only while something waits for room: then each reader that pops a message has to call `refill`."""
 
     @property
@@ -156,7 +156,7 @@ class SubscriberQueue(Sink):
         if self.offer(sample):
             return
         # What the same publisher published before, and still waits, goes in first: its messages keep their order.
-        overtaken = [] if self.waiting is None or self.keep_oldest else self.waiting.pop_earlier(self, sample)
+        overtaken = [] if self.wait_queue is None or self.keep_oldest else self.wait_queue.pop_earlier(self, sample)
         for each in (*(delivery.sample for delivery in overtaken), sample):
             if self.drop_oldest():
                 self._append(each)
@@ -171,18 +171,18 @@ class SubscriberQueue(Sink):
         """
         return not self.lossy and (sample.publisher_class != _NRT or not sample.source.link)
 
-    def wait_queue(self) -> WaitQueue:
-        if self.waiting is None:
-            self.waiting = WaitQueue()
-        return self.waiting
+    def get_wait_queue(self) -> WaitQueue:
+        if self.wait_queue is None:
+            self.wait_queue = WaitQueue()
+        return self.wait_queue
 
     def refill(self) -> None:
-        if (waiting := self.waiting) is not None:
+        if (waiting := self.wait_queue) is not None:
             waiting.serve()
             if len(self.queue) <= self.limit // 2:  # plenty: with one place it would be lossy again at once
                 waiting.recover()
             if not waiting:
-                self.waiting = None
+                self.wait_queue = None
 
     def publisher_joined(self) -> None:
         """Wake those that wait for a publisher."""

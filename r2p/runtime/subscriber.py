@@ -161,7 +161,7 @@ class Subscriber(Generic[T]):
             credit = YIELD_EVERY if sink.priority >= wake_scheduler.top else 1
             while queue:
                 sample = queue.popleft()
-                if sink.waiting is not None:
+                if sink.wait_queue is not None:
                     sink.refill()
                 message = sample.message
                 if ages or message.__class__ is not kind:
@@ -260,7 +260,7 @@ class Subscriber(Generic[T]):
         sink, queue = self._sink, self.queue
         while queue:
             sample = queue.popleft()
-            if sink.waiting is not None:
+            if sink.wait_queue is not None:
                 sink.refill()
             message: T | None = self._examine(sample)
             if message is not None:

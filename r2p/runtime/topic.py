@@ -22,21 +22,21 @@ from r2p.runtime.sample import PublisherClass, Sample
 class RemoteSubscriber(Sink):
     """The subscribers of one topic at the other end of one link, as publishers see them."""
 
-    __slots__ = ("link", "link_name", "waiting")
+    __slots__ = ("link", "link_name", "wait_queue")
 
-    def __init__(self, link_name: str, link: object, waiting: WaitQueue) -> None:
+    def __init__(self, link_name: str, link: object, wait_queue: WaitQueue) -> None:
         super().__init__()
         self.link_name = link_name
         self.link = link
         """The link itself; topics only compare it."""
-        self.waiting = waiting
+        self.wait_queue = wait_queue
 
     @property
     def owner(self) -> str:
         return self.link_name
 
-    def wait_queue(self) -> WaitQueue:
-        return self.waiting
+    def get_wait_queue(self) -> WaitQueue:
+        return self.wait_queue
 
 
 class PublisherHandle(Protocol):
@@ -150,10 +150,10 @@ class Topic:
             queue = sink.queue
             if len(queue) >= sink.limit:
                 # Never for a queue of the publishing node: it would wait for itself.
-                if sink.node is not own and (sink.waits or sink.waits_for(sample)):
+                if sink.node is not own and (sink.blocks_publishers or sink.waits_for(sample)):
                     blocked = [sink] if blocked is None else [*blocked, sink]
                     continue
-                if sink.waiting is not None:  # what waits may have to go in first
+                if sink.wait_queue is not None:  # what waits may have to go in first
                     sink.force(sample)
                     continue
                 if not sink.drop_oldest():
@@ -180,7 +180,7 @@ class Topic:
         """Offer the sample to links; returns `blocked`, and those that have no room."""
         for remote in subscribers:
             # Behind what waits in the same line: nothing overtakes. Two look-ups, as lines are mostly empty.
-            waiting = remote.waiting
+            waiting = remote.wait_queue
             in_line = (waiting.real_time or waiting.non_real_time) and waiting.line_of(sample)
             if remote.link is slot_link or (not in_line and remote.offer(sample)):
                 continue
@@ -215,7 +215,7 @@ class Topic:
             self.queues = [each for each in self.queues if each is not sink]
         else:
             self.remote_subscribers = [each for each in self.remote_subscribers if each is not sink]
-        sink.wait_queue().drop_sink(sink)
+        sink.get_wait_queue().drop_sink(sink)
 
     def publisher_of(self, sample: Sample) -> PublisherHandle | None:
         """The publisher of this module that a link reports to what became of the sample. None: it came by a link."""

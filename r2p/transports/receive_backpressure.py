@@ -69,7 +69,7 @@ class BlockedMessage(PendingDelivery):
 
     def leave(self, sink: Sink) -> None:
         """Wait no more for this sink."""
-        sink.wait_queue().remove(sink, self)
+        sink.get_wait_queue().remove(sink, self)
         self.remaining.remove(sink)
 
     def on_completed(self, sink: Sink, reason: str) -> None:
@@ -79,7 +79,7 @@ class BlockedMessage(PendingDelivery):
     def _retry(self) -> None:
         self.remaining = [sink for sink in self.remaining if not self._offer(sink)]
         for sink in self.remaining:
-            sink.wait_queue().add(sink, self)
+            sink.get_wait_queue().add(sink, self)
         self._look()
 
     def _offer(self, sink: Sink) -> bool:
@@ -158,7 +158,7 @@ class LinkBackpressure(ReceiveBackpressure):
             self.lost.guard(sink.force, message.sample)
         for sink in slow:
             self._lossy.add(sink)
-            sink.wait_queue().recoveries.append(functools.partial(self._lossy.discard, sink))
+            sink.get_wait_queue().recoveries.append(functools.partial(self._lossy.discard, sink))
         if message.remaining:
             self._begin_stall(message)
         else:
@@ -184,6 +184,6 @@ class LinkBackpressure(ReceiveBackpressure):
             guard(sink.refill)  # a last attempt
         for sink in list(message.remaining):
             if not guard(sink.become_lossy, reason):
-                sink.wait_queue().remove(sink, message)
+                sink.get_wait_queue().remove(sink, message)
                 message.complete(sink, INTERNAL_ERROR)  # else the line would stand still for ever
             self._in_vain_at = self.loop.time()

@@ -44,7 +44,7 @@ class Other(RemoteSubscriber):
             self.lost += 1
 
     def refill(self) -> None:
-        self.waiting.serve()
+        self.wait_queue.serve()
 
 
 class Passing(Topic):
@@ -115,7 +115,7 @@ async def test_a_link_that_hangs_holds_it_up_once() -> None:
     end, other = gateway(flow_controlled=True)
     end.receive(LINES)
     await asyncio.sleep(LONGEST_STALL * 1.5)
-    assert (other.taken, other.lost, other.waits, end.reads) == ([], len(LINES), False, True)
+    assert (other.taken, other.lost, other.blocks_publishers, end.reads) == ([], len(LINES), False, True)
 
 
 @pytest.mark.parametrize("publisher_class", [PublisherClass.SPORADIC, PublisherClass.PERIODIC])
@@ -180,7 +180,7 @@ async def test_closed_while_it_waits() -> None:
     end.receive(LINES)
     await asyncio.sleep(LONGEST_STALL / 2)
     end.close()
-    assert not other.wait_queue()
+    assert not other.get_wait_queue()
     other.space = len(LINES)
     other.refill()
     await asyncio.sleep(LONGEST_STALL * 2)
@@ -245,4 +245,4 @@ async def test_a_message_that_raises_while_it_waits_for_room_waits_no_more() -> 
     with pytest.raises(RuntimeError):
         other.refill()  # a link guards this, and goes on
     await asyncio.sleep(LONGEST_STALL)
-    assert (other.taken, end.reads, other.waiting.non_real_time) == (ALL[2:], True, deque())
+    assert (other.taken, end.reads, other.wait_queue.non_real_time) == (ALL[2:], True, deque())

@@ -79,11 +79,11 @@ class Publisher(BasePublisher[M]):
         return not without
 
     async def _wait_for_room(self, sample: Sample, blocked: list[Sink]) -> None:
-        lossy = [sink for sink in blocked if not sink.waits]
+        lossy = [sink for sink in blocked if not sink.blocks_publishers]
         if lossy:
             self._force(sample, lossy)
             # `_force` may call the user's code, which may make more of them lossy, or these wait again.
-            blocked = [sink for sink in blocked if sink.waits and sink not in lossy]
+            blocked = [sink for sink in blocked if sink.blocks_publishers and sink not in lossy]
             if not blocked:
                 return
         loop = self._space.loop

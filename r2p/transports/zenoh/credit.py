@@ -92,15 +92,15 @@ class ZenohSubscriber(LinkSubscriber):
             self.count_lost("no credit")
 
     def refill(self) -> None:
-        while not self._link.stats.lost.guard(self.waiting.serve):
+        while not self._link.stats.lost.guard(self.wait_queue.serve):
             pass  # the one that raised waits no more
-        self.waiting.recover()
+        self.wait_queue.recover()
 
     def become_lossy(self, reason: str) -> None:
         """Go on without the subscribers that have no room; the others are waited for as before."""
         self._streams[_NRT].window.skip_full()
         self._sender.credits.wait()
-        self.waiting.reject(self, reason)
+        self.wait_queue.reject(self, reason)
 
     # For the sender
 
@@ -144,7 +144,7 @@ class ZenohSubscriber(LinkSubscriber):
     @property
     def awaits_credit(self) -> bool:
         """Whether a publisher waits, or went on without a session that may grant credit again."""
-        return bool(self.waiting) or not all(
+        return bool(self.wait_queue) or not all(
             each.waited_for for each in self._streams[_NRT].window.subscribers.values()
         )
 
@@ -367,7 +367,7 @@ class CreditReader:
             return
         subscribers = list(self._sender.subscribers())
         for subscriber in subscribers:
-            if subscriber.wait_queue():
+            if subscriber.get_wait_queue():
                 self._lost.guard(subscriber.refill)
         # Only a publisher that waits has a thread woken for the next credit; else that is read after a pause.
         if any(subscriber.awaits_credit for subscriber in subscribers):

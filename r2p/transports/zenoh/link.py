@@ -124,7 +124,7 @@ class ZenohLink(Link):
 
     def discard(self) -> int:
         for subscriber in self.sender.subscribers():
-            subscriber.wait_queue().reject_all("link down")
+            subscriber.get_wait_queue().reject_all("link down")
         return self.sender.batcher.discard()
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:

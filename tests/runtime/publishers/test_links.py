@@ -360,7 +360,7 @@ async def test_a_link_that_became_lossy_does_not_disturb_those_that_wait() -> No
         assert isinstance(near, r2p.Publisher)
         assert near.missed == 0
         (leds,) = a.space.topics["leds"].queues
-        assert leds.waits
+        assert leds.blocks_publishers
         assert leds.lost > 100
         assert {each.value for each in got} == {1, 2}
 

@@ -362,7 +362,7 @@ async def test_a_publish_that_waits_can_be_cancelled() -> None:
             with pytest.raises(TimeoutError):
                 await asyncio.wait_for(publisher.publish(led(number)), 0.01)
         assert (leds.lost, publisher.missed) == (100, 100)
-        assert not leds._sink.waiting  # nothing grows
+        assert not leds._sink.wait_queue  # nothing grows
         assert (await leds.fetch()).led == 1
         await publisher.publish(led(7))
         assert drain(leds) == [7]
@@ -522,7 +522,7 @@ async def test_an_event_gets_the_first_place_and_events_keep_their_order() -> No
             assert not alarms[number % 2].publish_nowait(led(number))
         assert [(await leds.fetch()).led for _ in range(9)] == [0, 1, 2, 3, 4, 5, 6, 8, 9]
         await asyncio.gather(*waiting)
-        assert not leds._sink.waiting  # nothing is left behind
+        assert not leds._sink.wait_queue  # nothing is left behind
 
 
 @pytest.mark.virtual_time

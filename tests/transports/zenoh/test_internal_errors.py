@@ -24,7 +24,7 @@ def subscriber(topic: str, **faults: Callable[..., Any]) -> Any:
     """Stands for a topic on its way out, with a subscriber that waits and has not said anything."""
     calls: list[str] = []
     subscriber = SimpleNamespace(
-        topic=SimpleNamespace(name=topic), calls=calls, silent_checks=Counter(), wait_queue=lambda: True
+        topic=SimpleNamespace(name=topic), calls=calls, silent_checks=Counter(), get_wait_queue=lambda: True
     )
     subscriber.awaits_credit = False
     subscriber.unacknowledged = lambda: {7}

@@ -112,7 +112,7 @@ async def test_what_waits_for_credit_when_the_link_goes_down_is_counted() -> Non
         remote = publisher._topic.remote_subscribers[0]
         assert isinstance(remote, ZenohSubscriber)
         await until(lambda: len(subscriber.queue) == subscriber._sink.limit and not remote.unacknowledged())
-        await until(lambda: bool(remote.waiting.non_real_time))  # as its subscriber does not read: no credit comes
+        await until(lambda: bool(remote.wait_queue.non_real_time))  # as its subscriber does not read: no credit comes
         await cable.cut()
         await sending
         assert link.losses["link down"] > 0
