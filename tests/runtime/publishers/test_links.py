@@ -325,7 +325,7 @@ async def test_a_link_is_offered_a_sample_with_what_late_means(
     late: Literal["drop", "send"], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[r2p.Sample] = []
-    monkeypatch.setattr(MemoryLink, "takes", lambda _link, sample: asked.append(sample))
+    monkeypatch.setattr(MemoryLink, "has_room_for", lambda _link, sample: asked.append(sample))
     async with joined("A") as a, joined("B") as b:
         publisher = a.start(hold).advertise("leds", Led, r2p.Sporadic(0.5, late=late))
         b.start(hold).subscribe("leds", Led)
