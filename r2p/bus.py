@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Self
 
 from r2p.clock import SHORTEST, check_seconds, clock_of
 from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.errors import Closed, Error
 from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import Mailbox, Outcome
@@ -45,7 +46,7 @@ __all__ = [
 ]
 
 QUEUE = 8192
-"""Frames that wait for the iteration at most; then the oldest are dropped, and counted."""
+"""Frames that wait for an iteration at most; then the oldest are dropped, and counted."""
 
 
 # After a period, frames of it may still have to be read. These decide when there are none left.
@@ -67,18 +68,22 @@ class BusMonitor:
         self.since = 0
         """When the bus was opened."""
         self.lost = 0
-        """Frames that were dropped as the iteration was too slow."""
+        """Frames that were dropped as an iteration was too slow."""
         self._port = None if isinstance(via, str) else via
         self._report = on_status or (lambda _text: None)
-        self._queue: deque[SeenFrame] = deque(maxlen=QUEUE)
-        self._iterated = False
+        self._queues: list[deque[SeenFrame]] = []  # one for each iteration, while it lasts
         self._waits_for = ""
         self._arrived = asyncio.Event()
         self._synced = asyncio.Event()
         self._running: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
-        """Open the bus. Raises TransportError for a URL that can't work; an interface that is down is waited for."""
+        """Open the bus. Raises TransportError for a URL that can't work, and Error if it was open before.
+
+        An interface that is down is waited for.
+        """
+        if self._running is not None:
+            raise Error(f"the monitor of {self.via} was opened before: make a new one")
         # Not at the top: `Calendar` is used without a bus, and the transport takes its time to load.
         from r2p.transports.rtcan.transport import RtcanOptions, open_port
 
@@ -118,9 +123,20 @@ class BusMonitor:
             await asyncio.wait([self._running])
 
     def _check(self) -> None:
-        """Raise the error that ended the port."""
-        if self._running is not None and self._running.done() and not self._running.cancelled():
+        """Raise the error that ended the port, or Closed if the monitor is closed."""
+        if self._running is None or self._running.cancelled():
+            raise self._closed()
+        if self._running.done():
             self._running.result()
+
+    def _closed(self) -> Closed:
+        return Closed(f"the monitor of {self.via} is not open: use it in an `async with` block")
+
+    def _opened_monitor(self) -> Monitor:
+        """The monitor, also after the bus was closed: it keeps its results. Raises Closed before it was opened."""
+        if self._running is None:
+            raise self._closed()
+        return self._monitor
 
     def _wake(self, _done: object) -> None:
         self._arrived.set()
@@ -131,35 +147,40 @@ class BusMonitor:
     @property
     def timing(self) -> Timing:
         """The slots of the cycle: those that the master announces, else those of the URL."""
-        return self._monitor.directory.timing
+        return self._opened_monitor().directory.timing
 
     @property
     def slots(self) -> list[BusSlot]:
         """The use of each slot, over `slot_cycles` whole cycles."""
-        return self._monitor.slots
+        return self._opened_monitor().slots
 
     @property
     def slot_cycles(self) -> int:
         """The number of whole cycles that `slots` is about."""
-        return self._monitor.cycles
+        return self._opened_monitor().cycles
 
     async def __aiter__(self) -> AsyncIterator[SeenFrame]:
-        """Iterate over every frame from now on."""
-        self._iterated = True
-        while True:
-            while self._queue:
-                yield self._queue.popleft()
-            self._check()
-            self._arrived.clear()
-            await self._arrived.wait()
+        """Iterate over every frame from now on. Raises Closed outside of the `async with` block."""
+        queue: deque[SeenFrame] = deque(maxlen=QUEUE)
+        self._queues.append(queue)
+        try:
+            while True:
+                while queue:
+                    yield queue.popleft()
+                self._check()
+                self._arrived.clear()
+                await self._arrived.wait()
+        finally:  # after a `break` frames are neither kept nor counted as lost
+            self._queues = [each for each in self._queues if each is not queue]
 
     async def loads(self, period: float) -> AsyncIterator[BusLoad]:
         """Iterate over what the bus carried in each `period` (seconds).
 
         Periods are those of the frames' stamps, so the loads are right even when this program is late. Raises
-        MessageError for what is not a number of seconds.
+        MessageError for what is not a number of seconds, and Closed outside of the `async with` block.
         """
         check_seconds("the period of loads", period, least=SHORTEST)
+        self._check()
         length = round(period * SECOND)
         end = self._now()
         self._monitor.begin(end, length)
@@ -191,9 +212,10 @@ class BusMonitor:
     async def cycles(self, count: int, timeout: float) -> bool:
         """Watch so many whole cycles. False if there was no sync for `timeout` seconds.
 
-        Raises MessageError for what is not a number of seconds.
+        Raises MessageError for what is not a number of seconds, and Closed outside of the `async with` block.
         """
         check_seconds("the timeout of cycles", timeout, least=0.0)
+        self._check()
         self._monitor.reset(self._now())
         while self._monitor.cycles < count:
             self._synced.clear()
@@ -218,9 +240,9 @@ class BusMonitor:
     def _saw(self, seen: SeenFrame) -> None:
         if seen.kind is FrameKind.SYNC:
             self._synced.set()
-        if self._iterated:
-            self.lost += len(self._queue) == QUEUE
-            self._queue.append(seen)
+        for queue in self._queues:
+            self.lost += len(queue) == queue.maxlen
+            queue.append(seen)
             self._arrived.set()
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:

@@ -100,6 +100,40 @@ async def test_slow_iterations_lose_the_oldest_counted(monkeypatch: pytest.Monke
         await frames.aclose()  # type: ignore[attr-defined]
 
 
+async def test_an_iteration_that_ended_keeps_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("r2p.bus.QUEUE", 500)
+    async with robot() as (_, listener):
+        async for first in listener:
+            break
+        await asyncio.sleep(5)
+        assert listener.lost == 0
+        async for second in listener:
+            break
+        assert second.stamp > first.stamp + 5_000_000_000
+
+
+async def test_a_monitor_that_is_not_open_raises_closed() -> None:
+    monitor = BusMonitor(SimPort(SimCan(), CanNode("listener")))
+
+    async def use() -> None:
+        with pytest.raises(r2p.Closed, match="listener is not open: use it in an `async with` block"):
+            await anext(aiter(monitor))
+        with pytest.raises(r2p.Closed):
+            await anext(monitor.loads(1.0))
+        with pytest.raises(r2p.Closed):
+            await monitor.cycles(1, timeout=1.0)
+
+    await use()
+    for read in (lambda: monitor.timing, lambda: monitor.slots, lambda: monitor.slot_cycles):
+        with pytest.raises(r2p.Closed):
+            read()
+    async with monitor:
+        with pytest.raises(r2p.Error, match="opened before"):
+            await monitor.__aenter__()
+    await use()
+    assert monitor.timing.slots == 60
+
+
 async def test_what_the_commands_print() -> None:
     async with robot() as (_, listener):
         lines, records = [], []
