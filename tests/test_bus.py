@@ -103,13 +103,16 @@ async def test_slow_iterations_lose_the_oldest_counted(monkeypatch: pytest.Monke
 async def test_an_iteration_that_ended_keeps_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("r2p.bus.QUEUE", 500)
     async with robot() as (_, listener):
-        async for first in listener:
+        stamps = []
+        async for seen in listener:
+            stamps.append(seen.stamp)
             break
         await asyncio.sleep(5)
         assert listener.lost == 0
-        async for second in listener:
+        async for seen in listener:
+            stamps.append(seen.stamp)
             break
-        assert second.stamp > first.stamp + 5_000_000_000
+        assert stamps[1] > stamps[0] + 5_000_000_000
 
 
 async def test_a_monitor_that_is_not_open_raises_closed() -> None:

@@ -38,7 +38,7 @@ async def pub(
     count: Count = None,
     once: Once = False,
     rate: Rate = None,
-    klass: Annotated[
+    choice: Annotated[
         ClassChoice | None,
         typer.Option(
             "--class",
@@ -54,42 +54,42 @@ async def pub(
     Fields that are left out are zero. With --once, -n or stdin it first waits for a subscriber, at most --timeout.
     Ctrl-C ends it.
     """
-    klass = klass or ClassChoice(r2p.PublisherClass.NON_REAL_TIME)
-    periodic = klass.publisher_class is r2p.PublisherClass.PERIODIC
+    choice = choice or ClassChoice(r2p.PublisherClass.NON_REAL_TIME)
+    periodic = choice.publisher_class is r2p.PublisherClass.PERIODIC
     from_stdin = message == [STDIN]
     if periodic and (from_stdin or rate is not None):
         raise UsageError("--class periodic:TIME sets when to publish: leave out --rate, and don't read from stdin")
-    cls = await find(session, topic, type)
-    job = _Job(session, topic, cls, klass, 1 if once else count, timeout)
+    message_class = await find(session, topic, type)
+    publication = _Publication(session, topic, message_class, choice, 1 if once else count, timeout)
     if from_stdin:
-        await job.publish_lines(rate)
+        await publication.publish_lines(rate)
         return
     try:
-        value = parse(cls, message or [])
+        value = parse(message_class, message or [])
     except r2p.MessageError as error:
         raise UsageError(str(error)) from error
     if periodic:
-        await job.publish_periodically(value)
+        await publication.publish_periodically(value)
     else:
-        await job.publish(value, DEFAULT_RATE if rate is None else rate)
+        await publication.publish(value, DEFAULT_RATE if rate is None else rate)
 
 
-class _Job:
+class _Publication:
     """Publishes messages of one topic."""
 
     def __init__(
         self,
         session: Session,
         topic: str,
-        cls: type[r2p.Message],
-        klass: ClassChoice,
+        message_class: type[r2p.Message],
+        choice: ClassChoice,
         count: int | None,
         timeout: float | None,
     ) -> None:
         self._session = session
         self._topic = topic
-        self._cls = cls
-        self._klass = klass
+        self._message_class = message_class
+        self._choice = choice
         self._count = count
         self._timeout = timeout
 
@@ -114,8 +114,8 @@ class _Job:
                 return None
             return message if ready else None
 
-        klass = r2p.Periodic(self._klass.time, fill)
-        publisher = self._session.node.advertise(self._topic, self._cls, klass)
+        periodic = r2p.Periodic(self._choice.time, fill)
+        publisher = self._session.node.advertise(self._topic, self._message_class, periodic)
         await self._wait_subscriber(publisher, needed=not ready)
         ready = True
         await done.wait()
@@ -131,7 +131,7 @@ class _Job:
             if not line.strip():
                 continue
             try:
-                message = parse_line(self._cls, line)
+                message = parse_line(self._message_class, line)
             except r2p.MessageError as error:
                 raise r2p.MessageError(f"line {number}: {error}") from error
             await publisher.publish(message)
@@ -141,9 +141,9 @@ class _Job:
                 await anext(ticks)
 
     def _advertise(self) -> r2p.Publisher[Any] | r2p.SporadicPublisher[Any]:
-        if self._klass.publisher_class is r2p.PublisherClass.SPORADIC:
-            return self._session.node.advertise(self._topic, self._cls, r2p.Sporadic(self._klass.time))
-        return self._session.node.advertise(self._topic, self._cls)
+        if self._choice.publisher_class is r2p.PublisherClass.SPORADIC:
+            return self._session.node.advertise(self._topic, self._message_class, r2p.Sporadic(self._choice.time))
+        return self._session.node.advertise(self._topic, self._message_class)
 
     async def _wait_subscriber(self, publisher: _AnyPublisher, *, needed: bool) -> None:
         """Wait for a subscriber if one is needed; otherwise only report after a second that there is none."""
@@ -167,28 +167,42 @@ class _Job:
 
 
 async def read_lines(stream: TextIO | None = None) -> AsyncIterator[str]:
-    """Yield the lines of stdin (or of `stream`) without blocking the event loop.
+    """Yield the lines of stdin (or of `stream`), without their ends, and without blocking the event loop.
 
-    Raises MessageError for a line longer than 1 MB.
+    Bytes that are not UTF-8 become U+FFFD. Raises MessageError for a line longer than 1 MB.
     """
-    stream = stream or sys.stdin
-    fd = waitable(stream)
-    if fd is None:
-        for line in stream:
-            yield line
-        return
     rest = b""
-    while data := await _read(fd):
+    async for data in _chunks(stream or sys.stdin):
         *complete, rest = (rest + data).split(b"\n")
-        for each in complete:
-            yield each.decode(errors="replace")
+        for line in complete:
+            yield _decode(line)
         if len(rest) > _LINE_MAX:
-            raise r2p.MessageError("a line on stdin is longer than 1 MB")
+            break
     if rest:
-        yield rest.decode(errors="replace")
+        yield _decode(rest)
+
+
+def _decode(line: bytes) -> str:
+    if len(line) > _LINE_MAX:
+        raise r2p.MessageError("a line on stdin is longer than 1 MB")
+    return line.removesuffix(b"\r").decode(errors="replace")
+
+
+async def _chunks(stream: TextIO) -> AsyncIterator[bytes]:
+    fd = waitable(stream)
+    if fd is not None:
+        while data := await _read(fd):
+            yield data
+    elif (binary := getattr(stream, "buffer", None)) is not None:  # a regular file, which never blocks
+        while data := binary.read1(_CHUNK):
+            yield data
+    else:  # text in memory
+        while text := stream.read(_CHUNK):
+            yield text.encode(errors="replace")
 
 
 async def _read(fd: int) -> bytes:
+    # What is there already is read at once: `add_reader` costs a turn of the event loop for each chunk.
     if not select.select([fd], [], [], 0)[0]:
         loop = asyncio.get_running_loop()
         readable = asyncio.Event()

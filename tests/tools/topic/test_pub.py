@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import io
+import os
+import threading
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +15,7 @@ import r2p
 from r2p.msg import Led, Velocity3
 from r2p.tools.options import class_choice
 from r2p.tools.session import TimedOut, UsageError
-from r2p.tools.topic.pub import pub
+from r2p.tools.topic.pub import pub, read_lines
 from tests.tools.rig import robot, tool
 
 
@@ -101,9 +104,9 @@ async def test_nobody_subscribes_in_time() -> None:
     [
         ({}, 1.0, r2p.PublisherClass.NON_REAL_TIME),
         ({"rate": 20}, 0.05, r2p.PublisherClass.NON_REAL_TIME),
-        ({"rate": 20, "klass": class_choice("nrt")}, 0.05, r2p.PublisherClass.NON_REAL_TIME),
-        ({"rate": 20, "klass": class_choice("sporadic:10ms")}, 0.05, r2p.PublisherClass.SPORADIC),
-        ({"klass": class_choice("periodic:250ms")}, 0.25, r2p.PublisherClass.PERIODIC),
+        ({"rate": 20, "choice": class_choice("nrt")}, 0.05, r2p.PublisherClass.NON_REAL_TIME),
+        ({"rate": 20, "choice": class_choice("sporadic:10ms")}, 0.05, r2p.PublisherClass.SPORADIC),
+        ({"choice": class_choice("periodic:250ms")}, 0.25, r2p.PublisherClass.PERIODIC),
     ],
 )
 async def test_rate_and_class(options: dict[str, Any], gap: float, publisher_class: r2p.PublisherClass) -> None:
@@ -154,7 +157,7 @@ async def test_mistakes() -> None:
         with pytest.raises(UsageError, match="Led has no field x: it has led, value"):
             await pub(session, "cmd", ["x=1"], type="Led")
         with pytest.raises(UsageError, match="leave out --rate"):
-            await pub(session, "cmd", ["-"], type="Led", klass=class_choice("periodic:1s"))
+            await pub(session, "cmd", ["-"], type="Led", choice=class_choice("periodic:1s"))
 
 
 @pytest.mark.virtual_time
@@ -185,3 +188,28 @@ async def test_a_bad_line_on_stdin_is_told_by_its_number(monkeypatch: pytest.Mon
     async with robot(listener.listen), tool() as session:
         with pytest.raises(r2p.MessageError, match=r"line 3: Led\.led takes an integer"):
             await pub(session, "cmd", ["-"], type="Led")
+
+
+@pytest.mark.parametrize("regular", [True, False], ids=["file", "pipe"])
+def test_lines_are_read_alike_from_files_and_pipes(regular: bool, tmp_path: Path) -> None:
+    async def lines(data: bytes) -> list[str]:
+        path = tmp_path / "lines"
+        if regular:
+            path.write_bytes(data)
+        else:
+            os.mkfifo(path)
+            writer = threading.Thread(target=path.write_bytes, args=(data,))
+            writer.start()
+        try:
+            with path.open(encoding="utf-8") as stream:
+                return [line async for line in read_lines(stream)]
+        finally:
+            if not regular:
+                writer.join()
+            path.unlink()
+
+    assert asyncio.run(lines(b"one\r\n\n\xff two\nthree")) == ["one", "", "\ufffd two", "three"]
+    assert asyncio.run(lines(b"x" * (1 << 20) + b"\ny")) == ["x" * (1 << 20), "y"]
+    for too_long in b"x" * (1 << 20) + b"xx\n", b"x" * (1 << 20) + b"x":
+        with pytest.raises(r2p.MessageError, match="longer than 1 MB"):
+            asyncio.run(lines(too_long))
