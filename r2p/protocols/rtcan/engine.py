@@ -303,6 +303,9 @@ class Engine:
     def _update_mode(self, now: int) -> None:
         """Decide whether and how the node may send, by its id8, its network and the cycle.
 
+        Three gates are set here: the transmitter's mode; `queue.only`, which holds all but management back during an
+        election; and `_joined`, without which `ready` is False and `publish`, `manage`, `reserve` and `fill` send
+        nothing.
         Called after each sync, timer, change of the id8, and management message of the bus: whatever may change one.
         """
         # While a master is elected only management may go: so its first sync meets a quiet bus.

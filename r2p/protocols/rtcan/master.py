@@ -22,7 +22,9 @@ FRESH = 1_500_000_000
 """A candidate counts for this long after its claim (ns)."""
 _WINDOW = 3  # cycles in which claims are collected
 _COLLECTING = 3  # cycles in which a new master only renews what the last one granted
-_TRIES = 4  # of the first sync, which may collide. A node alone gets no acknowledge: it leads all the same
+# Attempts after the first one to send the first sync, which may collide. A node alone gets no acknowledge: it leads all
+# the same.
+_RETRIES = 4
 
 
 class Role(enum.Enum):
@@ -53,7 +55,7 @@ class Election:
             self._candidates.pop(id8, None)
 
     def begin(self, now: int, *, forget: bool) -> None:
-        """There is no master: collect candidates. `forget`: those of before may be dead."""
+        """Start an election: collect candidates. `forget` those known so far, which may be dead."""
         if forget:
             self._candidates.clear()
         self.role = Role.ELECTING
@@ -61,7 +63,7 @@ class Election:
         self._timers.set("election", now + self._window)
 
     def decide(self, now: int, id8: int) -> bool:
-        """The time is over. Says whether this node is elected."""
+        """End the collection window; return whether this node is elected."""
         better = self._better(now, id8)
         if better > self._waited_for:
             self._timers.set("election", now + (better - self._waited_for) * self._window)
@@ -111,7 +113,7 @@ class MasterRole:
         self._on_elected = on_elected
         self._retry = retry
         self._first: tuple[rtcan.Frame, int, int, int] | None = None  # the first sync with the port: start, count, mask
-        self._tries = 0
+        self._retries = 0
         self._collecting = 0
         self._inherits = False
 
@@ -124,18 +126,21 @@ class MasterRole:
         start, counter = self._cycle.upcoming(now)
         mask = self._grants.calendar.mask(counter)
         frame = rtcan.encode_sync(counter, mask)
-        if self._transmitter.send_first_sync(FirstSync(self._first_sent), frame, start):
+        if self._transmitter.send_first_sync(FirstSync(self._first_confirmed), frame, start):
             self._first = frame, start, counter, mask
         else:
             self._retry(now)
 
     def cancel(self) -> None:
-        """Don't become the master. A first sync that waits is withdrawn, as all frames are when the mode changes."""
-        self._tries = 0
+        """Abandon the attempt to become master.
+
+        A first sync that waits is withdrawn, as all frames are when the mode changes.
+        """
+        self._retries = 0
         self._first = None
 
     def begin_cycle(self, now: int) -> bool:
-        """Begin the next cycle with a sync. False: that should have been long ago."""
+        """Begin the next cycle with a sync. False: this node stood still too long to stay master."""
         if now > self._cycle.reference + (HOLDOVER + 2) * self._cycle.timing.cycle:
             return False
         if self._collecting:
@@ -147,12 +152,12 @@ class MasterRole:
         return True
 
     def step_down(self) -> None:
-        """Don't be the master any more."""
+        """Give up the role."""
         self._cycle.stop()
         self._grants.clear()
 
-    def _first_sent(self, now: int, outcome: Outcome, at: int) -> None:
-        """What became of the first sync."""
+    def _first_confirmed(self, now: int, outcome: Outcome, at: int) -> None:
+        """Lead, or try again, by what became of the first sync."""
         if self._first is None:
             return
         frame, planned, counter, mask = self._first
@@ -163,15 +168,15 @@ class MasterRole:
                 self._inherits = self._grants.collecting = False
                 self._collecting = 0
             self._lead(now, start, counter, mask)
-        elif outcome is not Outcome.UNKNOWN and self._tries < _TRIES:
-            self._tries += 1
+        elif outcome is not Outcome.UNKNOWN and self._retries < _RETRIES:
+            self._retries += 1
             self._retry(now)
         else:  # it may not have been on the bus; the next one is on the grid
             start, counter = self._cycle.upcoming(now)
             self._lead(now, start - self._cycle.timing.cycle, counter - 1, None)
 
     def _lead(self, now: int, start: int, counter: int, mask: int | None) -> None:
-        self._tries = 0
+        self._retries = 0
         self._cycle.lead(start, counter, mask, anew=not self._inherits)
         self._on_elected(now, self._inherits)
         self._transmitter.begin_cycle(now)

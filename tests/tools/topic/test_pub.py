@@ -6,8 +6,7 @@ import asyncio
 import io
 import os
 import threading
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -17,6 +16,9 @@ from r2p.tools.options import class_choice
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.pub import pub, read_lines
 from tests.tools.rig import robot, tool
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 class Listener:
