@@ -2,10 +2,11 @@
 
     link  ->  BridgedTopic.deliver  ->  Route  ->  RemoteSubscriber of another link
 
-`RoutingTable` makes the routes when demand changes; which of them messages of a link take is worked out when the first
-one comes after that. So forwarding is one loop over what is there, and a change costs as much as the routes that it
-concerns. Each message asks the clock whether its two ports may still forward: a gateway that was stopped must not go on
-with an old tree. Messages that come in while it listens anew are held, and go on if it may.
+`RoutingTable` makes the routes when demand changes. The first message that then comes from a link looks up which of
+them are in use, and the result is kept for the next ones. So forwarding is one loop over a list, and a change costs as
+much as the routes that it concerns. For each message the clock is read to see whether both ports may still forward: a
+gateway that was stopped must not go on with an old tree. Messages that come in while the gateway listens anew are held.
+They are forwarded if it may forward afterwards.
 """
 
 import functools
@@ -113,8 +114,8 @@ class BridgedTopic(Topic):
         return self.relayed is not None or super().in_use
 
     def last_received(self, publisher: Hashable) -> LastReceived:
-        """One for each way in: a message that was dropped because its link is silent counts as never seen, so that it
-        passes when it comes by another one.
+        """Return a new one for each link. A message that was dropped at one link, as that does not forward, is then
+        not a duplicate when it comes by another link.
         """
         return LastReceived()
 
@@ -236,7 +237,7 @@ class BridgedTopic(Topic):
 
 
 class RelayedTopic:
-    """A topic of the robot, on all links: `topics` by name, one unless it is called otherwise on some links.
+    """A topic of the robot, on all links. `topics` has it by name: several if some links have another name for it.
 
     Its routes lead from links on which it has been published to those on which it has been subscribed; they stay for
     their counters. `published_on` and `subscribed_on` are the ports where that is so now.
@@ -279,6 +280,11 @@ class RelayedTopic:
         route.subscriber = route.target.by_link.get(route.port.link)
         self._from.setdefault(source, {})[route.port.name] = route
         self._into.setdefault(route.port.name, {})[source] = route
+
+    def routes_added(self, published_on: list[BridgePort], subscribed_on: list[BridgePort]) -> None:
+        """Note that the routes from all of the first to all of the second are there."""
+        self.sources = {port.name for port in published_on}
+        self.targets = {port.name for port in subscribed_on}
 
     def keep(self, links: set[str]) -> None:
         """Remove the routes from and to all other links."""

@@ -179,8 +179,7 @@ class RoutingTable:
             if relayed.route(source.name, target.name) is None:
                 shaper = self._shaper(topic, source, target)
                 relayed.add(source.name, Route(target, self._topic(topic, target), shaper))
-        relayed.sources = {port.name for port in published_on}
-        relayed.targets = {port.name for port in subscribed_on}
+        relayed.routes_added(published_on, subscribed_on)
         if new or added:
             relayed.changed()
 

@@ -1,4 +1,6 @@
-"""Liveliness tokens: what each r2p module on zenoh has, as keys that zenoh keeps while it lives (PROTOCOL.md 10).
+"""Liveliness tokens: the modules on zenoh with their publishers and subscribers (PROTOCOL.md 10).
+
+Each is a key that zenoh keeps while the session that declared it lives.
 
     1/SESSION/module/NAME/INSTANCE/FLAGS/HOPS
     1/SESSION/pub|sub/TOPIC/INSTANCE/NODE/CLASS/SIZE/FINGERPRINT/WINDOW/HOPS
@@ -8,9 +10,9 @@ is that of the module concerned, another one where `HOPS` (gateways in between) 
 stands also for a node or a fingerprint that is not known; `%` for the slash of a topic or a module in a namespace.
 `SIZE` is that of a message, so 1024 at most. Tokens of another version are ignored.
 
-In front of each token stands `live/*`, or `live`, behind the name of the network. Every session numbers the keys that
-zenoh passes on to it, up to their first wildcard, and keeps these numbers for as long as it lives: so a key without a
-wildcard would stay in the memory of every router, for each module that has ever been there.
+In front of each token stands `live/*`, behind the name of the network; `live` alone is accepted, too. Every session
+numbers the keys that zenoh passes on to it, up to their first wildcard, and keeps these numbers for as long as it
+lives: so a key without a wildcard would stay in the memory of every router, for each module that has ever been there.
 """
 
 import re
@@ -25,7 +27,7 @@ from r2p.names import MODULE_PATH, MODULE_PATH_MAX
 
 VERSION = "1"
 
-PLACE = "live"
+KEY_PREFIX = "live"
 """The part of the key under which tokens are watched."""
 
 _WILD = "*/"
@@ -41,7 +43,7 @@ _TOPIC = re.compile(
 )
 _CLASS_MAX = 0xFF
 _OBSERVER = 0x80
-FLAGS = 0x7F
+FLAGS_MASK = 0x7F
 """The flags of ALIVE that a token can hold."""
 
 _ROLES = {"pub": ROLE_PUBLISHES, "sub": ROLE_SUBSCRIBES}
@@ -129,7 +131,7 @@ def decode(key: str) -> Token:
     raise DecodeError(f"{key[:80]!r} is not a token")
 
 
-def is_carried(token: Token) -> bool:
+def is_representable(token: Token) -> bool:
     """Whether the token survives encoding and decoding. Names from another link may contain what means something else
     in a key, or in a key expression of zenoh, such as `/` and `*`.
     """
@@ -139,14 +141,14 @@ def is_carried(token: Token) -> bool:
         return False
 
 
-def place(token: str) -> str:
-    """Return the key under which a token is declared."""
-    return f"{PLACE}/{_WILD}{token}"
+def token_key(token: str) -> str:
+    """Return the key under which a token is declared, without the name of the network."""
+    return f"{KEY_PREFIX}/{_WILD}{token}"
 
 
-def token_at(place: str) -> str:
-    """Return the token of a key under PLACE."""
-    return place.removeprefix(_WILD)
+def token_of(suffix: str) -> str:
+    """Return the token of what follows `live/` in a key; other implementations may leave out the wildcard."""
+    return suffix.removeprefix(_WILD)
 
 
 def is_module(key: str) -> bool:

@@ -40,7 +40,7 @@ TOKENS = st.one_of(
 def test_what_is_encoded_is_decoded(token: liveliness.Token) -> None:
     key = liveliness.encode(token)
     assert liveliness.decode(key) == token
-    assert liveliness.is_carried(token)
+    assert liveliness.is_representable(token)
     assert not set(key) & set("*$#?")  # what zenoh keeps for itself
 
 
@@ -95,22 +95,22 @@ def test_another_version_is_left_alone() -> None:
 
 @pytest.mark.parametrize("name", ["a#b", "a*b", "a//b", "$*", "a/b/c", "a-b", "a%b", "-", " ", "a?b", "a" * 25])
 def test_names_that_no_key_carries(name: str) -> None:
-    assert not liveliness.is_carried(ModuleToken(7, name, 7))
-    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, name))
+    assert not liveliness.is_representable(ModuleToken(7, name, 7))
+    assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, "leds", 7, name))
 
 
 @pytest.mark.parametrize("topic", ["a#b", "a*b", "a//b", "$*", "a/b/c", "/a", "a-b", "a%b", "-", "a" * 17])
 def test_topics_that_no_key_carries(topic: str) -> None:
-    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, topic, 7))
+    assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, topic, 7))
 
 
 def test_sizes_and_hops_that_no_key_carries() -> None:
-    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, size=1025))
-    assert not liveliness.is_carried(TopicToken(7, ROLE_PUBLISHES, "leds", 7, hops=100))
+    assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, "leds", 7, size=1025))
+    assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, "leds", 7, hops=100))
 
 
 def test_keys_have_a_wildcard_so_that_zenoh_forgets_them_and_may_lack_it() -> None:
     token = liveliness.encode(ModuleToken(1, "PC1", 1))
-    assert liveliness.place(token) == f"live/*/{token}"
-    assert liveliness.token_at(liveliness.place(token).removeprefix("live/")) == token
-    assert liveliness.token_at(token) == token
+    assert liveliness.token_key(token) == f"live/*/{token}"
+    assert liveliness.token_of(liveliness.token_key(token).removeprefix("live/")) == token
+    assert liveliness.token_of(token) == token

@@ -143,7 +143,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
             case management.Alive(name, flags):
                 known = self._own.relayed(("module", name))
                 if isinstance(known, ModuleToken):
-                    token = msgspec.structs.replace(known, flags=flags & liveliness.FLAGS)
+                    token = msgspec.structs.replace(known, flags=flags & liveliness.FLAGS_MASK)
                     self._relay(("module", name), token, gone=False)
                 else:
                     for each in management.alias_messages(name):
@@ -158,7 +158,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def _relay(self, key: tuple[str | int, ...], token: liveliness.Token, *, gone: bool) -> None:
         if gone:
             self._own.set_relayed(key, None)
-        elif liveliness.is_carried(token):
+        elif liveliness.is_representable(token):
             self._own.set_relayed(key, token)
         else:
             self.counts["name not carried"] += 1

@@ -9,7 +9,7 @@ A topic goes out no further than its subscribers have room (r2p.protocols.flow_c
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import msgspec
 import zenoh
@@ -70,7 +70,7 @@ class ZenohSubscriber(LinkSubscriber):
 
     def _offer_down(self, sample: Sample) -> bool:
         if sample.publisher_class != _NRT:
-            return False
+            return False  # so its publisher reports it as missed
         self.count_lost(LINK_DOWN)
         return True
 
@@ -172,7 +172,7 @@ class ZenohSender:
         self.batcher = Batcher(self.loop, link.stats, batching=batching)
         self.credits = CreditReader(self)
         self.reachability = Reachability(self)
-        self.final_credits = FinalCredits(self.loop, self.credits.receive, self._count_unknown)
+        self.final_credits = FinalCredits(self)
         self._hub = hub
         self._subscribers = subscribers
         self._prefix = ""
@@ -235,14 +235,15 @@ class ZenohSender:
         if unacknowledged and gone and self.link.up:
             self.final_credits.expect(topic, session, unacknowledged)
         elif unacknowledged and gone:  # no credit comes on a link that is down
-            self._count_unknown(unacknowledged)
+            self.count_unknown(unacknowledged)
 
     def final_credit_received(self, topic: str, session: int) -> None:
         """A subscriber says that it leaves."""
         self.final_credits.received(topic, session)
         self.reachability.set_leaving(topic, session)
 
-    def _count_unknown(self, count: int) -> None:
+    def count_unknown(self, count: int) -> None:
+        """Count messages of which it stays unknown whether a subscriber got them."""
         self.link.stats.lost["unknown at disconnect"] += count
 
     def report_unreachable(self, topic: str, session: int) -> None:
@@ -341,12 +342,11 @@ class CreditReader:
         self._serve()
 
     def _read(self, sample: zenoh.Sample | None) -> None:
-        subscribers = {each.topic.name: each for each in self._sender.subscribers()}
         while sample is not None and self._reader is not None:
-            self._lost.guard(self._apply, sample.payload, subscribers)
+            self._lost.guard(self._apply, sample.payload)
             sample = self._reader.receive()
 
-    def _apply(self, payload: zenoh.ZBytes, subscribers: dict[str, ZenohSubscriber]) -> None:
+    def _apply(self, payload: zenoh.ZBytes) -> None:
         try:
             credit = decode_credit(payload.to_bytes() if len(payload) <= _CREDIT_BYTES_MAX else b"")
             PublisherClass(credit.publisher_class)
@@ -355,7 +355,7 @@ class CreditReader:
         except (DecodeError, ValueError):
             self._lost["undecodable"] += 1
         else:
-            subscriber = subscribers.get(credit.topic)
+            subscriber = self._sender.subscriber(credit.topic)
             if subscriber is not None:
                 subscriber.acknowledge(credit)
             if credit.leaving:
@@ -383,18 +383,18 @@ class CreditReader:
 # New subscribers
 
 _RETRY_S = 0.002
-"""Seconds until the second look whether messages reach a new subscriber; each further one takes that much longer."""
+"""Seconds until the second check whether messages reach a new subscriber; each further one takes that much longer."""
 
 _RETRY_FACTOR_MAX = 100
 
 _RETRIES = 50
-"""Looks, together 2.5 s, after which the user has to know."""
+"""Checks, together 2.5 s, after which the user has to know."""
 
 _CHECK_S = 0.25
-"""Seconds between two looks whether what was sent is acknowledged."""
+"""Seconds between two checks whether what was sent is acknowledged."""
 
 _RESENDS = 6
-"""Looks at which latched values are sent once more, before the user has to know."""
+"""Checks at which latched values are sent once more, before the user has to know."""
 
 
 class _PendingSubscriber(msgspec.Struct, eq=False):
@@ -406,7 +406,7 @@ class _PendingSubscriber(msgspec.Struct, eq=False):
 
 
 class Reachability:
-    """Whether messages reach the subscribers: looked at before they are sent to, and after.
+    """Whether messages reach the subscribers: checked before they are sent to, and after.
 
     Tokens and routes for messages spread through the network at different times, and a router's access control may let
     pass the one and not the other.
@@ -457,7 +457,7 @@ class Reachability:
     def _reaches(self, topic: str) -> bool:
         try:
             return self._sender.publishers.reaches(topic)
-        except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next check follows
             self._lost.internal_error(error)
             return False
 
@@ -493,18 +493,13 @@ class _DepartedSubscriber(msgspec.Struct, eq=False):
 
 
 class FinalCredits:
-    """Waits for the last credit of subscribers whose token is gone; only what then stays open counts as unknown.
+    """Waits for the final credit of subscribers whose token is gone.
 
-    `receive` reads the credits that have come; `count` gets the number of messages of a subscriber that has not left in
-    order.
+    A subscriber that sends one has left in order. What another one did not acknowledge counts as unknown.
     """
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, receive: Callable[[], object], count: Callable[[int], object]
-    ) -> None:
-        self._loop = loop
-        self._receive = receive
-        self._count = count
+    def __init__(self, sender: ZenohSender) -> None:
+        self._sender = sender
         self._departed: dict[tuple[str, int], _DepartedSubscriber] = {}
 
     def expect(self, topic: str, session: int, unacknowledged: int) -> None:
@@ -514,7 +509,7 @@ class FinalCredits:
         if before is not None:  # it came back meanwhile, and is gone again
             before.timer.cancel()
             unacknowledged += before.unacknowledged
-        timer = self._loop.call_later(FINAL_CREDIT_S, self._expired, key)
+        timer = self._sender.loop.call_later(FINAL_CREDIT_S, self._expired, key)
         self._departed[key] = _DepartedSubscriber(unacknowledged, timer)
 
     def received(self, topic: str, session: int) -> None:
@@ -525,14 +520,14 @@ class FinalCredits:
 
     def close(self) -> None:
         """Count what is open: no credit comes any more."""
-        self._receive()
+        self._sender.credits.receive()
         departed, self._departed = self._departed, {}
         for each in departed.values():
             each.timer.cancel()
-            self._count(each.unacknowledged)
+            self._sender.count_unknown(each.unacknowledged)
 
     def _expired(self, key: tuple[str, int]) -> None:
-        self._receive()  # which may be the very credit
+        self._sender.credits.receive()  # which may be the very credit
         departed = self._departed.pop(key, None)
         if departed is not None:
-            self._count(departed.unacknowledged)
+            self._sender.count_unknown(departed.unacknowledged)

@@ -97,7 +97,7 @@ class ZenohLink(Link):
         if not self._connects:  # before tokens come: they are believed only on a link that is up
             self.on_up()
         session.watch_transports(self._queue(self._transport_changed))
-        session.watch_tokens(f"{prefix}/{liveliness.PLACE}", self._token_changes)
+        session.watch_tokens(f"{prefix}/{liveliness.KEY_PREFIX}", self._token_changes)
         session.listen(f"{prefix}/control", self._queue(self._control_received))
         queue = functools.partial(self._queue, most=_TYPE_QUERIES_MAX)
         session.answer_queries(f"{prefix}/schema/{self.instance:x}/*", self._schema, queue)
@@ -184,10 +184,10 @@ class ZenohLink(Link):
         match event:
             case Declare(key):
                 if self._session is not None:
-                    self._session.declare_token(f"{self._prefix}/{liveliness.place(key)}")
+                    self._session.declare_token(f"{self._prefix}/{liveliness.token_key(key)}")
             case Undeclare(key):
                 if self._session is not None:
-                    self._session.undeclare_token(f"{self._prefix}/{liveliness.place(key)}")
+                    self._session.undeclare_token(f"{self._prefix}/{liveliness.token_key(key)}")
             case QueryTokens():
                 self._query_tokens()
             case SubscriberLeft(topic, int(session), gone):
@@ -247,7 +247,9 @@ class ZenohLink(Link):
         """Query all tokens: zenoh reports each only once, and some were refused."""
         if self._session is not None:
             self._tokens.query_started()
-            self._session.query_tokens(f"{self._prefix}/{liveliness.PLACE}", _TOKENS_TIMEOUT_S, self._token_answers)
+            self._session.query_tokens(
+                f"{self._prefix}/{liveliness.KEY_PREFIX}", _TOKENS_TIMEOUT_S, self._token_answers
+            )
 
     def _token_answered(self, answer: str | bool) -> None:
         """A token, or at last whether these were all."""

@@ -216,7 +216,7 @@ class ZenohSession:
             there = sample.kind == zenoh.SampleKind.PUT
             self._token_count += 1 if there else -1
             self.outbound.set_token_count(self._token_count)
-            queue.put((liveliness.token_at(str(sample.key_expr)[start:]), there))
+            queue.put((liveliness.token_of(str(sample.key_expr)[start:]), there))
 
         tokens: FifoChannel[zenoh.Sample] = FifoChannel(_CHANNEL_MAX)
         declared = self._session.liveliness().declare_subscriber(f"{prefix}/**", tokens, history=True)
@@ -238,7 +238,7 @@ class ZenohSession:
                 if reply.ok is None:  # the time is over
                     complete = False
                 else:
-                    queue.put(liveliness.token_at(str(reply.ok.key_expr)[start:]))
+                    queue.put(liveliness.token_of(str(reply.ok.key_expr)[start:]))
             return complete
 
         def run() -> None:
@@ -382,9 +382,9 @@ class ZenohSession:
 
         def tokens(kind: str) -> list[tuple[str, str]]:
             replies: FifoChannel[zenoh.Reply] = FifoChannel(_CHANNEL_MAX)
-            found = self._session.liveliness().get(f"r2p/*/{liveliness.PLACE}/**/{kind}/**", replies, timeout=1.0)
+            found = self._session.liveliness().get(f"r2p/*/{liveliness.KEY_PREFIX}/**/{kind}/**", replies, timeout=1.0)
             keys = [str(reply.ok.key_expr).split("/", 3) for reply in found if reply.ok is not None]
-            found_at = [(network, liveliness.token_at(key)) for _, network, _, key in keys if is_network_name(network)]
+            found_at = [(network, liveliness.token_of(key)) for _, network, _, key in keys if is_network_name(network)]
             return [(network, token) for network, token in found_at if token.split("/")[2:3] == [kind]]
 
         def find() -> set[str]:

@@ -27,7 +27,12 @@ class Bench:
     def __init__(self) -> None:
         self.counted: list[int] = []
         self.found: tuple[str, int] | None = None
-        self.final_credits = FinalCredits(asyncio.get_running_loop(), self._look, self.counted.append)
+        sender: Any = SimpleNamespace(
+            loop=asyncio.get_running_loop(),
+            credits=SimpleNamespace(receive=self._look),
+            count_unknown=self.counted.append,
+        )
+        self.final_credits = FinalCredits(sender)
 
     def _look(self) -> None:
         if self.found is not None:

@@ -39,7 +39,7 @@ async def test_what_a_subscriber_that_is_gone_has_not_confirmed_is_unknown() -> 
     async with nodes(net, "A") as (alice,), alien_on(net) as alien:
         publisher = alice.advertise("leds", Led)
         wants = liveliness.encode(TopicToken(7, ROLE_SUBSCRIBES, "leds", 7, "node", size=layout(Led).size, window=64))
-        token = alien.liveliness().declare_token(f"r2p/lab/{liveliness.place(wants)}")
+        token = alien.liveliness().declare_token(f"r2p/lab/{liveliness.token_key(wants)}")
         reader = alien.declare_subscriber("r2p/lab/topic/leds", zenoh.handlers.RingChannel(1))
         await publisher.wait_subscriber()
         for number in range(5):
@@ -58,7 +58,7 @@ async def test_a_last_credit_is_for_all_classes_and_may_come_after_the_end_of_th
     async with nodes(net, "A") as (alice,), alien_on(net) as alien:
         publisher, link = alice.advertise("leds", Led), link_of(alice)
         wants = liveliness.encode(TopicToken(7, ROLE_SUBSCRIBES, "leds", 7, "node", size=layout(Led).size, window=64))
-        token = alien.liveliness().declare_token(f"r2p/lab/{liveliness.place(wants)}")
+        token = alien.liveliness().declare_token(f"r2p/lab/{liveliness.token_key(wants)}")
         reader = alien.declare_subscriber("r2p/lab/topic/leds", zenoh.handlers.RingChannel(1))
         await publisher.wait_subscriber()
         for number in range(5):
