@@ -29,12 +29,21 @@ Gateways agree on their tree (`r2p.protocols.bridge`) with three more types, whi
 
 import enum
 import functools
-import struct
-from collections.abc import Iterable
 
 import msgspec
 
 from r2p.codecs import UnknownType
+from r2p.codecs._gateway_fields import MESH_HEARD as MESH_HEARD
+from r2p.codecs._gateway_fields import PARTS_MAX as PARTS_MAX
+from r2p.codecs._gateway_fields import decode_acks as decode_acks
+from r2p.codecs._gateway_fields import decode_heard as decode_heard
+from r2p.codecs._gateway_fields import encode_acks as encode_acks
+from r2p.codecs._gateway_fields import encode_heard as encode_heard
+from r2p.codecs._gateway_fields import is_newer_serial as is_newer_serial
+from r2p.codecs._gateway_fields import last_part, part_number
+from r2p.codecs._gateway_fields import leaf_port as leaf_port
+from r2p.codecs._gateway_fields import make_part as make_part
+from r2p.codecs._gateway_fields import next_serial as next_serial
 from r2p.codecs._records import Codec, Record
 from r2p.errors import MessageError
 from r2p.names import module_alias
@@ -149,13 +158,6 @@ _VERSION = 1
 _PIECE = 22  # characters of Name.piece
 BRIDGE_ACKS = 2  # acks in a Bridge
 LEAF_ACKS = 3  # acks in a Leaf
-MESH_HEARD = 3  # entries in Mesh.heard
-PARTS_MAX = 16
-"""Parts of a Name or a Mesh: the number of a part has four bits."""
-_PART_BITS = 4
-_SERIALS = 0x10000  # counts of Bridge and Leaf, and serials of Mesh, start again at 0 after this many
-_ACK = struct.Struct("<IH")
-_HEARD = struct.Struct("<BIB")
 _MARK = b"r2p"
 _MARKED = slice(22, 25)  # of an encoded message: in its params, behind RTCAN's message id
 
@@ -295,12 +297,12 @@ class Name(msgspec.Struct, frozen=True, gc=False):
     @property
     def number(self) -> int:
         """The number of this piece."""
-        return _part_number(self.part)
+        return part_number(self.part)
 
     @property
     def last(self) -> int:
         """The number of the last piece."""
-        return _last_part(self.part)
+        return last_part(self.part)
 
 
 class Bridge(msgspec.Struct, frozen=True, gc=False):
@@ -333,12 +335,12 @@ class Mesh(msgspec.Struct, frozen=True, gc=False):
     @property
     def number(self) -> int:
         """The number of this part."""
-        return _part_number(self.part)
+        return part_number(self.part)
 
     @property
     def last(self) -> int:
         """The number of the last part."""
-        return _last_part(self.part)
+        return last_part(self.part)
 
 
 class Leaf(msgspec.Struct, frozen=True, gc=False):
@@ -550,54 +552,6 @@ def alias_messages(name: str) -> list[Name]:
         return []
     pieces = [name[at : at + _PIECE] for at in range(0, len(name), _PIECE)]
     return [Name(alias, make_part(number, len(pieces) - 1), piece) for number, piece in enumerate(pieces)]
-
-
-def make_part(number: int, last: int) -> int:
-    """The `part` of a Name or a Mesh: the number of this part, and of the last one."""
-    return number << _PART_BITS | last
-
-
-def _part_number(part: int) -> int:
-    return part >> _PART_BITS
-
-
-def _last_part(part: int) -> int:
-    return part & PARTS_MAX - 1
-
-
-def next_serial(serial: int) -> int:
-    """The count of a Bridge or a Leaf, or the serial of a Mesh, that follows this one."""
-    return (serial + 1) % _SERIALS
-
-
-def is_newer_serial(serial: int, last: int) -> bool:
-    """Whether such a number comes after `last`: at most half the range ahead of it."""
-    return 0 < (serial - last) % _SERIALS < _SERIALS // 2
-
-
-def leaf_port(number: int) -> int:
-    """The `port` of a Leaf for the link with this number: its low byte, as the field has one byte."""
-    return number & 0xFF
-
-
-def encode_acks(acks: Iterable[tuple[int, int]], places: int) -> bytes:
-    """The `acks` of a Bridge (BRIDGE_ACKS places) or a Leaf (LEAF_ACKS): senders and counts."""
-    return b"".join(_ACK.pack(*ack) for ack in acks).ljust(places * _ACK.size, b"\0")
-
-
-def decode_acks(acks: bytes) -> list[tuple[int, int]]:
-    """Senders and counts in the `acks` of a Bridge or a Leaf; the sender of a free place is 0."""
-    return list(_ACK.iter_unpack(acks))
-
-
-def encode_heard(heard: Iterable[tuple[int, int, int]]) -> bytes:
-    """The `heard` of a Mesh: own port, other gateway, and its port."""
-    return b"".join(_HEARD.pack(*each) for each in heard).ljust(MESH_HEARD * _HEARD.size, b"\0")
-
-
-def decode_heard(heard: bytes) -> list[tuple[int, int, int]]:
-    """Own port, other gateway and its port in the `heard` of a Mesh, free places left out."""
-    return [each for each in _HEARD.iter_unpack(heard) if each[1]]
 
 
 # What params hold: on RTCAN a message id and the mark, and in the last byte the state of an r2p subscription.

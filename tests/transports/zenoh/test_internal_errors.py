@@ -43,7 +43,9 @@ class Payload(bytes):
 async def test_credits() -> None:
     stats, loop = LinkStats(), asyncio.get_running_loop()
     subscribers = [subscriber("a", acknowledge=once(print)), subscriber("b", refill=once(print)), subscriber("c")]
+    by_topic = {each.topic.name: each for each in subscribers}
     sender: Any = SimpleNamespace(loop=loop, link=SimpleNamespace(stats=stats), subscribers=lambda: subscribers)
+    sender.subscriber = by_topic.get
     credits_of = CreditReader(sender)
     waiting = [SimpleNamespace(payload=Payload(encode_credit(Credit(7, 1, 5, each)))) for each in "abc"]
     session: Any = SimpleNamespace(

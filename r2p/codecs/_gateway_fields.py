@@ -1,0 +1,66 @@
+"""Fields inside the messages of gateways (PROTOCOL.md 9): parts, counts and serials, acknowledgements, neighbours.
+
+`r2p.codecs.management` has their messages, and exports what is here.
+"""
+
+import struct
+from collections.abc import Iterable
+
+MESH_HEARD = 3  # entries in Mesh.heard
+PARTS_MAX = 16
+"""Parts of a Name or a Mesh: the number of a part has four bits."""
+
+_PART_BITS = 4
+_SERIALS = 0x10000  # counts of Bridge and Leaf, and serials of Mesh, start again at 0 after this many
+_ACK = struct.Struct("<IH")
+_HEARD = struct.Struct("<BIB")
+
+
+def make_part(number: int, last: int) -> int:
+    """The `part` of a Name or a Mesh: the number of this part, and of the last one."""
+    return number << _PART_BITS | last
+
+
+def part_number(part: int) -> int:
+    """The number of this part, from 0."""
+    return part >> _PART_BITS
+
+
+def last_part(part: int) -> int:
+    """The number of the last part."""
+    return part & PARTS_MAX - 1
+
+
+def next_serial(serial: int) -> int:
+    """The count of a Bridge or a Leaf, or the serial of a Mesh, that follows this one."""
+    return (serial + 1) % _SERIALS
+
+
+def is_newer_serial(serial: int, last: int) -> bool:
+    """Whether such a number comes after `last`: at most half the range ahead of it."""
+    return 0 < (serial - last) % _SERIALS < _SERIALS // 2
+
+
+def leaf_port(number: int) -> int:
+    """The `port` of a Leaf for the link with this number: its low byte, as the field has one byte."""
+    return number & 0xFF
+
+
+def encode_acks(acks: Iterable[tuple[int, int]], places: int) -> bytes:
+    """The `acks` of a Bridge (BRIDGE_ACKS places) or a Leaf (LEAF_ACKS): senders and counts."""
+    return b"".join(_ACK.pack(*ack) for ack in acks).ljust(places * _ACK.size, b"\0")
+
+
+def decode_acks(acks: bytes) -> list[tuple[int, int]]:
+    """Senders and counts in the `acks` of a Bridge or a Leaf; the sender of a free place is 0."""
+    return list(_ACK.iter_unpack(acks))
+
+
+def encode_heard(heard: Iterable[tuple[int, int, int]]) -> bytes:
+    """The `heard` of a Mesh: own port, other gateway, and its port."""
+    return b"".join(_HEARD.pack(*each) for each in heard).ljust(MESH_HEARD * _HEARD.size, b"\0")
+
+
+def decode_heard(heard: bytes) -> list[tuple[int, int, int]]:
+    """Own port, other gateway and its port in the `heard` of a Mesh, free places left out."""
+    return [each for each in _HEARD.iter_unpack(heard) if each[1]]
