@@ -254,7 +254,7 @@ class BusMonitor:
         self._report(f"{self.via} is up")
 
     def down(self, reason: str) -> None:
-        """The bus can't be used any more."""
+        """Note that the bus can no longer be used."""
         self._report(f"{self.via} is down: {reason}")
 
     def waits(self, reason: str) -> None:

@@ -293,7 +293,7 @@ class Ticker:
             self._fd = None
 
     def _start_timerfd(self, first: int) -> bool:
-        """Use a timerfd. False where there is none (not Linux, no descriptors left): then loop timers do."""
+        """Use a timerfd. Returns False, and leaves it to loop timers, off Linux or without descriptors."""
         if sys.platform != "linux":
             return False
         try:

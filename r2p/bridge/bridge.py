@@ -94,7 +94,7 @@ class Bridge:
             self._notify(link, "too many links", f"a gateway joins {MOST_PORTS} links: this one is not", True)
 
     def detach(self, link: Link) -> None:
-        """The module does not have the link any more."""
+        """Remove a link that the module no longer has."""
         port = self.ports.pop(link.name)
         del self._by_number[port.number]
         self._close(port)

@@ -182,7 +182,7 @@ class BridgedTopic(Topic):
     def _send(
         self, subscribers: list[RemoteSubscriber], sample: Sample, blocked: list[Sink] | None, slot_link: object
     ) -> list[Sink] | None:
-        """What is published here goes where we forward, and nowhere else: there another gateway brings it."""
+        """Send what is published here on the links that this gateway forwards to; others send the rest."""
         now = self._monotonic()
         silent = [each for each in subscribers if now >= self._ports[each.link_name].tree_port.forwards_until]
         for each in silent:

@@ -58,7 +58,7 @@ class MultihomedModule:
         link.gateway_hooks = port
 
     def detach(self, link: Link) -> None:
-        """The module does not have the link any more."""
+        """Remove a link that the module no longer has."""
         port = self._ports.pop(link.name)
         del self._by_number[port.number]
         for key, unable in self._unable.items():

@@ -133,7 +133,7 @@ class Policy:
         return 0 if harmless or self._may_control(source) else DENIED_CONTROL
 
     def rate_limit(self, topic: str) -> float | None:
-        """Messages a second at most; None: there is no limit."""
+        """Greatest number of messages a second; None for no limit."""
         return _first(self._options.rate_limit, topic)
 
     def class_of(self, topic: str, source: str) -> ClassOf | None:

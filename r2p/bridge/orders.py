@@ -2,7 +2,7 @@
 
 An order names a module by its alias of 7 characters. On links with a prefix that is the alias of the name with the
 prefix, so `ModuleNames` finds the one module that it stands for, or says that there are two. What does not pass is
-logged, and its sender is told by DENIED.
+logged, and its sender gets a DENIED.
 """
 
 import msgspec

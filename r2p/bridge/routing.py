@@ -1,6 +1,6 @@
 """Which topics a gateway forwards, and what it announces of them on each link: worked out whenever demand changes.
 
-On a link we publish what is published on another one from which it may come, and subscribe to what is subscribed on
+On a link, a gateway publishes what other links may send there, and subscribes to what is subscribed on
 another one to which it may go. All of that only on links that are in the tree; so demand travels along the tree, and
 can't feed itself.
 

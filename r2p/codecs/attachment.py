@@ -228,7 +228,7 @@ def decode(data: bytes) -> Header:
 class Credit(msgspec.Struct, frozen=True, gc=False):
     """How far a subscriber's session has come: up to this serial of the publisher's session, in this topic and class.
 
-    `leaving`: it does not subscribe any more, so this is its final credit.
+    `leaving`: it no longer subscribes, so this is its final credit.
     """
 
     session: int

@@ -51,7 +51,7 @@ _ROLE_NAMES = {role: name for name, role in _ROLES.items()}
 
 
 class ModuleToken(msgspec.Struct, frozen=True):
-    """A module lives. `flags` are FLAG_... of ALIVE, `instance` is None for firmware behind a gateway."""
+    """A module that is running. `flags` are FLAG_... of ALIVE, `instance` is None for firmware behind a gateway."""
 
     session: int
     name: str

@@ -232,7 +232,7 @@ class Path(msgspec.Struct, frozen=True, gc=False):
 
 
 class Hello(msgspec.Struct, frozen=True, gc=False):
-    """An r2p module lives. `instance` is the random number of its start; it is gone after `lease_ms` of silence."""
+    """An r2p module runs. `instance` is the random number of its start; it is gone after `lease_ms` of silence."""
 
     module: str
     instance: int
@@ -251,7 +251,7 @@ class TypeInfo(msgspec.Struct, frozen=True, gc=False):
 
 
 class Unsubscribe(msgspec.Struct, frozen=True, gc=False):
-    """The r2p module that started as `instance` does not subscribe to this topic any more."""
+    """The r2p module that started as `instance` no longer subscribes to this topic."""
 
     topic: str
     instance: int

@@ -116,7 +116,7 @@ class Watchdog:
                 logger.warning("the event loop runs again after %.0f ms", took)
 
     def _pause(self) -> bool:
-        """Wait until the next look; True if there is none, as the watchdog ends."""
+        """Wait until the next check. Returns True if the watchdog ends instead."""
         start, used = self._clock.monotonic(), _used()
         if self._ended.wait(self._limit / 4):
             return True

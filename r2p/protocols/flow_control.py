@@ -82,7 +82,7 @@ class SendWindow:
         self._update()
 
     def skip_full(self) -> list[int]:
-        """Wait no more for subscribers without room, until their next credit; return their sessions."""
+        """Stop waiting for subscribers without room, until their next credit; return their sessions."""
         full = [session for session, each in self.subscribers.items() if each.is_full(self.serial)]
         for session in full:
             self.subscribers[session].waited_for = False

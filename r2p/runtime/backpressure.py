@@ -63,7 +63,7 @@ class Sink(abc.ABC):
         """Accept the sample even without room: then one sample is lost, and counted."""
 
     def count_lost(self, reason: str) -> None:
-        """Count a sample that waited, and does not any more; links also count it by reason."""
+        """Count a sample whose wait was given up; links also count it by reason."""
         self.lost += 1
 
     @abc.abstractmethod
@@ -115,7 +115,7 @@ class PendingDelivery(abc.ABC):
             self.on_completed(sink, reason)
 
     def withdraw(self) -> list[Sink]:
-        """Wait no more; returns the sinks that do not have the sample."""
+        """Stop waiting; returns the sinks that do not have the sample."""
         without, self.remaining = self.remaining, []
         for sink in without:
             sink.get_wait_queue().remove(sink, self)
@@ -191,7 +191,7 @@ class WaitQueue:
             callback()
 
     def drop_sink(self, sink: Sink) -> None:
-        """Complete everything that waits for this sink, without a loss: nothing is behind it any more."""
+        """Complete everything that waits for this sink, without a loss: nothing is behind it now."""
         for line in (self.real_time, self.non_real_time):
             for delivery in _pop(line, sink):
                 delivery.complete(sink)

@@ -1,6 +1,6 @@
 """What happens to a module's links and on its network, as events that programs and tools iterate over.
 
-A listener is a bounded queue that lives as long as its iterator: one that is never read, or not any more, is garbage.
+A listener is a bounded queue that lives as long as its iterator: one that is not read is garbage-collected.
 """
 
 import asyncio

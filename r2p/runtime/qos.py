@@ -54,7 +54,7 @@ class Sporadic(msgspec.Struct, frozen=True):
 
     At most `pending` messages wait for room, in order; one more drops the oldest of them. An overdue message is dropped
     (`late="drop"`) and reported to `on_missed`, or still sent (`late="send"`) and reported to `on_late`. `on_degraded`
-    is called when a link can't do what the class asks for any more.
+    is called when a link can no longer do what the class asks for.
     """
 
     publisher_class: ClassVar = PublisherClass.SPORADIC

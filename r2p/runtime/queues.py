@@ -43,7 +43,7 @@ class EndpointOwner(Protocol):
 
     @property
     def ending(self) -> bool:
-        """Whether functions that the node gave away are not to be called any more."""
+        """Whether the node's callbacks must no longer be called."""
 
     def crash(self, error: Exception) -> None:
         """End the node with an error of a function that it gave away."""

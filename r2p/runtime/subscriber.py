@@ -256,7 +256,7 @@ class Subscriber(Generic[T]):
             self._sink.waiter = None
 
     def _next(self) -> T | None:
-        """Pop messages up to the next one that is fresh and decodes. None: there is none."""
+        """Pop messages up to the next one that is fresh and decodes; returns None if there is no such message."""
         sink, queue = self._sink, self.queue
         while queue:
             sample = queue.popleft()

@@ -50,7 +50,7 @@ class PublisherHandle(Protocol):
         """A subscriber joined, or came back after a reboot."""
 
     def link_degraded(self, link: str, reason: str) -> None:
-        """A link that carried the topic does not any more."""
+        """Handle a link that no longer carries the topic."""
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
         """A link gave up a message that it had accepted; `late` is in seconds."""
@@ -89,7 +89,7 @@ class SlotPublisher(abc.ABC):
 
     @abc.abstractmethod
     def link_degraded(self, link: str, reason: str) -> None:
-        """The link has no slots any more."""
+        """Handle a link that has lost its slots."""
 
     @abc.abstractmethod
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
@@ -266,7 +266,7 @@ class LinkView(Protocol):
         """Why there can never be slots for messages of `size` bytes each `period` seconds."""
 
     def network_time(self) -> int | None:
-        """The time (ns) that all nodes of the link's network share. None: it has none, or it is not known."""
+        """The time (ns) that all nodes of the link's network share; None if it has no such time, or it is not known."""
 
     async def admission(self, topic: str) -> None:
         """Wait until the link has admitted the topic."""

@@ -57,7 +57,7 @@ def run(
 
     Virtual time starts at 2013-01-01 UTC and lasts 48 days at most. `seed` goes to the loop's random numbers,
     `loop.random`. Tasks that `main` leaves behind are cancelled, as by `asyncio.run`. Raises what `main` raises, and
-    `Deadlock` when it waits for something that can't happen any more, and KeyboardInterrupt on Ctrl-C.
+    `Deadlock` when it waits for something that can no longer happen, and KeyboardInterrupt on Ctrl-C.
 
     Timers that only repeat themselves (announcements, periodic publishers, time-outs that no task waits for) do not
     keep a program alive: Deadlock is raised when they have woken no task for half a second of real time and 20 seconds

@@ -246,7 +246,7 @@ class RateCounter:
 
 
 class _LogCounter(logging.Handler):
-    """Counts log lines, which are written below the table, so that it can't be drawn over any more."""
+    """Counts log lines, which are written below the table, so that it can no longer be drawn over."""
 
     def __init__(self) -> None:
         super().__init__()

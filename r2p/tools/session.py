@@ -243,7 +243,7 @@ class Session:
         """Listen until the other modules have announced what they have, or for `wait` seconds.
 
         r2p modules are queried and answer at once, gateways for the modules behind them; firmware repeats one
-        announcement at a time. Where more may come, the user is told; `of` is the plural for that message. Raises
+        announcement at a time. Where more may come, the user is informed; `of` is the plural for that message. Raises
         r2p.TransportError if no link comes up.
         """
         if not self.settings.via:

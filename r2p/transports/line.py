@@ -205,7 +205,7 @@ class LineLink(BufferedLink):
         return lines
 
     def carrier_full(self) -> None:
-        """Give the carrier no more: it holds bytes that it could not send."""
+        """Stop giving data to the carrier: it holds bytes that it could not send."""
         self._blocked = True
 
     def carrier_ready(self) -> None:

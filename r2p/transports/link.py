@@ -242,11 +242,11 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def remove_publisher(self, name: str, source: Hashable) -> None:
-        """Receive no more of a topic from this publisher."""
+        """Stop receiving a topic from this publisher."""
 
     @abc.abstractmethod
     def remove_publishers(self, name: str) -> None:
-        """Receive no more of a topic."""
+        """Stop receiving a topic."""
 
     @abc.abstractmethod
     def _subscriber_joined(self, event: SubscriberJoined) -> None:
@@ -294,15 +294,15 @@ class Link(abc.ABC):
         return None
 
     def network_time(self) -> int | None:
-        """The time (ns) that all nodes of the network share. None: it has none, or it is not known."""
+        """The time (ns) that all nodes of the network share; None if it has no such time, or it is not known."""
         return None
 
     def translation(self) -> ClockOffset | None:
-        """How that time is translated to UTC here, and how well. None: there is none, or it is not known."""
+        """How network time translates to UTC here, and how accurately; None if that is not known."""
         return None
 
     def params(self, topic: str) -> bytes | None:
-        """What the other ends need to know to receive a topic from us. None: it can't be published here."""
+        """What the peers need to know to receive a topic from this module; None if it can't be published here."""
         return NO_PARAMS
 
     def window(self, topic: Topic) -> int:

@@ -128,7 +128,7 @@ class MemoryNetwork:
                 self._send_to(address, datagram)
 
     def arrived(self, count: int = 1) -> None:
-        """Messages are not on their way any more."""
+        """Note that messages are no longer on their way."""
         was_full = self.full
         self._in_flight -= count
         if was_full and not self.full:

@@ -68,7 +68,7 @@ class BlockedMessage(PendingDelivery):
         self._holds = True
 
     def leave(self, sink: Sink) -> None:
-        """Wait no more for this sink."""
+        """Stop waiting for this sink."""
         sink.get_wait_queue().remove(sink, self)
         self.remaining.remove(sink)
 

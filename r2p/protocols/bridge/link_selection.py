@@ -32,7 +32,7 @@ from r2p.protocols.bridge.ports import (
 from r2p.units import LONG_AGO, NEVER, SECOND
 
 TWIN_MEMORY = 7_000_000_000
-"""Ns after which two links that led to one network are not believed to do so any more, unless it shows again."""
+"""Ns after which two links that led to one network no longer count as doing so, unless it shows again."""
 
 _SUSPICION = SECOND  # ns in which it shows by which link our own messages came back
 _LINGER = SECOND  # ns for which LEAF goes on after its use has ended: gateways may be waiting for an answer
@@ -305,7 +305,7 @@ class LinkSelection:
         self._update(now)
 
     def receive_leaf(self, now: int, number: int, message: Leaf) -> None:
-        """Our own LEAF came in."""
+        """Handle a LEAF of this module that came back."""
         link = self.by_number.get(number)
         if link is None:
             return
@@ -316,7 +316,7 @@ class LinkSelection:
         self._update(now)
 
     def receive_probe(self, now: int, number: int, port: int) -> None:
-        """Our own probe came in, that was sent by a link with this number modulo PORT_MODULUS."""
+        """Handle a probe of this module that came back; it was sent on a link with this number modulo PORT_MODULUS."""
         link = self.by_number.get(number)
         if link is not None:
             others = [other for other in self.by_number if other != number and other % PORT_MODULUS == port]
@@ -342,7 +342,7 @@ class LinkSelection:
 
     def set_remote(self, now: int, number: int, instance: int | None) -> None:
         """Enter which module is at the other end of a line. Where two lines lead to one module, the one of the two that
-        has the lower instance gives up one of them; the other just sees that nothing is subscribed there any more.
+        has the lower instance gives up one of them; the other just sees that nothing is subscribed there now.
         """
         link = self.by_number.get(number)
         if instance is not None and instance < self._instance:

@@ -256,7 +256,7 @@ class TreePort(msgspec.Struct, eq=False):
         self.send_at = at
 
     def check_leaves(self, now: int, rooted_at: int) -> None:
-        """Note the instant from which on all modules know our root."""
+        """Note the instant from which all modules know this gateway's root."""
         if self.leaves_ready_since is None and all(each.acked_at >= rooted_at for each in self.leaves.values()):
             self.leaves_ready_since = now
 

@@ -39,7 +39,7 @@ class DiscoveryProtocol(ABC):
     @property
     @abstractmethod
     def sole_peer(self) -> int | None:
-        """The instance of the one r2p module on the link itself; None if there is none, or more than one."""
+        """The instance of the only r2p module on the link itself; None unless there is exactly one."""
 
     @property
     @abstractmethod

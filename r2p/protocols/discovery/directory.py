@@ -48,7 +48,7 @@ class TopicInfo(msgspec.Struct):
     typed_at: dict[int, int] = {}
 
     def set_type(self, role: int, known: TopicType | None) -> None:
-        """Set what the peers in this role say; None: nothing any more."""
+        """Set what the peers in this role say; None removes it."""
         if known is None:
             self.types.pop(role, None)
         else:

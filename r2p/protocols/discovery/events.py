@@ -98,7 +98,7 @@ class SubscriberJoined(msgspec.Struct, frozen=True):
 
 
 class SubscribersGone(msgspec.Struct, frozen=True):
-    """The topic has no subscriber on this link any more: detach it."""
+    """The topic has no subscriber left on this link: detach it."""
 
     topic: str
 

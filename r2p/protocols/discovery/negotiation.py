@@ -183,14 +183,14 @@ class SubscriptionNegotiation:
                 self._fits(peer, topic, role, theirs)
 
     def withdrawn(self, topic: str) -> None:
-        """End all remote subscriptions of a topic that this module publishes no more."""
+        """End all remote subscriptions of a topic that this module no longer publishes."""
         self._requests.forget(topic)
         for peer in self._peers.all():
             self._remove_subscriber(peer, topic)
             peer.forget_type(topic, ROLE_SUBSCRIBES)
 
     def subscription_ended(self, topic: str) -> None:
-        """Accept no more messages of a topic that this module subscribes to no more."""
+        """Stop accepting messages of a topic that this module no longer subscribes to."""
         self._offers.forget(topic)
         for peer in self._peers.all():
             self._remove_publisher(peer, topic)
@@ -395,7 +395,7 @@ class SharedAnswers(Generic[M]):
         return list(self._deferred.pop(topic, {}).items())
 
     def remove(self, source: PeerAddress, topic: str | None = None) -> None:
-        """Don't answer a peer any more, about one topic or about all."""
+        """Stop answering a peer, about one topic or about all."""
         for deferred in self._deferred.values() if topic is None else [self._deferred.get(topic, {})]:
             deferred.pop(source, None)
 

@@ -113,7 +113,7 @@ class Schedule:
         self._relayed[item] = None
 
     def drop(self, item: Item) -> None:
-        """Announce an item no more."""
+        """Stop announcing an item."""
         for items in (self._fresh, self._ring, self._slow):
             if item in items:
                 del items[item]

@@ -112,7 +112,7 @@ class Matching:
             self.topics[topic].mismatch = topic in self._mismatches
 
     def _clear_mismatch(self, session: _PeerSession, key: TopicRole) -> None:
-        """The session's type of the topic is not in the way any more."""
+        """Forget that the session's type of the topic did not fit."""
         if session.mismatched.pop(key, None) is not None:
             self._mismatches[key[0]] -= 1
             if not self._mismatches[key[0]]:

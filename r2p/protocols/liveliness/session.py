@@ -196,7 +196,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._pop_events()
 
     def leave(self, now: int) -> list[Event]:
-        """Send nothing any more: the tokens go with the session."""
+        """Stop; the tokens go with the session."""
         self._up = False
         self._refused.clear()
         return self._pop_events()
@@ -250,7 +250,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._pop_events()
 
     def disappeared(self, now: int, key: str) -> list[Event]:
-        """A token is not there any more."""
+        """Handle a token that is gone."""
         if key in self._tokens:
             self._remove_token(now, key)
         else:

@@ -132,7 +132,7 @@ class Calendar:
         return self._enter(reservation)
 
     def remove(self, message: int) -> bool:
-        """Give the slots of a message back. False: it has none."""
+        """Give back the slots of a message. Returns False if it has no slots."""
         return self._entries.pop(message, None) is not None
 
     def free(self, period: int) -> int:

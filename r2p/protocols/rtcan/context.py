@@ -15,7 +15,7 @@ class Timers(KeyedTimers):
     def __init__(self) -> None:
         super().__init__()
         self.due = NEVER
-        """When the next key runs out; NEVER if there is none."""
+        """The instant at which the next key expires, or NEVER."""
 
     def set(self, key: Hashable, due: int) -> None:
         super().set(key, due)

@@ -179,7 +179,7 @@ class Cycle:
         return changed
 
     def stop(self) -> None:
-        """There is no cycle any more."""
+        """Forget the cycle."""
         self.state = CycleState.NONE
         self._set_mask(None)
         self._length = 0
@@ -196,7 +196,7 @@ class Cycle:
     def delay(self, by: int) -> bool:
         """The first sync of a network that goes on has left `by` ns late. False: too late for its count.
 
-        Then network time can't catch up any more, and a new network begins.
+        Network time can no longer catch up then, and a new network begins.
         """
         self._behind += by
         return 2 * self._behind < self.timing.cycle

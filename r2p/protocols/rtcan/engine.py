@@ -106,7 +106,7 @@ class Engine:
 
     @property
     def id8(self) -> int | None:
-        """Our id8; None: not yet, or not any more."""
+        """This node's id8; None while it has no id8."""
         return self.node_id.id8 if self.ready else None
 
     @property
@@ -159,7 +159,7 @@ class Engine:
         return self._drain()
 
     def stop(self, now: int) -> Sequence[Action]:
-        """The bus can't be used any more, or the node leaves: everything that waits is discarded."""
+        """Stop, as the bus can no longer be used, or the node leaves. Everything that waits is discarded."""
         self._running = False
         self.node_id.stop(now)  # first: messages are discarded, and a master steps down, before the cycle stops
         self.network.stop(now)
@@ -257,7 +257,7 @@ class Engine:
         self.reassembly.subscribe(message, size)
 
     def unsubscribe(self, message: int) -> None:
-        """Receive no more of them."""
+        """Stop receiving messages with this id."""
         self.reassembly.unsubscribe(message)
 
     # Periodic messages
@@ -380,7 +380,7 @@ class Engine:
             self._update_mode(now)
 
     def _on_own_id8(self, now: int, identifier: int) -> None:
-        """A frame of another node with our id8."""
+        """Handle a frame of another node that has this node's id8."""
         if rtcan.message_of(identifier) != rtcan.FIRMWARE_MANAGEMENT:
             self.node_id.duplicate_id_seen(now)
             self._update_mode(now)

@@ -166,7 +166,7 @@ class Ready(msgspec.Struct, frozen=True):
 
 
 class IdConflict(msgspec.Struct, frozen=True):
-    """Another node uses our id8. `yielded`: this node gives it up, and sends nothing until the next `Ready`."""
+    """Another node uses this node's id8. `yielded`: this node gives it up, and sends nothing until the next `Ready`."""
 
     id8: int
     yielded: bool
@@ -181,7 +181,7 @@ class NewMaster(msgspec.Struct, frozen=True):
 
 
 class LostSync(msgspec.Struct, frozen=True):
-    """There is no cycle any more: periodic messages go as soft real-time ones."""
+    """The cycle is lost: periodic messages go as soft real-time ones."""
 
     reason: str
 

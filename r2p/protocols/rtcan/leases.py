@@ -108,7 +108,7 @@ class SlotRequests:
             self.schedule(now, each)
 
     def pause(self, now: int, reason: str) -> None:
-        """There is no master: no slots may be used."""
+        """Note that there is no master, so that no slots may be used."""
         self.has_master = False
         for each in self._periodics.values():
             self.suspend(now, each, reason)
@@ -124,7 +124,7 @@ class SlotRequests:
             self._timers.set(("ask", periodic.high), now)
 
     def periodic_with(self, message: int) -> PeriodicMessage | None:
-        """Our periodic message with this message id."""
+        """The periodic message of this node with this message id."""
         periodic = self._periodics.get(rtcan.high_byte(message))
         return periodic if periodic is not None and periodic.message == message else None
 
@@ -188,7 +188,7 @@ class SlotRequests:
         self._actions.append(SlotsGranted(periodic.high, grant.period, grant.phase, interval))
 
     def on_renewed(self, now: int, answer: Renewed) -> None:
-        """The master prolongs leases, perhaps late. Slots that it does not know any more have to be asked for anew."""
+        """The master prolongs leases, perhaps late. Slots that it no longer knows are requested again."""
         for high, asked_at in list(self._asked.items()):
             periodic, asked = self._periodics.get(high), asked_at.get(answer.serial)
             if asked is None or periodic is None or not periodic.active:
@@ -216,7 +216,7 @@ class SlotRequests:
             self._actions.append(SlotsRefused(periodic.high, text))
 
     def revoke(self, now: int, periodic: PeriodicMessage, reason: str) -> None:
-        """Its slots are gone. Answers to earlier requests don't count any more."""
+        """Its slots are gone. Answers to earlier requests no longer count."""
         periodic.reservation = None
         self._asked.pop(periodic.high, None)
         self.suspend(now, periodic, reason)

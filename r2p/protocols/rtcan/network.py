@@ -91,7 +91,7 @@ class MasterTracker:
         return True
 
     def matches(self, network: management.Network) -> bool:
-        """Whether a network has our slots."""
+        """Whether a network has the number and length of slots of this node's."""
         timing = self._cycle.timing
         return (network.slots, network.slot) == (timing.slots, timing.slot)
 
@@ -295,7 +295,7 @@ class NetworkMembership:
         )
 
     def forget_mismatch(self, now: int) -> None:
-        """No NETWORK says any more that the parameters differ, or one says that they don't."""
+        """Forget that parameters differ: no NETWORK says so any longer, or one says that they don't."""
         if self.mismatch is None:
             return
         self.mismatch = None

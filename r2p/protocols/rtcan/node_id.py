@@ -111,7 +111,7 @@ class NodeId:
         self.claim(now)
 
     def claim(self, now: int, *, at_once: bool = False) -> None:
-        """Send our claim; not more often than every 100 ms unless `at_once`."""
+        """Send this node's claim; not more often than every 100 ms unless `at_once`."""
         if self.stage is not Stage.LISTENING and (at_once or now >= self._claimed_at + _APART):
             self._claimed_at = now
             self._send_claim(now)
@@ -135,7 +135,7 @@ class NodeId:
             self._timers.set("claim", now + _APART + _SPREAD)  # the answer to this one may come at once
 
     def duplicate_id_seen(self, now: int) -> None:
-        """A frame with our id8 came in that this node did not send."""
+        """Handle a frame with this node's id8 that another node sent."""
         if self.stage is Stage.LISTENING:
             return
         self._context.counts["frames with our id8"] += 1

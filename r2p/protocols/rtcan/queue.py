@@ -186,7 +186,7 @@ class LaxityQueue:
         return False
 
     def remove(self, message: QueuedMessage) -> None:
-        """Give up a message whose frame is not with the port any more."""
+        """Give up a message whose frame the port no longer has."""
         fifo = self._fifos[message.message]
         if message is fifo.waiting[0]:
             fifo.busy = False

@@ -56,7 +56,7 @@ class Reassembly:
             self._buffers[message] = buffer
 
     def unsubscribe(self, message: int) -> None:
-        """Receive no more messages with this id; an unfinished one is lost."""
+        """Stop receiving messages with this id; an unfinished one is lost."""
         unfinished = self.open.get(message)
         if unfinished is not None:
             self._reset(unfinished, "interrupted")

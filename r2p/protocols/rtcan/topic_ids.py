@@ -37,7 +37,7 @@ class TopicIdAllocator:
 
     def __init__(self) -> None:
         self.refused: set[str] = set()
-        """Our topics for which there is none."""
+        """Topics of this module for which no high byte is free."""
         self._lease = _LEASE
         self._ours: dict[str, int] = {}
         self._announced: dict[int, _AnnouncedId] = {}  # by message id; the lease that ends first comes first
@@ -50,7 +50,7 @@ class TopicIdAllocator:
         self._lease = max(_LEASE, round(_ROUNDS * _MESSAGES * _COUNT / rate * SECOND))
 
     def pick(self, topic: str) -> int | None:
-        """The high byte of our topic, the same at each call. None: all are in use."""
+        """Return the high byte of a topic of this module, the same at each call; None if all are in use."""
         high = self._ours.get(topic)
         if high is not None:
             return high
@@ -66,7 +66,7 @@ class TopicIdAllocator:
         return None
 
     def drop(self, topic: str) -> None:
-        """Give back the high byte of a topic that this module does not publish any more."""
+        """Give back the high byte of a topic that this module no longer publishes."""
         self._ours.pop(topic, None)
 
     def on_announced(self, now: int, topic: str, message: int, own_id8: int, *, firmware: bool = False) -> list[str]:

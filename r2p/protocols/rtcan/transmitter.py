@@ -207,7 +207,7 @@ class SlotTransmitter:
     # Messages
 
     def withdraw_management(self, id8: int, kind: int) -> None:
-        """Drop management of this type that waits: it is not true any more."""
+        """Drop waiting management of this type: it is no longer true."""
         self.queue.withdraw(rtcan.message_id(rtcan.MANAGEMENT, id8), lambda each: type_of(each.payload) == kind)
 
     def forget(self, periodic: PeriodicMessage) -> None:

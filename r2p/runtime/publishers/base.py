@@ -150,7 +150,7 @@ class BasePublisher(Generic[M]):
                 waiter.set_result(None)
 
     def link_degraded(self, link: str, reason: str) -> None:
-        """Report that a link that carried the topic does not any more, or has lost its slots."""
+        """Report that a link no longer carries the topic, or has lost its slots."""
         self._report(Missed(self.topic, reason, where=link, count=0), self._on_degraded)
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:

@@ -108,7 +108,7 @@ class CanBus:
         self.statistics = Statistics(self.bit, self.timeline.now())
 
     def close(self) -> None:
-        """Drop all events: nothing happens on this bus any more."""
+        """Drop all events, so that nothing further happens on this bus."""
         self.timeline.close()
 
     # For controllers (`BusWire`)

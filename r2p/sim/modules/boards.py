@@ -157,16 +157,14 @@ class ProximityModule(Board):
         self,
         name: str = "PROX1",
         *,
-        distance_to: DistanceTo,
-        noise: random.Random,
-        spec: RangeSpec | None = None,
+        sensors: RangeArray,
         topic: str = "proximity",
         period: float = 0.05,
         via: Via = None,
         remap: dict[str, str] | None = None,
     ) -> None:
         """`period` in seconds: the sensors need 40 ms for a measurement."""
-        self.sensors = RangeArray(distance_to, noise, spec)
+        self.sensors = sensors
         node = functools.partial(proximity, sensors=self.sensors, topic=topic, period=period)
         super().__init__(name, via=via, remap=remap, nodes={"prox": node})
 

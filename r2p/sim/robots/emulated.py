@@ -30,12 +30,13 @@ from r2p.sim.modules.boards import (
     MotorModule,
     PowerModule,
     ProximityModule,
+    RangeArray,
     Setpoints,
 )
 from r2p.sim.modules.plant import Plant
 from r2p.sim.physics.motor import Battery, Drive, Gains, Motor, speed_gains
 from r2p.sim.physics.omni import OmniBody, OmniSpec, Triple
-from r2p.sim.physics.world import RangeSpec, World
+from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.latest import Traffic
 from r2p.transports.link import Transport
@@ -231,9 +232,8 @@ class Triskar2:
         def distance_to(number: int) -> float:
             return self.hardware.distance_to_wall(ahead + triskar2.BEARINGS[number])
 
-        return ProximityModule(
-            name, distance_to=distance_to, noise=self.hardware.noise(name), spec=RangeSpec(), topic=topic, via=self.via
-        )
+        sensors = RangeArray(distance_to, self.hardware.noise(name))
+        return ProximityModule(name, sensors=sensors, topic=topic, via=self.via)
 
 
 def _check_name(name: str) -> None:

@@ -18,7 +18,7 @@ _PERIOD = 1.0  # s
 
 @contextlib.asynccontextmanager
 async def listen(via: list[str] | None) -> AsyncIterator[BusMonitor]:
-    """Open the one `rtcan:` URL of `via` for listening. Raises UsageError if there is none, or more than one."""
+    """Open the one `rtcan:` URL of `via` for listening. Raises UsageError unless there is exactly one."""
     given = settings(via, tool=True).via
     urls = [url for url in given if url.startswith("rtcan:")]
     if len(urls) != 1:

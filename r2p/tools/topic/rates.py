@@ -142,7 +142,7 @@ async def _measure(
 
 
 class _Sequences:
-    """Counts the gaps in the sequence numbers of one publisher. A number that arrives late is not missing any more."""
+    """Counts the gaps in the sequence numbers of one publisher. One that arrives late is not missing."""
 
     def __init__(self) -> None:
         self.last = 0

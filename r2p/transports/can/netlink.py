@@ -78,7 +78,7 @@ class Interface(msgspec.Struct, frozen=True):
 
 
 def find_interface(name: str) -> Interface | None:
-    """The CAN interface of this name. None: there is none, or it is not for CAN."""
+    """Return the CAN interface of this name; None if no such interface exists, or it is not for CAN."""
     return next((each for each in list_interfaces() if each.name == name), None)
 
 

@@ -39,7 +39,7 @@ class CanPortListener(Protocol):
         """The bus can be used."""
 
     def down(self, reason: str) -> None:
-        """The bus can't be used any more: interface down or gone, or bus-off. All mailboxes are empty, and none of
+        """The bus can no longer be used: interface down or gone, or bus-off. All mailboxes are empty, and none of
         their frames is sent later.
         """
 
@@ -117,7 +117,7 @@ class CanPort(abc.ABC):
 
 
 class OpenInterface(abc.ABC):
-    """A real interface while it can be used. `ended` gets the reason when it can't any more."""
+    """A real interface while it can be used. `ended` gets the reason when it no longer can."""
 
     def __init__(
         self, listener: CanPortListener, *, latency: int, confirm_timeout: int, one_at_a_time: bool = False

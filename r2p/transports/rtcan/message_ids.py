@@ -98,7 +98,7 @@ class MessageIdMap:
         self._link.add_publisher(topic, size, message_id)
 
     def remove(self, now: int, name: str, source: PeerAddress) -> None:
-        """Receive no more from this publisher, or from all firmware."""
+        """Stop receiving from this publisher, or from all firmware."""
         for message_id in self._ids.pop((name, source), ()):
             self._remove_id(now, message_id)
 

@@ -291,7 +291,7 @@ _CREDIT_RING = 1024
 """Credits that come in that time at most."""
 
 _CREDIT_BYTES_MAX = 256
-"""Longer messages are not copied: they are no credit."""
+"""Longer messages are not copied, as they can't be credits."""
 
 
 class CreditReader:
@@ -519,7 +519,7 @@ class FinalCredits:
             departed.timer.cancel()
 
     def close(self) -> None:
-        """Count what is open: no credit comes any more."""
+        """Count what is open, as no further credit comes."""
         self._sender.credits.receive()
         departed, self._departed = self._departed, {}
         for each in departed.values():

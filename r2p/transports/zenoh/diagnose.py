@@ -1,4 +1,4 @@
-"""Explains why there is no connection. zenoh itself says only that there is none; so this module tries each step."""
+"""Explains why a connection fails. zenoh itself says only that it failed, so this module tries each step."""
 
 import asyncio
 import contextlib

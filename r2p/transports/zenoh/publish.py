@@ -61,7 +61,7 @@ class TxStream:
         self._put: Put = put_nowhere
 
     def prepare(self, source: Source, origin: Origin, put: Put) -> None:
-        """Switch to another publisher; nothing of the one before waits any more."""
+        """Switch to another publisher, once nothing of the one before waits."""
         self.source = source
         self._packer = Packer(origin)
         self._put = put
@@ -198,7 +198,7 @@ class PublisherCache:
         self._prefix = prefix
 
     def close(self) -> None:
-        """Send no more; what is declared goes with the session."""
+        """Stop sending; what is declared goes with the session."""
         self._session = None
 
     def declare(self, topic: Topic) -> None:

@@ -41,7 +41,7 @@ _OVERHEAD = 32
 """Bytes of a message besides its payload, in a packet of several: its stamp, and its share in header and framing."""
 
 _FINAL_CREDITS_MAX = 256
-"""Sessions that learn that a topic is not subscribed any more; older ones may be gone long since."""
+"""Sessions that learn that a topic is no longer subscribed to; older ones may be long gone."""
 
 _SENDERS_MAX = 4096
 """Senders that are remembered: by a stream with their serials, by a link with their losses."""
@@ -131,7 +131,7 @@ class RxStream:
             self._stats.lost["not subscribed"] += dropped
 
     def _send_final_credits(self) -> None:
-        """Tell the publishers that what is still on the way is not wanted any more."""
+        """Tell the publishers that what is still on the way is no longer wanted."""
         latest = itertools.islice(reversed(self.windows.items()), _FINAL_CREDITS_MAX)
         for (session, publisher_class), window in latest:
             last = (window.next_serial - 1) & SERIAL_WRAP if window.next_serial >= 0 else 0
@@ -436,7 +436,7 @@ class ZenohReceiver:
     ) -> None:
         """Report to a publisher's session that its messages up to this serial were accepted.
 
-        `leaving`: the topic is not subscribed any more, in no class.
+        `leaving`: the topic is no longer subscribed to, in any class.
         """
         if self._session is not None:
             data = encode_credit(Credit(self._instance, publisher_class, serial, topic, leaving))

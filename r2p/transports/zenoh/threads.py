@@ -44,7 +44,7 @@ def start_thread(function: Callable[[], object], name: str) -> threading.Thread:
 def as_exception(error: BaseException) -> Exception:
     """Return what a thread caught as an error that may be raised, or counted, in the event loop.
 
-    A panic in zenoh's Rust is pyo3's PanicException, which is no Exception: it would pass by all who count errors.
+    A panic in zenoh's Rust is pyo3's PanicException, a BaseException that code which counts errors would miss.
     """
     if isinstance(error, Exception):
         return error
@@ -120,7 +120,7 @@ class OutboundThread:
         self._jobs.put(function if then is None else lambda: self._answer(function, then))
 
     def finish(self) -> None:
-        """Wait for all calls, and end the thread. Not to be called in the loop, which must submit nothing any more."""
+        """Wait for all calls, and end the thread. Call it outside the event loop, which submits nothing then."""
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join()

@@ -20,6 +20,7 @@ from r2p.sim.modules.boards import (
     Pins,
     PowerModule,
     ProximityModule,
+    RangeArray,
     leds,
     sample,
 )
@@ -67,7 +68,7 @@ async def command(node: r2p.Node, ticks: float, seconds: float) -> None:
 async def test_names_topics_and_rates_by_default(r2p_network: Network) -> None:
     boards = [
         Bench().module(r2p_network),
-        ProximityModule(distance_to=lambda _: math.inf, noise=random.Random(1), via=r2p_network.transport()),
+        ProximityModule(sensors=RangeArray(lambda _: math.inf, random.Random(1)), via=r2p_network.transport()),
         PowerModule(battery=Cells(), via=r2p_network.transport()),
         ImuModule(unit=InertialUnit(Motion, random.Random(2)), via=r2p_network.transport()),
         IoModule(pins=Pins(), via=r2p_network.transport()),
@@ -174,7 +175,7 @@ async def test_the_current_is_told(r2p_network: Network) -> None:
 async def test_the_proximity_module_tells_millimetres(r2p_network: Network) -> None:
     seen = [200.0, 450.0, math.inf, 2000.0]
     module = ProximityModule(
-        distance_to=lambda number: seen[number], noise=random.Random(1), via=r2p_network.transport()
+        sensors=RangeArray(lambda number: seen[number], random.Random(1)), via=r2p_network.transport()
     )
     async with r2p_network.node("PC1") as node, module:
         ranges = node.subscribe("proximity", Proximity)
