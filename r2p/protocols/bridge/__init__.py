@@ -10,6 +10,7 @@ so by one and the same tree, which has no loop.
 What a gateway was given under an old tree must be gone before it forwards under a new one: hence the pause `SETTLE`
 between agreement and forwarding. It is longer than a message may take from its publisher to the last gateway.
 
-Read `mesh` first (who hears whom, and the tree in it), then `ports` (timings, acknowledgements, clients) and `tree`
-(one gateway's part). `link_selection` is the same from the side of modules with several links.
+Read `mesh` first (who hears whom, and the tree in it), then `ports` (one port: timings, acknowledgements, its state)
+and `tree` (all ports of one gateway, and its clients). `link_selection` is the same from the side of modules with
+several links.
 """

@@ -31,10 +31,10 @@ from r2p.protocols.bridge.ports import (
 )
 from r2p.units import LONG_AGO, NEVER, SECOND
 
-TWIN_MEMORY = 7_000_000_000
+TWIN_MEMORY = 7 * SECOND
 """Ns after which two links that led to one network no longer count as doing so, unless it shows again."""
 
-_SUSPICION = SECOND  # ns in which it shows by which link our own messages came back
+_SUSPICION = SECOND  # ns in which it shows by which link messages of this module came back
 _LINGER = SECOND  # ns for which LEAF goes on after its use has ended: gateways may be waiting for an answer
 
 
@@ -43,7 +43,7 @@ class CandidateLink(msgspec.Struct, eq=False):
 
     `twins` are other links to the same network, by number, and when that last showed; `loops` those that lead to it
     through a gateway of firmware. LEAF is sent soon if there is `something_new`, and once when it `asks` whose messages
-    came in; `suspected_at`: when that was asked first. `echoes`: it gives back what we send. `remote` is the instance
+    came in; `suspected_at`: when that was asked first. `echoes`: it gives back what is sent. `remote` is the instance
     of the module at the other end of a line.
     """
 
@@ -93,25 +93,25 @@ class LinkChoice:
         self._closed_at = LONG_AGO  # when a contested link was given up
 
     def forget(self, number: int) -> None:
-        """The link is down."""
+        """Forget a link that is down."""
         self._barred.pop(number, None)
 
     def add(self, number: int) -> bool:
-        """Use a link at once that is new and leads where no other one does. Says whether that changes anything."""
+        """Use a link at once that is new and leads where no other one does; return whether that changes anything."""
         if number in self.without or number in self.used:
             return False
         self.used |= {number}
         return True
 
     def remove(self, number: int) -> bool:
-        """Such a link is down."""
+        """Give up such a link that is down; return whether that changes anything."""
         if number not in self.used:
             return False
         self.used -= {number}
         return True
 
     def choose(self, now: int, links: list[CandidateLink]) -> bool:
-        """Look at the links (those that are up, in order) anew; says whether more than one is contested."""
+        """Choose among the links that are up (in order); return whether more than one is contested."""
         links = [link for link in links if link.number not in self.without]
         candidates, barred = self._candidates(now, links)
         contested = [link for link in candidates if link.is_contested(now)]
@@ -209,7 +209,7 @@ class LinkSelection:
     # Links
 
     def open(self, now: int, number: int, *, lone: bool) -> None:
-        """A link is up; `lone`: it has only one other end."""
+        """Add a link that came up; `lone`: it has only one other end."""
         self.close(now, number)
         link = self.by_number[number] = CandidateLink(number, now if lone else now + LISTEN)
         if not (lone and self._stands_alone(link)):
@@ -219,7 +219,7 @@ class LinkSelection:
             self.changes += choice.add(number)
 
     def close(self, now: int, number: int) -> None:
-        """A link is down."""
+        """Remove a link that went down."""
         link = self.by_number.get(number)
         if link is None:
             return
@@ -235,7 +235,7 @@ class LinkSelection:
             self._update(now)
 
     def forget(self, number: int) -> None:
-        """A link is removed for good."""
+        """Forget a link that is removed for good."""
         self._choices = {key: choice for key, choice in self._choices.items() if number not in key}
 
     # What follows
@@ -262,7 +262,7 @@ class LinkSelection:
         return min((each.number for each in others if each.number < number), default=None)
 
     def pop_messages(self) -> list[tuple[int, Leaf | None]]:
-        """What to send, once."""
+        """Return what to send, and forget it."""
         messages, self._messages = self._messages, []
         return messages
 
@@ -289,7 +289,7 @@ class LinkSelection:
     # What comes in
 
     def receive_bridge(self, now: int, number: int, message: Bridge) -> None:
-        """A gateway has sent BRIDGE on the link's network."""
+        """Handle a BRIDGE: there is a gateway on the link's network."""
         link = self.by_number.get(number)
         if link is None or not message.gateway:
             return
@@ -324,9 +324,9 @@ class LinkSelection:
             self._update(now)
 
     def receive_own(self, now: int, number: int) -> bool:
-        """What this module sent came in by this link. True if another link may have sent it: LEAF or a probe will show.
+        """Handle what this module sent, or another one of its name, and what came in by this link.
 
-        False: it is an echo, or there is another module of our name.
+        True: another link may have sent it, which LEAF or a probe will show. False: it is an echo, or a namesake.
         """
         link = self.by_number.get(number)
         if link is None or len(self.by_number) < 2 or link.echoes:

@@ -21,6 +21,7 @@ from r2p.codecs.management import (
     make_part,
     next_serial,
 )
+from r2p.units import SECOND
 
 PortId = tuple[int, int]
 """A port: gateway, and the number of the port there."""
@@ -30,19 +31,19 @@ Adjacency = tuple[int, int, int]
 
 Edge = tuple[PortId, PortId]
 
-_UNFINISHED = 64  # records of which parts are missing: forged, or of gateways that died in the middle
+_UNFINISHED_MAX = 64  # records of which parts are missing: forged, or of gateways that died in the middle
 
-MOST_HEARD = MESH_HEARD * PARTS_MAX
+HEARD_MAX = MESH_HEARD * PARTS_MAX
 """Adjacencies that a gateway can announce. One with more could not agree with any other, and would not forward."""
 
-MOST_RECORDS = 256
+RECORDS_MAX = 256
 """Gateways of which a record is kept: whom each one hears."""
 CHANGES = 100
 """Changes that one gateway may announce in a row ..."""
-CHANGE_FORGIVEN = 5_000_000_000
+CHANGE_FORGIVEN = 5 * SECOND
 """... and ns until it may announce one more. One that always changes would keep all others from agreeing."""
 
-_KEPT = 5_000_000_000  # ns for which the record of a gateway outside the mesh is kept without being repeated
+_KEPT = 5 * SECOND  # ns for which the record of a gateway outside the mesh is kept without being repeated
 
 
 # MESH messages
@@ -50,7 +51,7 @@ _KEPT = 5_000_000_000  # ns for which the record of a gateway outside the mesh i
 
 def mesh_messages(gateway: int, serial: int, heard: Iterable[Adjacency]) -> list[Mesh]:
     """Make the messages that announce whom a gateway hears."""
-    adjacencies = sorted(heard)[:MOST_HEARD]
+    adjacencies = sorted(heard)[:HEARD_MAX]
     pieces = [adjacencies[at : at + MESH_HEARD] for at in range(0, len(adjacencies), MESH_HEARD)] or [[]]
     last = len(pieces) - 1
     return [Mesh(gateway, serial, make_part(number, last), encode_heard(piece)) for number, piece in enumerate(pieces)]
@@ -68,7 +69,7 @@ class MeshAssembler:
         pieces = self._pieces.setdefault(key, {})
         pieces[message.number] = frozenset(decode_heard(message.heard))
         if set(pieces) != set(range(message.last + 1)):
-            while len(self._pieces) > _UNFINISHED:
+            while len(self._pieces) > _UNFINISHED_MAX:
                 del self._pieces[next(iter(self._pieces))]
             return None
         del self._pieces[key]
@@ -151,13 +152,15 @@ class MeshMap:
     """The mesh that `gateway` is part of."""
 
     def __init__(self, gateway: int) -> None:
-        self.edges: frozenset[Edge] = frozenset()
-        self.members: set[int] = set()
+        self.gateway = gateway
+        self.members = {gateway}
         self.root = gateway
-        """The lowest gateway."""
-        self.fingerprint = digest(self.edges)
+        """The lowest gateway of the mesh."""
+        self.rooted_at = 0
+        """The instant from which messages of this gateway name the root."""
+        self._edges: frozenset[Edge] = frozenset()
+        self.fingerprint = digest(self._edges)
         """Of the edges: gateways agree where it is the same."""
-        self._gateway = gateway
         self._forwarding: frozenset[PortId] = frozenset()
         self._records: dict[int, _GatewayRecord] = {}
         self._heard_by_members: set[int] = set()
@@ -176,17 +179,17 @@ class MeshMap:
         """Whether a gateway is in the mesh, or a member hears it. Any other may be forged."""
         return gateway in self.members or gateway in self._heard_by_members
 
-    def forwards(self, port: PortId) -> bool:
-        """Whether the tree contains the port."""
-        return port in self._forwarding
+    def forwards(self, number: int) -> bool:
+        """Whether the tree contains this gateway's port of this number."""
+        return (self.gateway, number) in self._forwarding
 
-    def set_heard(self, heard: frozenset[Adjacency]) -> bool:
+    def set_heard(self, now: int, heard: frozenset[Adjacency]) -> bool:
         """Enter whom this gateway hears now; return whether that has changed."""
         if heard == self._heard:
             return False
         self._heard = heard
         self._serial = next_serial(self._serial)
-        self._recompute()
+        self._recompute(now)
         return True
 
     def receive(self, now: int, message: Mesh) -> bool:
@@ -203,13 +206,13 @@ class MeshMap:
         record.changes += 1
         self._records[message.gateway] = record
         if self.concerns(message.gateway):
-            self._recompute()
+            self._recompute(now)
         return True
 
     def _record(self, now: int, gateway: int, known: _GatewayRecord | None) -> _GatewayRecord | None:
         """Return the record of a gateway that announces a change; None if there is no room, or it changes too often."""
         if known is None:
-            if len(self._records) >= MOST_RECORDS and not self._make_room(gateway):
+            if len(self._records) >= RECORDS_MAX and not self._make_room(gateway):
                 return None
             return _GatewayRecord(0, frozenset(), now, changed_at=now)
         forgiven = min(known.changes, (now - known.changed_at) // CHANGE_FORGIVEN)
@@ -236,20 +239,21 @@ class MeshMap:
 
     def messages(self, gateway: int) -> list[Mesh]:
         """Make the messages that announce whom this gateway hears, or another one of which there is a record."""
-        if gateway == self._gateway:
+        if gateway == self.gateway:
             return mesh_messages(gateway, self._serial, self._heard)
         record = self._records[gateway]
         return mesh_messages(gateway, record.serial, record.heard)
 
-    def _recompute(self) -> None:
+    def _recompute(self, now: int) -> None:
         heard = {gateway: record.heard for gateway, record in self._records.items()}
-        heard[self._gateway] = self._heard
-        edges = edges_from(self._gateway, heard)
-        members = {port[0] for edge in edges for port in edge} | {self._gateway}
+        heard[self.gateway] = self._heard
+        edges = edges_from(self.gateway, heard)
+        members = {port[0] for edge in edges for port in edge} | {self.gateway}
         self._heard_by_members = {there for here in members for _, there, _ in heard.get(here, ())}
-        if edges != self.edges:
-            self.edges = edges
-            self.members = {port[0] for edge in edges for port in edge}
-            self.root = min(self.members, default=self._gateway)
+        if edges != self._edges:
+            self._edges, self.members = edges, members
             self.fingerprint = digest(sorted(edges))
             self._forwarding = spanning_tree(edges)
+            if min(members) != self.root:
+                self.root = min(members)
+                self.rooted_at = now + 1  # what was sent in this very instant still named the old one

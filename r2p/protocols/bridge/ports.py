@@ -1,10 +1,23 @@
-"""The ports of a gateway: those that take part in the spanning tree, and those of its clients, which do not.
+"""One port of a gateway: what was heard there, and until when the port may forward because of it.
 
-`TreePort` is what is known at one link, `ClientPorts` runs the ports of clients; `tree` decides for all others.
-Timings and acknowledgements are here, too: modules with several links (`link_selection`) share them with gateways.
+A port's state follows from what is known now, not from the state before. Of these the first one that applies counts:
 
-An acknowledgement names a sender and the number of its last message. It proves that the link works in both directions,
-and that the other end knows what that message said.
+    LOOP         a probe shows a loop through a gateway that sends no BRIDGE, and this port is the one that yields
+    LISTENING    the port is open for less than LISTEN: other gateways may be there that were not heard yet
+    CONVERGING   for less than SETTLE, all modules that send LEAF here know this gateway's root; or some do not yet
+    ALONE        no other gateway is on this network                                  forwards
+    CONVERGING   gateways on this network have not acknowledged the same mesh
+    BLOCKED      they have, and the tree does not contain the port
+    CONVERGING   they have, the tree contains the port, for less than SETTLE
+    FORWARDING   they have, the tree contains the port, for SETTLE or longer          forwards until a lease runs out
+
+So nearly any state can follow any other: a port that hears its first gateway goes from ALONE to CONVERGING, and back
+when the last one is silent. After a time in which the program stood still, ports are LISTENING again. REFUSED is set by
+the owner of the ports, for those beyond PORTS_MAX and for clients that turn out to be gateways.
+
+Modules with several links (`link_selection`) share the timings with gateways, and the acknowledgements. One of these
+names a sender and the number of its last message. It proves that the link works in both directions, and that the other
+end knows what that message said.
 """
 
 import enum
@@ -13,23 +26,17 @@ from collections.abc import Mapping
 
 import msgspec
 
-from r2p.codecs.management import (
-    BRIDGE_ACKS,
-    Bridge,
-    Leaf,
-    Mesh,
-    decode_acks,
-    encode_acks,
-    is_newer_serial,
-    next_serial,
-)
-from r2p.protocols.bridge.mesh import PortId
-from r2p.units import LONG_AGO, MILLISECOND, NEVER
+from r2p.codecs.management import Bridge, Leaf, Mesh, decode_acks, encode_acks, is_newer_serial, next_serial
+from r2p.codecs.probes import PORT_MODULUS
+from r2p.protocols.bridge.mesh import MeshMap, PortId, digest
+from r2p.units import LONG_AGO, MILLISECOND, NEVER, SECOND
 
 TICK = 80 * MILLISECOND
 """Ns between two BRIDGE where there are other gateways: seven fit into a lease, so some may be lost."""
 TICK_ALONE = 200 * MILLISECOND
+"""The same where there are none: three fit into a lease."""
 TICK_LISTENING = 50 * MILLISECOND
+"""The same at a new port, so that several are sent, and answered, before it may forward."""
 LEASE = 600 * MILLISECOND
 """How long an acknowledgement holds, from the instant at which the message that it acknowledges was sent."""
 DEAD = 650 * MILLISECOND
@@ -38,34 +45,27 @@ LISTEN = 800 * MILLISECOND
 """A new port forwards nothing for this long. More than a lease: an old gateway that is stuck has stopped by then."""
 SETTLE = 300 * MILLISECOND
 """Between agreement and forwarding; no message may take longer from its publisher to the last gateway."""
-PROBE = 2_000 * MILLISECOND
+PROBE = 2 * SECOND
 """Between two probes for loops through gateways that do not know this protocol."""
-PROBE_MEMORY = 7_000 * MILLISECOND
+PROBE_MEMORY = 7 * SECOND
 """A loop is believed in for this long after a probe showed it: two of three probes may be lost."""
 PROBE_PROVEN = 300 * MILLISECOND
 """A gateway of which only a probe was heard for this long is not on this network itself."""
-STRANGE_PROBES = 256
+STRANGE_PROBES_MAX = 256
 """Probes of gateways outside the mesh that are kept for each port: they may be forged."""
 
-MOST_PORTS = 250
+PORTS_MAX = 250
 """Ports of a gateway that other gateways may use: the number has one byte on the wire."""
 
-CLIENTS = 250
-"""The port number that all clients share on the wire."""
-
-FIRST_CLIENT = 1000
-"""Clients are numbered from here on within the gateway."""
-
-FLAPS = 8
+FLAPS_MAX = 8
 """Neighbours that may go before newcomers have to wait."""
-FLAP_FORGIVEN = 10_000 * MILLISECOND
+FLAP_FORGIVEN = 10 * SECOND
 """Ns after which one of those is forgotten."""
 
 APART = 10 * MILLISECOND
 """Ns between two messages out of turn at least."""
-MOST_LEAVES = 32  # on one network; all modules beyond these use one link only
-
-_NO_ACKS = encode_acks((), BRIDGE_ACKS)
+LEAVES_MAX = 32
+"""Modules with several links on one network; all beyond these use one link only."""
 
 
 class PortState(enum.Enum):
@@ -78,9 +78,6 @@ class PortState(enum.Enum):
     BLOCKED = "blocked"
     LOOP = "loop"
     REFUSED = "refused"
-
-
-_REFUSED = (PortState.REFUSED, PortState.LOOP)
 
 
 # What the owner of the ports is to do
@@ -120,7 +117,7 @@ Action = SendToPort | SendToClients | SendProbe | PortChanged
 class Neighbour(msgspec.Struct):
     """A port or a module that was heard on the same network; instants in monotonic ns.
 
-    `acked_at`: when the newest of our messages was sent that it has acknowledged.
+    `acked_at`: when the newest message of this program was sent that it has acknowledged.
     """
 
     heard_at: int
@@ -134,18 +131,17 @@ class SentMessages:
     """The messages of one sender: gives each a number, and remembers for a lease when it was sent."""
 
     def __init__(self, sender: int) -> None:
-        self.count = 0
-        """The number of the last one."""
+        self._count = 0
         self._sender = sender
         self._sent: deque[tuple[int, int]] = deque()  # number, instant
 
     def next_number(self, now: int) -> int:
         """Number a message that is sent now."""
-        self.count = next_serial(self.count)
-        self._sent.append((self.count, now))
+        self._count = next_serial(self._count)
+        self._sent.append((self._count, now))
         while now - self._sent[0][1] > LEASE:
             self._sent.popleft()
-        return self.count
+        return self._count
 
     def acked_at(self, acks: bytes) -> int:
         """When the message was sent that `acks` acknowledge; 0 if they name none, or one older than a lease."""
@@ -169,9 +165,6 @@ def pack_acks(heard: Mapping[PortId, Neighbour], places: int) -> list[bytes]:
     acks = list({sender: neighbour.count for (sender, _), neighbour in latest}.items())
     starts = range(0, max(len(acks), 1), places)
     return [encode_acks(acks[at : at + places], places) for at in starts]
-
-
-# Ports
 
 
 class TreePort(msgspec.Struct, eq=False):
@@ -214,183 +207,227 @@ class TreePort(msgspec.Struct, eq=False):
         """The gateways that were heard on its network."""
         return {gateway for gateway, _ in self.neighbours}
 
-    def hurry(self, now: int) -> None:
-        """Send the next BRIDGE out of turn."""
-        self.send_at = min(self.send_at, max(now, self.sent_at + APART))
+    def next_deadline(self) -> int:
+        """When to send or to update, if nothing else happens."""
+        due = min(self.send_at, self.probe_at)
+        if self.state is PortState.LISTENING:
+            due = min(due, self.opened_at + LISTEN)
+        agreed, ready = self.agreed_since, self.leaves_ready_since
+        if self.state is PortState.CONVERGING and agreed is not None and ready is not None:
+            due = min(due, max(agreed, ready) + SETTLE)
+        return due
 
-    def receive_leaf(self, now: int, message: Leaf, gateway: int, acked_at: int, rooted_at: int) -> bool:
-        """Enter a LEAF that came in at a port of this `gateway`; False: nothing changes.
+    # What comes in
 
-        `acked_at` is when the message was sent that it acknowledges, `rooted_at` when this gateway's root last changed.
+    def admits_newcomers(self, now: int) -> bool:
+        """Whether a gateway that is new here becomes a neighbour, after those that came and went."""
+        if self.flaps:
+            forgiven = min(self.flaps, (now - self.flapped_at) // FLAP_FORGIVEN)
+            self.flaps -= forgiven
+            self.flapped_at += forgiven * FLAP_FORGIVEN
+        return self.flaps < FLAPS_MAX
+
+    def receive_bridge(self, now: int, message: Bridge, acked_at: int) -> bool:
+        """Enter a BRIDGE of a neighbour, old or new; False: it is late. `acked_at`: see `Neighbour`."""
+        sender = (message.gateway, message.port)
+        neighbour = self.neighbours.get(sender)
+        if neighbour is None:
+            neighbour = Neighbour(now, message.count, agreement=message.agreement)
+            # It is on this network itself: its probes came straight, not through a loop of firmware.
+            self.probes = {each: at for each, at in self.probes.items() if each[0] != message.gateway}
+            self.neighbours = self.neighbours | {sender: neighbour}
+        elif is_late(message.count, neighbour.count):
+            return False
+        if neighbour.agreement != message.agreement:
+            neighbour.acked_at = 0  # it consented to another mesh
+            self.hurry(now)
+        neighbour.heard_at, neighbour.count, neighbour.agreement = now, message.count, message.agreement
+        neighbour.acked_at = max(neighbour.acked_at, acked_at)
+        return True
+
+    def receive_leaf(self, now: int, message: Leaf, mesh: MeshMap, acked_at: int) -> bool:
+        """Enter a LEAF; False: nothing changes. `acked_at` is when the message was sent that it acknowledges.
+
         The module is entered once it knows this root. It is answered at once: it waits for the gateway's consent.
         """
         leaf_id = (message.module, message.port)
         leaf = self.leaves.get(leaf_id)
         if leaf is None:
             self.hurry(now)
-            # Without a current acknowledgement it may be an old message; it counts once it has heard our answer.
-            if not acked_at or acked_at < rooted_at or len(self.leaves) >= MOST_LEAVES:
+            # Without a current acknowledgement it may be an old message; it counts once it has heard the answer.
+            if not acked_at or acked_at < mesh.rooted_at or len(self.leaves) >= LEAVES_MAX:
                 return False
             self.leaves = self.leaves | {leaf_id: Neighbour(now, message.count, acked_at)}
         elif is_late(message.count, leaf.count):
             return False
-        elif not _may_hear(message, gateway):
+        elif not _may_hear(message, mesh.gateway):
             self.leaves = {each: known for each, known in self.leaves.items() if each != leaf_id}
         else:
             leaf.heard_at, leaf.count, leaf.acked_at = now, message.count, max(leaf.acked_at, acked_at)
         return True
 
+    def receive_probe(self, now: int, sender: PortId, mesh: MeshMap) -> bool:
+        """Enter a probe of a gateway that is not on this network itself; False: there is no room.
+
+        There always is for one of the mesh. Others may be forged, or join later: STRANGE_PROBES_MAX of theirs are kept.
+        """
+        known = sender in self.probes or sender[0] in mesh.members
+        if not known and sum(each not in mesh.members for each, _ in self.probes) >= STRANGE_PROBES_MAX:
+            self.lost["too many probes"] += 1
+            return False
+        self.probes = self.probes | {sender: (self.probes.get(sender, (now, now))[0], now)}
+        return True
+
+    # Time
+
+    def expire(self, now: int, mesh: MeshMap) -> None:
+        """Forget gateways and modules that were silent for DEAD, and old probes."""
+        if any(now - each.heard_at >= DEAD for each in self.neighbours.values()):
+            before = self.gateways
+            self.neighbours = _fresh(now, self.neighbours)
+            if not self.flaps:
+                self.flapped_at = now
+            gone = len(before - self.gateways - {mesh.gateway})
+            self.flaps = min(self.flaps + gone, FLAPS_MAX)
+        self.expire_leaves(now)
+        if any(now - last >= PROBE_MEMORY for _, last in self.probes.values()):
+            self.probes = {sender: at for sender, at in self.probes.items() if now - at[1] < PROBE_MEMORY}
+
     def expire_leaves(self, now: int) -> None:
         """Forget modules that were silent for DEAD."""
         if any(now - each.heard_at >= DEAD for each in self.leaves.values()):
-            self.leaves = {leaf_id: each for leaf_id, each in self.leaves.items() if now - each.heard_at < DEAD}
+            self.leaves = _fresh(now, self.leaves)
 
     def extend_leaves(self, now: int) -> None:
         """Keep the modules for longer: what they sent while this program stood still is yet to be read."""
         for leaf in self.leaves.values():
             leaf.heard_at = now
 
-    def invalidate_leaves(self, at: int) -> None:
-        """Let nothing pass until the modules have acknowledged the new root, or are gone; send it `at` that instant."""
-        self.leaves_ready_since = None
-        self.send_at = at
+    def start_over(self, now: int) -> None:
+        """Listen anew: this program stood still for so long that others may have given this gateway up."""
+        self.send_at = now
+        if self.private and not self.neighbours:  # no gateway can have come meanwhile
+            self.extend_leaves(now)
+            return
+        self.resumes = self.resumes or self.state is PortState.ALONE
+        self.opened_at = now
+        self.neighbours = {}
+        self.leaves = {}
+        self.agreed_since = None
 
-    def check_leaves(self, now: int, rooted_at: int) -> None:
-        """Note the instant from which all modules know this gateway's root."""
-        if self.leaves_ready_since is None and all(each.acked_at >= rooted_at for each in self.leaves.values()):
+    # What goes out
+
+    def hurry(self, now: int) -> None:
+        """Send the next BRIDGE out of turn."""
+        self.send_at = min(self.send_at, max(now, self.sent_at + APART))
+
+    def note_sent(self, now: int, mesh: MeshMap) -> None:
+        """Note that BRIDGE was sent: plan the next one, and forward for longer where that needs no consent."""
+        listening, others = self.state is PortState.LISTENING, self.neighbours or self.leaves
+        self.sent_at = now
+        self.send_at = now + (TICK_LISTENING if listening else TICK if others else TICK_ALONE)
+        self.forwards_until = self._forwards_until(mesh)
+
+    # What follows
+
+    def root_changed(self, mesh: MeshMap) -> None:
+        """Let nothing pass until the modules here have acknowledged the new root, or are gone."""
+        if self.leaves:
+            self.leaves_ready_since = None
+            self.send_at = mesh.rooted_at
+
+    def update(self, now: int, mesh: MeshMap) -> bool:
+        """Work out whether the gateways here agree, and the state; return whether that, or the place in the tree, is
+        another one.
+        """
+        view = (mesh.fingerprint, frozenset(self.neighbours))
+        if view != self.view:
+            self.view = view
+            self.agreement = digest(mesh.fingerprint, sorted([(mesh.gateway, self.number), *self.neighbours]))
+            self.agreed_since = None
+            self.hurry(now)
+        if not self.is_agreed(now, mesh):
+            self.agreed_since = None
+        elif self.agreed_since is None:
+            self.agreed_since = now
+        return self.update_state(now, mesh)
+
+    def update_state(self, now: int, mesh: MeshMap) -> bool:
+        """Do the same for a port at which there can be no other gateway."""
+        if self.leaves_ready_since is None and all(each.acked_at >= mesh.rooted_at for each in self.leaves.values()):
             self.leaves_ready_since = now
+        before = self.state, self.in_tree
+        self.state = self._state(now, mesh)
+        self.in_tree = self._is_in_tree(mesh)
+        self.forwards_until = self._forwards_until(mesh)
+        if self.state is not PortState.LISTENING or self.neighbours:
+            self.resumes = False  # listening is over, or the port will not be alone: hold no more samples for it
+        return (self.state, self.in_tree) != before
+
+    def is_agreed(self, now: int, mesh: MeshMap) -> bool:
+        """Whether all gateways there have acknowledged the very same mesh within a lease."""
+        return all(  # other ports of this gateway agree anyway
+            each.agreement == self.agreement and now < each.acked_at + LEASE
+            for (gateway, _), each in self.neighbours.items()
+            if gateway != mesh.gateway
+        )
+
+    def _state(self, now: int, mesh: MeshMap) -> PortState:
+        if self._loops(now, mesh):  # first of all: agreement says nothing about gateways that do not take part
+            return PortState.LOOP
+        if now < self.opened_at + LISTEN:
+            return PortState.LISTENING
+        if self.leaves_ready_since is None or now < self.leaves_ready_since + SETTLE:
+            return PortState.CONVERGING
+        if not self.neighbours:
+            return PortState.ALONE
+        if self.agreed_since is None:
+            return PortState.CONVERGING
+        if not mesh.forwards(self.number):
+            return PortState.BLOCKED
+        return PortState.FORWARDING if now >= self.agreed_since + SETTLE else PortState.CONVERGING
+
+    def _is_in_tree(self, mesh: MeshMap) -> bool:
+        """Whether the port is in the tree, also at times when nothing may pass yet."""
+        if self.state in (PortState.ALONE, PortState.FORWARDING):
+            return True
+        if self.state in (PortState.BLOCKED, PortState.LOOP):
+            return False
+        if self.neighbours and self.agreed_since is not None:
+            return mesh.forwards(self.number)  # before SETTLE is over: demand travels first, then data
+        return self.in_tree  # not agreed yet: the next tree may be the same, and then demand need not move
+
+    def _forwards_until(self, mesh: MeshMap) -> int:
+        if self.state is PortState.ALONE:
+            # Another gateway that comes listens for longer than a lease: by then it has heard this one, or this program
+            # is stuck.
+            return NEVER if self.private else self.sent_at + LEASE
+        if self.state is not PortState.FORWARDING:
+            return 0
+        acked = [each.acked_at for (gateway, _), each in self.neighbours.items() if gateway != mesh.gateway]
+        return min([self.sent_at, *acked]) + LEASE
+
+    def _loops(self, now: int, mesh: MeshMap) -> bool:
+        """Whether the port is part of a loop through a gateway that sends no BRIDGE, and is the end that yields.
+
+        A probe that came in proves the loop. Of two ports of one gateway the one with the higher number (modulo
+        PORT_MODULUS) yields, of two gateways the one with the higher number.
+        """
+        for (gateway, its_port), (first, _) in self.probes.items():
+            if now - first < PROBE_PROVEN or gateway in self.gateways:
+                continue
+            if gateway == mesh.gateway and its_port < self.number % PORT_MODULUS:
+                return True
+            if gateway in mesh.members and gateway < mesh.gateway:
+                return True
+        return False
+
+
+def _fresh(now: int, heard: dict[PortId, Neighbour]) -> dict[PortId, Neighbour]:
+    return {sender: each for sender, each in heard.items() if now - each.heard_at < DEAD}
 
 
 def _may_hear(message: Leaf, gateway: int) -> bool:
     """Whether the module may hear the gateway. One that does not has lost its consent, and need not be waited for."""
     names = [name for name, _ in decode_acks(message.acks)]
     return gateway in names or 0 not in names  # with no free entry it may be one of those that did not fit
-
-
-class ClientPorts:
-    """The clients of a gateway: any number of connections, which take part in no mesh, and share one port of the tree.
-
-    A client is a module or a tool at the other end of a connection of its own, not a gateway. So nothing that a client
-    says changes what other links forward. One that sends BRIDGE or MESH, or by whose connection one of our probes comes
-    back, is a gateway: it is refused for as long as its connection lasts. Each client is given LISTEN to show that
-    before its port forwards. Modules with several links send LEAF here, too: each is waited for on its own connection.
-
-    Every method takes `now` (monotonic ns); what is to be done goes to `actions`. The work that the time brings does
-    not grow with the number of clients, apart from what is sent to all of them.
-    """
-
-    def __init__(self, gateway: int, actions: list[Action]) -> None:
-        self.ports: dict[int, TreePort] = {}
-        self._gateway = gateway
-        self._actions = actions
-        self._root = gateway
-        self._rooted_at = 0
-        self._sent = SentMessages(gateway)
-        self._send_at = 0
-        self._polled_at = 0
-        self._listening: deque[TreePort] = deque()
-        self._with_leaves: dict[int, TreePort] = {}
-
-    def open(self, now: int, number: int) -> TreePort:
-        """Add a port for a client that connected; `number` is FIRST_CLIENT or more."""
-        port = TreePort(number, now, private=True)
-        if not self.ports:  # nothing was due while there were no clients
-            self._send_at = now + TICK_ALONE
-        self.ports[port.number] = port
-        self._listening.append(port)
-        self._send_bridge(now, port)
-        return port
-
-    def close(self, number: int) -> None:
-        """Remove the port of a client whose connection ended."""
-        port = self.ports.pop(number, None)
-        if port is None:
-            return
-        self._with_leaves.pop(port.number, None)
-        if port in self._listening:
-            self._listening.remove(port)
-        port.forwards_until = 0
-
-    def refuse(self, port: TreePort, state: PortState) -> None:
-        """Let nothing pass for a client that is a gateway. `state` is REFUSED, or LOOP for a gateway of firmware."""
-        if port.state not in _REFUSED:
-            self._with_leaves.pop(port.number, None)
-            port.leaves = {}
-            self._set_state(port, state)
-
-    def receive_leaf(self, now: int, port: TreePort, message: Leaf) -> None:
-        """Enter a LEAF that came in from a client."""
-        if not message.module or port.state in _REFUSED:
-            return
-        self._with_leaves[port.number] = port
-        port.receive_leaf(now, message, self._gateway, self._sent.acked_at(message.acks), self._rooted_at)
-        self._update(now, port)
-
-    def set_root(self, at: int, root: int) -> None:
-        """Announce another root from `at` on: nothing passes to modules with several links before they know it."""
-        self._root, self._rooted_at = root, at
-        for port in self._with_leaves.values():
-            if port.leaves:
-                port.invalidate_leaves(at)
-                self._update(at, port)
-
-    def poll(self, now: int) -> None:
-        """Send what is due, and forget modules that were silent for DEAD."""
-        stood_still = now - self._polled_at > LEASE
-        self._polled_at = now
-        while self._listening and now >= self._listening[0].opened_at + LISTEN:
-            self._update(now, self._listening.popleft())
-        for port in list(self._with_leaves.values()):
-            if stood_still:
-                port.extend_leaves(now)
-            port.expire_leaves(now)
-            self._update(now, port)
-            if port.send_at <= now:
-                self._send_bridge(now, port)
-            if not port.leaves and port.state is PortState.ALONE:  # nothing there depends on the time any more
-                del self._with_leaves[port.number]
-        if self.ports and self._send_at <= now:
-            self._send_at = now + TICK_ALONE
-            self._actions.append(SendToClients(self._bridge(now, _NO_ACKS)))
-
-    def next_deadline(self) -> int:
-        """When to call `poll`."""
-        if not self.ports:
-            return NEVER
-        dues = [self._send_at]
-        if self._listening:
-            dues.append(self._listening[0].opened_at + LISTEN)
-        for port in self._with_leaves.values():
-            dues.append(port.send_at)
-            if port.state is PortState.CONVERGING and port.leaves_ready_since is not None:
-                dues.append(port.leaves_ready_since + SETTLE)
-        return min(dues)
-
-    def _update(self, now: int, port: TreePort) -> None:
-        port.check_leaves(now, self._rooted_at)
-        if port.state in _REFUSED:
-            return
-        if now < port.opened_at + LISTEN:
-            state = PortState.LISTENING
-        elif port.leaves_ready_since is None or now < port.leaves_ready_since + SETTLE:
-            state = PortState.CONVERGING
-        else:
-            state = PortState.ALONE
-        self._set_state(port, state)
-
-    def _set_state(self, port: TreePort, state: PortState) -> None:
-        port.forwards_until = NEVER if state is PortState.ALONE else 0
-        if state is not port.state:
-            port.state = state
-            port.in_tree = state not in _REFUSED and (port.in_tree or state is PortState.ALONE)
-            self._actions.append(PortChanged(port.number))
-
-    def _send_bridge(self, now: int, port: TreePort) -> None:
-        """Send BRIDGE to one client, with acknowledgements for its modules."""
-        for packed in pack_acks(port.leaves, BRIDGE_ACKS):
-            self._actions.append(SendToPort(port.number, self._bridge(now, packed)))
-        port.sent_at = now
-        port.send_at = now + TICK
-
-    def _bridge(self, now: int, acks: bytes) -> Bridge:
-        return Bridge(self._gateway, CLIENTS, self._sent.next_number(now), 0, self._root, acks)

@@ -102,7 +102,7 @@ def merging(*, deaf: str, mute: str = "") -> tuple[World, Module]:
     assert both.used == "AB"
     made.networks["C"] = made.networks["D"] = [*made.networks["C"], *made.networks["D"]]
     made.delay = 2 * MS
-    while one.tree.root == 200:
+    while one.tree.mesh.root == 200:
         made.run(MS // 10)
     both.deaf, both.mute = {"AB".index(each) for each in deaf}, {"AB".index(each) for each in mute}
     return made, both

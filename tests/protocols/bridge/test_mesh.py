@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs import management
-from r2p.protocols.bridge.mesh import MOST_HEARD, Adjacency, MeshAssembler, edges_from, mesh_messages, spanning_tree
+from r2p.protocols.bridge.mesh import HEARD_MAX, Adjacency, MeshAssembler, edges_from, mesh_messages, spanning_tree
 
 attachments = st.lists(st.lists(st.integers(0, 5), min_size=2, max_size=4), min_size=1, max_size=6)
 """For each gateway the networks of its ports."""
@@ -53,7 +53,7 @@ def test_what_only_one_side_hears_does_not_count() -> None:
     assert edges_from(1, heard) == {((1, 0), (2, 0)), ((2, 0), (1, 0))}
 
 
-@given(st.sets(st.tuples(st.integers(0, 255), st.integers(1, 2**32 - 1), st.integers(0, 255)), max_size=MOST_HEARD))
+@given(st.sets(st.tuples(st.integers(0, 255), st.integers(1, 2**32 - 1), st.integers(0, 255)), max_size=HEARD_MAX))
 def test_a_mesh_message_in_parts(heard: set[Adjacency]) -> None:
     messages = mesh_messages(7, 3, heard)
     assembly = MeshAssembler()

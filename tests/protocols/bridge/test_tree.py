@@ -8,8 +8,8 @@ import random
 import pytest
 
 from r2p.codecs.management import Bridge, Mesh, encode
-from r2p.protocols.bridge.mesh import CHANGES, MOST_HEARD, MOST_RECORDS, MeshMap, mesh_messages
-from r2p.protocols.bridge.ports import STRANGE_PROBES, PortState
+from r2p.protocols.bridge.mesh import CHANGES, HEARD_MAX, RECORDS_MAX, MeshMap, mesh_messages
+from r2p.protocols.bridge.ports import STRANGE_PROBES_MAX, PortState
 from r2p.protocols.bridge.tree import SpanningTree
 from tests.protocols.bridge.wires import MS, Gateway, World
 
@@ -43,12 +43,12 @@ def test_forged_probes_are_not_kept_without_end() -> None:
     tree = SpanningTree(5)
     tree.open(0, 0)
     port = tree.ports[0]
-    for gateway in range(1000, 1000 + STRANGE_PROBES + 3):
+    for gateway in range(1000, 1000 + STRANGE_PROBES_MAX + 3):
         tree.receive_probe(SECOND, 0, gateway, 1)
-    assert (len(port.probes), port.lost) == (STRANGE_PROBES, {"too many probes": 3})
+    assert (len(port.probes), port.lost) == (STRANGE_PROBES_MAX, {"too many probes": 3})
     tree.receive_probe(SECOND, 0, 5, 1)  # our own, and what is known already
     tree.receive_probe(2 * SECOND, 0, 1000, 1)
-    assert (len(port.probes), port.probes[1000, 1]) == (STRANGE_PROBES + 1, (SECOND, 2 * SECOND))
+    assert (len(port.probes), port.probes[1000, 1]) == (STRANGE_PROBES_MAX + 1, (SECOND, 2 * SECOND))
     assert port.lost.total() == 3
 
 
@@ -199,9 +199,9 @@ def test_tables_are_bounded() -> None:
         tree.receive_mesh(SECOND, 0, Mesh(number, 1, 0, bytes(18)))
         tree.receive_bridge(SECOND, 0, Bridge(number, 1, 1, 0, number, bytes(12)))
     (port,) = tree.ports.values()
-    assert len(port.neighbours) == MOST_HEARD
-    assert port.lost["too many gateways"] == 4_998 - MOST_HEARD
-    assert len(tree._mesh._records) <= MOST_RECORDS
+    assert len(port.neighbours) == HEARD_MAX
+    assert port.lost["too many gateways"] == 4_998 - HEARD_MAX
+    assert len(tree.mesh._records) <= RECORDS_MAX
 
 
 def test_neighbours_that_come_and_go_are_damped() -> None:
@@ -221,7 +221,7 @@ def test_neighbours_that_come_and_go_are_damped() -> None:
 
 def test_a_gateway_that_tells_another_mesh_each_time_is_damped() -> None:
     known = MeshMap(100)
-    known.set_heard(frozenset({(1, 101, 0)}))
+    known.set_heard(0, frozenset({(1, 101, 0)}))
     learnt = 0
     for serial in range(600):
         (message,) = mesh_messages(101, serial, [(0, 100, 1), (1, 500 + serial, 1)])
