@@ -174,12 +174,12 @@ def _account(run: Soak, verdict: Verdict, report: Callable[[str], object]) -> No
 
 def _hops(robot: dict[str, Any], gateway: dict[str, Any], pc: dict[str, Any], verdict: Verdict) -> Iterator[str]:
     out = next(name for name in gateway["links"] if name.startswith("zenoh"))
-    ways = [each for each in gateway["ways"] if each[1] == out and each[2]]
-    source = ways[0][0] if ways else ""
+    routes = [each for each in gateway["routes"] if each[1] == out and each[2]]
+    source = routes[0][0] if routes else ""
     _, received, lost = gateway["links"].get(source, (0, 0, {}))
-    forwarded, dropped = sum(each[2] for each in ways), sum(each[3] for each in ways)
+    forwarded, dropped = sum(each[2] for each in routes), sum(each[3] for each in routes)
     out_sent, _, out_lost = gateway["links"][out]
-    waited = out_lost.get("converging", 0) - sum(each[4].get("converging", 0) for each in ways)
+    waited = out_lost.get("converging", 0) - sum(each[4].get("converging", 0) for each in routes)
     yield verdict.hop("robot's publisher to its link", robot["published"], robot["sent"], _of(robot, *_SENDING))
     yield verdict.hop("robot's link to the gateway's", robot["sent"], received, _of({"losses": lost}, "wrong size"))
     yield verdict.hop("through the gateway", received, forwarded, dropped + gateway["ports"].get(source, 0))
@@ -199,7 +199,7 @@ def _lost_before_zenoh(robot: dict[str, Any], gateway: dict[str, Any]) -> int:
             if name.startswith("zenoh")
             else losses.get("wrong size", 0)
         )
-    lost += sum(gateway["ports"].values()) + sum(each[3] for each in gateway["ways"])
+    lost += sum(gateway["ports"].values()) + sum(each[3] for each in gateway["routes"])
     return lost
 
 

@@ -99,10 +99,12 @@ async def _gateway(pipe: Connection) -> None:
 
 def _forwarded(module: r2p.Module) -> dict[str, Any]:
     statistics = module.gateway_statistics()
-    ways = [each for each in statistics.ways if each.topic == TOPIC]
+    routes = [each for each in statistics.routes if each.topic == TOPIC]
     return {
         "links": {each.name: (each.stats.sent, each.stats.received, dict(each.losses)) for each in module.links},
-        "ways": [(each.source, each.target, each.forwarded, sum(each.dropped.values()), each.dropped) for each in ways],
+        "routes": [
+            (each.source, each.target, each.forwarded, sum(each.dropped.values()), each.dropped) for each in routes
+        ],
         "ports": {each.link: sum(each.dropped.values()) for each in statistics.ports},
     }
 

@@ -32,8 +32,8 @@ async def main(*links: str) -> None:
         print("joined:", ", ".join(links), flush=True)
         while True:
             await asyncio.sleep(10)
-            for way in gateway.gateway_statistics().ways:
-                print(f"{way.topic}: {way.forwarded} from {way.source} to {way.target}, dropped: {way.dropped}")
+            for each in gateway.gateway_statistics().routes:
+                print(f"{each.topic}: {each.forwarded} from {each.source} to {each.target}, dropped: {each.dropped}")
 
 
 if __name__ == "__main__":

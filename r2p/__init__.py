@@ -10,7 +10,7 @@ Nodes are coroutine functions that exchange typed messages on topics; modules ru
     r2p.run(blink, via="tcp:192.168.0.10:23")
 """
 
-from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics, PortStatistics, RouteStatistics
 from r2p.errors import (
     Broken,
     Closed,
@@ -80,6 +80,7 @@ __all__ = [
     "PortStatistics",
     "Publisher",
     "PublisherClass",
+    "RouteStatistics",
     "Sample",
     "Source",
     "Sporadic",
@@ -90,7 +91,6 @@ __all__ = [
     "TopicView",
     "TransportError",
     "TypeMismatch",
-    "WayStatistics",
     "f32",
     "f64",
     "i8",

@@ -12,7 +12,7 @@ STOP and the like; `options` says what may pass. `multihoming` is for modules wi
 from r2p.bridge.bridge import Bridge
 from r2p.bridge.multihoming import MultihomedModule
 from r2p.bridge.options import BridgeOptions, ClassOf
-from r2p.bridge.port import GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge.port import GatewayStatistics, PortStatistics, RouteStatistics
 
 __all__ = [
     "Bridge",
@@ -21,5 +21,5 @@ __all__ = [
     "GatewayStatistics",
     "MultihomedModule",
     "PortStatistics",
-    "WayStatistics",
+    "RouteStatistics",
 ]

@@ -12,7 +12,7 @@ from r2p.bridge.directory_relay import DirectoryRelay
 from r2p.bridge.forwarding import BridgedTopic, HeldMessages
 from r2p.bridge.options import BridgeOptions, Policy
 from r2p.bridge.orders import ModuleNames, OrderRelay
-from r2p.bridge.port import BridgePort, GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge.port import BridgePort, GatewayStatistics, PortStatistics, RouteStatistics
 from r2p.bridge.routing import RoutingTable
 from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management, probes
@@ -290,12 +290,12 @@ class Bridge:
     def statistics(self) -> GatewayStatistics:
         """What the gateway has done so far."""
         ports = [_port_statistics(port) for port in self.ports.values()]
-        ways = [
-            WayStatistics(topic, source, target, route.forwarded, dict(route.dropped))
+        routes = [
+            RouteStatistics(topic, source, target, route.forwarded, dict(route.dropped))
             for topic, relayed in sorted(self.routing.by_name.items())
             for (source, target), route in sorted(relayed.routes, key=operator.itemgetter(0))
         ]
-        return GatewayStatistics(ports, ways)
+        return GatewayStatistics(ports, routes)
 
 
 class _PortHooks(GatewayHooks):

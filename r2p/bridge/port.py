@@ -70,7 +70,7 @@ def by_kind(ports: list[BridgePort]) -> PortsByKind:
 # What gateways count, for people and programs
 
 
-class WayStatistics(msgspec.Struct, frozen=True):
+class RouteStatistics(msgspec.Struct, frozen=True):
     """One topic from one link to another; `dropped` by reason, all since the route exists."""
 
     topic: str
@@ -99,4 +99,4 @@ class GatewayStatistics(msgspec.Struct, frozen=True):
     """What a gateway has forwarded and dropped so far, on all links and topics."""
 
     ports: list[PortStatistics]
-    ways: list[WayStatistics]
+    routes: list[RouteStatistics]

@@ -235,13 +235,13 @@ class RateCounter:
             Row("", each.link, "", each.state, each.gateways, 0.0, 0, each.dropped, each.offset, each.error)
             for each in statistics.ports
         ]
-        for way in statistics.ways:
-            key = (way.topic, way.source, way.target)
-            self._last[key] = way.forwarded
-            if way.forwarded or way.dropped:
+        for route in statistics.routes:
+            key = (route.topic, route.source, route.target)
+            self._last[key] = route.forwarded
+            if route.forwarded or route.dropped:
                 before = last.get(key, 0)
-                new = way.forwarded - (before if before <= way.forwarded else 0)  # less: the route is a new one
-                rows.append(Row(*key, "", 0, round(new / since, 3), way.forwarded, way.dropped))
+                new = route.forwarded - (before if before <= route.forwarded else 0)  # less: the route is a new one
+                rows.append(Row(*key, "", 0, round(new / since, 3), route.forwarded, route.dropped))
         return rows
 
 
@@ -298,14 +298,14 @@ def table(rows: list[Row]) -> str:
     """Return the rows as text: links, and below them the busiest topics."""
     names = _short_names({row.source for row in rows if not row.topic})
     links = [row.cells(names) for row in rows if not row.topic]
-    ways = sorted((row for row in rows if row.topic), key=lambda row: (-row.rate, row.topic))
+    routes = sorted((row for row in rows if row.topic), key=lambda row: (-row.rate, row.topic))
     clocks = ["clock"] if any(each["clock"] for each in links) else []
     text = aligned(links, ["link", "state", *clocks, "dropped"])
-    if ways:
+    if routes:
         columns = ["topic", "from", "to", "rate", "forwarded", "dropped"]
-        text += "\n" + aligned([row.cells(names) for row in ways[:_ROWS]], columns)
-    if len(ways) > _ROWS:
-        text += f"... and {len(ways) - _ROWS} more\n"
+        text += "\n" + aligned([row.cells(names) for row in routes[:_ROWS]], columns)
+    if len(routes) > _ROWS:
+        text += f"... and {len(routes) - _ROWS} more\n"
     return text
 
 

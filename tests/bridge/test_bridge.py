@@ -51,10 +51,10 @@ def drain(subscriber: r2p.Subscriber[Led]) -> list[int]:
     return values
 
 
-def ways(module: r2p.Module, topic: str = "leds") -> dict[tuple[str, str], tuple[int, dict[str, int]]]:
+def routes(module: r2p.Module, topic: str = "leds") -> dict[tuple[str, str], tuple[int, dict[str, int]]]:
     return {
         (each.source, each.target): (each.forwarded, each.dropped)
-        for each in module.gateway_statistics().ways
+        for each in module.gateway_statistics().routes
         if each.topic == topic
     }
 
@@ -71,7 +71,7 @@ async def test_both_ways() -> None:
         await asyncio.sleep(0.1)
         assert drain(leds) == list(range(10))
         assert drain(backs) == list(range(100, 110))
-        assert ways(gw)["memory:a", "memory:b"] == (10, {})
+        assert routes(gw)["memory:a", "memory:b"] == (10, {})
 
 
 async def test_nothing_is_asked_for_that_nobody_wants() -> None:
@@ -84,7 +84,7 @@ async def test_nothing_is_asked_for_that_nobody_wants() -> None:
         subscriber.close()
         await asyncio.sleep(0.1)
         assert not leds.subscribers
-        assert ways(gw)["memory:a", "memory:b"] == (0, {})
+        assert routes(gw)["memory:a", "memory:b"] == (0, {})
 
 
 async def test_subscribers_on_the_same_side_get_it_once() -> None:
@@ -168,7 +168,7 @@ async def test_rate_limit() -> None:
             await leds.publish(Led(led=number))
             await asyncio.sleep(0.01)
         assert len(drain(far)) in range(19, 23)  # in 2 s
-        forwarded, dropped = ways(gw)["memory:a", "memory:b"]
+        forwarded, dropped = routes(gw)["memory:a", "memory:b"]
         assert dropped == {"rate limit": 200 - forwarded}
 
 
@@ -209,7 +209,7 @@ async def test_a_late_message_is_dropped_if_its_publisher_said_when() -> None:
         await leds.publish(Led(led=1))
         await asyncio.sleep(0.2)
         assert drain(far) == [0]
-        assert ways(gw)["memory:a", "memory:b"] == (1, {"late": 1})
+        assert routes(gw)["memory:a", "memory:b"] == (1, {"late": 1})
 
 
 async def test_two_types_are_refused_across_the_gateway() -> None:
@@ -347,7 +347,7 @@ async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.Monkey
             await asyncio.sleep(0.1)
             kinds = [type(order) for order in b.orders()]
             assert kinds == ([management.Stop, management.Reboot] if allowed else [management.Stop])
-            assert bool(ways(gw, "BOOT_IMU1")) is allowed
+            assert bool(routes(gw, "BOOT_IMU1")) is allowed
 
 
 @pytest.mark.parametrize(
@@ -524,7 +524,7 @@ async def test_periodic_messages_towards_a_bus(reserve: bool) -> None:
         got = drain(far)
         assert got == sorted(set(got))
         assert len(got) > 300
-        assert ways(gw)["memory:a", "sim:bus"][1] == {}
+        assert routes(gw)["memory:a", "sim:bus"][1] == {}
 
 
 def always(message: r2p.Message) -> Callable[[], r2p.Message]:

@@ -83,7 +83,7 @@ async def test_a_publisher_whose_clock_is_wrong_loses_no_event(ahead: int) -> No
         assert [each.sequence for each in samples] == list(range(1, 21))
         assert {each.deadline - each.stamp for each in samples} == {SECOND // 2}
         assert all(0 < each.expires - each.stamp + ahead * SECOND <= 0.6 * SECOND for each in samples)
-        assert not [way for way in gateway.gateway_statistics().ways if way.dropped]
+        assert not [route for route in gateway.gateway_statistics().routes if route.dropped]
 
 
 async def test_an_event_that_was_held_up_is_late_whatever_its_publishers_clock_shows() -> None:
@@ -106,7 +106,7 @@ async def test_an_event_that_was_held_up_is_late_whatever_its_publishers_clock_s
             left.delay = 0.0
             await asyncio.sleep(2)
         assert [each.sequence for each in subscriber.queue] == [1, 3]
-        dropped = {way.topic: way.dropped for way in gateway.gateway_statistics().ways if way.dropped}
+        dropped = {route.topic: route.dropped for route in gateway.gateway_statistics().routes if route.dropped}
         assert dropped == {"bump": {"late": 1}}
 
 

@@ -130,7 +130,7 @@ async def test_guests_may_look_but_neither_drive_nor_stop(folder: Folder) -> Non
         await denied.wait_subscriber()
         told = guest.events()
         await denied.publish(Led(2))
-        assert (await first(told, LinkNotice)).kind == "unheard"
+        assert (await first(told, LinkNotice)).kind == "unreachable subscriber"
         guest.command(r2p.Command.STOP, "ROBOT")
         await allowed.publish(Led(1))
         assert await commands.fetch() == Led(1)

@@ -11,7 +11,7 @@ import pytest
 import typer
 
 import r2p
-from r2p.bridge import BridgeOptions, GatewayStatistics, PortStatistics, WayStatistics
+from r2p.bridge import BridgeOptions, GatewayStatistics, PortStatistics, RouteStatistics
 from r2p.bridge.options import Policy
 from r2p.msg import GatewayStatus, Led
 from r2p.testing.network import node_in
@@ -30,17 +30,17 @@ PORTS = [
 ]
 
 
-def ways(forwarded: int) -> list[WayStatistics]:
+def routes(forwarded: int) -> list[RouteStatistics]:
     return [
-        WayStatistics("encoder", "rtcan:can0", "zenoh:", forwarded, {"late": 2}),
-        WayStatistics("encoder", "zenoh:", "rtcan:can0", 0, {}),
+        RouteStatistics("encoder", "rtcan:can0", "zenoh:", forwarded, {"late": 2}),
+        RouteStatistics("encoder", "zenoh:", "rtcan:can0", 0, {}),
     ]
 
 
 def test_the_table() -> None:
     rates = RateCounter()
-    rates.rows(GatewayStatistics(PORTS, ways(100)), 1 * SECOND)
-    rows = rates.rows(GatewayStatistics(PORTS, ways(300)), 3 * SECOND)
+    rates.rows(GatewayStatistics(PORTS, routes(100)), 1 * SECOND)
+    rows = rates.rows(GatewayStatistics(PORTS, routes(300)), 3 * SECOND)
     assert table(rows).splitlines() == [
         "LINK        STATE                     DROPPED",
         "rtcan:can0  forwarding (1 more here)",
@@ -54,19 +54,19 @@ def test_the_table() -> None:
 def test_two_links_of_a_kind_have_their_names_in_the_table() -> None:
     ports = [PortStatistics(link, "forwarding", 0, {}) for link in ("tcp:a:23", "tcp:b:23", "zenoh:tcp/c:7447")]
     there = [
-        WayStatistics("encoder", "tcp:a:23", "zenoh:tcp/c:7447", 5, {}),
-        WayStatistics("leds", "zenoh:tcp/c:7447", "tcp:b:23", 5, {}),
-        WayStatistics("leds", "zenoh:tcp/c:7447", "tcp:gone:23", 5, {}),
+        RouteStatistics("encoder", "tcp:a:23", "zenoh:tcp/c:7447", 5, {}),
+        RouteStatistics("leds", "zenoh:tcp/c:7447", "tcp:b:23", 5, {}),
+        RouteStatistics("leds", "zenoh:tcp/c:7447", "tcp:gone:23", 5, {}),
     ]
     text = table(RateCounter().rows(GatewayStatistics(ports, there), SECOND))
-    ways = [line.split()[:3] for line in text.partition("TOPIC")[2].splitlines()[1:]]
-    assert ways == [["encoder", "tcp:a:23", "zenoh"], ["leds", "zenoh", "tcp:b:23"], ["leds", "zenoh", "tcp:gone:23"]]
+    routes = [line.split()[:3] for line in text.partition("TOPIC")[2].splitlines()[1:]]
+    assert routes == [["encoder", "tcp:a:23", "zenoh"], ["leds", "zenoh", "tcp:b:23"], ["leds", "zenoh", "tcp:gone:23"]]
 
 
-def test_a_way_that_is_made_anew_counts_anew() -> None:
+def test_a_route_that_is_made_anew_counts_anew() -> None:
     rates = RateCounter()
-    rates.rows(GatewayStatistics(PORTS, ways(100)), 1 * SECOND)
-    rows = rates.rows(GatewayStatistics(PORTS, ways(20)), 2 * SECOND)
+    rates.rows(GatewayStatistics(PORTS, routes(100)), 1 * SECOND)
+    rows = rates.rows(GatewayStatistics(PORTS, routes(20)), 2 * SECOND)
     assert [row.rate for row in rows if row.topic] == [20.0]
 
 

@@ -646,7 +646,7 @@ async def test_a_flood_of_conflicts_does_not_fill_the_log(caplog: pytest.LogCapt
             for swap in range(8):
                 script.hear(manage(m.Hello(f"M{number}", 2 * number + swap % 2 + 1, 0, 0, 5000)))
         assert caplog.text.count("two modules carry the name") == 10
-        assert script.link.losses["conflicts not told"] >= 136
+        assert script.link.losses["conflicts not reported"] >= 136
 
 
 async def test_lines_that_wait_keep_the_stamp_of_their_reception(monkeypatch: pytest.MonkeyPatch) -> None:

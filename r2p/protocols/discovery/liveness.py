@@ -233,7 +233,7 @@ class PeerLiveness:
         if len(self._next_report) >= _REPORTED_MAX:
             self._next_report = {each: at for each, at in self._next_report.items() if at > now}
             if len(self._next_report) >= _REPORTED_MAX:
-                self._counts["conflicts not told"] += 1
+                self._counts["conflicts not reported"] += 1
                 return False
         self._next_report[subject] = now + _REPORT_INTERVAL
         return True

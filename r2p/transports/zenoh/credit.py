@@ -254,7 +254,7 @@ class ZenohSender:
         text = (
             f"topic {topic} does not reach module {module}: does the access control of a router deny {key} to either?"
         )
-        self._hub.link_notice(self.link, "unheard", text, trouble=True)
+        self._hub.link_notice(self.link, "unreachable subscriber", text, trouble=True)
 
     # Publishers
 

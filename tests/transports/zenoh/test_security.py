@@ -181,7 +181,7 @@ async def test_a_topic_that_access_control_denies(tmp_path: Path, message: str) 
         await plain.publish(Led(1))
         assert await plains.fetch() == Led(1)
         notice = await first(told, LinkNotice)
-        assert notice.kind == "unheard"
+        assert notice.kind == "unreachable subscriber"
         assert "topic secret does not reach module B" in notice.text
         assert "access control" in notice.text
         assert not secrets.queue
@@ -237,6 +237,6 @@ async def test_access_control_by_certificate(tmp_path: Path) -> None:
         await denied.wait_subscriber()
         told = guest.events()
         await denied.publish(Led(2))
-        assert (await first(told, LinkNotice)).kind == "unheard"
+        assert (await first(told, LinkNotice)).kind == "unreachable subscriber"
         await fine.publish(Led(1))
         assert await subscriber.fetch() == Led(1)
