@@ -5,14 +5,13 @@ subscribed elsewhere; so subscriptions travel through it, also from gateway to g
 sent. It never decodes a message. Where it forwards at all is agreed with the other gateways (`r2p.protocols.bridge`).
 
 Read `forwarding` first (a message's way through), then `routing` (which routes there are) and `bridge` (ports, tree,
-management messages). `shaping` changes messages on their way, `directory_relay` passes on modules and nodes, `orders`
-STOP and the like; `options` says what may pass. `multihoming` is for modules with several links that are not gateways.
+management messages). `options` says what may pass and how it is changed, `directory_relay` passes on modules and nodes,
+`orders` STOP and the like. `multihoming` is for modules with several links that are not gateways.
 """
 
-from r2p.bridge.bridge import Bridge
+from r2p.bridge.bridge import Bridge, GatewayStatistics, PortStatistics, RouteStatistics
 from r2p.bridge.multihoming import MultihomedModule
 from r2p.bridge.options import BridgeOptions, ClassOf
-from r2p.bridge.port import GatewayStatistics, PortStatistics, RouteStatistics
 
 __all__ = [
     "Bridge",

@@ -8,19 +8,19 @@ import itertools
 import operator
 from collections.abc import Callable
 
+import msgspec
+
 from r2p.bridge.directory_relay import DirectoryRelay
-from r2p.bridge.forwarding import BridgedTopic, HeldMessages
+from r2p.bridge.forwarding import BridgedTopic, BridgePort, HeldMessages
 from r2p.bridge.options import BridgeOptions, Policy
 from r2p.bridge.orders import ModuleNames, OrderRelay
-from r2p.bridge.port import BridgePort, GatewayStatistics, PortStatistics, RouteStatistics
 from r2p.bridge.routing import RoutingTable
 from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management, probes
 from r2p.codecs.management import ManagementType
 from r2p.errors import DecodeError
 from r2p.protocols.bridge.ports import (
-    FIRST_CLIENT,
-    MOST_PORTS,
+    PORTS_MAX,
     Action,
     PortChanged,
     PortState,
@@ -29,7 +29,7 @@ from r2p.protocols.bridge.ports import (
     SendToPort,
     TreePort,
 )
-from r2p.protocols.bridge.tree import SpanningTree
+from r2p.protocols.bridge.tree import FIRST_CLIENT, SpanningTree
 from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
@@ -42,12 +42,52 @@ _TROUBLE = (PortState.LOOP, PortState.REFUSED)
 _TEXTS = {
     PortState.ALONE: "forwards",
     PortState.FORWARDING: "forwards, in agreement with {gateways}",
-    PortState.BLOCKED: "is blocked: its network is joined to our others by {gateways}",
+    PortState.BLOCKED: "is blocked: its network is joined to the others by {gateways}",
     PortState.CONVERGING: "is silent until it agrees with {gateways}",
     PortState.LISTENING: "listens for other gateways",
-    PortState.LOOP: "is blocked: what we send on another link comes back here, through a gateway that is not r2p's",
+    PortState.LOOP: "is blocked: what is sent on another link comes back here, through a gateway that is not r2p's",
     PortState.REFUSED: "no gateway may be there: nothing passes; listen with ?gateways=yes where gateways are to join",
 }
+
+_HANDLED = {
+    ManagementType.ALIVE,
+    ManagementType.HELLO,
+    ManagementType.DENIED,
+    *management.ORDER_TYPES,
+    *management.GATEWAY_TYPES,
+}
+
+
+class RouteStatistics(msgspec.Struct, frozen=True):
+    """One topic from one link to another; `dropped` by reason, all since the route exists."""
+
+    topic: str
+    source: str
+    target: str
+    forwarded: int
+    dropped: dict[str, int]
+
+
+class PortStatistics(msgspec.Struct, frozen=True):
+    """One link of a gateway: its state in the tree, and how many other gateways are on its network.
+
+    `dropped` counts what came in while nothing was forwarded. `offset` (ns) is UTC less the time of the link's network,
+    where that has one, known to +-`error` (ns).
+    """
+
+    link: str
+    state: str
+    gateways: int
+    dropped: dict[str, int]
+    offset: int | None = None
+    error: int | None = None
+
+
+class GatewayStatistics(msgspec.Struct, frozen=True):
+    """What a gateway has forwarded and dropped so far, on all links and topics."""
+
+    ports: list[PortStatistics]
+    routes: list[RouteStatistics]
 
 
 class Bridge:
@@ -83,7 +123,7 @@ class Bridge:
 
     def attach(self, link: Link) -> None:
         """The module has one more link, up or not yet."""
-        number = next((each for each in range(MOST_PORTS) if each not in self._by_number), None)
+        number = next((each for each in range(PORTS_MAX) if each not in self._by_number), None)
         if not link.admits_gateways or number is None:
             number = next(self._client_numbers)
         port = BridgePort(link, number, self.policy.kind(link.name), self._clock.now)
@@ -91,7 +131,7 @@ class Bridge:
         link.gateway_hooks = _PortHooks(self, port)
         if link.admits_gateways and number >= FIRST_CLIENT:
             port.state = port.tree_port.state = PortState.REFUSED
-            self._notify(link, "too many links", f"a gateway joins {MOST_PORTS} links: this one is not", True)
+            self._notify(link, "too many links", f"a gateway joins {PORTS_MAX} links: this one is not", True)
 
     def detach(self, link: Link) -> None:
         """Remove a link that the module no longer has."""
@@ -142,24 +182,24 @@ class Bridge:
 
     def handle_management(self, port: BridgePort, data: bytes) -> bool:
         """Handle a management message; True if discovery need not see it."""
-        kind = management.type_of(data)
-        if kind in management.GATEWAY_TYPES:
-            self._receive_gateway(port, data)
-            return True
-        if kind in management.ORDER_TYPES:
-            return self._orders.forward(port, data)
-        if kind == ManagementType.DENIED:
-            self._orders.forward_denial(port, data)
-        return kind in (ManagementType.ALIVE, ManagementType.HELLO) and self._receive_presence(port, data)
-
-    def _receive_presence(self, port: BridgePort, data: bytes) -> bool:
-        """Handle an ALIVE, which may be a probe, or a HELLO; True if discovery need not see it."""
+        if management.type_of(data) not in _HANDLED:
+            return False
         try:
             message = management.decode(data)
         except (DecodeError, UnknownType):
-            return False
-        if self._is_own(port, message):
+            return False  # discovery counts it
+        if isinstance(message, management.Bridge | management.Mesh | management.Leaf):
+            self._receive_gateway(port, message)
             return True
+        if isinstance(message, management.Order):
+            return self._orders.forward(port, message)
+        if isinstance(message, management.Denied):
+            self._orders.forward_denial(port, message)
+            return False
+        return self._is_own(port, message) or self._receive_presence(port, message, data)
+
+    def _receive_presence(self, port: BridgePort, message: management.Management, data: bytes) -> bool:
+        """Handle an ALIVE, which may be a probe, or a HELLO; True if discovery need not see it."""
         if isinstance(message, management.Hello):
             if message.flags & management.HELLO_QUERY:
                 self.directory.query(port)
@@ -170,7 +210,9 @@ class Bridge:
         return probe is not None
 
     def _is_own(self, port: BridgePort, message: management.Management) -> bool:
-        """Whether another link of ours on the same network sent it; an echo of this one is for discovery to find."""
+        """Whether another link of this module on the same network sent it; an echo of this one is for discovery to
+        find.
+        """
         if port.tree_port.echoes:
             return False
         if isinstance(message, management.Hello):
@@ -180,17 +222,13 @@ class Bridge:
     def _receive_probe(self, port: BridgePort, gateway: int, its_port: int) -> None:
         if not port.is_client:
             self.tree.receive_probe(self._clock.monotonic(), port.number, gateway, its_port)
-        elif self.tree.knows(gateway):
+        elif gateway in self.tree.mesh.members:
             self.tree.clients.refuse(port.tree_port, PortState.LOOP)
         self._act()
 
-    def _receive_gateway(self, port: BridgePort, data: bytes) -> None:
-        """Handle a BRIDGE, MESH or LEAF."""
-        try:
-            message = management.decode(data)
-        except (DecodeError, UnknownType):
-            port.link.stats.lost["undecodable"] += 1
-            return
+    def _receive_gateway(
+        self, port: BridgePort, message: management.Bridge | management.Mesh | management.Leaf
+    ) -> None:
         now = self._clock.monotonic()
         if port.is_client and isinstance(message, management.Leaf):
             self.tree.clients.receive_leaf(now, port.tree_port, message)
@@ -201,7 +239,7 @@ class Bridge:
             self.tree.receive_bridge(now, port.number, message)
         elif isinstance(message, management.Mesh):
             self.tree.receive_mesh(now, port.number, message)
-        elif isinstance(message, management.Leaf):
+        else:
             self.tree.receive_leaf(now, port.number, message)
         self._act()
 

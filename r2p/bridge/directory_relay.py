@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterable
 
 import msgspec
 
-from r2p.bridge.forwarding import MOST_HOPS
+from r2p.bridge.forwarding import HOPS_MAX, BridgePort
 from r2p.bridge.options import Policy
-from r2p.bridge.port import BridgePort
 from r2p.clock import Alarm
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_GONE, ROLE_PUBLISHES
@@ -378,7 +377,7 @@ class DirectoryRelay:
     def _desired_module(self, module: _ModuleFact, source: BridgePort, port: BridgePort) -> _Announced | None:
         info = source.link.discovery.modules.get(module.info.name, module.info)  # as it was heard last
         link_name = self._policy.module_to_link_name(module.name, port.name, foreign=module.foreign)
-        if link_name is None or info.hops + 1 > MOST_HOPS:
+        if link_name is None or info.hops + 1 > HOPS_MAX:
             return None
         known = port.link.discovery.modules.get(link_name)
         if known is not None and known.instance == info.instance:

@@ -1,4 +1,4 @@
-"""A topic of a gateway: what comes in by one link goes out by those others where it is subscribed.
+"""A gateway's links and topics: what comes in by one link goes out by those others where it is subscribed.
 
     link  ->  BridgedTopic.deliver  ->  Route  ->  RemoteSubscriber of another link
 
@@ -13,19 +13,76 @@ import functools
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator
 
-from r2p.bridge.port import BridgePort, PortsByKind, by_kind
-from r2p.bridge.shaping import RelayedPeriodic, Shaper
+from r2p.bridge.options import RelayedPeriodic, Shaper
+from r2p.log_lines import LineLimit
+from r2p.protocols.bridge.ports import PortState, TreePort
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.duplicates import DuplicateFilter, LastReceived
 from r2p.runtime.queues import SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import RemoteSubscriber, SlotPublisher, Topic
+from r2p.transports.link import Link
+from r2p.units import LONG_AGO
 
-MOST_HOPS = 15
+HOPS_MAX = 15
 """Gateways that a message crosses at most: the last defence against loops where messages carry hops."""
 
-MOST_HELD = 4096
+HELD_MAX = 4096
 """Messages that are held at most."""
+
+
+class BridgePort:
+    """A link and its place in the tree (one that forwards nothing while the link is down).
+
+    `kind` is that of `Policy.kind`, `now` gives UTC in ns.
+    """
+
+    def __init__(self, link: Link, number: int, kind: tuple[bool, ...], now: Callable[[], int]) -> None:
+        self.link = link
+        self.number = number
+        self.kind = kind
+        self.now = now
+        self.is_client = not link.admits_gateways
+        """Whether no gateway may be at the link's other end."""
+        self.tree_port = TreePort(number, 0)
+        self.state = PortState.LISTENING
+        """As it was reported last."""
+        self.dropped: Counter[str] = Counter()
+        """Messages that came in, or were published here, while nothing was forwarded."""
+        self.demand = link.discovery.demand()
+        self.denied_at = LONG_AGO
+        """When it was answered last that an order does not pass (monotonic ns)."""
+        self.refusal_lines = LineLimit(1)  # a second
+        """For the lines of the log that say so."""
+
+    @property
+    def name(self) -> str:
+        return self.link.name
+
+    @property
+    def in_tree(self) -> bool:
+        return self.tree_port.in_tree
+
+    @property
+    def resumes(self) -> bool:
+        """Whether it forwards nothing just because this program stood still, and is likely to go on."""
+        return self.tree_port.resumes or self.tree_port.state is PortState.ALONE
+
+    def count_dropped(self, reason: str) -> None:
+        """Count a message that does not pass."""
+        self.dropped[reason] += 1
+        self.link.stats.lost[reason] += 1
+
+
+PortsByKind = list[list[BridgePort]]
+
+
+def by_kind(ports: list[BridgePort]) -> PortsByKind:
+    """The ports in groups between which the policy makes no difference."""
+    groups: dict[tuple[bool, ...], list[BridgePort]] = {}
+    for port in ports:
+        groups.setdefault(port.kind, []).append(port)
+    return list(groups.values())
 
 
 class HeldMessages:
@@ -38,9 +95,9 @@ class HeldMessages:
         return bool(self._held)
 
     def hold(self, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
-        """Hold a message; False if it expires or there are too many. `go_on` gives back the sinks without room."""
+        """Hold a message; False if it expires or there are too many. `go_on` returns the sinks without room."""
         # Events and periods are of no use later.
-        if sample.publisher_class != PublisherClass.NON_REAL_TIME or len(self._held) >= MOST_HELD:
+        if sample.publisher_class != PublisherClass.NON_REAL_TIME or len(self._held) >= HELD_MAX:
             return False
         self._held.append((sample, go_on))
         return True
@@ -71,6 +128,7 @@ class Route:
         self.subscriber: RemoteSubscriber | None = None
         self.forwarded = 0
         self.dropped: Counter[str] = Counter()
+        """By reason; the link counts only what it would have sent but for the tree (`converging`)."""
 
 
 class BridgedTopic(Topic):
@@ -88,8 +146,8 @@ class BridgedTopic(Topic):
         self.relayed: RelayedTopic | None = None
         """Set while the gateway forwards the topic."""
         self.active_routes: dict[str, list[Route]] = {}
-        """The routes that messages take now, by the name of the link that they come from, as far as any came since the
-        last change. Replaced whole at a change, as a message may be on its way through one of the lists.
+        """The routes that messages take now, by the name of the link that they come from: looked up when the first one
+        comes. A change replaces the whole dict, as a message may be on its way through one of the lists.
         """
         self.by_link: dict[object, RemoteSubscriber] = {}
         """Remote subscribers by their links."""
@@ -114,9 +172,7 @@ class BridgedTopic(Topic):
         return self.relayed is not None or super().in_use
 
     def last_received(self, publisher: Hashable) -> LastReceived:
-        """Return a new one for each link. A message that was dropped at one link, as that does not forward, is then
-        not a duplicate when it comes by another link.
-        """
+        """Return a new one for each link, as one link may have to drop what another one forwards later."""
         return LastReceived()
 
     # Messages
@@ -140,7 +196,7 @@ class BridgedTopic(Topic):
             if routes is None:
                 routes = [] if self.relayed is None else self.relayed.active_from(link)
                 self.active_routes[link] = routes
-            if not routes and not self.queues:  # not yet, or not any more, as its publisher will soon know: no loss
+            if not routes and not self.queues:  # not yet, or no longer, which its publisher will soon know: no loss
                 port.dropped["not subscribed"] += 1
                 return None
         blocked = super().deliver(sample) if self.queues else None
@@ -162,9 +218,9 @@ class BridgedTopic(Topic):
                 port.link.stats.lost["converging"] += 1
             return blocked
         shaper = route.shaper
-        if shaper is None and not sample.deadline and sample.hops < MOST_HOPS:  # most messages: nothing else to ask
+        if shaper is None and not sample.deadline and sample.hops < HOPS_MAX:  # most messages: nothing else to ask
             return _offer(route, sample, blocked)
-        if sample.hops >= MOST_HOPS:
+        if sample.hops >= HOPS_MAX:
             route.dropped["too many hops"] += 1
         elif sample.deadline and sample.drop_late and port.now() > sample.due:
             route.dropped["late"] += 1
@@ -201,8 +257,7 @@ class BridgedTopic(Topic):
             if port is not None:
                 port.count_dropped("converging")
             return None
-        waits = subscriber.get_wait_queue().line_of(sample) or not subscriber.offer(sample)
-        return [subscriber] if waits else None
+        return None if subscriber.offer_in_order(sample) else [subscriber]
 
     # Subscribers
 
@@ -237,7 +292,7 @@ class BridgedTopic(Topic):
 
 
 class RelayedTopic:
-    """A topic of the robot, on all links. `topics` has it by name: several if some links have another name for it.
+    """A topic of the robot, on all links. `topics` has it by its names, which differ where there is a prefix.
 
     Its routes lead from links on which it has been published to those on which it has been subscribed; they stay for
     their counters. `published_on` and `subscribed_on` are the ports where that is so now.
@@ -320,12 +375,12 @@ class RelayedTopic:
 
 
 def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
-    """Send a message; gives back the sinks without room, with this one if its publisher has to wait for it."""
+    """Send a message; return the sinks without room, and this one with them if its publisher has to wait for it."""
     subscriber = route.subscriber
     if subscriber is None:  # it has left while the message was on its way through the routes
         return blocked
     route.forwarded += 1
-    if not subscriber.get_wait_queue().line_of(sample) and subscriber.offer(sample):
+    if subscriber.offer_in_order(sample):
         return blocked
     if not subscriber.blocks_publishers and sample.publisher_class == PublisherClass.NON_REAL_TIME:
         subscriber.force(sample)  # it had no room for long: one slow link must not hold up all the others
@@ -340,5 +395,5 @@ def _offer_shaped(route: Route, shaped: Sample | None, sample: Sample, blocked: 
         route.dropped["rate limit"] += 1
         return blocked
     for sink in _offer(route, shaped, None) or ():
-        sink.force(shaped)  # a sink that is given back to the link would get the message that came in
+        sink.force(shaped)  # it must not wait: the link would offer the message that came in, not the one shaped here
     return blocked

@@ -1,10 +1,15 @@
-"""What a gateway lets through, and under which names: `BridgeOptions` as the user gives them, `Policy` to apply them.
+"""What a gateway lets through, under which names, and what it changes: `BridgeOptions` as the user gives them.
 
-A topic, and a module of this robot, have one canonical name: the one behind which no prefix stands. On the links of
-`prefix_on` they are called otherwise, so that several robots can share a network.
+`Policy` applies them to topics, modules and links. A topic, and a module of this robot, have one canonical name: the
+one without a prefix. On the links of `prefix_on` they have another one, so that several robots can share a network.
+
+`Shaper` changes messages on one route: their rate, and publisher classes that the next link can't keep. A bus has no
+slots for messages that are not published there, so periodic ones become sporadic; with `reserve` the gateway asks for
+slots as soon as it knows size and period, and `RelayedPeriodic` fills them.
 """
 
 import re
+from collections.abc import Callable
 from fnmatch import fnmatchcase
 from typing import TypeVar
 
@@ -13,11 +18,17 @@ import msgspec
 from r2p.codecs.management import DENIED_CONTROL, DENIED_READ_ONLY
 from r2p.errors import Error
 from r2p.names import LOADER_PREFIX
-from r2p.runtime.sample import PublisherClass
+from r2p.protocols.time_left import TimesLeft
+from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.topic import SlotPublisher
+from r2p.units import SECOND
 
 T = TypeVar("T")
 
-_CACHED = 1024  # names of links: each new client brings another one
+_CACHED_MAX = 1024  # names of links: each new client brings another one
+_UNKNOWN_PERIOD = SECOND // 20  # ns until a deadline while the period is not known
+_PERIOD_MAX = 10 * SECOND  # ns; after a longer pause the publisher has started again
+_SURE = 8  # intervals after which a period counts as known
 
 _PREFIX = re.compile(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_")
 
@@ -122,19 +133,14 @@ class Policy:
             return True
         return bool(self._allow) and not any(fnmatchcase(topic, each.topic) for each in self._allow)
 
-    def order_denied(self, source: str, target: str, *, harmless: bool) -> int:
-        """Why an order may not go from one link to another (DENIED_..., 0: it may); STOP is harmless."""
-        if self._is_read_only(target):
+    def order_denied(self, source: str, target: str | None, *, harmless: bool) -> int:
+        """Why an order may not go from one link to another (DENIED_..., 0: it may); STOP is harmless.
+
+        `target` None: why the gateway itself does not obey it.
+        """
+        if target is not None and self._is_read_only(target):
             return DENIED_READ_ONLY
         return 0 if harmless or self._may_control(source) else DENIED_CONTROL
-
-    def own_order_denied(self, source: str, *, harmless: bool) -> int:
-        """Why the gateway itself does not obey an order from this link (DENIED_..., 0: it does)."""
-        return 0 if harmless or self._may_control(source) else DENIED_CONTROL
-
-    def rate_limit(self, topic: str) -> float | None:
-        """Greatest number of messages a second; None for no limit."""
-        return _first(self._options.rate_limit, topic)
 
     def class_of(self, topic: str, source: str) -> ClassOf | None:
         """The class of messages from a debug line; None: the one that they carry."""
@@ -144,6 +150,13 @@ class Policy:
     def reserves(self, topic: str) -> bool:
         """Whether the topic is to have slots of its own on a bus."""
         return any(fnmatchcase(topic, each) for each in self._options.reserve)
+
+    def shaper(
+        self, topic: str, source: str, *, soften: bool, reserve: "Callable[[int, float], RelayedPeriodic] | None" = None
+    ) -> "Shaper | None":
+        """Return what changes a topic's messages from this link; None: nothing does. For the rest see `Shaper`."""
+        rate, klass = _first(self._options.rate_limit, topic), self.class_of(topic, source)
+        return Shaper(rate, klass, soften=soften, reserve=reserve) if rate or klass or soften else None
 
     def to_link_name(self, topic: str, link: str) -> str:
         """The name of a topic on this link."""
@@ -181,7 +194,7 @@ class Policy:
         """What stands before the names of topics and modules on a link; empty: nothing."""
         prefix = self._prefixes.get(link)
         if prefix is None:
-            if len(self._prefixes) >= _CACHED:
+            if len(self._prefixes) >= _CACHED_MAX:
                 self._prefixes.clear()
             has_prefix = any(is_link(link, each) for each in self._options.prefix_on)
             prefix = self._prefixes[link] = self._options.prefix if has_prefix else ""
@@ -192,6 +205,138 @@ class Policy:
 
     def _may_control(self, source: str) -> bool:
         return self._options.allow_control or source.partition(":")[0] not in IP
+
+
+class RelayedPeriodic(SlotPublisher):
+    """Fills the slots of a bus with what comes in by another link: messages of `size` bytes each `period` seconds."""
+
+    lead = 0.0005
+
+    def __init__(self, size: int, period: float) -> None:
+        self.period = period
+        self.missed = 0
+        """Messages that were overtaken by the next one before their slot came, or that the bus lost."""
+        self._size = size
+        self._latest: Sample | None = None
+        self._slot_link: object = None
+
+    @property
+    def size(self) -> int:
+        return self._size
+
+    def offer(self, sample: Sample) -> bool:
+        """Keep a message for the next slot; False if the bus has no slots for it now, or not of this size."""
+        if self._slot_link is None or len(sample.data) != self._size:
+            return False
+        self.missed += self._latest is not None
+        self._latest = sample
+        return True
+
+    def use_slot_clock(self, slot_link: object, period: float) -> bool:
+        if self._slot_link not in (None, slot_link):
+            return False
+        self._slot_link = slot_link
+        self.period = period
+        return True
+
+    def use_own_clock(self, slot_link: object) -> None:
+        if self._slot_link is slot_link:
+            self._slot_link = self._latest = None
+
+    def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
+        latest, self._latest = self._latest, None
+        return latest
+
+    def link_degraded(self, link: str, reason: str) -> None:
+        """The slots are lost: messages go as sporadic ones, which the link's notices report."""
+
+    def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
+        self.missed += 1
+
+
+class Shaper:
+    """The changes on one route.
+
+    `rate`: messages a second at most, with room for two at once. `klass`: the class, which a debug line does not carry.
+    `soften`: periodic messages become sporadic ones that are due within their period, as the next link has no slots for
+    them. `reserve` is called with size (bytes) and period (s) when those of a publisher are known, and again when it
+    comes back with another size; it returns what takes the messages from then on.
+    """
+
+    def __init__(
+        self,
+        rate: float | None,
+        klass: ClassOf | None,
+        *,
+        soften: bool,
+        reserve: Callable[[int, float], RelayedPeriodic] | None = None,
+    ) -> None:
+        self.reserved: RelayedPeriodic | None = None
+        self._reserve = reserve
+        self._gap = None if rate is None else round(SECOND / rate)
+        self._class = klass
+        self._soften = soften
+        self._free_at = 0
+        self._periods: dict[tuple[str, str], _PublisherPeriod] = {}
+        self._times_left = TimesLeft()
+
+    def shape(self, sample: Sample, now: int, utc: int) -> Sample | None:
+        """The message to forward at `now` (monotonic ns; the same in UTC); None: it exceeds the rate."""
+        if self._gap is not None:
+            if now < self._free_at:
+                return None
+            self._free_at = max(self._free_at, now - self._gap) + self._gap
+        if self._class is not None and not sample.deadline:
+            sample = _classed(sample, self._class)
+        if self._soften and sample.publisher_class is PublisherClass.PERIODIC:
+            return self._softened(sample, now, utc)
+        return sample
+
+    def _softened(self, sample: Sample, now: int, utc: int) -> Sample:
+        period, deadline, expires = self._period(sample), sample.deadline, sample.expires
+        if not deadline:
+            deadline = sample.stamp + period
+            source = sample.source
+            expires = utc + self._times_left.of((source.module, source.node)).left(now, sample.stamp, deadline)
+        sporadic = PublisherClass.SPORADIC
+        return msgspec.structs.replace(
+            sample, publisher_class=sporadic, deadline=deadline, expires=expires, drop_late=False
+        )
+
+    def _period(self, sample: Sample) -> int:
+        """The publisher's period (ns), as its stamps show it."""
+        source = sample.source
+        known = self._periods.get((source.module, source.node))
+        if known is None:
+            if len(self._periods) >= TimesLeft.MOST:
+                self._periods.clear()
+            self._periods[source.module, source.node] = _PublisherPeriod(sample.stamp, len(sample.data))
+            return _UNKNOWN_PERIOD
+        since = sample.stamp - known.stamp
+        known.stamp = sample.stamp
+        if since >= _PERIOD_MAX or len(sample.data) != known.size:
+            known.size, known.period, known.count = len(sample.data), 0, 0
+        elif since > 0:
+            known.count += 1
+            # The shortest interval counts, as messages may be lost; a publisher that slows down is followed by steps.
+            known.period = since if not known.period else min(since, known.period + known.period // 8)
+            if known.count == _SURE and self._reserve is not None:
+                self.reserved = self._reserve(known.size, known.period / SECOND)
+        return known.period or _UNKNOWN_PERIOD
+
+
+class _PublisherPeriod(msgspec.Struct):
+    """The last stamp of a publisher, the size of its messages, and its period as far as known (ns)."""
+
+    stamp: int
+    size: int
+    period: int = 0
+    count: int = 0
+
+
+def _classed(sample: Sample, klass: ClassOf) -> Sample:
+    deadline = sample.stamp + round(klass.time * SECOND) if klass.time else 0
+    return msgspec.structs.replace(sample, publisher_class=klass.publisher_class, deadline=deadline, drop_late=False)
 
 
 def _first(table: dict[str, T], topic: str) -> T | None:

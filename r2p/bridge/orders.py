@@ -8,19 +8,19 @@ logged, and its sender gets a DENIED.
 import msgspec
 
 from r2p.bridge.directory_relay import DirectoryRelay
+from r2p.bridge.forwarding import BridgePort
 from r2p.bridge.options import Policy
-from r2p.bridge.port import BridgePort
 from r2p.clock import Clock
-from r2p.codecs import UnknownType, management
-from r2p.errors import DecodeError
+from r2p.codecs import management
 from r2p.log_lines import get_logger
 from r2p.names import module_alias
 from r2p.transports.link import is_booting
+from r2p.units import SECOND
 
 logger = get_logger("r2p.bridge")
 
-_DENIED_APART = 200_000_000  # ns between two DENIED on one link
-_MOST_AMBIGUOUS = 100  # aliases of two modules that are remembered, so that each is logged once
+_DENIED_APART = SECOND // 5  # ns between two DENIED on one link
+_AMBIGUOUS_MAX = 100  # aliases of two modules that are remembered, so that each is logged once
 
 _REASONS = {
     management.DENIED_CONTROL: "see --allow-control",
@@ -65,7 +65,7 @@ class ModuleNames:
         return self._policy.module_to_link_name(module[0], other, foreign=False)
 
     def _log_ambiguous(self, alias: str, prefix: str, found: list[str]) -> None:
-        if alias not in self._ambiguous and len(self._ambiguous) < _MOST_AMBIGUOUS:
+        if alias not in self._ambiguous and len(self._ambiguous) < _AMBIGUOUS_MAX:
             self._ambiguous.add(alias)
             names = " and ".join(prefix + each for each in sorted(found))
             logger.error("%s have the same alias %s: orders reach neither; rename one", names, alias)
@@ -83,17 +83,11 @@ class OrderRelay:
         self._policy = policy
         self._names = names
 
-    def forward(self, port: BridgePort, data: bytes) -> bool:
+    def forward(self, port: BridgePort, order: management.Order) -> bool:
         """Forward an order that came in; True: it is for this module, which does not obey it."""
-        try:
-            order = management.decode(data)
-        except (DecodeError, UnknownType):
-            return False
-        if not isinstance(order, management.Order):
-            return False
         harmless = isinstance(order, management.Stop)
         if order.module == self._module:
-            reason = self._policy.own_order_denied(port.name, harmless=harmless)
+            reason = self._policy.order_denied(port.name, None, harmless=harmless)
             if reason:
                 self._refuse(port, order, reason, known=True)
                 return True
@@ -122,13 +116,9 @@ class OrderRelay:
         if refused and (known or not passed):
             self._refuse(port, order, refused, known=known)
 
-    def forward_denial(self, port: BridgePort, data: bytes) -> None:
+    def forward_denial(self, port: BridgePort, denied: management.Denied) -> None:
         """Forward a DENIED to all links: the sender of the order may be anywhere."""
-        try:
-            denied = management.decode(data)
-        except (DecodeError, UnknownType):
-            return
-        name = self._names.to_canonical(denied.module, port.name) if isinstance(denied, management.Denied) else None
+        name = self._names.to_canonical(denied.module, port.name)
         if name is None:
             return
         for other in self._open_from(port):

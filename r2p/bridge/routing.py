@@ -15,10 +15,8 @@ from collections.abc import Iterable, Iterator
 
 import msgspec
 
-from r2p.bridge.forwarding import BridgedTopic, RelayedTopic, Route
-from r2p.bridge.options import Policy
-from r2p.bridge.port import BridgePort, PortsByKind, by_kind
-from r2p.bridge.shaping import RelayedPeriodic, Shaper
+from r2p.bridge.forwarding import BridgedTopic, BridgePort, PortsByKind, RelayedTopic, Route, by_kind
+from r2p.bridge.options import Policy, RelayedPeriodic, Shaper
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.log_lines import LineLimit, get_logger
 from r2p.names import LOADER_PREFIX
@@ -188,8 +186,7 @@ class RoutingTable:
         reserve = (
             functools.partial(self._reserve, topic, target) if has_slots and self._policy.reserves(topic) else None
         )
-        rate, klass = self._policy.rate_limit(topic), self._policy.class_of(topic, source.name)
-        return Shaper.of(rate=rate, klass=klass, soften=has_slots, reserve=reserve)
+        return self._policy.shaper(topic, source.name, soften=has_slots, reserve=reserve)
 
     def _reserve(self, topic: str, target: BridgePort, size: int, period: float) -> RelayedPeriodic:
         """Ask a bus for slots for messages of `size` bytes each `period` seconds."""

@@ -74,13 +74,16 @@ class Sink(abc.ABC):
     def refill(self) -> None:
         """Give what waits the room that there is."""
 
+    def offer_in_order(self, sample: Sample) -> bool:
+        """Accept the sample, if there is room and nothing that came before waits for it."""
+        return not self.get_wait_queue().line_of(sample) and self.offer(sample)
+
     def offer_latched(self, sample: Sample) -> None:
         """Accept a value that its publisher latches, as soon as there is room."""
-        queue = self.get_wait_queue()
         if not self.reachable:
             self.force(sample)
-        elif queue.line_of(sample) or not self.offer(sample):  # never past what waits already
-            queue.add_latched(self, sample)
+        elif not self.offer_in_order(sample):
+            self.get_wait_queue().add_latched(self, sample)
 
     def become_lossy(self, reason: str) -> None:
         """Stop making publishers wait, until it has plenty of room again: it made none in time."""
