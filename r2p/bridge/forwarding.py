@@ -17,9 +17,8 @@ from r2p.bridge.options import RelayedPeriodic, Shaper
 from r2p.log_lines import LineLimit
 from r2p.protocols.bridge.ports import PortState, TreePort
 from r2p.runtime.backpressure import Sink
-from r2p.runtime.duplicates import DuplicateFilter, LastReceived
 from r2p.runtime.queues import SubscriberQueue, WakeScheduler
-from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.sample import DuplicateFilter, LastReceived, PublisherClass, Sample
 from r2p.runtime.topic import RemoteSubscriber, SlotPublisher, Topic
 from r2p.transports.link import Link
 from r2p.units import LONG_AGO

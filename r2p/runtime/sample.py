@@ -2,6 +2,12 @@
 
 It carries the message both as the object that was published and as packed bytes. A local subscriber gets the object, a
 link sends the bytes, and a gateway never needs the type.
+
+Samples that come again, after a repetition, by another link or by another gateway, are recognised by sequence number
+and stamp, as a publisher that has started again counts anew. `LastReceived` is for a publisher whose start is known, so
+its messages never go back: whatever is not newer than the last one is dropped, and order is kept. A gateway does not
+know the start, and the clock of a module without a battery may go back with it, so `DuplicateFilter` drops only what it
+has seen: else all messages of such a module would be lost behind the gateway.
 """
 
 import msgspec
@@ -9,6 +15,9 @@ import msgspec
 from r2p.codecs.attachment import ClockOffset
 from r2p.codecs.attachment import PublisherClass as PublisherClass  # a part of each sample: imported from here
 from r2p.messages import Message
+
+_KEPT_MAX = 64  # messages of each publisher
+_PUBLISHERS_MAX = 1024  # of a topic; with one more all are forgotten
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -59,3 +68,40 @@ class Sample(msgspec.Struct, gc=False):
     def due(self) -> int:
         """The deadline by the clock here; 0: none."""
         return self.expires or self.deadline
+
+
+class LastReceived(msgspec.Struct, eq=False, weakref=True):
+    """The last message of a remote publisher, by whatever way it came."""
+
+    sequence: int = 0
+    stamp: int = 0
+
+    def accept(self, sequence: int, stamp: int) -> bool:
+        """Enter a message; False if it, or a later one, was here before. Messages without a number are all new."""
+        if sequence and sequence <= self.sequence and stamp <= self.stamp:
+            return False
+        self.sequence = sequence
+        self.stamp = stamp
+        return True
+
+
+class DuplicateFilter:
+    """The last messages of all publishers of a topic, by number and stamp."""
+
+    def __init__(self) -> None:
+        self._stamps: dict[tuple[str, str], list[int]] = {}
+
+    def accept(self, sample: Sample) -> bool:
+        """Enter a message that has a number; False if it was here before."""
+        source = sample.source
+        key = (source.module, source.node)
+        stamps = self._stamps.get(key)
+        if stamps is None:
+            if len(self._stamps) >= _PUBLISHERS_MAX:
+                self._stamps.clear()
+            stamps = self._stamps[key] = [0] * _KEPT_MAX
+        place = sample.sequence % _KEPT_MAX
+        if stamps[place] == sample.stamp:
+            return False
+        stamps[place] = sample.stamp
+        return True

@@ -14,9 +14,8 @@ from r2p.clock import Clock
 from r2p.errors import TypeMismatch
 from r2p.messages import Layout
 from r2p.runtime.backpressure import Sink, WaitQueue
-from r2p.runtime.duplicates import LastReceived
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue, WakeScheduler
-from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.sample import LastReceived, PublisherClass, Sample
 
 
 class RemoteSubscriber(Sink):

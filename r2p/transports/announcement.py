@@ -7,8 +7,8 @@ the one that is wanted now, and `announce` makes the difference.
 import msgspec
 
 from r2p.codecs.management import ANY_TYPE, CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.events import Event, TopicType
+from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.topic import Topic
 
 

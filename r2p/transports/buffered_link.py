@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Protocol
 import msgspec
 
 from r2p.names import MANAGEMENT
-from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.events import SubscriberJoined
+from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic

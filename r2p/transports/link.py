@@ -21,7 +21,6 @@ from r2p.codecs.management import FLAG_BOOT, NO_PARAMS, QUEUE
 from r2p.messages import Message
 from r2p.names import TOPIC_MAX
 from r2p.protocols.discovery.announcer import Relayed
-from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.events import (
     Command,
     Event,
@@ -33,7 +32,7 @@ from r2p.protocols.discovery.events import (
     SubscriberJoined,
     SubscribersGone,
 )
-from r2p.protocols.discovery.session import Discovery
+from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace

@@ -1,8 +1,8 @@
 """Who sent what comes in: lines and CAN frames do not say it, so it follows from what discovery knows."""
 
 from r2p.codecs.management import ROLE_PUBLISHES
-from r2p.protocols.discovery.base import DiscoveryProtocol
 from r2p.protocols.discovery.events import PeerAddress
+from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.sample import Source
 
 

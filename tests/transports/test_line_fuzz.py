@@ -15,7 +15,7 @@ from r2p.codecs import management as m
 from r2p.errors import MessageError
 from r2p.msg import Led, Text
 from r2p.names import module_alias
-from r2p.protocols.discovery import demand, directory, peers
+from r2p.protocols.discovery import directory, negotiation
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.testing.network import node_in
 from tests.transports.conversation import Script, line, manage
@@ -89,8 +89,8 @@ def _slots(base: type) -> tuple[str, ...]:
 @pytest.mark.virtual_time
 @pytest.mark.parametrize("seed", range(4))
 async def test_nothing_grows_whatever_a_peer_says(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    for bounded in (directory, peers, demand):
-        monkeypatch.setattr(bounded, "MOST", MOST)
+    monkeypatch.setattr(directory, "TABLE_MAX", MOST)
+    monkeypatch.setattr(negotiation, "PEERS_MAX", MOST)
     chance = random.Random(seed)
     script = Script()
     errors: list[Any] = []

@@ -3,6 +3,8 @@
 The schedule holds keys only. The announcer makes the messages of a key when its turn has come, from what is true then.
 """
 
+from collections import Counter
+
 import msgspec
 
 from r2p.codecs import management
@@ -10,6 +12,7 @@ from r2p.codecs.management import ANSWERED, NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES
 from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory
 from r2p.protocols.discovery.events import Outbox, TopicType
 from r2p.protocols.discovery.schedule import Item, ItemKind, Schedule
+from r2p.units import MILLISECOND
 
 Relayed = management.Hello | management.Alive | management.Endpoint
 """What a gateway passes on of other modules."""
@@ -48,14 +51,14 @@ class Announcer:
         self.r2p = False
         self.publishers: dict[str, LocalTopic] = {}
         self.subscribers: dict[str, LocalTopic] = {}
-        self.with_publisher: set[str] = set()
-        """The subscribed topics that a peer publishes to this module."""
-        self.with_subscriber: set[str] = set()
-        """The published topics that a peer subscribes to."""
+        self.publisher_counts: Counter[str] = Counter()
+        """How many peers publish each of the subscribed topics to this module; those that none does are missing."""
+        self.subscriber_counts: Counter[str] = Counter()
+        """The same of published topics, and of peers that subscribe to them."""
         self._observer = observer
+        self.outbox = outbox
         self._directory = directory
         self._schedule = schedule
-        self._outbox = outbox
         self._endpoints: dict[tuple[str, str, int], int] = {}
         self._relayed: dict[tuple[str | int, ...], Relayed] = {}
 
@@ -95,7 +98,7 @@ class Announcer:
 
     def announce_once(self, kind: ItemKind, *key: str | int) -> None:
         """Announce something once, as soon as the rate allows and if the link is up; not twice if it waits already."""
-        if self._outbox.up:
+        if self.outbox.up:
             self._schedule.add(Item(kind, key, once=True))
 
     def advertise_again(self, topic: str) -> None:
@@ -109,7 +112,7 @@ class Announcer:
 
     def relay(self, message: Relayed) -> None:
         """Pass on what another module has said on another link, as soon as the rate allows."""
-        if not self._outbox.up:
+        if not self.outbox.up:
             return
         match message:
             case management.Hello(module) | management.Alive(module):
@@ -118,7 +121,7 @@ class Announcer:
                 key = (instance, node, topic, role & ~ROLE_GONE)
         if isinstance(message, management.Hello):
             # On a slow link the next one comes late: its module must not seem gone until then.
-            lease = max(message.lease_ms, 3 * self._schedule.relay_time // 1_000_000)
+            lease = max(message.lease_ms, 3 * self._schedule.relay_time // MILLISECOND)
             message = msgspec.structs.replace(message, lease_ms=min(lease, management.LEASE_MS_MAX))
         self._relayed[key] = message
         self._schedule.relay(Item(ItemKind.RELAY, key, once=True))
@@ -137,10 +140,10 @@ class Announcer:
 
     def flush(self, now: int) -> None:
         """Send what is due."""
-        while self._outbox.up and (item := self._schedule.pop(now)) is not None:
+        while self.outbox.up and (item := self._schedule.pop(now)) is not None:
             messages = self._messages(item)
             if messages:
-                self._outbox.send(*messages)
+                self.outbox.send(*messages)
                 self._schedule.sent(now, len(messages))
 
     # The messages
@@ -148,7 +151,7 @@ class Announcer:
     def hello(self, flags: int = 0) -> management.Hello:
         """This module's HELLO. Its lease outlasts two lost rounds of repetition."""
         tool = management.HELLO_TOOL if self._observer else 0
-        lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // 1_000_000
+        lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // MILLISECOND
         return management.Hello(self.module, self.instance, flags | tool, 0, lease)
 
     def requests(self, topic: str, own: LocalTopic, size: int = 0) -> list[management.Management]:
@@ -159,12 +162,12 @@ class Announcer:
         size = own.type.size or size or self._directory.size_of(topic)
         if not size:
             return []
-        params = NO_PARAMS if not self.r2p else ANSWERED if topic in self.with_publisher else UNANSWERED
+        params = NO_PARAMS if not self.r2p else ANSWERED if topic in self.publisher_counts else UNANSWERED
         return [management.SubscribeRequest(topic, size, management.queue_length(size, own.queue), params)]
 
     def _advertisement(self, topic: str, own: LocalTopic) -> management.Advertise:
         """The advertisement of a topic; r2p modules see in it whether the topic has a subscriber yet."""
-        unanswered = self.r2p and topic not in self.with_subscriber
+        unanswered = self.r2p and topic not in self.subscriber_counts
         params = management.with_unanswered(own.params) if unanswered else own.params
         return management.Advertise(topic, own.type.size, 0, params)
 

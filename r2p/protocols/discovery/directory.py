@@ -1,32 +1,39 @@
 """What the modules on one link have said: their names, topics and endpoints. Nothing here decides what flows.
 
+`Directory` has it for one link. `Demand` is for gateways only: which topics the others publish and subscribe to,
+whether this module has them or not.
+
 Every table is bounded. When it is full, the entry that was not repeated for longest is forgotten: a flood of made-up
 messages pushes out true entries only until they are repeated.
 """
 
 from collections import Counter
+from collections.abc import Hashable
 from typing import Any, TypeVar
 
 import msgspec
 
 from r2p.codecs import management
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.names import MODULE_PATH_MAX, module_alias
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, TopicType
 from r2p.protocols.discovery.schedule import SLOW_ROUNDS
 from r2p.protocols.timers import KeyedTimers
+from r2p.units import MILLISECOND, SECOND
 
-MOST = 4096
+TABLE_MAX = 4096
 """Entries in each table."""
 
-LEASE = 5_000_000_000
+LEASE = 5 * SECOND
 """Ns that an r2p module may be silent at least, whatever its HELLO says: three rounds of repetition, and some more."""
 
-FOR_EVER = management.LEASE_MS_MAX * 1_000_000
+FOR_EVER = management.LEASE_MS_MAX * MILLISECOND
 """The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
 
 _UNFINISHED_MAX = 256
 """Aliases of which some parts were received, and not all."""
 
+_TopicRole = tuple[str, int]
 K = TypeVar("K")
 V = TypeVar("V")
 
@@ -53,7 +60,7 @@ class TopicInfo(msgspec.Struct):
             self.types.pop(role, None)
         else:
             self.types[role] = known
-        best = self.types.get(management.ROLE_PUBLISHES) or self.types.get(management.ROLE_SUBSCRIBES, TopicType())
+        best = self.types.get(ROLE_PUBLISHES) or self.types.get(ROLE_SUBSCRIBES, TopicType())
         self.size = best.size
         self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
 
@@ -74,7 +81,7 @@ class EndpointInfo(msgspec.Struct, frozen=True):
     def latches(self, topic: str) -> bool:
         """Whether it publishes this topic, and latches it."""
         latches = self.publisher_class & management.CLASS_LATCHES
-        return self.topic == topic and self.role == management.ROLE_PUBLISHES and latches > 0
+        return self.topic == topic and self.role == ROLE_PUBLISHES and latches > 0
 
 
 EndpointKey = tuple[int, str, str, int]
@@ -99,8 +106,10 @@ class Directory:
         """A number that changes when modules or endpoints change."""
         self.direct_instances: dict[str, int] = {}
         """The instances of the r2p modules on the link itself, not behind a gateway."""
-        self._timers = timers
-        self._counts = counts
+        self.timers = timers
+        """Of everything that lasts for a while on this link."""
+        self.counts = counts
+        """What was dropped on this link, by reason."""
         self._direct: dict[PeerAddress, dict[str, ModuleInfo]] = {}
         self._leases: dict[PeerAddress, Counter[int]] = {}
         self._names: dict[int, str] = {}
@@ -149,7 +158,7 @@ class Directory:
             last_heard=now,
             instance=message.instance,
             observer=bool(message.flags & management.HELLO_TOOL),
-            lease=max(LEASE, message.lease_ms * 1_000_000),
+            lease=max(LEASE, message.lease_ms * MILLISECOND),
             hops=message.hops,
             source=source,
         )
@@ -241,11 +250,11 @@ class Directory:
             self._drop_endpoint((old.instance, old.node, old.topic, old.role))
         known = self.modules.get(module)
         if known is None:  # the HELLO of its module may never come
-            self._timers.set(("endpoint", key), now + LEASE)
+            self.timers.set(("endpoint", key), now + LEASE)
         elif known.lease < FOR_EVER:
-            self._timers.set(("endpoint", key), now + SLOW_ROUNDS * known.lease)
+            self.timers.set(("endpoint", key), now + SLOW_ROUNDS * known.lease)
         else:
-            self._timers.clear(("endpoint", key))
+            self.timers.clear(("endpoint", key))
 
     def forget_endpoint(self, key: EndpointKey) -> None:
         if self.endpoints.pop(key, None) is not None:
@@ -258,7 +267,7 @@ class Directory:
 
     def _drop_endpoint(self, key: EndpointKey) -> None:
         """Forget what belongs to an endpoint that has left the table."""
-        self._timers.clear(("endpoint", key))
+        self.timers.clear(("endpoint", key))
         keys = self._endpoints_of[key[0]]
         del keys[key]
         if not keys:
@@ -268,9 +277,9 @@ class Directory:
         """Enter a value as the latest one; returns the one that was forgotten for it. A dict keeps the order."""
         table.pop(key, None)  # to enter it as the last one again
         forgotten = None
-        if len(table) >= MOST:
+        if len(table) >= TABLE_MAX:
             forgotten = table.pop(next(iter(table)))
-            self._counts[reason] += 1
+            self.counts[reason] += 1
         table[key] = value
         return forgotten
 
@@ -289,10 +298,7 @@ class Directory:
             del self._direct[info.source]
         if info.r2p:
             leases = self._leases[info.source]
-            leases[info.lease] -= 1
-            if not leases[info.lease]:
-                del leases[info.lease]
-            if not leases:
+            if decrement(leases, info.lease) and not leases:
                 del self._leases[info.source]
 
     def _forget(self, info: ModuleInfo) -> None:
@@ -334,10 +340,143 @@ class Aliases:
         if len(name) > MODULE_PATH_MAX or module_alias(name) != message.alias or self._names.get(message.alias) == name:
             return None
         self._names[message.alias] = name
-        _bound(self._names, MOST)
+        _bound(self._names, TABLE_MAX)
         return name
 
 
 def _bound(table: dict[str, Any], most: int) -> None:
     while len(table) > most:
         del table[next(iter(table))]
+
+
+def decrement(counter: Counter[K], key: K) -> bool:
+    """Count one less of a key, which goes with the last one; return whether this was the last one."""
+    counter[key] -= 1
+    if counter[key]:
+        return False
+    del counter[key]
+    return True
+
+
+# For gateways
+
+
+class Demand:
+    """Topics by role (ROLE_...), and the sources that publish or subscribe to them: peers, or sessions of zenoh."""
+
+    def __init__(self) -> None:
+        self._sources: dict[_TopicRole, dict[Hashable, None]] = {}
+        self._changed: set[str] = set()
+
+    def is_published(self, topic: str) -> bool:
+        return (topic, ROLE_PUBLISHES) in self._sources
+
+    def is_subscribed(self, topic: str) -> bool:
+        return (topic, ROLE_SUBSCRIBES) in self._sources
+
+    def topics(self) -> set[str]:
+        return {topic for topic, _ in self._sources}
+
+    def sources_of(self, topic: str, role: int) -> list[Hashable]:
+        return list(self._sources.get((topic, role), ()))
+
+    def entries_of(self, source: Hashable) -> list[_TopicRole]:
+        """What a source publishes and subscribes to."""
+        return [entry for entry, sources in self._sources.items() if source in sources]
+
+    def pop_changed(self) -> set[str]:
+        """The topics that got their first source in a role, or lost the last one, since the last call."""
+        changed, self._changed = self._changed, set()
+        return changed
+
+    def add(self, topic: str, role: int, source: Hashable) -> bool:
+        """Enter a source; False if the table is full."""
+        sources = self._sources.get((topic, role))
+        if sources is None:
+            if len(self._sources) >= TABLE_MAX:
+                return False
+            sources = self._sources[topic, role] = {}
+            self._changed.add(topic)
+        if source not in sources and len(sources) >= TABLE_MAX:
+            return False
+        sources[source] = None
+        return True
+
+    def remove(self, topic: str, role: int, source: Hashable) -> None:
+        sources = self._sources.get((topic, role))
+        if sources is None:
+            return
+        sources.pop(source, None)
+        if not sources:
+            del self._sources[topic, role]
+            self._changed.add(topic)
+
+
+class LeasedDemand(Demand):
+    """Demand by management messages: what r2p modules say holds for a lease, what firmware says for good.
+
+    It uses the timers of its discovery, with keys that begin with "demand".
+    """
+
+    def __init__(self, timers: KeyedTimers, directory: Directory) -> None:
+        super().__init__()
+        self._timers = timers
+        self._directory = directory
+        self._permanent: dict[PeerAddress, dict[_TopicRole, None]] = {}
+        """Entries without a lease, by source."""
+
+    def receive(self, now: int, message: management.Management, source: PeerAddress) -> None:
+        match message:
+            case management.Advertise(topic) | management.SubscribeResponse(topic):
+                self._enter(now, topic, ROLE_PUBLISHES, source)
+            case management.SubscribeRequest(topic):
+                self._enter(now, topic, ROLE_SUBSCRIBES, source)
+            case management.Unsubscribe(topic, instance) if self._directory.is_alone(source, instance):
+                self.expired(topic, ROLE_SUBSCRIBES, source)
+            case management.Hello(_, instance, flags, 0):
+                if not flags & management.HELLO_LEAVING:
+                    self._start_leases(now, source)
+                elif self._directory.is_alone(source, instance):
+                    self._source_gone(source)
+
+    def expired(self, topic: str, role: int, source: PeerAddress) -> None:
+        """End an entry."""
+        self._timers.clear(("demand", topic, role, source))
+        permanent = self._permanent.get(source)
+        if permanent is not None:
+            permanent.pop((topic, role), None)
+            if not permanent:
+                del self._permanent[source]
+        self.remove(topic, role, source)
+
+    def link_down(self) -> None:
+        """End all leases. Firmware does not notice that the link is down, so its entries stay."""
+        for topic, role in list(self._sources):
+            for source in list(self._sources.get((topic, role), ())):
+                if ("demand", topic, role, source) in self._timers:
+                    self.expired(topic, role, source)
+
+    def _source_gone(self, source: PeerAddress) -> None:
+        for topic, role in self.entries_of(source):
+            self.expired(topic, role, source)
+
+    def _enter(self, now: int, topic: str, role: int, source: PeerAddress) -> None:
+        lease = self._lease(source)  # None also while an r2p module's HELLO has not come: see `_start_leases`
+        if not self.add(topic, role, source):
+            return
+        if lease is not None:
+            self._timers.set(("demand", topic, role, source), now + lease)
+            self._permanent.get(source, {}).pop((topic, role), None)
+        elif ("demand", topic, role, source) not in self._timers:
+            self._permanent.setdefault(source, {})[topic, role] = None
+
+    def _start_leases(self, now: int, source: PeerAddress) -> None:
+        """What a module said before its first HELLO is a lease, too."""
+        lease = self._lease(source) if source in self._permanent else None
+        if lease is not None:
+            for topic, role in self._permanent.pop(source):
+                self._timers.set(("demand", topic, role, source), now + lease)
+
+    def _lease(self, source: PeerAddress) -> int | None:
+        lease = self._directory.lease_of(source)
+        return lease if lease is not None and lease < FOR_EVER else None

@@ -30,12 +30,7 @@ MESSAGE_OF_COMMAND: dict[Command, type[management.Order]] = {
     Command.BOOTLOAD: management.Bootload,
 }
 COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, MESSAGE_OF_COMMAND, strict=True))
-"""The command by the type byte of its message, as a DENIED names it."""
-
-
-def command_of(message: management.Order) -> Command:
-    """The command that a message gives."""
-    return next(command for command, cls in MESSAGE_OF_COMMAND.items() if type(message) is cls)
+"""The command by the type byte of its message: `management.order_type`."""
 
 
 class TopicType(msgspec.Struct, frozen=True):
@@ -225,7 +220,7 @@ Event = (
     | QueryTokens
 )
 
-_ECHO_MEMORY = 256
+_SENT_MAX = 256
 """Messages that are recognised when a line echoes them: more than are on the way at a time."""
 
 
@@ -235,7 +230,7 @@ class Outbox:
     def __init__(self) -> None:
         self.up = False
         self._events: list[Event] = []
-        self._sent: deque[bytes] = deque(maxlen=_ECHO_MEMORY)
+        self._sent: deque[bytes] = deque(maxlen=_SENT_MAX)
 
     def send(self, *messages: management.Management, urgent: bool = False) -> None:
         if self.up:

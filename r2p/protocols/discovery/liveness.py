@@ -4,7 +4,6 @@ Firmware is known by its ALIVE only. It never says good-bye, and is remembered f
 with the random number of its start (its instance), which tells a restart from a second module with the same name.
 """
 
-from collections import Counter
 from collections.abc import Hashable
 from typing import TypeVar
 
@@ -19,11 +18,9 @@ from r2p.protocols.discovery.events import (
     ModuleGone,
     ModuleInfo,
     NameConflict,
-    Outbox,
     PeerAddress,
 )
 from r2p.protocols.discovery.negotiation import SubscriptionNegotiation
-from r2p.protocols.timers import KeyedTimers
 from r2p.units import SECOND
 
 _REPORT_INTERVAL = 5 * SECOND
@@ -41,23 +38,15 @@ _RESTART = management.FLAG_REBOOTED | management.FLAG_BOOT
 class PeerLiveness:
     """The modules of one link."""
 
-    def __init__(
-        self,
-        announcer: Announcer,
-        negotiation: SubscriptionNegotiation,
-        directory: Directory,
-        timers: KeyedTimers,
-        outbox: Outbox,
-        counts: Counter[str],
-    ) -> None:
+    def __init__(self, announcer: Announcer, negotiation: SubscriptionNegotiation, directory: Directory) -> None:
         self._module = announcer.module
         self._instance = announcer.instance
         self._announcer = announcer
         self._negotiation = negotiation
         self._directory = directory
-        self._timers = timers
-        self._outbox = outbox
-        self._counts = counts
+        self._timers = directory.timers
+        self._outbox = announcer.outbox
+        self._counts = directory.counts
         self._aliases = Aliases()
         self._echoing_until = 0
         self._next_report: dict[str, int] = {}

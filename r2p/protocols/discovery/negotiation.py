@@ -5,19 +5,22 @@ and where many of them ask at once, they share an answer (`SharedAnswers`). Only
 
 A type that does not fit is refused by both sides, because each sends its own with every repetition and as the answer to
 what it refuses. A TYPE is never answered, so two modules that disagree don't argue for ever.
+
+A subscription of firmware lasts for ever. That of an r2p peer (its HELLO came without a gateway in between) is a lease.
+After a good-bye a peer counts as r2p until its lease would be over, because what it sent before may still arrive.
 """
 
-from collections import Counter
 from typing import Generic, TypeVar
+
+import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic
-from r2p.protocols.discovery.directory import LEASE, Directory
+from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, decrement
 from r2p.protocols.discovery.events import (
     Mismatched,
     ModuleInfo,
-    Outbox,
     PeerAddress,
     PublisherFound,
     PublisherGone,
@@ -25,36 +28,83 @@ from r2p.protocols.discovery.events import (
     SubscribersGone,
     TopicType,
 )
-from r2p.protocols.discovery.peers import Peer, Peers
-from r2p.protocols.timers import KeyedTimers
+from r2p.units import MILLISECOND, SECOND
 
 M = TypeVar("M")
 
 _SENT_BY_R2P = (UNANSWERED, ANSWERED)
 
-GRACE = 50_000_000
+GRACE = 50 * MILLISECOND
 """Ns after a SUBSCRIBE_RESPONSE, or a reconnect, in which firmware drops messages of the topic: the thread that handles
 the response has its lowest priority."""
-_SHARED_GAP = 20_000_000
+_SHARED_GAP = 20 * MILLISECOND
 """Ns between two answers about one topic, for each module on the link."""
 _AT_ONCE = 3
 """Answers about one topic that need not wait."""
+_RESPONSE_LOST = SECOND
+"""Ns after which a response has arrived or was lost: less than a round of repetition."""
+PEERS_MAX = 4096
+"""Peers on one link."""
+
+
+class Peer(msgspec.Struct, eq=False):
+    """One address on the link.
+
+    `direct` are the r2p modules there, by name; a line with more than two ends has several at one address. `lease` is
+    in ns, None: as long as the module lives. `publishers` are the topics whose messages are accepted from this address,
+    with params and size.
+
+    `subscriptions` are the topics that the peer subscribes to, and whether it may have restarted since: then its next
+    request is as good as new. `permanent` are those that are no leases, `joined_at` (ns) is when `SubscriberJoined` was
+    emitted last, and `waiting` are those that get no messages yet. The keys of `types` and `mismatched` are topic and
+    role.
+    """
+
+    source: PeerAddress
+    direct: set[str] = msgspec.field(default_factory=set)
+    r2p_until: int = 0
+    lease: int | None = None
+    subscriptions: dict[str, bool] = msgspec.field(default_factory=dict)
+    joined_at: dict[str, int] = msgspec.field(default_factory=dict)
+    permanent: set[str] = msgspec.field(default_factory=set)
+    waiting: dict[str, SubscriberJoined] = msgspec.field(default_factory=dict)
+    publishers: dict[str, tuple[bytes, int]] = msgspec.field(default_factory=dict)
+    types: dict[tuple[str, int], TopicType] = msgspec.field(default_factory=dict)
+    mismatched: dict[tuple[str, int], TopicType] = msgspec.field(default_factory=dict)
+
+    def is_r2p(self, now: int) -> bool:
+        return bool(self.direct) or now < self.r2p_until
+
+    def add_module(self, now: int, info: ModuleInfo) -> None:
+        """Enter an r2p module that said HELLO from this address."""
+        lease = None if info.lease >= FOR_EVER else info.lease
+        shared = len(self.direct) > (info.name in self.direct)
+        if shared and lease is not None:  # the longest lease counts, and that only ends with them all
+            lease = max(lease, self.lease) if self.lease is not None else None
+        self.lease = lease
+        self.direct.add(info.name)
+        self.r2p_until = max(self.r2p_until, now + info.lease)
+
+    def mark_restarted(self) -> None:
+        self.subscriptions = dict.fromkeys(self.subscriptions, True)
+
+    def forget_type(self, topic: str, role: int) -> None:
+        self.types.pop((topic, role), None)
+        self.mismatched.pop((topic, role), None)
 
 
 class SubscriptionNegotiation:
     """The subscriptions of one link, by peer and topic."""
 
-    def __init__(
-        self, own: Announcer, directory: Directory, timers: KeyedTimers, outbox: Outbox, counts: Counter[str]
-    ) -> None:
+    def __init__(self, own: Announcer, directory: Directory) -> None:
         self._own = own
         self._directory = directory
-        self._timers = timers
-        self._outbox = outbox
-        self._counts = counts
-        self._peers = Peers(counts)
-        self._offers = SharedAnswers[management.Advertise](timers, ROLE_PUBLISHES)
-        self._requests = SharedAnswers[management.SubscribeRequest](timers, ROLE_SUBSCRIBES)
+        self._timers = directory.timers
+        self._outbox = own.outbox
+        self._counts = directory.counts
+        self._peers: dict[PeerAddress, Peer] = {}
+        self._offers = SharedAnswers[management.Advertise](directory, ROLE_PUBLISHES)
+        self._requests = SharedAnswers[management.SubscribeRequest](directory, ROLE_SUBSCRIBES)
         self._attached: set[str] = set()
         """The topics for which `SubscriberJoined` was emitted, and no `SubscribersGone` since."""
 
@@ -65,13 +115,11 @@ class SubscriptionNegotiation:
         topic = message.topic
         self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
         own = self._own.subscribers.get(topic)
-        peer = self._peers.get_or_create(source) if own is not None else None
+        peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
             return
         # Firmware is asked at once and every time: it may have restarted, which it does not say.
-        if peer.is_r2p(now) and (
-            _receives(peer, message) or self._offers.defer(now, topic, source, message, self._directory.r2p_modules)
-        ):
+        if peer.is_r2p(now) and (_receives(peer, message) or self._offers.defer(now, topic, source, message)):
             return
         self._send_request(now, topic, own, [(peer, message)])
 
@@ -80,31 +128,31 @@ class SubscriptionNegotiation:
         topic = message.topic
         self._directory.add_type(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
         own = self._own.publishers.get(topic)
-        peer = self._peers.get_or_create(source) if own is not None else None
+        peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
             return
         r2p = peer.is_r2p(now) or message.params in _SENT_BY_R2P  # its HELLO may be later than its request
-        if not (r2p and self._requests.defer(now, topic, source, message, self._directory.r2p_modules)):
+        if not (r2p and self._requests.defer(now, topic, source, message)):
             self._send_response(now, topic, own, [(peer, message)])
 
     def responded(self, now: int, message: management.SubscribeResponse, source: PeerAddress) -> None:
         """SUBSCRIBE_RESPONSE, of a publisher that will send: accept its messages."""
         topic = message.topic
-        peer = self._peers.get_or_create(source) if topic in self._own.subscribers else None
+        peer = self._get_or_create(source) if topic in self._own.subscribers else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, message)):
             return
         self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size))
         # Every response to a repeated request comes here; only new params, as after a restart, are an event.
         if peer.publishers.get(topic) != (message.params, message.size):
+            self._own.publisher_counts[topic] += topic not in peer.publishers
             peer.publishers[topic] = (message.params, message.size)
-            self._own.with_publisher.add(topic)
             self._outbox.emit(PublisherFound(topic, source, message.params, message.size))
 
     def typed(self, now: int, message: management.TypeInfo, source: PeerAddress) -> None:
         """TYPE: compare a peer's type of a topic with this module's, if it has the topic."""
         self._directory.add_type(now, message.topic, message.role, TopicType(message.size, message.fingerprint))
         own = self._counterpart(message.role).get(message.topic)
-        peer = self._peers.get_or_create(source) if own is not None else None
+        peer = self._get_or_create(source) if own is not None else None
         if peer is not None:
             theirs = peer.types[message.topic, message.role] = TopicType(message.size, message.fingerprint)
             self._fits(peer, message.topic, message.role, theirs)
@@ -123,13 +171,13 @@ class SubscriptionNegotiation:
 
     def answer(self, now: int, role: int, topic: str) -> None:
         """Answer all r2p modules that have said since the last answer that they publish or subscribe to the topic."""
-        own, modules = self._counterpart(role).get(topic), self._directory.r2p_modules
+        own = self._counterpart(role).get(topic)
         if role == ROLE_PUBLISHES:
-            offers = self._with_peers(self._offers.pop(now, topic, modules))
+            offers = self._with_peers(self._offers.pop(now, topic))
             if own is not None and offers:
                 self._send_request(now, topic, own, offers)
         else:
-            requests = self._with_peers(self._requests.pop(now, topic, modules))
+            requests = self._with_peers(self._requests.pop(now, topic))
             if own is not None and requests:
                 self._send_response(now, topic, own, requests)
 
@@ -163,9 +211,10 @@ class SubscriptionNegotiation:
         self._outbox.send(management.SubscribeResponse(topic, own.type.size, queue, own.params))
         for peer, request in requests:
             unanswered = peer.is_r2p(now) and request.params == UNANSWERED
-            if self._peers.add_subscriber(now, peer, topic, unanswered=unanswered):
-                self._own.with_subscriber.add(topic)
-                self._add_subscriber(now, peer, SubscriberJoined(topic, request.params, request.queue, peer.source))
+            if self._add_subscriber(now, peer, topic, unanswered=unanswered):
+                self._announce_subscriber(
+                    now, peer, SubscriberJoined(topic, request.params, request.queue, peer.source)
+                )
             self._renew(now, peer, topic)
 
     def _may_subscribe(self, peer: Peer, topic: str) -> bool:
@@ -176,7 +225,7 @@ class SubscriptionNegotiation:
 
     def type_changed(self, topic: str, role: int) -> None:
         """Compare this module's new type of a topic with those of the peers in this role."""
-        for peer in self._peers.all():
+        for peer in list(self._peers.values()):
             peer.mismatched.pop((topic, role), None)  # so a mismatch with the new type is reported, too
             theirs = peer.types.get((topic, role))
             if theirs is not None:
@@ -185,14 +234,14 @@ class SubscriptionNegotiation:
     def withdrawn(self, topic: str) -> None:
         """End all remote subscriptions of a topic that this module no longer publishes."""
         self._requests.forget(topic)
-        for peer in self._peers.all():
+        for peer in list(self._peers.values()):
             self._remove_subscriber(peer, topic)
             peer.forget_type(topic, ROLE_SUBSCRIBES)
 
     def subscription_ended(self, topic: str) -> None:
         """Stop accepting messages of a topic that this module no longer subscribes to."""
         self._offers.forget(topic)
-        for peer in self._peers.all():
+        for peer in list(self._peers.values()):
             self._remove_publisher(peer, topic)
             peer.forget_type(topic, ROLE_PUBLISHES)
 
@@ -200,7 +249,7 @@ class SubscriptionNegotiation:
 
     def module_found(self, now: int, info: ModuleInfo, *, is_new: bool) -> None:
         """An r2p module is directly at an address: from now on, subscriptions from there are leases."""
-        peer = self._peers.get_or_create(info.source)
+        peer = self._get_or_create(info.source)
         if peer is None:
             return
         if not peer.is_r2p(now):  # nor was it firmware that had subscribed before the link was down
@@ -236,12 +285,12 @@ class SubscriptionNegotiation:
         """End all leases. Firmware does not notice that the link is down, so its subscriptions stay."""
         self._offers.clear()
         self._requests.clear()
-        for peer in self._peers.all():
+        for peer in list(self._peers.values()):
             peer.r2p_until = 0  # another module may answer after the reconnect
             for topic in [topic for topic in peer.subscriptions if topic not in peer.permanent]:
                 self._remove_subscriber(peer, topic)
             peer.mark_restarted()
-            self._peers.prune(peer)
+            self._prune(peer)
 
     def lease_over(self, source: PeerAddress, topic: str) -> None:
         peer = self._peers.get(source)
@@ -265,7 +314,7 @@ class SubscriptionNegotiation:
         """Forget a peer: what it sent before it left has arrived by now."""
         peer = self._peers.get(source)
         if peer is not None:
-            self._peers.prune(peer)
+            self._prune(peer)
 
     def _forget_peer(self, now: int, peer: Peer) -> None:
         self._offers.remove(peer.source)
@@ -278,6 +327,21 @@ class SubscriptionNegotiation:
         peer.mismatched.clear()
         peer.r2p_until = now + LEASE
         self._timers.set(("peer", peer.source), peer.r2p_until)
+
+    def _get_or_create(self, source: PeerAddress) -> Peer | None:
+        """Return the peer at this address; None, and counted, where there are too many."""
+        peer = self._peers.get(source)
+        if peer is None:
+            if len(self._peers) >= PEERS_MAX:
+                self._counts["too many peers"] += 1
+                return None
+            peer = self._peers[source] = Peer(source)
+        return peer
+
+    def _prune(self, peer: Peer) -> None:
+        """Forget a peer that has no module, no subscription and no publisher."""
+        if not (peer.direct or peer.subscriptions or peer.publishers):
+            self._peers.pop(peer.source, None)
 
     def _counterpart(self, role: int) -> dict[str, LocalTopic]:
         """This module's topics in the opposite role of a peer."""
@@ -300,7 +364,22 @@ class SubscriptionNegotiation:
             self._remove_publisher(peer, topic)
         return False
 
-    def _add_subscriber(self, now: int, peer: Peer, joined: SubscriberJoined) -> None:
+    def _add_subscriber(self, now: int, peer: Peer, topic: str, *, unanswered: bool) -> bool:
+        """Enter a subscription; return whether it is new, or as good as new.
+
+        It is as good as new after a restart. So it is where the peer is still `unanswered` a while after it joined: the
+        response was lost, and with it what was sent before the peer accepted anything.
+        """
+        restarted = peer.subscriptions.get(topic)
+        peer.subscriptions[topic] = False
+        if restarted is None:
+            self._own.subscriber_counts[topic] += 1
+        elif not restarted and not (unanswered and now - peer.joined_at[topic] >= _RESPONSE_LOST):
+            return False
+        peer.joined_at[topic] = now
+        return True
+
+    def _announce_subscriber(self, now: int, peer: Peer, joined: SubscriberJoined) -> None:
         """Attach a new subscriber. Firmware gets time to handle the response before the first message."""
         if peer.is_r2p(now) or joined.params in _SENT_BY_R2P:
             self._attach(joined)
@@ -328,16 +407,17 @@ class SubscriptionNegotiation:
         self._timers.clear(("lease", peer.source, topic))
         if peer.waiting.pop(topic, None) is not None:
             self._timers.clear(("grace", peer.source, topic))
-        if self._peers.remove_subscriber(peer, topic):
-            self._own.with_subscriber.discard(topic)
-            if topic in self._attached:
-                self._attached.remove(topic)
-                self._outbox.emit(SubscribersGone(topic))
+        if peer.subscriptions.pop(topic, None) is None:
+            return
+        peer.permanent.discard(topic)
+        del peer.joined_at[topic]
+        if decrement(self._own.subscriber_counts, topic) and topic in self._attached:
+            self._attached.remove(topic)
+            self._outbox.emit(SubscribersGone(topic))
 
     def _remove_publisher(self, peer: Peer, topic: str) -> None:
         if peer.publishers.pop(topic, None) is not None:
-            if not any(topic in each.publishers for each in self._peers.all()):  # then requests say so again
-                self._own.with_publisher.discard(topic)
+            decrement(self._own.publisher_counts, topic)
             self._outbox.emit(PublisherGone(topic, peer.source))
 
 
@@ -368,30 +448,30 @@ class SharedAnswers(Generic[M]):
     that begin with "answer".
     """
 
-    def __init__(self, timers: KeyedTimers, role: int) -> None:
-        self._timers = timers
+    def __init__(self, directory: Directory, role: int) -> None:
+        self._directory = directory
+        self._timers = directory.timers
         self._role = role
         self._full_at: dict[str, int] = {}
         self._deferred: dict[str, dict[PeerAddress, M]] = {}
 
-    def defer(self, now: int, topic: str, source: PeerAddress, message: M, modules: int) -> bool:
-        """Whether the answer to this message waits for its timer; `modules` are known on the link."""
+    def defer(self, now: int, topic: str, source: PeerAddress, message: M) -> bool:
+        """Decide whether the answer to this message waits for its timer."""
         deferred = self._deferred.get(topic)
         if deferred is not None:
             deferred[source] = message
             return True
-        gap = _SHARED_GAP * modules
-        ready = self._full_at.get(topic, 0) - (_AT_ONCE - 1) * gap
+        ready = self._full_at.get(topic, 0) - (_AT_ONCE - 1) * self._gap
         if ready <= now:
-            self._count(now, topic, gap)
+            self._count(now, topic)
             return False
         self._deferred[topic] = {source: message}
         self._timers.set(("answer", self._role, topic), ready)
         return True
 
-    def pop(self, now: int, topic: str, modules: int) -> list[tuple[PeerAddress, M]]:
+    def pop(self, now: int, topic: str) -> list[tuple[PeerAddress, M]]:
         """The peers to answer now that the timer has run out, and what each of them said last."""
-        self._count(now, topic, _SHARED_GAP * modules)
+        self._count(now, topic)
         return list(self._deferred.pop(topic, {}).items())
 
     def remove(self, source: PeerAddress, topic: str | None = None) -> None:
@@ -408,5 +488,9 @@ class SharedAnswers(Generic[M]):
         for topic in self._full_at.keys() | self._deferred.keys():
             self.forget(topic)
 
-    def _count(self, now: int, topic: str, gap: int) -> None:
-        self._full_at[topic] = max(self._full_at.get(topic, 0), now) + gap
+    @property
+    def _gap(self) -> int:
+        return _SHARED_GAP * self._directory.r2p_modules
+
+    def _count(self, now: int, topic: str) -> None:
+        self._full_at[topic] = max(self._full_at.get(topic, 0), now) + self._gap

@@ -5,17 +5,18 @@ from collections import Counter
 import msgspec
 
 from r2p.codecs.liveliness import ModuleToken, TopicToken
-from r2p.protocols.discovery.directory import FOR_EVER, MOST, EndpointInfo, EndpointKey
+from r2p.protocols.discovery.directory import FOR_EVER, TABLE_MAX, EndpointInfo, EndpointKey, decrement
 from r2p.protocols.discovery.events import Event, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
+from r2p.units import SECOND
 
-_CONFLICT_AFTER = 1_500_000_000
+_CONFLICT_AFTER = 3 * SECOND // 2
 """Ns for which two modules of one name must be there: the token of one that hangs may live for a second."""
 
 
 class ModuleRegistry:
     """The other modules on the network of module `module`, run `instance`. What has changed is added to `events`.
 
-    It keeps MOST modules; of others only the name, so that they are shown as soon as another module is gone.
+    It keeps TABLE_MAX modules; of others only the name, so that they are shown as soon as another module is gone.
     """
 
     def __init__(self, module: str, instance: int, events: list[Event], counts: Counter[str]) -> None:
@@ -60,12 +61,10 @@ class ModuleRegistry:
     def endpoint_disappeared(self, token: TopicToken) -> None:
         """Remove it, unless another token declares it as well, as when its class has changed."""
         key = _endpoint_key(token)
-        if key is not None and key in self._endpoint_tokens:
-            self._endpoint_tokens[key] -= 1
-            if not self._endpoint_tokens[key]:
-                del self._endpoint_tokens[key], self.endpoints[key]
-                self._forget_endpoint(key)
-                self.generation += 1
+        if key is not None and key in self._endpoint_tokens and decrement(self._endpoint_tokens, key):
+            del self.endpoints[key]
+            self._forget_endpoint(key)
+            self.generation += 1
 
     # Without tokens
 
@@ -90,13 +89,13 @@ class ModuleRegistry:
 
     def next_deadline(self) -> int | None:
         """When to call `poll` (monotonic ns); a time in the past means at once."""
-        if self._without_room and len(self.modules) < MOST:
+        if self._without_room and len(self.modules) < TABLE_MAX:
             return 0
         return min(self._conflict_at.values(), default=None)
 
     def poll(self, now: int) -> None:
         """Show modules that have room now, and report two modules that have had the same name for long enough."""
-        while self._without_room and len(self.modules) < MOST:
+        while self._without_room and len(self.modules) < TABLE_MAX:
             self._update(now, next(iter(self._without_room)))
         for name in [name for name, due in self._conflict_at.items() if due <= now]:
             del self._conflict_at[name]
@@ -124,7 +123,7 @@ class ModuleRegistry:
             self._conflict_at.pop(name, None)
 
     def _keep(self, before: ModuleInfo | None, info: ModuleInfo) -> None:
-        if before is None and len(self.modules) >= MOST:
+        if before is None and len(self.modules) >= TABLE_MAX:
             self._counts["modules forgotten"] += 1
             if info.name in self._tokens:  # firmware is announced again, a token is not
                 self._without_room[info.name] = None

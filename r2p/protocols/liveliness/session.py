@@ -16,9 +16,7 @@ from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBS
 from r2p.errors import DecodeError
 from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Relayed
-from r2p.protocols.discovery.base import DiscoveryProtocol
-from r2p.protocols.discovery.demand import Demand
-from r2p.protocols.discovery.directory import MOST, Aliases
+from r2p.protocols.discovery.directory import TABLE_MAX, Aliases, Demand
 from r2p.protocols.discovery.events import (
     COMMAND_OF_TYPE,
     MESSAGE_OF_COMMAND,
@@ -32,23 +30,22 @@ from r2p.protocols.discovery.events import (
     QueryTokens,
     Send,
     TopicType,
-    command_of,
 )
-from r2p.protocols.liveliness.matching import Matching
+from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.protocols.liveliness.modules import ModuleRegistry
-from r2p.protocols.liveliness.tokens import DeclaredTopic, TokenSet
+from r2p.protocols.liveliness.tokens import DeclaredTopic, Matching, TokenSet
 from r2p.units import SECOND
 
-TOKENS_MAX = 4 * MOST
+TOKENS_MAX = 4 * TABLE_MAX
 """Tokens of other modules that are kept."""
 
 _MARK_EVERY = SECOND // 2
 """Ns after which what has a token is marked as heard once more."""
 
-_FIRST_PAUSE = 5 * SECOND
+_PAUSE_MIN = 5 * SECOND
 """Ns from when there is room for refused tokens until they are queried; twice as long each time."""
 
-_LONGEST_PAUSE = 300 * SECOND
+_PAUSE_MAX = 300 * SECOND
 """Ns that this pause may become, and ns without a query after which it is short again."""
 
 
@@ -90,7 +87,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def generation(self) -> int:
         return self._modules.generation
 
-    # What the module has and wants
+    # What this module has
 
     def set_flags(self, now: int, flags: int) -> list[Event]:
         if flags != self._own.flags:
@@ -108,7 +105,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def subscribe(
         self, now: int, topic: str, size: int = 0, queue: int = 16, fingerprint: bytes = ANY_TYPE
     ) -> list[Event]:
-        """`queue` 0: any number of messages may be on the way, the module would rather lose some."""
+        """`queue` 0: any number of messages may be on the way, as the module would rather lose some."""
         return self._set_topic(topic, ROLE_SUBSCRIBES, DeclaredTopic(TopicType(size, fingerprint), queue))
 
     def unsubscribe(self, now: int, topic: str) -> list[Event]:
@@ -163,7 +160,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         else:
             self.counts["name not carried"] += 1
 
-    # What the user wants
+    # What users ask for
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         self._send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
@@ -186,13 +183,13 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._pop_events()
 
     def link_down(self, now: int) -> list[Event]:
-        """The network is away: forget all tokens, which will appear again. This module's own are declared anew then."""
+        """Forget all tokens, which will appear again. This module's own are declared anew then."""
         self._up = False
         self._events += self._own.withdraw_all()
         for key in list(self._tokens):
             self._remove_token(now, key)
         self._refused.clear()
-        self._modules.clear()  # what is left is firmware, of which gateways tell by messages
+        self._modules.clear()  # what is left is firmware, which gateways announce by messages
         return self._pop_events()
 
     def leave(self, now: int) -> list[Event]:
@@ -232,7 +229,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     # Tokens of other modules
 
     def appeared(self, now: int, key: str) -> list[Event]:
-        """A token is there; what is known already is ignored."""
+        """Handle a token that is there; one that is known already is ignored."""
         token = None if key in self._tokens else self._decoded(key)
         if token is None or token.session == self._instance:
             return self._pop_events()
@@ -259,18 +256,18 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._pop_events()
 
     def refused(self, now: int) -> list[Event]:
-        """There was no room for a token."""
+        """Count a token for which there was no room."""
         self.counts["too many tokens"] += 1
         return self.missed(now, 1)
 
     def missed(self, now: int, count: int) -> list[Event]:
-        """This many tokens may be there that were not reported; they are queried when there is room for them."""
+        """Note that so many tokens may be there that were not reported, which are queried when there is room."""
         self._refused.add(count)
         self._review_refused(now)
         return self._pop_events()
 
     def query_ended(self, now: int, *, complete: bool) -> list[Event]:
-        """All answers to `QueryTokens` have come, or, if not `complete`, some of them."""
+        """Note that all answers to `QueryTokens` have come, or, if not `complete`, some of them."""
         self._refused.query_ended(complete=complete)
         self._review_refused(now)
         return self._pop_events()
@@ -317,7 +314,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def _handle(self, now: int, message: management.Management, source: PeerAddress) -> None:
         match message:
             case management.Stop(self._module) | management.Reboot(self._module) | management.Bootload(self._module):
-                self._events.append(CommandReceived(command_of(message)))
+                self._events.append(CommandReceived(COMMAND_OF_TYPE[management.order_type(message)]))
             case management.Conflict(self._module, a, b) if self._instance in (a, b):
                 self._events.append(NameConflict(self._module, a, b))
             case management.Denied(gateway, module, order, reason) if order in COMMAND_OF_TYPE:
@@ -365,7 +362,7 @@ class RefusedTokens:
         """An estimate: a token that went may have been one of those that were refused."""
         self._query_at: int | None = None
         self._querying = False
-        self._pause = _FIRST_PAUSE
+        self._pause = _PAUSE_MIN
         self._last_query: int | None = None
 
     def add(self, count: int = 1) -> None:
@@ -374,11 +371,11 @@ class RefusedTokens:
         self._count += count
 
     def remove_one(self) -> None:
-        """A token is gone that was not kept."""
+        """Note that a token is gone that was not kept."""
         self._count = max(0, self._count - 1)
 
     def clear(self) -> None:
-        """All tokens are gone, and will be reported again."""
+        """Start over: all tokens are gone, and will be reported again."""
         self._any = False
         self._count = 0
         self._query_at = None
@@ -391,8 +388,8 @@ class RefusedTokens:
         """Plan a query if there is room for `free` tokens."""
         if self._querying or self._query_at is not None or not self._fit(free):
             return
-        if self._last_query is not None and now - self._last_query >= _LONGEST_PAUSE:
-            self._pause = _FIRST_PAUSE
+        if self._last_query is not None and now - self._last_query >= _PAUSE_MAX:
+            self._pause = _PAUSE_MIN
         self._query_at = now + self._pause + self._pause * self._spread // 256
 
     def is_due(self, now: int, free: int) -> bool:
@@ -403,11 +400,11 @@ class RefusedTokens:
         if not self._fit(free):
             return False
         self._any, self._count, self._querying = False, 0, True
-        self._last_query, self._pause = now, min(2 * self._pause, _LONGEST_PAUSE)
+        self._last_query, self._pause = now, min(2 * self._pause, _PAUSE_MAX)
         return True
 
     def query_ended(self, *, complete: bool) -> None:
-        """All answers are there; if not `complete`, others may be missing."""
+        """Note that the query is over; if not `complete`, some answers may be missing."""
         self._querying = False
         self._count //= 2  # one that came meanwhile may also be among the answers; rather too few than too many
         self._any = self._any or not complete

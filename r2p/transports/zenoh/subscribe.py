@@ -21,8 +21,7 @@ from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.flow_control import ReceiveWindow
 from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import Sink
-from r2p.runtime.duplicates import LastReceived
-from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link
 from r2p.transports.zenoh.backlog import Backlog

@@ -3,7 +3,7 @@
 import pytest
 
 from r2p.codecs import management as m
-from r2p.protocols.discovery.directory import MOST
+from r2p.protocols.discovery.directory import TABLE_MAX
 from r2p.protocols.discovery.events import (
     Command,
     CommandReceived,
@@ -233,12 +233,12 @@ def test_endpoints_that_are_forgotten_leave_no_timer() -> None:
     discovery = Discovery("A", 1)
     discovery.link_up(0)
     discovery.receive(0, m.encode(m.Hello("B", 2)))
-    for number in range(3 * MOST):
+    for number in range(3 * TABLE_MAX):
         topic = f"t{number}"
         endpoint = m.Endpoint(m.ROLE_PUBLISHES, 2, "n", topic, m.CLASS_NRT)
         discovery.receive(number, m.encode(endpoint))
-    assert len(discovery.endpoints) == MOST
-    assert len(discovery._timers._due) <= MOST + 8
+    assert len(discovery.endpoints) == TABLE_MAX
+    assert len(discovery._timers._due) <= TABLE_MAX + 8
 
 
 def test_a_last_start_that_gateways_still_announce_is_not_a_namesake() -> None:

@@ -200,7 +200,7 @@ class TestHostile:
         assert discovery.counts == {reason: 1}
 
     def test_tables_are_bounded(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(directory, "MOST", 10)
+        monkeypatch.setattr(directory, "TABLE_MAX", 10)
         discovery = started()
         events: list[Event] = []
         for n in range(30):
@@ -216,13 +216,13 @@ class TestHostile:
         assert not discovery.endpoints
 
     def test_addresses_are_bounded(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("r2p.protocols.discovery.peers.MOST", 10)
+        monkeypatch.setattr("r2p.protocols.discovery.negotiation.PEERS_MAX", 10)
         discovery = started()
         assert [joined(discovery, S, source=n) for n in range(12)] == [True] * 10 + [False] * 2
         assert discovery.counts["too many peers"] == 2
 
     def test_addresses_that_left_make_room(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("r2p.protocols.discovery.peers.MOST", 10)
+        monkeypatch.setattr("r2p.protocols.discovery.negotiation.PEERS_MAX", 10)
         discovery = started()
         for n in range(50):
             now = S + n * 6 * S

@@ -193,7 +193,7 @@ def test_modules_ask_one_by_one() -> None:
 
 
 def test_a_module_without_room_is_there_when_another_one_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modules, "MOST", 2)
+    monkeypatch.setattr(modules, "TABLE_MAX", 2)
     network = Network()
     network.add(*KEYS[:4], liveliness.encode(TopicToken(3, ROLE_PUBLISHES, "leds", 3, "node")))
     assert list(network.module.modules) == ["M1", "M2"]
@@ -212,7 +212,7 @@ def test_a_module_without_room_is_there_when_another_one_goes(monkeypatch: pytes
 
 
 def test_modules_without_room_do_not_appear_while_the_network_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modules, "MOST", 2)
+    monkeypatch.setattr(modules, "TABLE_MAX", 2)
     network = Network()
     network.add(*KEYS[:6])
     assert not [each for each in network.module.link_down(0) if isinstance(each, ModuleChanged)]

@@ -306,7 +306,7 @@ async def test_a_router_that_asks_who_is_there_is_not_stopped_by_many_answers() 
 @pytest.mark.parametrize("asks", ["router", "client"])
 async def test_refused_tokens_are_believed_when_there_is_room(monkeypatch: pytest.MonkeyPatch, asks: str) -> None:
     monkeypatch.setattr(liveliness_session, "TOKENS_MAX", 8)
-    monkeypatch.setattr(liveliness_session, "_FIRST_PAUSE", 1)
+    monkeypatch.setattr(liveliness_session, "_PAUSE_MIN", 1)
     async with nodes(net := Net(), "A", "B") as (alice, bob), alien_on(net) as alien:
         link, live = link_of(alice if asks == "router" else bob), alien.liveliness()
         tokens = [live.declare_token(f"r2p/lab/live/*/1/{n:x}/module/M{n}/{n:x}/0/0") for n in range(1, 13)]

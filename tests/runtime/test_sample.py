@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from r2p.runtime.duplicates import DuplicateFilter, LastReceived
-from r2p.runtime.sample import Sample, Source
+from r2p.runtime.sample import DuplicateFilter, LastReceived, Sample, Source
 
 
 def sample(sequence: int, stamp: int, module: str = "A") -> Sample:
