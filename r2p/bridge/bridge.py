@@ -116,13 +116,13 @@ class Bridge:
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
     def make_topic(self, name: str, wake_scheduler: WakeScheduler) -> Topic:
-        """For the module's topic space."""
+        """Make a topic for the module's topic space."""
         return BridgedTopic(name, wake_scheduler, self.ports, self._clock.monotonic, self._held)
 
     # Links
 
     def attach(self, link: Link) -> None:
-        """The module has one more link, up or not yet."""
+        """Add a link, up or not yet."""
         number = next((each for each in range(PORTS_MAX) if each not in self._by_number), None)
         if not link.admits_gateways or number is None:
             number = next(self._client_numbers)
@@ -141,7 +141,7 @@ class Bridge:
         self._port_changed(port)
 
     def link_changed(self, link: Link) -> None:
-        """The link went up or down."""
+        """Follow a link that went up or down."""
         port = self.ports[link.name]
         if link.up:
             self._open(port)
@@ -174,7 +174,7 @@ class Bridge:
         self._act()
 
     def close(self) -> None:
-        """The module ends."""
+        """Stop, as the module ends."""
         self._alarm.close()
         self.directory.close()
 
@@ -337,7 +337,7 @@ class Bridge:
 
 
 class _PortHooks(GatewayHooks):
-    """What the gateway has to say about one of its links."""
+    """What the gateway decides about one of its links."""
 
     def __init__(self, bridge: Bridge, port: BridgePort) -> None:
         self._bridge = bridge

@@ -24,25 +24,27 @@ from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
-from r2p.units import SECOND
+from r2p.units import MILLISECOND, SECOND
 
 ROUNDS = 5
 """Looks at what has changed in a second, at most."""
 
-_REPEAT = 1_500_000_000  # ns in which everything is repeated, if there is little of it
-_REPEAT_MOST = 20_000_000_000  # ns; a HELLO is believed for 65 s at most
+_REPEAT = 3 * SECOND // 2  # ns in which everything is repeated, if there is little of it
+_REPEAT_MAX = 20 * SECOND  # ns; a HELLO is believed for 65 s at most
 _REPEATED = 4_000  # messages a second that only repeat what is known
 _SLICE = 250  # facts that are repeated at once
-_SLICE_APART = 20_000_000  # ns between two of them
+_SLICE_APART = 20 * MILLISECOND  # ns between two of them
 _REST = 10  # times as long as a look took before the next one: on a slow computer it must not take all the time
-_SOON = 2_000_000  # ns; so that what comes together is looked at together
-_APART = 200_000_000  # ns between two answers on one link
-_LATELY = 2_000_000_000  # ns; an answer contains the firmware that was heard since
+_SOON = 2 * MILLISECOND  # ns; so that what comes together is looked at together
+_APART = 200 * MILLISECOND  # ns between two answers on one link
+_LATELY = 2 * SECOND  # ns; an answer contains the firmware that was heard since
 _Key = tuple[object, ...]
 
 
 class _ModuleFact(msgspec.Struct, frozen=True):
-    """A module as it is known on a link, by its canonical name; `foreign`: it is not the robot's."""
+    """A module as it is known on a link, by its canonical name; `foreign`: it is not the robot's. When it was heard is
+    left out: it is no news.
+    """
 
     name: str
     foreign: bool
@@ -127,24 +129,24 @@ class DirectoryRelay:
         self._repeated_at = 0
 
     def query(self, port: BridgePort) -> None:
-        """A peer on the link wants to know everything."""
+        """Announce everything on the link, as a peer there asks for it."""
         self._link(port).asked = True
         self._set_alarm(self._clock.monotonic())
 
     def changed(self, port: BridgePort) -> None:
-        """A module or a node came or went there, or the link has another place in the tree."""
+        """Look at a link where a module or a node came or went, or that has another place in the tree."""
         link = self._link(port)
         if not link.dirty:  # else the alarm is set: many changes at once must not cost as many looks at all links
             link.dirty = True
             self._set_alarm(self._clock.monotonic())
 
     def forget(self, port: BridgePort) -> None:
-        """The link is down, or gone. Its facts are compared with those of other links when it is looked at next."""
+        """Forget what was announced on a link that is down or gone; its facts go when it is looked at next."""
         self._links[port.name] = _LinkDirectory(self._link(port).facts, dirty=True)
         self._set_alarm(self._clock.monotonic())
 
     def close(self) -> None:
-        """The gateway ends."""
+        """Stop, as the gateway ends."""
         self._alarm.close()
 
     def _link(self, port: BridgePort) -> _LinkDirectory:
@@ -227,7 +229,7 @@ class DirectoryRelay:
             self._repeat_slice(port, link, link.to_repeat, now)
 
     def _put_off(self, port: BridgePort, now: int) -> None:
-        """Nothing can be announced there now: look again soon."""
+        """Look again soon, as nothing can be announced there now."""
         link = self._link(port)
         if link.repeat_at is not None or link.asked:
             link.repeat_at = max(link.repeat_at or 0, now + _APART)
@@ -237,7 +239,7 @@ class DirectoryRelay:
     def _period(self) -> int:
         """The time (ns) in which everything is repeated."""
         count = len(self._sources) * max(len(self._ports) - 1, 1)
-        return min(max(_REPEAT, count * SECOND // _REPEATED), _REPEAT_MOST)
+        return min(max(_REPEAT, count * SECOND // _REPEATED), _REPEAT_MAX)
 
     def _meet(self, port: BridgePort) -> None:
         """See whether a peer is new there, which is to get everything."""
@@ -301,7 +303,7 @@ class DirectoryRelay:
             if not self._sources[key]:
                 del self._sources[key]
         for key, fact in link.facts.items():
-            if not _is_same(before.get(key), fact):
+            if before.get(key) != fact:
                 changed[key] = None
             self._sources.setdefault(key, {})[name] = fact
 
@@ -312,8 +314,8 @@ class DirectoryRelay:
             module = self._policy.module_to_canonical(info.name, port.name)
             if module is None:
                 hidden.add(info.instance)
-            elif module[0] != self._name:  # of our name: our last start, which others still announce
-                facts["module", module[0]] = _ModuleFact(*module, info)
+            elif module[0] != self._name:  # else it is this module's last start, which others still announce
+                facts["module", module[0]] = _ModuleFact(*module, msgspec.structs.replace(info, last_heard=0))
         for endpoint in port.link.discovery.endpoints.values():
             topic = self._policy.to_canonical(endpoint.topic, port.name)
             if topic is not None and endpoint.instance != self._instance and endpoint.instance not in hidden:
@@ -339,7 +341,7 @@ class DirectoryRelay:
             link.to_repeat, link.answering = None, False
 
     def _announce(self, port: BridgePort, key: _Key) -> _Announced | None:
-        """Announce on a link what has changed of a fact; gives back what is known there from now on."""
+        """Announce on a link what has changed of a fact; return what is known there from now on."""
         announced = self._link(port).announced
         before = announced.get(key)
         new = self._desired(port, key) if port.in_tree else None
@@ -385,7 +387,7 @@ class DirectoryRelay:
         messages: list[Relayed] = []
         if info.r2p and info.instance is not None:
             flags = management.HELLO_TOOL if info.observer else 0
-            lease = min(max(info.lease, 3 * self._period()) // 1_000_000, management.LEASE_MS_MAX)
+            lease = min(max(info.lease, 3 * self._period()) // MILLISECOND, management.LEASE_MS_MAX)
             messages.append(management.Hello(link_name, info.instance, flags, info.hops + 1, lease))
         if not info.observer:
             messages.append(management.Alive(link_name, info.flags))
@@ -401,14 +403,6 @@ class DirectoryRelay:
             return None  # it is on both links, and uses both
         endpoint = management.Endpoint(info.role, info.instance, info.node, link_name, info.publisher_class)
         return _Announced((endpoint,), 0)
-
-
-def _is_same(before: _Fact | None, now: _Fact) -> bool:
-    """Whether a fact is as it was, but for when it was heard."""
-    if isinstance(before, _ModuleFact) and isinstance(now, _ModuleFact):
-        info = msgspec.structs.replace(now.info, last_heard=before.info.last_heard)
-        return before == msgspec.structs.replace(now, info=info)
-    return before == now
 
 
 def _subject(message: Relayed) -> object:

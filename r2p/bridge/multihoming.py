@@ -48,7 +48,7 @@ class MultihomedModule:
     # Links
 
     def attach(self, link: Link) -> None:
-        """The module has one more link, up or not yet; those that come first are preferred."""
+        """Add a link, up or not yet; those that come first are preferred."""
         self._attached += 1
         port = _MultihomedPort(self, link, self._attached)
         self._ports[link.name] = self._by_number[port.number] = port
@@ -69,7 +69,7 @@ class MultihomedModule:
         self._act()
 
     def link_changed(self, link: Link) -> None:
-        """The link went up or down."""
+        """Follow a link that went up or down."""
         port = self._ports.get(link.name)
         if port is None:
             return
@@ -83,7 +83,7 @@ class MultihomedModule:
             self._announce(list(self._space.topics.values()), [link])
 
     def close(self) -> None:
-        """The module ends."""
+        """Stop, as the module ends."""
         self._alarm.close()
 
     # What comes in
@@ -119,7 +119,7 @@ class MultihomedModule:
         return True
 
     def discovery_changed(self, port: "_MultihomedPort") -> None:
-        """Discovery may have found which module is at the other end, or how long messages of a topic are."""
+        """See whether discovery has found which module is at the other end, or how long messages of a topic are."""
         if port.link.point_to_point and port.link.discovery.generation != port.generation:
             port.generation = port.link.discovery.generation
             self.selection.set_remote(self._now(), port.number, port.link.discovery.sole_peer)
@@ -204,7 +204,7 @@ class MultihomedModule:
         self._alarm.set(self.selection.next_deadline())
 
     def _choose(self) -> None:
-        """Other links are used than before."""
+        """Follow a choice of other links than before."""
         before = self._used
         withouts = {_ALL, *self._without.values()}
         self._used = {without: self.selection.used(self._now(), without) for without in withouts}
@@ -212,7 +212,9 @@ class MultihomedModule:
         ports = [port for number in sorted(changed) if (port := self._by_number.get(number)) and port.link.up]
         for port in ports:
             if port.number in self._used[_ALL]:
-                self._report_used(port.link)
+                if port.link.stands_by:
+                    port.link.stands_by = ""
+                    self._notify(port.link, "used", "is used again", False)
             elif port.number in before[_ALL]:
                 port.link.stats.lost["standing by"] += port.link.discard()  # what waits there would arrive twice
         for topic in self._space.topics.values():
@@ -224,11 +226,6 @@ class MultihomedModule:
         for topic in topics:
             for link in links:
                 link.stats.lost.guard(link.topic_changed, topic)
-
-    def _report_used(self, link: Link) -> None:
-        if link.stands_by:
-            link.stands_by = ""
-            self._notify(link, "used", "is used again", False)
 
     def _report_unused(self, number: int, link: Link) -> None:
         other = self.selection.stands_by_for(number) if link.up and not link.stands_by else None
@@ -250,7 +247,7 @@ class MultihomedModule:
 
 
 class _MultihomedPort(GatewayHooks):
-    """What the module has to say about one of its links."""
+    """One link of the module, and what the module decides about it."""
 
     def __init__(self, owner: MultihomedModule, link: Link, number: int) -> None:
         self.link = link

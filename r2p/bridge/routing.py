@@ -110,8 +110,9 @@ class RoutingTable:
 
     def _review(self, topic: str) -> None:
         ports = [port for port in self._ports.values() if port.in_tree and self._carries(topic, port)]
-        published_on = [port for port in ports if self._is_published(topic, port)]
-        subscribed_on = [port for port in ports if self._is_subscribed(topic, port)]
+        names = {port: self._policy.to_link_name(topic, port.name) for port in ports}
+        published_on = [port for port in ports if port.demand.is_published(names[port])]
+        subscribed_on = [port for port in ports if port.demand.is_subscribed(names[port])]
         if self._is_used(topic, ports, published_on, subscribed_on):
             self._idle.discard(topic)
             self._relay(topic, ports, published_on, subscribed_on)
@@ -290,12 +291,6 @@ class RoutingTable:
         return next((info.types[role] for info in infos if info is not None and role in info.types), None)
 
     # One topic on one link
-
-    def _is_published(self, topic: str, port: BridgePort) -> bool:
-        return port.demand.is_published(self._policy.to_link_name(topic, port.name))
-
-    def _is_subscribed(self, topic: str, port: BridgePort) -> bool:
-        return port.demand.is_subscribed(self._policy.to_link_name(topic, port.name))
 
     def _topic(self, topic: str, port: BridgePort) -> BridgedTopic:
         here = self._space.open(self._policy.to_link_name(topic, port.name), None)

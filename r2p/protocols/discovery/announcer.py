@@ -128,7 +128,7 @@ class Announcer:
 
     def update_r2p(self) -> None:
         """Begin or end the announcement of endpoints, which only r2p modules understand."""
-        r2p = self._directory.knows_r2p
+        r2p = self._directory.r2p_modules > 0
         if self.r2p == r2p:
             return
         self.r2p = r2p

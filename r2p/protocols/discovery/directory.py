@@ -104,8 +104,6 @@ class Directory:
         self.endpoints: dict[EndpointKey, EndpointInfo] = {}
         self.generation = 0
         """A number that changes when modules or endpoints change."""
-        self.direct_instances: dict[str, int] = {}
-        """The instances of the r2p modules on the link itself, not behind a gateway."""
         self.timers = timers
         """Of everything that lasts for a while on this link."""
         self.counts = counts
@@ -117,13 +115,14 @@ class Directory:
         self._starts: dict[str, _Starts] = {}
 
     @property
-    def knows_r2p(self) -> bool:
-        return bool(self._names)
-
-    @property
     def r2p_modules(self) -> int:
         """The number of r2p modules known on the link."""
         return len(self._names)
+
+    def sole_peer(self) -> int | None:
+        """The instance of the only r2p module on the link itself, not behind a gateway; None unless there is one."""
+        direct = [info.instance for there in self._direct.values() for info in there.values() if info.r2p]
+        return direct[0] if len(direct) == 1 else None
 
     def name_of(self, instance: int) -> str:
         return self._names.get(instance, "")
@@ -168,17 +167,13 @@ class Directory:
         before = self.modules.get(info.name)
         if before is not None and before.instance is not None and before.instance != info.instance:
             self._forget_instance(before.instance)  # the endpoints of its last start are gone
-        self.generation += before is None or _identity(before) != _identity(info)
+        self.generation += before is None or before.differs(info)
         forgotten = self._put(self.modules, info.name, info, "modules forgotten")
         self._forget_direct(before)
         self._forget_direct(forgotten)
         self._enter_direct(info)
         if info.instance is not None:
             self._names[info.instance] = info.name
-        if info.instance is not None and not info.hops:
-            self.direct_instances[info.name] = info.instance
-        else:
-            self.direct_instances.pop(info.name, None)
         if forgotten is not None:
             self._forget(forgotten)
         return forgotten
@@ -303,7 +298,6 @@ class Directory:
 
     def _forget(self, info: ModuleInfo) -> None:
         self._starts.pop(info.name, None)
-        self.direct_instances.pop(info.name, None)
         if info.instance is not None:
             self._forget_instance(info.instance)
 
@@ -311,10 +305,6 @@ class Directory:
         self._names.pop(instance, None)
         for key in list(self._endpoints_of.get(instance, ())):
             self.forget_endpoint(key)
-
-
-def _identity(info: ModuleInfo) -> tuple[object, ...]:
-    return (info.instance, info.observer, info.source, info.flags, info.hops)
 
 
 class Aliases:
@@ -437,7 +427,8 @@ class LeasedDemand(Demand):
                 if not flags & management.HELLO_LEAVING:
                     self._start_leases(now, source)
                 elif self._directory.is_alone(source, instance):
-                    self._source_gone(source)
+                    for topic, role in self.entries_of(source):
+                        self.expired(topic, role, source)
 
     def expired(self, topic: str, role: int, source: PeerAddress) -> None:
         """End an entry."""
@@ -455,10 +446,6 @@ class LeasedDemand(Demand):
             for source in list(self._sources.get((topic, role), ())):
                 if ("demand", topic, role, source) in self._timers:
                     self.expired(topic, role, source)
-
-    def _source_gone(self, source: PeerAddress) -> None:
-        for topic, role in self.entries_of(source):
-            self.expired(topic, role, source)
 
     def _enter(self, now: int, topic: str, role: int, source: PeerAddress) -> None:
         lease = self._lease(source)  # None also while an r2p module's HELLO has not come: see `_start_leases`

@@ -73,6 +73,10 @@ class ModuleInfo(msgspec.Struct, frozen=True):
     def r2p(self) -> bool:
         return self.instance is not None
 
+    def differs(self, other: "ModuleInfo") -> bool:
+        """Whether more is another than when the module was heard."""
+        return msgspec.structs.replace(other, last_heard=self.last_heard) != self
+
 
 class Send(msgspec.Struct, frozen=True):
     """Send these 32 bytes on the topic `R2P`, `urgent` ones before everything else."""

@@ -4,7 +4,6 @@ Firmware is known by its ALIVE only. It never says good-bye, and is remembered f
 with the random number of its start (its instance), which tells a restart from a second module with the same name.
 """
 
-from collections.abc import Hashable
 from typing import TypeVar
 
 import msgspec
@@ -156,7 +155,7 @@ class PeerLiveness:
     # Modules
 
     def _present(self, now: int, message: management.Hello, source: PeerAddress) -> None:
-        """An r2p module introduces itself, for the first time or again."""
+        """Enter an r2p module that introduces itself, for the first time or again."""
         # What was known before has to be looked at first: `_enter` replaces it.
         known_start = self._directory.was_before(message.module, message.instance)
         before, info = self._directory.read_hello(now, message, source)
@@ -191,7 +190,7 @@ class PeerLiveness:
         forgotten = self._directory.enter(info)  # made room for this one: as good as gone
         if info.r2p:
             self._timers.set(("module", info.name), now + info.lease)
-        if before is None or _state(before) != _state(info):
+        if before is None or before.differs(info):
             self._outbox.emit(ModuleChanged(info))
         if forgotten is not None and forgotten.r2p:
             self._remove(now, forgotten)
@@ -231,8 +230,3 @@ class PeerLiveness:
 def _restarted(before: int, after: int) -> bool:
     """Whether a module started anew between two ALIVEs: only a start changes its mode or ends a STOP."""
     return bool((before ^ after) & _RESTART or before & ~after & management.FLAG_STOPPED)
-
-
-def _state(info: ModuleInfo) -> tuple[Hashable, ...]:
-    """What `ModuleChanged` reports: everything but the time it was last heard."""
-    return (info.flags, info.instance, info.observer, info.lease, info.hops, info.source)

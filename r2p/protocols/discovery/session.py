@@ -54,6 +54,8 @@ class DiscoveryProtocol(ABC):
     `next_deadline()`, which may have changed after each call.
     """
 
+    flags: int
+    """This module's flags: FLAG_... of ALIVE."""
     counts: Counter[str]
     """Received messages that were dropped, by reason."""
     modules: dict[str, ModuleInfo]
@@ -64,14 +66,9 @@ class DiscoveryProtocol(ABC):
     """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
 
     @property
-    @abstractmethod
-    def flags(self) -> int:
-        """This module's flags: FLAG_... of ALIVE."""
-
-    @property
-    @abstractmethod
     def sole_peer(self) -> int | None:
-        """The instance of the only r2p module on the link itself; None unless there is exactly one."""
+        """The instance of the only r2p module on the link itself; None unless there is one, and just one."""
+        return None
 
     @property
     @abstractmethod
@@ -182,6 +179,7 @@ class Discovery(DiscoveryProtocol):
         observer: bool = False,
         counts: Counter[str] | None = None,
     ) -> None:
+        self.flags = 0
         self.counts = Counter() if counts is None else counts
         self._outbox = Outbox()
         self._schedule = Schedule(rate, burst, round(quiet * SECOND))
@@ -214,13 +212,8 @@ class Discovery(DiscoveryProtocol):
     # What is known of the link
 
     @property
-    def flags(self) -> int:
-        return self._announcer.flags
-
-    @property
     def sole_peer(self) -> int | None:
-        direct = self._directory.direct_instances
-        return next(iter(direct.values())) if len(direct) == 1 else None
+        return self._directory.sole_peer()
 
     @property
     def generation(self) -> int:
@@ -235,8 +228,8 @@ class Discovery(DiscoveryProtocol):
     # What this module has
 
     def set_flags(self, now: int, flags: int) -> list[Event]:
-        if flags != self._announcer.flags:
-            self._announcer.flags = flags
+        if flags != self.flags:
+            self.flags = self._announcer.flags = flags
             self._announcer.announce_once(ItemKind.PRESENCE)
         return self._flush(now)
 

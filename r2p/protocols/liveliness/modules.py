@@ -133,7 +133,7 @@ class ModuleRegistry:
             self._names.pop(before.instance, None)
         if info.instance is not None:
             self._names[info.instance] = info.name
-        if before is None or msgspec.structs.replace(before, last_heard=info.last_heard) != info:
+        if before is None or before.differs(info):
             self.generation += 1
             self._events.append(ModuleChanged(info))
         for key in () if info.instance is None else self._endpoints_of.get(info.instance, ()):

@@ -58,6 +58,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def __init__(
         self, module: str, instance: int, *, observer: bool = False, counts: Counter[str] | None = None
     ) -> None:
+        self.flags = 0
         self.counts = Counter() if counts is None else counts
         self._module = module
         self._instance = instance
@@ -75,22 +76,14 @@ class LivelinessDiscovery(DiscoveryProtocol):
         self._mark_at: int | None = None
 
     @property
-    def flags(self) -> int:
-        return self._own.flags
-
-    @property
-    def sole_peer(self) -> int | None:
-        """None: there may always be more than one module on the network."""
-        return None
-
-    @property
     def generation(self) -> int:
         return self._modules.generation
 
     # What this module has
 
     def set_flags(self, now: int, flags: int) -> list[Event]:
-        if flags != self._own.flags:
+        if flags != self.flags:
+            self.flags = flags
             self._own.set_flags(flags)
         return self._pop_events()
 

@@ -37,7 +37,7 @@ _RELAYED: TopicRole = ("", -1)  # ... and for all that is relayed
 
 
 class DeclaredTopic(msgspec.Struct, frozen=True):
-    """A topic that this module publishes, or subscribes to with a `window` (messages on the way; 0: it may lose some)."""
+    """A topic that this module publishes, or subscribes to (`window` messages may be on the way; 0: any number)."""
 
     type: TopicType
     window: int = 0
@@ -47,7 +47,7 @@ class TokenSet:
     """The tokens of one module."""
 
     def __init__(self, module: str, instance: int, *, observer: bool) -> None:
-        self.flags = 0
+        self._flags = 0
         self._module = module
         self._instance = instance
         self._observer = observer
@@ -67,7 +67,7 @@ class TokenSet:
         return self._topics.get((topic, role))
 
     def set_flags(self, flags: int) -> None:
-        self.flags = flags
+        self._flags = flags
         self._dirty.add(_MODULE)
 
     def set_topic(self, topic: str, role: int, own: DeclaredTopic) -> None:
@@ -126,7 +126,7 @@ class TokenSet:
 
     def _wanted(self, key: TopicRole) -> set[str]:
         if key == _MODULE:
-            module = ModuleToken(self._instance, self._module, self._instance, self.flags, self._observer)
+            module = ModuleToken(self._instance, self._module, self._instance, self._flags, self._observer)
             return {liveliness.encode(module)}
         if key == _RELAYED:
             return {liveliness.encode(token) for token in self._relayed.values()}
@@ -165,7 +165,6 @@ class Matching:
         self._events = events
         self._sessions: dict[int, _PeerSession] = {}
         self._subscribers: Counter[str] = Counter()  # sessions that this module sends to, by topic
-        self._token_counts: Counter[TopicRole] = Counter()
         self._sessions_of: dict[TopicRole, dict[int, _PeerSession]] = {}  # by number
         self._mismatches: Counter[str] = Counter()  # sessions and roles whose type does not fit, by topic
 
@@ -175,9 +174,10 @@ class Matching:
         topic_role = token.topic, token.role
         session.tokens.setdefault(topic_role, {})[key] = token
         self._sessions_of.setdefault(topic_role, {})[token.session] = session
-        self._token_counts[topic_role] += 1
         self.demand.add(*topic_role, token.session)
-        self._update_topic(now, token)
+        info = self.topics.setdefault(token.topic, TopicInfo(token.topic))
+        self._set_heard(now, info, token.role)
+        self._update_type(info, token.role)
         self._match(token.session, session, topic_role)
 
     def disappeared(self, key: str, token: TopicToken) -> None:
@@ -188,14 +188,16 @@ class Matching:
         del tokens[key]
         if not tokens:
             del session.tokens[topic_role]
-            del self._sessions_of[topic_role][token.session]
+            sessions = self._sessions_of[topic_role]
+            del sessions[token.session]
+            if not sessions:
+                del self._sessions_of[topic_role]
             self.demand.remove(*topic_role, token.session)
         self._match(token.session, session, topic_role)
         if not session.tokens:
             del self._sessions[token.session]
         self._update_type(self.topics[token.topic], token.role)
-        if decrement(self._token_counts, topic_role):
-            del self._sessions_of[topic_role]
+        if topic_role not in self._sessions_of:
             self._remove_role(*topic_role)
 
     def changed(self, topic: str, role: int) -> None:
@@ -207,7 +209,7 @@ class Matching:
 
     def mark_heard(self, now: int) -> None:
         """Mark what has a token as heard now."""
-        for topic, role in self._token_counts:
+        for topic, role in self._sessions_of:
             self._set_heard(now, self.topics[topic], role)
 
     def _match(self, number: int, session: _PeerSession, key: TopicRole) -> None:
@@ -258,11 +260,6 @@ class Matching:
         if decrement(self._subscribers, topic):
             self._events.append(SubscribersGone(topic))
 
-    def _update_topic(self, now: int, token: TopicToken) -> None:
-        info = self.topics.setdefault(token.topic, TopicInfo(token.topic))
-        self._set_heard(now, info, token.role)
-        self._update_type(info, token.role)
-
     def _update_type(self, info: TopicInfo, role: int) -> None:
         """A topic has the type of the first session that declares one."""
         sessions = self._sessions_of.get((info.name, role), {}).values()
@@ -277,7 +274,7 @@ class Matching:
 
     def _remove_role(self, topic: str, role: int) -> None:
         """Forget the role of a topic that has lost its last token, and the topic without the other role."""
-        if (topic, _counterpart(role)) not in self._token_counts:
+        if (topic, _counterpart(role)) not in self._sessions_of:
             del self.topics[topic]
         elif role == ROLE_PUBLISHES:
             self.topics[topic].advertised_at = None
