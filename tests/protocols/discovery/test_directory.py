@@ -1,20 +1,24 @@
-"""Aliases of long names, and what they stand for."""
+"""What the modules on a link have said: aliases of long names, and what gateways know of who publishes what."""
 
 from __future__ import annotations
 
 import pytest
 
-from r2p.codecs import management
+from r2p.codecs import management as m
 from r2p.errors import NameTooLong
 from r2p.names import module_alias, module_path
 from r2p.protocols.discovery.directory import Aliases
+from r2p.protocols.discovery.events import Send
+from r2p.protocols.discovery.negotiation import GRACE
+from r2p.protocols.discovery.session import Discovery
 
+SECOND = 1_000_000_000
 NAMES = ["robot1/MOTOR1", "a/b", "ABC_DEFGH", "sixteen_letters_/MOTOR_1"]
 
 
 def test_short_names_are_their_own_aliases() -> None:
     assert module_alias("MOTOR1") == "MOTOR1"
-    assert management.alias_messages("MOTOR1") == []
+    assert m.alias_messages("MOTOR1") == []
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -23,15 +27,15 @@ def test_a_name_travels_in_pieces(name: str) -> None:
     alias = module_alias(module_path(name))
     assert len(alias) <= 7
     assert aliases.name_of(alias) == alias
-    received = [management.decode(management.encode(each)) for each in management.alias_messages(name)]
-    complete = [aliases.receive(each) for each in reversed(received) if isinstance(each, management.Name)]
+    received = [m.decode(m.encode(each)) for each in m.alias_messages(name)]
+    complete = [aliases.receive(each) for each in reversed(received) if isinstance(each, m.Name)]
     assert complete[-1] == name
     assert aliases.name_of(alias) == name
 
 
 def test_an_alias_that_does_not_fit_is_not_believed() -> None:
     aliases = Aliases()
-    assert aliases.receive(management.Name("MOTOR1", 0, "robot1/MOTOR1")) is None
+    assert aliases.receive(m.Name("MOTOR1", 0, "robot1/MOTOR1")) is None
     assert aliases.name_of("MOTOR1") == "MOTOR1"
 
 
@@ -39,8 +43,8 @@ def test_made_up_aliases_are_bounded() -> None:
     aliases = Aliases()
     for number in range(10_000):
         name = f"robot/{number}"
-        aliases.receive(management.Name(module_alias(name), 0, name))
-        aliases.receive(management.Name(f"x{number}", 0x0F, "part"))
+        aliases.receive(m.Name(module_alias(name), 0, name))
+        aliases.receive(m.Name(f"x{number}", 0x0F, "part"))
     assert len(aliases._names) <= 4096
     assert len(aliases._parts) <= 256
 
@@ -54,3 +58,90 @@ def test_how_an_alias_is_made() -> None:
 def test_too_long() -> None:
     with pytest.raises(NameTooLong, match="at most 24"):
         module_path("sixteen_letters_/MOTOR_12")
+
+
+def made() -> Discovery:
+    discovery = Discovery("GW", 1)
+    discovery.demand()
+    discovery.link_up(0)
+    return discovery
+
+
+def hear(discovery: Discovery, now: float, *messages: m.Management, source: str = "a") -> None:
+    for message in messages:
+        discovery.receive(round(now * SECOND), m.encode(message), source)
+
+
+def test_firmware_wants_and_offers_for_good() -> None:
+    discovery = made()
+    hear(discovery, 0, m.Advertise("leds", 5), m.SubscribeRequest("cmd", 12, 5))
+    demand = discovery.demand()
+    assert demand.pop_changed() == {"leds", "cmd"}
+    discovery.poll(1000 * SECOND)
+    assert (demand.is_published("leds"), demand.is_subscribed("cmd"), demand.is_subscribed("leds")) == (
+        True,
+        True,
+        False,
+    )
+    discovery.link_down(1000 * SECOND)
+    assert demand.is_subscribed("cmd")
+
+
+def test_r2p_modules_want_for_a_lease() -> None:
+    discovery = made()
+    hear(discovery, 0, m.Hello("PC1", 7), m.SubscribeRequest("leds", 5, 1))
+    demand = discovery.demand()
+    hear(discovery, 3, m.SubscribeRequest("leds", 5, 1))
+    discovery.poll(7 * SECOND)
+    assert demand.is_subscribed("leds")
+    discovery.poll(9 * SECOND)
+    assert not demand.is_subscribed("leds")
+
+
+def test_a_request_before_the_first_hello_becomes_a_lease() -> None:
+    discovery = made()
+    hear(discovery, 0, m.SubscribeRequest("leds", 5, 1), m.Hello("PC1", 7))
+    discovery.poll(6 * SECOND)
+    assert not discovery.demand().is_subscribed("leds")
+
+
+def test_unsubscribe_and_good_bye() -> None:
+    discovery = made()
+    demand = discovery.demand()
+    hear(discovery, 0, m.Hello("PC1", 7), m.SubscribeRequest("leds", 5, 1), m.Advertise("cmd", 12))
+    hear(discovery, 1, m.Unsubscribe("leds", 7))
+    assert not demand.is_subscribed("leds")
+    hear(discovery, 1, m.Hello("PC1", 7, m.HELLO_LEAVING))
+    assert not demand.is_published("cmd")
+
+
+def test_two_who_share_a_line_do_not_speak_for_each_other() -> None:
+    discovery = made()
+    hear(discovery, 0, m.Hello("PC1", 7), m.Hello("PC2", 8), m.SubscribeRequest("leds", 5, 1))
+    hear(discovery, 1, m.Unsubscribe("leds", 7), m.Hello("PC1", 7, m.HELLO_LEAVING))
+    assert discovery.demand().is_subscribed("leds")
+
+
+def test_who_has_asked_before_joins_at_once() -> None:
+    discovery = made()
+    hear(discovery, 0, m.SubscribeRequest("leds", 5, 1))
+    events = discovery.advertise(SECOND, "leds", 5)
+    assert m.encode(m.SubscribeResponse("leds", 5, 1)) in [event.data for event in events if isinstance(event, Send)]
+    assert "SubscriberJoined" in {type(event).__name__ for event in discovery.poll(SECOND + GRACE)}
+
+
+def test_relayed_messages_take_their_turn() -> None:
+    discovery = Discovery("GW", 1, rate=10.0, burst=2)
+    discovery.link_up(0)
+    for number in range(5):
+        discovery.relay(0, m.Alive(f"M{number}"))
+        discovery.relay(0, m.Alive(f"M{number}"))
+    said = []
+    now = 0
+    while now < 3 * SECOND:
+        now = max(now, discovery.next_deadline() or now) + 1
+        for event in discovery.poll(now):
+            message = m.decode(event.data)  # type: ignore[union-attr]
+            if isinstance(message, m.Alive) and message.module != "GW":
+                said.append(message.module)
+    assert said == [f"M{number}" for number in range(5)]
