@@ -91,7 +91,7 @@ class GatewayStatistics(msgspec.Struct, frozen=True):
 
 
 class Bridge:
-    """Joins the links of a module. `notify(link, kind, text, trouble)` is called with what the user should know."""
+    """The gateway of a module. `notify(link, kind, text, trouble)` is called with what the user should know."""
 
     def __init__(
         self, space: TopicSpace, instance: int, options: BridgeOptions, notify: Callable[[Link, str, str, bool], None]
@@ -210,9 +210,7 @@ class Bridge:
         return probe is not None
 
     def _is_own(self, port: BridgePort, message: management.Management) -> bool:
-        """Whether another link of this module on the same network sent it; an echo of this one is for discovery to
-        find.
-        """
+        """Whether another link of this module on the same network sent it; discovery finds echoes of this one."""
         if port.tree_port.echoes:
             return False
         if isinstance(message, management.Hello):
@@ -323,10 +321,10 @@ class Bridge:
             denied = management.Denied(self._name, self._name, 0, management.DENIED_GATEWAYS)
             port.link.write_management(management.encode(denied))
 
-    # For people
+    # For users
 
     def statistics(self) -> GatewayStatistics:
-        """What the gateway has done so far."""
+        """Return what the gateway has done so far."""
         ports = [_port_statistics(port) for port in self.ports.values()]
         routes = [
             RouteStatistics(topic, source, target, route.forwarded, dict(route.dropped))

@@ -101,7 +101,7 @@ class _LinkDirectory(msgspec.Struct, eq=False):
 
 
 class DirectoryRelay:
-    """Announces on each link of the gateway `instance` what is known of modules and nodes on the others.
+    """What is known of modules and nodes on each link of the gateway `instance`, announced on the others.
 
     `repeating` is called whenever something is repeated.
     """
@@ -255,7 +255,7 @@ class DirectoryRelay:
         """Whether it need not wait until the gateways agree."""
         return not port.in_tree or now < port.tree_port.forwards_until
 
-    # What is there
+    # What is known
 
     def _look(self, now: int) -> None:
         """See what has changed on the links, and announce it on the others."""
@@ -365,7 +365,7 @@ class DirectoryRelay:
         port.link.stats.lost.guard(port.link.relay, message)
 
     def _desired(self, port: BridgePort, key: _Key) -> _Announced | None:
-        """What is to be known of a fact on this link; None: nothing."""
+        """What others are to know of a fact on this link, if anything."""
         sources = self._sources.get(key, {})
         names = [name for name in sources if name != port.name]
         if not names:
@@ -416,7 +416,7 @@ def _subject(message: Relayed) -> object:
 
 
 def _withdrawal(message: Relayed) -> Relayed | None:
-    """The message that takes this one back; None: it just gets old."""
+    """The message that takes this one back; None for one that just gets old."""
     match message:
         case management.Hello():
             return msgspec.structs.replace(message, flags=message.flags | management.HELLO_LEAVING)

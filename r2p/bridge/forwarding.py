@@ -360,12 +360,12 @@ class RelayedTopic:
             self.changed()
 
     def changed(self) -> None:
-        """Routes or their subscribers have changed: the next message asks `active_from` anew."""
+        """Let the next message ask `active_from` anew, as routes or their subscribers have changed."""
         for topic in self.topics.values():
             topic.active_routes = {}
 
     def subscriber_changed(self, topic: BridgedTopic, subscriber: RemoteSubscriber) -> None:
-        """A link joined the topic or left it."""
+        """Follow a link that joined the topic or left it."""
         now = topic.by_link.get(subscriber.link)
         for route in self._into.get(subscriber.link_name, {}).values():
             if route.target is topic and route.port.link is subscriber.link:

@@ -86,7 +86,7 @@ class MultihomedModule:
         """Stop, as the module ends."""
         self._alarm.close()
 
-    # What comes in
+    # Received messages
 
     def handle_management(self, port: "_MultihomedPort", data: bytes) -> bool:
         """Handle a management message; True if discovery need not see it."""
@@ -162,8 +162,10 @@ class MultihomedModule:
         return self._unable[key]
 
     def _drop_filter(self, topic: Topic) -> Callable[[str], bool]:
-        """Asked before each message while gateways consent to the use of several links for a while only: a module that
-        was stopped must not go on with them. Says whether the message came in by a link that is not used any more.
+        """Return what says whether a message came in by a link that is no longer used.
+
+        It is asked before each message while gateways consent to the use of several links for a while only: a module
+        that was stopped must not go on with them.
         """
 
         def drops(link: str) -> bool:

@@ -99,7 +99,7 @@ def is_link(name: str, pattern: str) -> bool:
 
 
 class Policy:
-    """Answers what the options say about a topic, a module or a link. Raises Error for invalid rules and prefixes."""
+    """What the options say about a topic, a module or a link. Raises Error for invalid rules and prefixes."""
 
     def __init__(self, options: BridgeOptions) -> None:
         self._options = options
@@ -163,18 +163,18 @@ class Policy:
         return self.prefix(link) + topic
 
     def to_canonical(self, name: str, link: str) -> str | None:
-        """The canonical name of a topic on this link; None: it is not the robot's."""
+        """The canonical name of a topic on this link; None if it is not the robot's."""
         prefix = self.prefix(link)
         return name.removeprefix(prefix) if name.startswith(prefix) else None
 
     def module_to_link_name(self, name: str, link: str, *, foreign: bool) -> str | None:
-        """The name of a module on this link; None: it is not visible there. `foreign` ones are not the robot's."""
+        """The name of a module on this link; None where it is not visible. `foreign` ones are not the robot's."""
         prefix = self.prefix(link)
         return (None if foreign else prefix + name) if prefix else name
 
     def module_to_canonical(self, name: str, link: str) -> tuple[str, bool] | None:
         """The canonical name of a module on this link, and whether it is foreign: on the network, and not the robot's.
-        None: it is another robot's.
+        None for one of another robot.
         """
         prefix = self.prefix(link)
         if not prefix:
@@ -208,7 +208,7 @@ class Policy:
 
 
 class RelayedPeriodic(SlotPublisher):
-    """Fills the slots of a bus with what comes in by another link: messages of `size` bytes each `period` seconds."""
+    """A publisher in slots of a bus, of `size` bytes each `period` seconds, for what comes in by another link."""
 
     lead = 0.0005
 
@@ -281,7 +281,7 @@ class Shaper:
         self._times_left = TimesLeft()
 
     def shape(self, sample: Sample, now: int, utc: int) -> Sample | None:
-        """The message to forward at `now` (monotonic ns; the same in UTC); None: it exceeds the rate."""
+        """The message to forward at `now` (monotonic ns; the same in UTC); None for one that exceeds the rate."""
         if self._gap is not None:
             if now < self._free_at:
                 return None

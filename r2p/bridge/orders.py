@@ -38,7 +38,7 @@ class ModuleNames:
         self._ambiguous: set[str] = set()
 
     def to_canonical(self, alias: str, link: str) -> str | None:
-        """The module that an order on this link names; None: none of the robot's, or it is ambiguous."""
+        """The module that an order on this link names; None if it is none of the robot's, or ambiguous."""
         prefix = self._policy.prefix(link)
         if not prefix:
             return alias
@@ -51,14 +51,14 @@ class ModuleNames:
         return alias.removeprefix(prefix) if alias.startswith(prefix) else None
 
     def to_link_name(self, name: str, link: str) -> str | None:
-        """The name of a module on a link; None: it is not visible there."""
+        """The name of a module on a link; None where it is not visible."""
         foreign = self._directory.foreign_link(name)
         if foreign:
             return name if link == foreign or not self._policy.prefix(link) else None
         return self._policy.prefix(link) + name
 
     def translate(self, name: str, link: str, other: str) -> str | None:
-        """The name on another link of a module that has this name on one link; None: the two must not be confused."""
+        """The name on another link of a module that has this name on one link; None if the two must not be confused."""
         module = self._policy.module_to_canonical(name, link)
         if module is None or module[1]:
             return None
@@ -72,7 +72,7 @@ class ModuleNames:
 
 
 class OrderRelay:
-    """Forwards orders and DENIED between the ports of the gateway `module`."""
+    """The relay of orders and DENIED between the ports of the gateway `module`."""
 
     def __init__(
         self, module: str, clock: Clock, ports: dict[str, BridgePort], policy: Policy, names: ModuleNames
@@ -97,8 +97,8 @@ class OrderRelay:
         return False
 
     def _forward_to(self, name: str, port: BridgePort, order: management.Order) -> None:
-        """The module may be anywhere: send the order to all links that it may go to. Refuse it if the module is known
-        behind a link that it may not go to, or if it may go nowhere.
+        """Send the order to all links that it may go to, as the module may be anywhere. Refuse it if the module is
+        known behind a link that it may not go to, or if it may go nowhere.
         """
         passed, refused, known = False, 0, False
         for other in self._open_from(port):

@@ -59,12 +59,12 @@ class RoutingTable:
     # What has changed
 
     def demand_changed(self, names: Iterable[str], port: BridgePort) -> None:
-        """The demand for these topics has changed on a link."""
+        """Review topics whose demand has changed on a link."""
         self._review_all(topic for name in names if (topic := self._to_canonical(name, port)) is not None)
 
     def port_changed(self, port: BridgePort) -> None:
-        """The link is new, or gone, or has another place in the tree: review what is published and subscribed there,
-        and announce there what other links publish and subscribe.
+        """Review what is published and subscribed on a link that is new, or gone, or has another place in the tree, and
+        announce there what other links publish and subscribe to.
         """
         there = {topic for name in port.demand.topics() if (topic := self._to_canonical(name, port))}
         self._review_all(there | self._idle)
@@ -237,7 +237,7 @@ class RoutingTable:
             port.link.stats.lost.guard(port.link.topic_changed, here)
 
     def desired_state(self, port: BridgePort, topic: Topic, own: Announcement) -> Announcement:
-        """What a link is to announce of a topic of which this module itself has `own`."""
+        """Return what a link is to announce of a topic of which this module itself has `own`."""
         if not port.in_tree:
             return NOTHING
         name = self._policy.to_canonical(topic.name, port.name)

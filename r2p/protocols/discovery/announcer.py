@@ -30,7 +30,7 @@ class LocalTopic(msgspec.Struct, frozen=True):
 
 
 class Announcer:
-    """Turns what the module has into messages, as fast as the schedule allows.
+    """The announcements of one module, sent as fast as the schedule allows.
 
     While r2p modules are known on the link (`r2p`), a TYPE goes before each announcement, and endpoints are announced.
     """

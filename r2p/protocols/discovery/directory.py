@@ -128,7 +128,7 @@ class Directory:
         return self._names.get(instance, "")
 
     def lease_of(self, source: PeerAddress) -> int | None:
-        """The longest lease of the r2p modules directly at an address; None: there are none."""
+        """The longest lease of the r2p modules directly at an address; None where there are none."""
         return max(self._leases.get(source, ()), default=None)
 
     def is_alone(self, source: PeerAddress, instance: int) -> bool:

@@ -229,7 +229,7 @@ _SENT_MAX = 256
 
 
 class Outbox:
-    """Collects the events of one call. While the link is not `up` nothing is sent."""
+    """The events of one call. While the link is not `up` nothing is sent."""
 
     def __init__(self) -> None:
         self.up = False

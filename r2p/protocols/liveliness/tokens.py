@@ -93,7 +93,7 @@ class TokenSet:
         self._dirty.add((topic, role))
 
     def set_relayed(self, key: tuple[str | int, ...], token: liveliness.Token | None) -> None:
-        """Declare something behind this module, which is a gateway; None: it is gone."""
+        """Declare something behind this module, which is a gateway; None undeclares it."""
         if token is None:
             self._relayed.pop(key, None)
         else:
