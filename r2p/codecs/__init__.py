@@ -9,8 +9,18 @@ of the caller (`MessageError`). Bytes that are not such a message raise `DecodeE
 - `schemas`: answers to the question for a type; `probes`: how gateways look for loops.
 """
 
+import enum
+
 from r2p.errors import DecodeError
 
 
 class UnknownType(DecodeError):
     """A type byte, or the version of an r2p type, that is not known: ignored, as firmware does (PROTOCOL.md 4)."""
+
+
+class PublisherClass(enum.IntEnum):
+    """The real-time class of a publisher (thesis 5.3.6), as several messages carry it."""
+
+    NON_REAL_TIME = 1
+    SPORADIC = 2
+    PERIODIC = 3

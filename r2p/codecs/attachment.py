@@ -20,7 +20,6 @@ serials and sequences count on from those in the header. Credit and the sender o
 | the rest | origin: `u8 class; u32 sender; u32 instance; u8 fingerprint[8]`, then `module/node` in ASCII |
 """
 
-import enum
 import functools
 import re
 import struct
@@ -29,8 +28,9 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from r2p.codecs import UnknownType
+from r2p.codecs import PublisherClass, UnknownType
 from r2p.errors import DecodeError
+from r2p.messages import ClockOffset
 from r2p.names import MODULE_PATH, MODULE_PATH_MAX, module_alias
 
 T = TypeVar("T")
@@ -64,32 +64,6 @@ _REMEMBERED_MAX = 4096  # origins that a reader keeps; an even number
 _SHOWN_MAX = 40  # bytes of a wrong name that an error shows
 
 
-class PublisherClass(enum.IntEnum):
-    """The real-time class of a publisher (thesis 5.3.6)."""
-
-    NON_REAL_TIME = 1
-    SPORADIC = 2
-    PERIODIC = 3
-
-
-_CLASSES = frozenset(PublisherClass)
-
-
-class ClockOffset(msgspec.Struct, frozen=True, gc=False):
-    """How a stamp was translated to UTC from another clock, that of the RTCAN network `epoch`.
-
-    UTC = that clock + `offset` (ns), known to +-`error` (ns).
-    """
-
-    epoch: int
-    offset: int
-    error: int
-
-    def utc(self, time: int) -> int:
-        """Translate an instant (ns) of that clock, such as one in a payload, to UTC (ns), known to +-`error`."""
-        return time + self.offset
-
-
 class Origin(msgspec.Struct, frozen=True):
     """The publisher of a message, and the module that put it on this network.
 
@@ -97,7 +71,7 @@ class Origin(msgspec.Struct, frozen=True):
     published it, 0 for firmware. Names are empty where they are not known. `fingerprint` all zero: type not known.
     """
 
-    publisher_class: int
+    publisher_class: PublisherClass
     sender: int
     instance: int
     fingerprint: bytes
@@ -232,7 +206,7 @@ class Credit(msgspec.Struct, frozen=True, gc=False):
     """
 
     session: int
-    publisher_class: int
+    publisher_class: PublisherClass
     serial: int
     topic: str
     leaving: bool = False
@@ -254,7 +228,7 @@ def decode_credit(data: bytes) -> Credit:
         raise DecodeError(f"credit for {data[_CREDIT.size :][:_SHOWN_MAX]!r}, which is not a valid topic")
     _, publisher_class, session, serial = _CREDIT.unpack_from(data)
     leaving = bool(publisher_class & _LEAVING)
-    return Credit(session, publisher_class & ~_LEAVING, serial, data[_CREDIT.size :].decode(), leaving)
+    return Credit(session, _checked_class(publisher_class & ~_LEAVING), serial, data[_CREDIT.size :].decode(), leaving)
 
 
 def encode_sender(session: int) -> bytes:
@@ -312,7 +286,12 @@ def _decode_origin(data: bytes) -> Origin:
     names = _NAMES.fullmatch(data, _ORIGIN.size)
     if names is None or len(names[1]) > MODULE_PATH_MAX:
         raise DecodeError(f"header ends in {data[_ORIGIN.size :][:_SHOWN_MAX]!r}, which is not a valid `module/node`")
-    publisher_class, sender, instance, fingerprint = _ORIGIN.unpack_from(data)
-    if publisher_class not in _CLASSES:
-        raise DecodeError(f"{publisher_class} is not a publisher class")
-    return Origin(publisher_class, sender, instance, fingerprint, names[1].decode(), names[2].decode())
+    number, sender, instance, fingerprint = _ORIGIN.unpack_from(data)
+    return Origin(_checked_class(number), sender, instance, fingerprint, names[1].decode(), names[2].decode())
+
+
+def _checked_class(number: int) -> PublisherClass:
+    try:
+        return PublisherClass(number)
+    except ValueError:
+        raise DecodeError(f"{number} is not a publisher class") from None

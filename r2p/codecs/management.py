@@ -32,7 +32,7 @@ import functools
 
 import msgspec
 
-from r2p.codecs import UnknownType
+from r2p.codecs import PublisherClass, UnknownType
 from r2p.codecs._gateway_fields import MESH_HEARD as MESH_HEARD
 from r2p.codecs._gateway_fields import PARTS_MAX as PARTS_MAX
 from r2p.codecs._gateway_fields import decode_acks as decode_acks
@@ -113,11 +113,9 @@ ROLE_SUBSCRIBES = 2
 ROLE_GONE = 128  # added to an Endpoint's role: it has ended
 _ROLES = (ROLE_PUBLISHES, ROLE_SUBSCRIBES)
 
-# Endpoint.publisher_class
+# Endpoint.publisher_class: a PublisherClass, by the names of PROTOCOL.md
 CLASS_NONE = 0
-CLASS_NRT = 1
-CLASS_SRT = 2  # sporadic
-CLASS_HRT = 3  # periodic
+CLASS_NRT, CLASS_SRT, CLASS_HRT = PublisherClass
 CLASS_LATCHES = 128  # added to the others: new subscribers get its last message
 
 NO_PARAMS = bytes(10)

@@ -22,7 +22,7 @@ firmware leaves rubbish behind it.
 compiles them, and `schemas` builds a class from its schema.
 """
 
-from r2p.messages.layouts import SIZE_MAX, Message, Timestamp, layout
+from r2p.messages.layouts import SIZE_MAX, ClockOffset, Message, Timestamp, layout
 from r2p.messages.schemas import message_type
 from r2p.messages.shapes import (
     Array,
@@ -50,6 +50,7 @@ __all__ = [
     "SIZE_MAX",
     "Array",
     "Chars",
+    "ClockOffset",
     "Field",
     "Layout",
     "Len",

@@ -81,6 +81,21 @@ class Timestamp(Message):
         return cls(sec, nsec)
 
 
+class ClockOffset(msgspec.Struct, frozen=True, gc=False):
+    """How a stamp was translated to UTC from another clock, that of the RTCAN network `epoch`.
+
+    UTC = that clock + `offset` (ns), known to +-`error` (ns).
+    """
+
+    epoch: int
+    offset: int
+    error: int
+
+    def utc(self, time: int) -> int:
+        """Translate an instant (ns) of that clock, such as one in a payload, to UTC (ns), known to +-`error`."""
+        return time + self.offset
+
+
 def check_field_name(path: str, name: str) -> None:
     """Raise MessageError for a name that a field can't have."""
     if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name) or name in _METHODS:

@@ -12,9 +12,8 @@ has seen: else all messages of such a module would be lost behind the gateway.
 
 import msgspec
 
-from r2p.codecs.attachment import ClockOffset
-from r2p.codecs.attachment import PublisherClass as PublisherClass  # a part of each sample: imported from here
-from r2p.messages import Message
+from r2p.codecs import PublisherClass as PublisherClass  # a part of each sample: imported from here
+from r2p.messages import ClockOffset, Message
 
 _KEPT_MAX = 64  # messages of each publisher
 _PUBLISHERS_MAX = 1024  # of a topic; with one more all are forgotten

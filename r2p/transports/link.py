@@ -16,9 +16,8 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
-from r2p.codecs.attachment import ClockOffset
 from r2p.codecs.management import FLAG_BOOT, NO_PARAMS, QUEUE
-from r2p.messages import Message
+from r2p.messages import ClockOffset, Message
 from r2p.names import TOPIC_MAX
 from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.events import (

@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 import msgspec
 
 from r2p.clock import check_seconds, in_background, random_of
-from r2p.codecs.attachment import ClockOffset
 from r2p.errors import TransportError
+from r2p.messages import ClockOffset
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import PublisherClass, Sample, Source

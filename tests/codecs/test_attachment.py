@@ -8,12 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.bridge.options import check_prefix
-from r2p.codecs import UnknownType, attachment
-from r2p.codecs.attachment import ClockOffset, Credit, Header, HeaderReader, Origin
+from r2p.codecs import PublisherClass, UnknownType, attachment
+from r2p.codecs.attachment import Credit, Header, HeaderReader, Origin
 from r2p.errors import DecodeError
+from r2p.messages import ClockOffset
 from r2p.names import module_alias
 
-ORIGIN = Origin(1, 0xA0B1C2D3, 0x01020304, bytes(range(8)), "PC1", "blink")
+ORIGIN = Origin(PublisherClass.NON_REAL_TIME, 0xA0B1C2D3, 0x01020304, bytes(range(8)), "PC1", "blink")
 HEADER = Header(ORIGIN, serial=7, sequence=9, stamp=1_700_000_000_000_000_000, deadline=1_700_000_000_020_000_000)
 
 U32 = st.integers(0, 0xFFFFFFFF)
@@ -24,7 +25,7 @@ HEADERS = st.builds(
     Header,
     origin=st.builds(
         Origin,
-        publisher_class=st.sampled_from([1, 2, 3]),
+        publisher_class=st.sampled_from(PublisherClass),
         sender=U32,
         instance=U32,
         fingerprint=st.binary(min_size=8, max_size=8),
@@ -199,7 +200,14 @@ def test_a_class_that_does_not_exist() -> None:
 
 
 @given(
-    st.builds(Credit, session=U32, publisher_class=st.integers(0, 127), serial=U32, topic=TOPICS, leaving=st.booleans())
+    st.builds(
+        Credit,
+        session=U32,
+        publisher_class=st.sampled_from(PublisherClass),
+        serial=U32,
+        topic=TOPICS,
+        leaving=st.booleans(),
+    )
 )
 def test_credits(credit: Credit) -> None:
     assert attachment.decode_credit(attachment.encode_credit(credit)) == credit
@@ -220,6 +228,7 @@ def test_without_bytes_there_is_no_version_to_ignore(decode: Callable[[bytes], o
         (attachment.decode, b"\1" * 7, "header too short: 7 bytes, at least 32 needed"),
         (attachment.decode_credit, b"\1" * 7, "credit too short: 7 bytes, at least 11 needed"),
         (attachment.decode_credit, b"\1" * 10 + b"a b", "credit for b'a b', which is not a valid topic"),
+        (attachment.decode_credit, b"\1\4" + bytes(8) + b"leds", "4 is not a publisher class"),
         (attachment.decode_sender, b"\1" * 7, "sender of 7 bytes, 5 needed"),
     ],
 )

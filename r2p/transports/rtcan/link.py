@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import msgspec
 
 from r2p.codecs import management, rtcan
-from r2p.codecs.attachment import ClockOffset
 from r2p.codecs.management import NO_PARAMS
+from r2p.messages import ClockOffset
 from r2p.names import MANAGEMENT
 from r2p.protocols.discovery.events import Event, ModuleGone, PublisherFound, PublisherGone
 from r2p.protocols.discovery.session import Discovery

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from r2p.clock import Clock
-from r2p.codecs.attachment import ClockOffset
+from r2p.messages import ClockOffset
 from r2p.protocols.rtcan.events import (
     Action,
     EngineSettings,

@@ -125,7 +125,7 @@ class ZenohSubscriber(LinkSubscriber):
 
     def acknowledge(self, credit: Credit) -> None:
         """Note how far a session has come; a publisher that waits for that goes on with `refill`."""
-        self._streams[PublisherClass(credit.publisher_class)].window.acknowledge(credit.session, credit.serial)
+        self._streams[credit.publisher_class].window.acknowledge(credit.session, credit.serial)
         self.set_leaving(credit.session, leaving=credit.leaving)
 
     def set_leaving(self, session: int, *, leaving: bool) -> None:
@@ -349,10 +349,9 @@ class CreditReader:
     def _apply(self, payload: zenoh.ZBytes) -> None:
         try:
             credit = decode_credit(payload.to_bytes() if len(payload) <= _CREDIT_BYTES_MAX else b"")
-            PublisherClass(credit.publisher_class)
         except UnknownType:
             self._lost["unknown type"] += 1
-        except (DecodeError, ValueError):
+        except DecodeError:
             self._lost["undecodable"] += 1
         else:
             subscriber = self._sender.subscriber(credit.topic)

@@ -187,10 +187,10 @@ class PublisherCache:
     def __init__(self) -> None:
         self._session: ZenohSession | None = None
         self._prefix = ""
-        self._publishers: dict[tuple[str, int], zenoh.Publisher] = {}
+        self._publishers: dict[tuple[str, PublisherClass], zenoh.Publisher] = {}
         self._asked: set[str] = set()
         self._answers: dict[str, bool] = {}
-        self._windows: dict[tuple[str, int], SendWindow] = {}
+        self._windows: dict[tuple[str, PublisherClass], SendWindow] = {}
 
     def connect(self, session: ZenohSession, prefix: str) -> None:
         """Use this session; the key of a topic is its name behind the prefix."""
@@ -203,8 +203,8 @@ class PublisherCache:
 
     def declare(self, topic: Topic) -> None:
         """Declare the publishers of a topic that is published now."""
-        classes = {int(publisher.publisher_class) for publisher in topic.publishers}
-        for publisher_class in classes or {int(PublisherClass.NON_REAL_TIME)}:  # none of our own: a gateway
+        classes = {publisher.publisher_class for publisher in topic.publishers}
+        for publisher_class in classes or {PublisherClass.NON_REAL_TIME}:  # none of our own: a gateway
             self._publisher(topic.name, publisher_class)
 
     def undeclare(self, topic: str) -> None:
@@ -233,7 +233,7 @@ class PublisherCache:
         self._asked.discard(topic)
         self._answers[topic] = bool(reached)
 
-    def put(self, topic: str, publisher_class: int) -> Put:
+    def put(self, topic: str, publisher_class: PublisherClass) -> Put:
         """Return what sends packets of the topic. It raises BlockingIOError if too many wait already."""
         publisher = self._publisher(topic, publisher_class)
         if publisher is None or self._session is None:
@@ -249,13 +249,13 @@ class PublisherCache:
 
         return put
 
-    def _publisher(self, topic: str, publisher_class: int) -> zenoh.Publisher | None:
+    def _publisher(self, topic: str, publisher_class: PublisherClass) -> zenoh.Publisher | None:
         key = topic, publisher_class
         if key not in self._publishers and self._session is not None:
             self._publishers[key] = self._session.declare_publisher(f"{self._prefix}{topic}", publisher_class)
         return self._publishers.get(key)
 
-    def window(self, topic: str, publisher_class: int) -> SendWindow:
+    def window(self, topic: str, publisher_class: PublisherClass) -> SendWindow:
         """Return the window of a topic in a class; it counts on for as long as the link lives."""
         return self._windows.setdefault((topic, publisher_class), SendWindow())
 

@@ -35,7 +35,7 @@ _CHANNEL_MAX = 65_536
 very call that asks for them, while it holds its locks, and would wait there for ever if they did not fit.
 """
 
-_PRIORITIES: dict[int, zenoh.Priority] = {
+_PRIORITIES: dict[PublisherClass, zenoh.Priority] = {
     PublisherClass.NON_REAL_TIME: zenoh.Priority.DATA,
     PublisherClass.SPORADIC: zenoh.Priority.INTERACTIVE_HIGH,
     PublisherClass.PERIODIC: zenoh.Priority.REAL_TIME,
@@ -314,7 +314,7 @@ class ZenohSession:
             self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE), loop, arrived
         )
 
-    def declare_publisher(self, key: str, publisher_class: int) -> zenoh.Publisher:
+    def declare_publisher(self, key: str, publisher_class: PublisherClass) -> zenoh.Publisher:
         """Declare a publisher with the priority of the class. Never BLOCK: that would stop the loop."""
         periodic = publisher_class == PublisherClass.PERIODIC
         publisher = self._session.declare_publisher(

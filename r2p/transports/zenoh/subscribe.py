@@ -50,7 +50,7 @@ _RESUME_S = 10.0
 
 _NRT = PublisherClass.NON_REAL_TIME
 
-ReceiveWindows = dict[tuple[int, int], ReceiveWindow]
+ReceiveWindows = dict[tuple[int, PublisherClass], ReceiveWindow]
 """How far each session has come in each class."""
 
 
@@ -365,7 +365,7 @@ class RxStream:
         publisher = RemotePublisher(
             origin,
             Source(origin.module, origin.node, self._receiver.link.name),
-            PublisherClass(origin.publisher_class),
+            origin.publisher_class,
             self._window(*key),
             -1,  # until `_check_type`, as well as the next one
             False,
@@ -375,7 +375,7 @@ class RxStream:
         self._check_type(publisher)
         return publisher
 
-    def _window(self, session: int, publisher_class: int) -> ReceiveWindow:
+    def _window(self, session: int, publisher_class: PublisherClass) -> ReceiveWindow:
         window = self.windows.pop((session, publisher_class), None)
         if window is None:
             if len(self.windows) >= _SENDERS_MAX:
@@ -403,7 +403,7 @@ class ZenohReceiver:
         self._session: ZenohSession | None = None
         self._prefix = ""
         self._streams: dict[str, RxStream] = {}
-        self._kept: dict[str, tuple[ReceiveWindows, dict[tuple[int, int], int]]] = {}
+        self._kept: dict[str, tuple[ReceiveWindows, dict[tuple[int, PublisherClass], int]]] = {}
         """The windows of each topic when the link went down, and how far they had come then."""
         self._kept_until = 0.0
         self._up = False
@@ -431,7 +431,7 @@ class ZenohReceiver:
             stream.reader = self._session.subscribe(key, RING, stream.arrived)
 
     def send_credit(
-        self, topic: str, session: int, publisher_class: int, serial: int, *, leaving: bool = False
+        self, topic: str, session: int, publisher_class: PublisherClass, serial: int, *, leaving: bool = False
     ) -> None:
         """Report to a publisher's session that its messages up to this serial were accepted.
 
@@ -528,6 +528,6 @@ def _type_of(topic: Topic) -> TopicType:
     return TopicType() if topic.layout is None else TopicType(topic.layout.size, topic.layout.fingerprint)
 
 
-def _progress(windows: ReceiveWindows) -> dict[tuple[int, int], int]:
+def _progress(windows: ReceiveWindows) -> dict[tuple[int, PublisherClass], int]:
     """The serial that is expected of each publisher of which a message has come."""
     return {key: window.next_serial for key, window in windows.items() if window.next_serial >= 0}

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 import r2p
-from r2p.codecs import attachment, management
+from r2p.codecs import PublisherClass, attachment, management
 from r2p.codecs.attachment import Header, Origin
 from r2p.msg import Led
 from r2p.testing.network import node_in
@@ -47,7 +47,8 @@ async def test_values_that_other_links_can_not_carry_stop_nothing() -> None:
             publisher = session.declare_publisher(f"{topics}/boom")
             await until(lambda: _reaches(publisher) and goes_on("boom"))
             for serial, size in enumerate((5, 300, 5), 1):
-                header = Header(Origin(1, 0xABCD, 0xABCD, bytes(8), "X", "x"), serial, serial, serial)
+                origin = Origin(PublisherClass.NON_REAL_TIME, 0xABCD, 0xABCD, bytes(8), "X", "x")
+                header = Header(origin, serial, serial, serial)
                 publisher.put(bytes(size), attachment=attachment.encode(header))
             await until(lambda: len(script.topics("boom")) == 2)
             link = gateway.links[0]

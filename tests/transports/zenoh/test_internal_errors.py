@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import r2p
+from r2p.codecs import PublisherClass
 from r2p.codecs.attachment import Credit, encode_credit
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.config import ZenohOptions
@@ -47,7 +48,8 @@ async def test_credits() -> None:
     sender: Any = SimpleNamespace(loop=loop, link=SimpleNamespace(stats=stats), subscribers=lambda: subscribers)
     sender.subscriber = by_topic.get
     credits_of = CreditReader(sender)
-    waiting = [SimpleNamespace(payload=Payload(encode_credit(Credit(7, 1, 5, each)))) for each in "abc"]
+    sent = [Credit(7, PublisherClass.NON_REAL_TIME, 5, each) for each in "abc"]
+    waiting = [SimpleNamespace(payload=Payload(encode_credit(each))) for each in sent]
     session: Any = SimpleNamespace(
         subscribe=lambda *_: SimpleNamespace(
             receive=lambda: waiting.pop(0) if waiting else None, wait=lambda: None, close=lambda: None

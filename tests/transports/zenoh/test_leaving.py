@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack
 import pytest
 import zenoh
 
-from r2p.codecs import liveliness
+from r2p.codecs import PublisherClass, liveliness
 from r2p.codecs.attachment import Credit, encode_credit
 from r2p.codecs.liveliness import TopicToken
 from r2p.codecs.management import ROLE_SUBSCRIBES
@@ -63,7 +63,7 @@ async def test_a_last_credit_is_for_all_classes_and_may_come_after_the_end_of_th
         await publisher.wait_subscriber()
         for number in range(5):
             await publisher.publish(Led(number))
-        last = encode_credit(Credit(7, 2, 0, "leds", leaving=True))
+        last = encode_credit(Credit(7, PublisherClass.SPORADIC, 0, "leds", leaving=True))
         if not late:
             alien.put(f"r2p/lab/credit/{link.instance:x}", last)
         token.undeclare()

@@ -31,7 +31,8 @@ from tests.transports.zenoh.cable import Net, ZenohCable, guarded, module, plain
 
 pytestmark = pytest.mark.anyio
 
-HEADER = Header(Origin(1, 7, 7, layout(Led).fingerprint, "ALIEN", "node"), 1, 1, 1_700_000_000_000_000_000)
+ORIGIN = Origin(r2p.PublisherClass.NON_REAL_TIME, 7, 7, layout(Led).fingerprint, "ALIEN", "node")
+HEADER = Header(ORIGIN, 1, 1, 1_700_000_000_000_000_000)
 
 
 @asynccontextmanager
@@ -170,7 +171,9 @@ async def test_a_node_that_joins_a_tool_in_its_module_is_waited_for_from_then_on
         for number in range(2 * WINDOW):
             await publisher.publish(Led(number))
         subscriber = bob.subscribe("leds", Led, queue=4 * WINDOW)
-        await until(lambda: link_of(alice).sender.publishers.window("leds", 1).limit != NO_LIMIT)
+        await until(
+            lambda: link_of(alice).sender.publishers.window("leds", r2p.PublisherClass.NON_REAL_TIME).limit != NO_LIMIT
+        )
         for number in range(2 * WINDOW):  # would take 30 s if it waited for credit that nobody thinks of
             await publisher.publish(Led(number))
         await until(lambda: len(subscriber.queue) >= 2 * WINDOW)

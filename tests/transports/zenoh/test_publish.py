@@ -7,8 +7,9 @@ import msgspec
 import pytest
 import zenoh
 
-from r2p.codecs import attachment
-from r2p.codecs.attachment import ClockOffset, Origin
+from r2p.codecs import PublisherClass, attachment
+from r2p.codecs.attachment import Origin
+from r2p.messages import ClockOffset
 from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.sample import Sample, Source
 from r2p.transports.stats import LinkStats
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.virtual_time
 
 HERE = Source("PC1", "talk")
 ELSEWHERE = Source("IMU", "", "rtcan:can0")
-ORIGIN = Origin(1, 1, 1, bytes(8), "PC1", "talk")
+ORIGIN = Origin(PublisherClass.NON_REAL_TIME, 1, 1, bytes(8), "PC1", "talk")
 
 
 class Wire:

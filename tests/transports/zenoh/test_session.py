@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from r2p.codecs import PublisherClass
 from r2p.transports.link import MESSAGES_PER_TURN
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh.session import LoopQueue, SubscriptionReader, ZenohSession
@@ -208,7 +209,7 @@ async def test_publishers_are_undeclared_before_their_session_is_closed() -> Non
     bare = Zenoh()
     stand_in: Any = bare
     session = ZenohSession(stand_in, LoggedCounter().internal_error)
-    session.declare_publisher("stays", 1)
-    session.undeclare_publisher(session.declare_publisher("ended", 2))
+    session.declare_publisher("stays", PublisherClass.NON_REAL_TIME)
+    session.undeclare_publisher(session.declare_publisher("ended", PublisherClass.SPORADIC))
     await session.close()
     assert bare.calls == ["ended", "stays", "close"]

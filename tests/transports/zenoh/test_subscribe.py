@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from r2p.clock import clock_of
-from r2p.codecs import attachment
+from r2p.codecs import PublisherClass, attachment
 from r2p.codecs.attachment import Header, Origin
 from r2p.messages import layout
 from r2p.msg import Led
@@ -83,7 +83,7 @@ class Ring:
         deadline: int = 0,
     ) -> None:
         """So many messages in one packet; sequences are as the serials, stamps ten times as much."""
-        origin = Origin(publisher_class, sender, sender, bytes(8), "A", "node")
+        origin = Origin(PublisherClass(publisher_class), sender, sender, bytes(8), "A", "node")
         stamps = [10 * (serial + at) for at in range(count)]
         header = attachment.encode(Header(origin, serial, serial, stamps[0], deadline, more=tuple(stamps[1:])))
         data = b"".join([(serial + at).to_bytes(size, "little") for at in range(count)])
@@ -219,7 +219,7 @@ async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
     ring.put(4)
     await turns()
     assert ring.stats.lost == {"wrong size": 1}
-    again = attachment.encode(Header(Origin(1, 8, 7, bytes(8), "A", "node"), 1, 4, 40))
+    again = attachment.encode(Header(Origin(PublisherClass.NON_REAL_TIME, 8, 7, bytes(8), "A", "node"), 1, 4, 40))
     ring.receiver._streams["leds"]._unpack(bytes(SIZE), again)  # by another gateway
     assert numbers(ring.sink) == [1, 2, 4]
     assert ring.stats.lost["seen before"] == 1
