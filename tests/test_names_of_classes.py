@@ -17,7 +17,7 @@ FUNCTION_LINES = 60
 def is_message(path: str, node: ast.ClassDef) -> bool:
     """Whether a class is named by the wire, or by the robots that send it."""
     bases = {ast.unparse(base) for base in node.bases}
-    return path.startswith(("r2p/msg/", "r2p/codecs/")) and not bases.isdisjoint({"Message", "msgspec.Struct"})
+    return path.startswith(("r2p/msg.py", "r2p/codecs/")) and not bases.isdisjoint({"Message", "msgspec.Struct"})
 
 
 def test_a_class_name_exists_once() -> None:

@@ -41,17 +41,16 @@ def _similar(where: str, name: str) -> str:
 
 
 def standard_types() -> list[type[r2p.Message]]:
-    """Return the classes of r2p.msg; of those with the same layout, the firmware's comes first."""
-    module = load_module(STANDARD)
-    return sorted((getattr(module, name) for name in module.__all__), key=lambda cls: str(cls.__module__))
+    """Return the classes of r2p.msg in their order; of those with the same layout, the firmware's comes first."""
+    found = vars(load_module(STANDARD)).values()
+    return [each for each in found if isinstance(each, type) and r2p.Message in each.__bases__]
 
 
 def type_name(cls: type[r2p.Message]) -> str:
     """Return the name of a class for `--type`; only its bare name if it was learnt from another module."""
     if cls.__module__ == LEARNT:
         return cls.__name__
-    module = STANDARD if cls.__module__.startswith(f"{STANDARD}.") else cls.__module__
-    return f"{module}:{cls.__name__}"
+    return f"{cls.__module__}:{cls.__name__}"
 
 
 class Types:

@@ -14,7 +14,7 @@ from tests.vectors import cases
 _NAMES = {
     "management": vars(management),
     "loader": vars(loader),
-    "messages": {name: getattr(r2p.msg, name) for name in r2p.msg.__all__},
+    "messages": vars(r2p.msg),
 }
 
 

@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import r2p.msg
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import Field, Len, Message, Timestamp, f32, i64, layout, u8, u64
 from r2p.messages.packing import _check
 from r2p.messages.shapes import HINTS
 from r2p.msg import Led, Speed3, StampedIMURaw9, StampedVelocity3, Text, Velocity3
+from r2p.tools.types import standard_types
 from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot, Wheel
 from tests.messages.strategies import messages
 
-STANDARD: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]
+STANDARD = standard_types()
 ALL = [*STANDARD, Numbers, Robot, Keywords, Derived, Redefined]
 BASE = Robot()
 

@@ -4,14 +4,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import r2p.msg
 from r2p.errors import MessageError
 from r2p.messages import Message, Timestamp, layout, message_type
 from r2p.messages.schemas import SCHEMA_MAX
+from r2p.tools.types import standard_types
 from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot
 from tests.messages.strategies import messages
 
-STANDARD: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]
+STANDARD = standard_types()
 
 
 @settings(max_examples=30)  # of each class

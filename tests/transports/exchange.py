@@ -8,12 +8,12 @@ import sys
 from collections.abc import AsyncIterator
 
 import r2p
-import r2p.msg
 from r2p.messages import Message, layout
 from r2p.modules.runner import run_main
 from r2p.runtime.events import ModuleEvent
+from r2p.tools.types import standard_types
 
-EVERY: list[type[Message]] = [getattr(r2p.msg, name) for name in r2p.msg.__all__]
+EVERY = standard_types()
 
 
 def filled(cls: type[Message]) -> Message:

@@ -1,0 +1,366 @@
+"""The standard messages: those of the firmware, those of the modules of thesis 7, texts, and the state of gateways.
+
+All fields default to zero. For other data define your own `r2p.Message`. A changed layout needs a new topic.
+
+In `Stamped...` messages `timestamp` is the network time (RTCAN) of the measurement. An RTCAN fragment carries 8 bytes;
+classes that are not the firmware's say how many their message takes.
+"""
+
+from typing import Annotated
+
+from r2p.messages import Len, Message, f32, f64, i16, i32, u8, u16, u32, u64
+from r2p.messages import Timestamp as Timestamp  # a part of the standard messages: imported from here
+
+# The firmware's, byte for byte (PROTOCOL.md 2). The names are the firmware's, without `Msg`, and with `Stamped` for its
+# `t`. The firmware does not say which units it uses; those given here are the ones of thesis 7 and 8.
+
+
+class Led(Message):
+    """State of one LED (topic `leds`)."""
+
+    led: u32 = 0
+    """Number of the LED."""
+    value: u8 = 0
+    """0 off, 1 on."""
+
+
+class Float32(Message):
+    """A number."""
+
+    data: f32 = 0.0
+
+
+class PWM(Message):
+    """Duty of one PWM output."""
+
+    pwm: u16 = 0
+    """Counts of the timer that makes the wave."""
+
+
+class PWM2(Message):
+    """Duties of two motors."""
+
+    pwm1: i16 = 0
+    """Counts of the timer; negative: backwards."""
+    pwm2: i16 = 0
+
+
+class PWM3(Message):
+    """Duties of three motors."""
+
+    pwm1: i16 = 0
+    """Counts of the timer; negative: backwards."""
+    pwm2: i16 = 0
+    pwm3: i16 = 0
+
+
+class Speed(Message):
+    """Speed of a motor."""
+
+    speed: u16 = 0
+    """In units of the motor's controller."""
+
+
+class Speed2(Message):
+    """Speed setpoints of two wheels (topic `speed`)."""
+
+    value: tuple[f32, f32] = (0.0, 0.0)
+    """In units of the motors' controllers."""
+
+
+class Speed3(Message):
+    """Speed setpoints of three wheels (topic `speed`)."""
+
+    value: tuple[f32, f32, f32] = (0.0, 0.0, 0.0)
+    """In units of the motors' controllers."""
+
+
+class QEI(Message):
+    """Movement of a quadrature encoder since the message before."""
+
+    delta: i16 = 0
+    """Ticks."""
+
+
+class StampedQEI(Message):
+    """Movement of a quadrature encoder since the message before, with its time."""
+
+    timestamp: Timestamp = Timestamp()
+    delta: i16 = 0
+    """Ticks."""
+
+
+class Encoder(Message):
+    """Movement of an encoder since the message before (topic `encoder`)."""
+
+    delta: f32 = 0.0
+    """In units of the node that publishes it."""
+
+
+class StampedEncoder(Message):
+    """Movement of an encoder since the message before, with its time (topic `encoder`)."""
+
+    timestamp: Timestamp = Timestamp()
+    delta: f32 = 0.0
+    """In units of the node that publishes it."""
+
+
+class Encoder2(Message):
+    """Movement of the two wheels of a differential drive since the message before."""
+
+    left_delta: f32 = 0.0
+    """In units of the node that publishes it."""
+    right_delta: f32 = 0.0
+
+
+class AbsoluteEncoder(Message):
+    """Position of an absolute encoder."""
+
+    position: f32 = 0.0
+    """In units of the node that publishes it."""
+
+
+class StampedPose3(Message):
+    """Position and heading in the plane, with its time."""
+
+    timestamp: Timestamp = Timestamp()
+    x: f32 = 0.0
+    """m."""
+    y: f32 = 0.0
+    """m."""
+    w: f32 = 0.0
+    """Heading, counter-clockwise from the x axis, rad."""
+
+
+class Velocity3(Message):
+    """Velocity in the plane, in the frame of the robot (topics `velocity`, `velocity_cmd`)."""
+
+    x: f32 = 0.0
+    """Forward, m/s."""
+    y: f32 = 0.0
+    """To the left, m/s."""
+    w: f32 = 0.0
+    """Counter-clockwise, rad/s."""
+
+
+class StampedVelocity3(Message):
+    """Velocity in the plane as in Velocity3, with its time."""
+
+    timestamp: Timestamp = Timestamp()
+    x: f32 = 0.0
+    y: f32 = 0.0
+    w: f32 = 0.0
+
+
+class Tilt(Message):
+    """Inclination about one axis (topic `tilt`)."""
+
+    angle: f32 = 0.0
+    """rad."""
+
+
+class IMURaw9(Message):
+    """Unfiltered readings of accelerometer, gyroscope and magnetometer (topic `imu_raw`).
+
+    In counts of the sensors. What a count is depends on their full scale: at best 1 mg, 8.75 mdps and 0.9 mgauss
+    (thesis 7.4.1).
+    """
+
+    acc_x: i16 = 0
+    acc_y: i16 = 0
+    acc_z: i16 = 0
+    gyro_x: i16 = 0
+    gyro_y: i16 = 0
+    gyro_z: i16 = 0
+    mag_x: i16 = 0
+    mag_y: i16 = 0
+    mag_z: i16 = 0
+
+
+class StampedIMURaw9(Message):
+    """Unfiltered readings as in IMURaw9, with their time (topic `imu_raw`)."""
+
+    timestamp: Timestamp = Timestamp()
+    acc_x: i16 = 0
+    acc_y: i16 = 0
+    acc_z: i16 = 0
+    gyro_x: i16 = 0
+    gyro_y: i16 = 0
+    gyro_z: i16 = 0
+    mag_x: i16 = 0
+    mag_y: i16 = 0
+    mag_z: i16 = 0
+
+
+# Of the modules of thesis 7 that have no published layout: in SI units, and in few CAN fragments. Angles are in rad,
+# counter-clockwise, except geographic ones.
+
+
+class IMU(Message):
+    """Attitude and rates of the robot, filtered (topic `imu`, thesis 7.4.2). 3 fragments."""
+
+    roll: f32 = 0.0
+    """About the x axis (forward), rad."""
+    pitch: f32 = 0.0
+    """About the y axis (to the left), rad."""
+    yaw: f32 = 0.0
+    """About the z axis (up), rad."""
+    roll_rate: f32 = 0.0
+    """rad/s."""
+    pitch_rate: f32 = 0.0
+    """rad/s."""
+    yaw_rate: f32 = 0.0
+    """rad/s."""
+
+
+class StampedIMU(Message):
+    """Attitude and rates of the robot as in IMU, with their time (topic `imu`). 4 fragments."""
+
+    timestamp: Timestamp = Timestamp()
+    roll: f32 = 0.0
+    pitch: f32 = 0.0
+    yaw: f32 = 0.0
+    roll_rate: f32 = 0.0
+    pitch_rate: f32 = 0.0
+    yaw_rate: f32 = 0.0
+
+
+class Proximity(Message):
+    """Distances that the four range finders of one module measure (topic `proximity`, thesis 7.5.2). 1 fragment."""
+
+    ranges: tuple[u16, u16, u16, u16] = (0, 0, 0, 0)
+    """mm; 65535: nothing in range, or no sensor."""
+
+
+class Battery(Message):
+    """The battery at the power supply module (topic `battery`, thesis 7.2.2). 1 fragment."""
+
+    voltage: u16 = 0
+    """mV."""
+    current: i16 = 0
+    """Out of the battery, mA; negative while it charges."""
+    charge: u8 = 0
+    """Remaining life, 0 to 100 %; 255: not calibrated."""
+    remaining: u16 = 0
+    """Remaining time at the present current, minutes; 65535: unknown."""
+
+
+class Pressure(Message):
+    """Air pressure, and the altitude that follows from it (topic `pressure`, thesis 7.4.2). 1 fragment."""
+
+    pressure: f32 = 0.0
+    """Pa."""
+    altitude: f32 = 0.0
+    """In the standard atmosphere, m."""
+
+
+class GPS(Message):
+    """A fix of the GPS receiver (topic `gps`, thesis 7.4.2). 4 fragments."""
+
+    latitude: f64 = 0.0
+    """Degrees, north is positive (WGS 84)."""
+    longitude: f64 = 0.0
+    """Degrees, east is positive."""
+    altitude: f32 = 0.0
+    """Above mean sea level, m."""
+    speed: f32 = 0.0
+    """Over ground, m/s."""
+    course: f32 = 0.0
+    """Over ground, degrees clockwise from true north."""
+    hdop: u16 = 0
+    """Horizontal dilution of precision, 1/100."""
+    satellites: u8 = 0
+    """In use."""
+    fix: u8 = 0
+    """NMEA's fix quality: 0 none, 1 GPS, 2 differential, 4 RTK, 5 float RTK."""
+
+
+class StampedGPS(Message):
+    """A fix of the GPS receiver as in GPS, with its time (topic `gps`). 5 fragments."""
+
+    timestamp: Timestamp = Timestamp()
+    latitude: f64 = 0.0
+    longitude: f64 = 0.0
+    altitude: f32 = 0.0
+    speed: f32 = 0.0
+    course: f32 = 0.0
+    hdop: u16 = 0
+    satellites: u8 = 0
+    fix: u8 = 0
+
+
+class Setpoint(Message):
+    """The position or speed that a motor controller is to reach, as configured (topic `setpoint`, thesis 7.3.2).
+
+    The controller counts encoder ticks; how far a tick is, the kinematics know. 1 fragment.
+    """
+
+    ticks: i32 = 0
+    """Position in ticks, or speed in ticks/s."""
+
+
+class Pose3(Message):
+    """Position and heading in the plane. 2 fragments."""
+
+    x: f32 = 0.0
+    """m."""
+    y: f32 = 0.0
+    """m."""
+    w: f32 = 0.0
+    """Heading, counter-clockwise from the x axis, rad."""
+
+
+class Odometry(Message):
+    """The movement of the robot, by forward kinematics (topic `odometry`, thesis 8.1). 3 fragments."""
+
+    pose: Pose3 = Pose3()
+    """Since the start, in the frame of the start."""
+    velocity: Velocity3 = Velocity3()
+    """In the frame of the robot."""
+
+
+class StampedOdometry(Message):
+    """The movement of the robot as in Odometry, with its time (topic `odometry`). 4 fragments."""
+
+    timestamp: Timestamp = Timestamp()
+    pose: Pose3 = Pose3()
+    velocity: Velocity3 = Velocity3()
+
+
+class Text(Message):
+    """A short text. 8 CAN fragments: a message has a fixed size, so a short text costs as much as a long one."""
+
+    text: Annotated[str, Len(64)] = ""
+
+
+class Log(Message):
+    """A log record of a node (topic `log` of every module). 19 CAN fragments."""
+
+    stamp: Timestamp = Timestamp()
+    """When it was logged, UTC."""
+    level: u8 = 0
+    """As in Python's logging: 10 debug, 20 info, 30 warning, 40 error, 50 critical."""
+    node: Annotated[str, Len(8)] = ""
+    """The node that logged it."""
+    text: Annotated[str, Len(128)] = ""
+
+
+class GatewayStatus(Message):
+    """The counters of a gateway, once a second (topic `gateway`). 12 CAN fragments.
+
+    There is one message for each link, where `topic` and `target` are empty, and one for each topic and pair of links
+    that it takes, where `state` is empty.
+    """
+
+    topic: Annotated[str, Len(16)] = ""
+    source: Annotated[str, Len(24)] = ""
+    """The link that messages come from."""
+    target: Annotated[str, Len(24)] = ""
+    """The link that they go to."""
+    state: Annotated[str, Len(12)] = ""
+    """The state of a link: listening, alone, forwarding, blocked, converging, loop, down."""
+    forwarded: u64 = 0
+    """Messages since the gateway started."""
+    dropped: u64 = 0
+    rate: f32 = 0.0
+    """Messages a second, lately."""
