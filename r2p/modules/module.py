@@ -8,9 +8,11 @@ The module owns everything that runs: one task for each node and each transport,
 """
 
 import asyncio
+import contextlib
 import logging
 import os
 import socket
+import threading
 from collections.abc import AsyncIterator, Iterable
 from types import TracebackType
 from typing import Self
@@ -20,15 +22,16 @@ from r2p.clock import clock_of
 from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import Closed, Error, NodeCrashed
 from r2p.log_lines import LineLimit, get_logger
+from r2p.messages import Timestamp
 from r2p.modules.graph import NetworkView
 from r2p.modules.link_manager import LinkManager
-from r2p.modules.log_topic import LogTopic
 from r2p.modules.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.modules.watchdog import Watchdog, watch
-from r2p.names import module_name, module_name_from, module_path, node_name, topic_name
+from r2p.msg import Log
+from r2p.names import NODE_MAX, module_name, module_name_from, module_path, node_name, topic_name
 from r2p.protocols.discovery.events import Command
 from r2p.runtime.events import EventHub, ModuleEvent
-from r2p.runtime.node import Node
+from r2p.runtime.node import Node, no_log
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.link import Link, Transport
 from r2p.transports.stats import LinkStats
@@ -40,7 +43,11 @@ logger = get_logger("r2p.module")
 CLEANUP_WARNING_AFTER = 1.0
 """Seconds after which the log names the nodes whose clean-up the module still waits for."""
 
+LOG_RATE = 50
+"""Records a second on the topic `log`, and records that may come at once: an eighth of a CAN bus of 1 Mbit/s."""
+
 _COMMAND_LINES = 1  # of the log in a second about one kind of command
+_LOG_TEXT_MAX = 128  # characters of `Log.text`
 
 
 class Module:
@@ -270,7 +277,7 @@ class Module:
         if name in self._supervisors and self._supervisors[name].running:
             raise Error(f"module {self.name} already has a node {name}: give this one another name=")
         names = self._remap | _checked_remap(remap)
-        log = self._log.publish if self._log is not None else _no_log
+        log = self._log.publish if self._log is not None else no_log
 
         def make_node() -> Node:
             return Node(name, self.space, priority=priority, remap=names, log=log, events=self._events)
@@ -364,8 +371,51 @@ def _checked_remap(remap: dict[str, str] | None) -> dict[str, str]:
     return {topic_name(old): topic_name(new) for old, new in (remap or {}).items()}
 
 
-def _no_log(level: int, node: str, text: str) -> None:
-    """Drop a record: an observer has no `log` topic."""
+class LogTopic:
+    """Publishes log records; those beyond the rate are counted in `suppressed`, and the next one says how many."""
+
+    def __init__(self, space: TopicSpace, remap: dict[str, str]) -> None:
+        self.suppressed = 0
+        self._space = space
+        self._thread = threading.get_ident()
+        self._node = Node("log", space, remap=remap)
+        self._publisher = self._node.advertise("log", Log)
+        self._credit = float(LOG_RATE)
+        self._credited_at = space.clock.monotonic()
+
+    def publish(self, level: int, node: str, text: str) -> None:
+        """Publish each line as a record, from any thread; never waits, and never fails."""
+        if threading.get_ident() != self._thread:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                self._space.loop.call_soon_threadsafe(self.publish, level, node, text)
+            return
+        for line in text.splitlines():
+            self._publish_line(level, node, line)
+
+    def close(self) -> None:
+        """Stop publishing."""
+        self._node.close()
+
+    def _publish_line(self, level: int, node: str, line: str) -> None:
+        if self._node.closed or not self._within_rate():
+            self.suppressed += 1
+            return
+        if self.suppressed:
+            line = f"({self.suppressed} suppressed) {line}"
+            self.suppressed = 0
+        text = line.encode("ascii", "replace").replace(b"\0", b"?")[:_LOG_TEXT_MAX].decode()  # as firmware reads it
+        stamp = Timestamp.from_ns(self._space.clock.now())
+        level = min(max(level, 0), 255)
+        self._publisher.publish_nowait(Log(stamp=stamp, level=level, node=node[:NODE_MAX], text=text))
+
+    def _within_rate(self) -> bool:
+        now = self._space.clock.monotonic()
+        self._credit = min(float(LOG_RATE), self._credit + (now - self._credited_at) * LOG_RATE / SECOND)
+        self._credited_at = now
+        if self._credit < 1.0:
+            return False
+        self._credit -= 1.0
+        return True
 
 
 class CommandHandler:

@@ -65,6 +65,10 @@ def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -
     return text if error is None else f"{text}\n{''.join(traceback.format_exception(error))}"
 
 
+def no_log(level: int, node: str, text: str) -> None:
+    """Drop a log record: the module is an observer, without a `log` topic."""
+
+
 class Node:
     """The first argument of a node's function: publishes, subscribes, ticks and logs for it. Made by `Module.start`."""
 
@@ -75,7 +79,7 @@ class Node:
         *,
         priority: int = 0,
         remap: dict[str, str] | None = None,
-        log: Callable[[int, str, str], None] = lambda _level, _node, _text: None,
+        log: Callable[[int, str, str], None] = no_log,
         events: EventHub | None = None,
     ) -> None:
         self.name = name

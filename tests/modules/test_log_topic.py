@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
-from r2p.modules.log_topic import RATE
+from r2p.modules.module import LOG_RATE
 from r2p.msg import Led, Log
 from r2p.runtime.topic import Topic
 from tests.bench import hold, led, local, settle
@@ -29,9 +29,9 @@ async def test_the_rate_is_limited_and_the_next_record_says_what_is_missing() ->
     async with local() as module:
         node = module.start(hold)
         records = module.start(hold, name="watch").subscribe("log", Log, queue=1000)
-        for number in range(RATE + 70):
+        for number in range(LOG_RATE + 70):
             node.log.info("%d", number)
-        assert texts(records) == [str(number) for number in range(RATE)]
+        assert texts(records) == [str(number) for number in range(LOG_RATE)]
         await settle(0.1)
         node.log.info("after a while")
         node.log.info("and on")
@@ -40,7 +40,7 @@ async def test_the_rate_is_limited_and_the_next_record_says_what_is_missing() ->
             await settle(0.1)
             for _ in range(10):
                 node.log.info("busy")
-        assert len(texts(records)) == pytest.approx(RATE * 10, abs=RATE)
+        assert len(texts(records)) == pytest.approx(LOG_RATE * 10, abs=LOG_RATE)
 
 
 @pytest.mark.virtual_time
@@ -96,7 +96,7 @@ async def test_a_node_that_logs_what_it_reads_from_the_log_is_slowed_down() -> N
         await settle()
         node.log.info("hello")
         await asyncio.sleep(10.0)
-        assert count <= 2 * RATE
+        assert count <= 2 * LOG_RATE
 
 
 @pytest.mark.virtual_time
