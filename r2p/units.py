@@ -1,4 +1,7 @@
-"""Units of time, and instants that no clock shows. Instants and durations are nanoseconds, as `int`."""
+"""Units of time, and instants that no clock shows. Instants and durations are nanoseconds, as `int`.
+
+Apart from `r2p.clock`, which codecs and protocols must not import: they get the time as an argument.
+"""
 
 MILLISECOND = 1_000_000
 SECOND = 1_000_000_000

@@ -4,15 +4,11 @@ Wheel
 speed:f32 currents:f32[2]
 """
 
-from hashlib import blake2b
-
 from r2p.errors import DecodeError
+from r2p.messages.layouts import fingerprint_of
 
-LONGEST = 40_000
+ANSWER_MAX = 40_000
 """Bytes of the longest answer that is read."""
-
-FINGERPRINT = 8
-"""Bytes of a fingerprint, which is the BLAKE2b hash of the schema."""
 
 
 def encode(name: str, schema: str) -> bytes:
@@ -22,9 +18,9 @@ def encode(name: str, schema: str) -> bytes:
 
 def decode(data: bytes, fingerprint: bytes) -> tuple[str, str]:
     """Decode name and schema. Raises DecodeError for a schema that does not have this fingerprint."""
-    if len(data) > LONGEST or not data.isascii():
+    if len(data) > ANSWER_MAX or not data.isascii():
         raise DecodeError("not a schema")
     name, _, schema = data.decode().partition("\n")
-    if blake2b(schema.encode(), digest_size=FINGERPRINT).digest() != fingerprint:
+    if fingerprint_of(schema) != fingerprint:
         raise DecodeError(f"a schema without the fingerprint {fingerprint.hex()}")
     return name, schema

@@ -32,6 +32,12 @@ def checkpoint() -> Generator[None, None, None]:
     yield
 
 
+def pulse(event: asyncio.Event) -> None:
+    """Wake the tasks that wait for the event now; those that come later wait for the next pulse."""
+    event.set()
+    event.clear()
+
+
 class EndpointOwner(Protocol):
     """The node that a publisher or a subscriber belongs to."""
 
@@ -57,7 +63,8 @@ class WakeScheduler:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
+        self._readers: list[tuple[int, int, asyncio.Future[None]]] = []
+        """What is to be woken: negated priority, a running number, the future of a reader."""
         self._order = itertools.count()
         self._running = False
         self._priorities: dict[int, int] = {}
@@ -84,14 +91,14 @@ class WakeScheduler:
     def wake_later(self, priority: int, waiter: asyncio.Future[None]) -> None:
         """Wake in its turn."""
         # The number keeps the order within a priority, and futures from being compared.
-        heapq.heappush(self._waiting, (-priority, next(self._order), waiter))
+        heapq.heappush(self._readers, (-priority, next(self._order), waiter))
         if not self._running:
             self._running = True
             self._loop.call_soon(self._turn)
 
     def _turn(self) -> None:
-        while self._waiting:
-            waiter = heapq.heappop(self._waiting)[2]
+        while self._readers:
+            waiter = heapq.heappop(self._readers)[2]
             if not waiter.done():  # else its task was cancelled meanwhile
                 waiter.set_result(None)
                 self._loop.call_soon(self._turn)  # the next one a turn later: important nodes come in between
@@ -109,7 +116,7 @@ class SubscriberQueue(Sink):
         "lossy",
         "node",
         "priority",
-        "publisher_waiters",
+        "publisher_came",
         "queue",
         "wait_queue",
         "waiter",
@@ -129,8 +136,8 @@ class SubscriberQueue(Sink):
         self.queue: deque[Sample] = deque()
         self.waiter: asyncio.Future[None] | None = None
         """The reader's future, while it waits for a message."""
-        self.publisher_waiters: list[asyncio.Future[None]] = []
-        """The futures of those that wait for a publisher."""
+        self.publisher_came = asyncio.Event()
+        """Pulsed, never left set: what waits for a publisher is woken."""
         self.wait_queue: WaitQueue | None = None
         """Set only while something waits for room: then each reader that pops a message has to call `refill`."""
 
@@ -177,18 +184,16 @@ class SubscriberQueue(Sink):
         return self.wait_queue
 
     def refill(self) -> None:
-        if (waiting := self.wait_queue) is not None:
-            waiting.serve()
+        if (wait_queue := self.wait_queue) is not None:
+            wait_queue.serve()
             if len(self.queue) <= self.limit // 2:  # plenty: with one place it would be lossy again at once
-                waiting.recover()
-            if not waiting:
+                wait_queue.recover()
+            if not wait_queue:
                 self.wait_queue = None
 
     def publisher_joined(self) -> None:
         """Wake those that wait for a publisher."""
-        for waiter in self.publisher_waiters:
-            if not waiter.done():
-                waiter.set_result(None)
+        pulse(self.publisher_came)
 
     def _append(self, sample: Sample) -> None:
         # `Topic.deliver` has a copy of this: change both.

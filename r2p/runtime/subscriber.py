@@ -124,16 +124,11 @@ class Subscriber(Generic[T]):
         return len(self._topic.publishers) + self._topic.remote_publishers
 
     async def wait_publisher(self) -> None:
-        """Wait until the topic has a publisher. Raises Closed if the subscription is closed before."""
+        """Wait until the topic has a publisher. Raises Closed if the subscription is closed, before or meanwhile."""
+        if not (self.publishers or self._closed):
+            await self._sink.publisher_came.wait()
         if self._closed:
             raise self._is_closed()
-        if not self.publishers:
-            waiter = self._space.loop.create_future()
-            self._sink.publisher_waiters.append(waiter)
-            try:
-                await waiter
-            finally:
-                self._sink.publisher_waiters.remove(waiter)
 
     def __aiter__(self) -> AsyncIterator[T]:
         return self._iterate(whole=False)
@@ -212,9 +207,7 @@ class Subscriber(Generic[T]):
             self._sink.refill()
             if (reader := self._sink.waiter) is not None and not reader.done():
                 reader.set_result(None)
-            for waiter in self._sink.publisher_waiters:
-                if not waiter.done():
-                    waiter.set_exception(self._is_closed())
+            self._sink.publisher_joined()
 
     async def __aenter__(self) -> Self:
         return self

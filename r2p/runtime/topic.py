@@ -46,16 +46,16 @@ class PublisherHandle(Protocol):
     latch: bool
 
     def subscriber_joined(self, sink: Sink) -> None:
-        """A subscriber joined, or came back after a reboot."""
+        """Send a latched value: a subscriber joined, or came back after a reboot."""
 
     def link_degraded(self, link: str, reason: str) -> None:
-        """Handle a link that no longer carries the topic."""
+        """Report that a link no longer carries the topic."""
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
-        """A link gave up a message that it had accepted; `late` is in seconds."""
+        """Report that a link gave up a message that it had accepted; `late` is in seconds."""
 
     def link_late(self, link: str, reason: str, late: float = 0.0) -> None:
-        """A link sent a message after its deadline."""
+        """Report that a link sent a message after its deadline; `late` is in seconds."""
 
 
 class SlotPublisher(abc.ABC):
@@ -84,15 +84,15 @@ class SlotPublisher(abc.ABC):
 
     @abc.abstractmethod
     def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
-        """The message for the slot due at `scheduled` (monotonic ns), `late` by ns, after `skipped` periods."""
+        """Return the message for the slot due at `scheduled` (monotonic ns), `late` by ns, after `skipped` periods."""
 
     @abc.abstractmethod
     def link_degraded(self, link: str, reason: str) -> None:
-        """Handle a link that has lost its slots."""
+        """Report that a link has lost its slots."""
 
     @abc.abstractmethod
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
-        """The link gave up a message that it had accepted; `late` is in seconds."""
+        """Report that the link gave up a message that it had accepted; `late` is in seconds."""
 
 
 class LatchedSource(Protocol):
@@ -179,8 +179,8 @@ class Topic:
         """Offer the sample to links; returns `blocked`, and those that have no room."""
         for remote in subscribers:
             # Behind what waits in the same line: nothing overtakes. Two look-ups, as lines are mostly empty.
-            waiting = remote.wait_queue
-            in_line = (waiting.real_time or waiting.non_real_time) and waiting.line_of(sample)
+            queue = remote.wait_queue
+            in_line = (queue.real_time or queue.non_real_time) and queue.line_of(sample)
             if remote.link is slot_link or (not in_line and remote.offer(sample)):
                 continue
             if blocked is None:

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from r2p import Module, Node
+from r2p import BridgeOptions, Module, Node
 from r2p.transports.memory import MemoryLink, MemoryNetwork
 
 
@@ -15,9 +15,21 @@ class Network(MemoryNetwork):
     and `counts` has what happened.
     """
 
-    def module(self, name: str, *, remap: dict[str, str] | None = None, observer: bool = False) -> Module:
-        """Return a module on this network, an `r2p.Module`; open it with `async with`."""
-        return Module(name, via=self.transport(), remap=remap, observer=observer, watchdog=False)
+    def module(
+        self,
+        name: str,
+        *others: "Network",
+        remap: dict[str, str] | None = None,
+        observer: bool = False,
+        bridge: bool | BridgeOptions = False,
+    ) -> Module:
+        """Return a module on this network, an `r2p.Module`; open it with `async with`.
+
+        It also has a link on each of the `others`; with `bridge` it is a gateway between all of them.
+        """
+        via = [each.transport() for each in (self, *others)]
+        # No watchdog: it measures real time, and a slow computer is not what is tested.
+        return Module(name, via=via, remap=remap, observer=observer, bridge=bridge, watchdog=False)
 
     @asynccontextmanager
     async def node(self, module: str, *, name: str = "test", priority: int = 0) -> AsyncIterator[Node]:
@@ -46,7 +58,7 @@ async def node_in(module: Module, *, name: str = "test", priority: int = 0) -> A
     Its publishers and subscribers are closed with it.
     """
     node = module.start(_idle, name=name, priority=priority)
-    await asyncio.sleep(0)  # let it start
+    await asyncio.sleep(0)  # until its task has begun: from then on its priority counts
     try:
         yield node
     finally:

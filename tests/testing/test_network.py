@@ -64,5 +64,16 @@ async def test_faults_and_plugs(r2p_network: Network) -> None:
         await leds.fetch(timeout=2)
 
 
+async def test_a_gateway_joins_two_networks(r2p_network: Network) -> None:
+    other = Network()
+    async with (
+        r2p_network.module("GW", other, bridge=True),
+        other.module("IMU1") as imu,
+        r2p_network.node("PC1") as node,
+    ):
+        imu.start(blink)
+        assert (await node.subscribe("leds", Led).fetch(timeout=30)).value == 1
+
+
 async def test_each_test_has_a_network_of_its_own(r2p_network: Network) -> None:
     assert not r2p_network.counts

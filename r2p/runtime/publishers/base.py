@@ -10,7 +10,7 @@ All go through `_report`: one line of the log a second at most, and the callback
 import asyncio
 from collections import deque
 from collections.abc import Sequence
-from typing import Generic, NoReturn, TypeVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 from msgspec import structs
 
@@ -20,11 +20,12 @@ from r2p.log_lines import LineLimit
 from r2p.messages import Layout, Message
 from r2p.runtime.backpressure import LINK_DOWN, Sink
 from r2p.runtime.qos import Missed, NonRealTime, Periodic, Signal, Sporadic
-from r2p.runtime.queues import YIELD_EVERY, EndpointOwner
+from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, pulse
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic, TopicSpace
 
 M = TypeVar("M", bound=Message)
+C = TypeVar("C", bound=NonRealTime | Sporadic | Periodic[Any])
 
 _LOG_LINES = 1  # a second about what is missed or late
 _CALLBACK_PAUSE = 0.001  # seconds between callbacks where one causes the next: else the event loop would stand still
@@ -32,7 +33,7 @@ _MOST_DEFERRED = 4  # callbacks that wait for that one by one; what comes on top
 _REMEMBERED = 64  # sequence numbers of messages that were missed last: several links may report one message
 
 
-class BasePublisher(Generic[M]):
+class BasePublisher(Generic[M, C]):
     """What all publishers share: made by `Node.advertise`, closed by `close()` or when their node ends."""
 
     publisher_class: PublisherClass
@@ -43,7 +44,7 @@ class BasePublisher(Generic[M]):
         node: EndpointOwner,
         topic: Topic,
         layout: Layout[M],
-        klass: NonRealTime | Sporadic | Periodic[M],
+        klass: C,
         *,
         latch: bool,
     ) -> None:
@@ -61,6 +62,7 @@ class BasePublisher(Generic[M]):
         """Messages that did not reach every subscriber in time."""
         self.late = 0
         """Messages that were published or sent after their time."""
+        self._class = klass
         self._on_missed = klass.on_missed
         self._on_late: Signal | None = klass.on_late
         self._on_degraded = klass.on_degraded
@@ -73,7 +75,7 @@ class BasePublisher(Generic[M]):
         self._last: Sample | None = None
         self._until_yield = YIELD_EVERY
         self._log_limit = LineLimit(_LOG_LINES)
-        self._waiters: list[asyncio.Future[None]] = []
+        self._subscriber_came = asyncio.Event()  # pulsed, never left set
         self._in_callback = False
         self._deferred: list[tuple[Signal, Missed]] = []
         self._missed_lately: deque[int] = deque(maxlen=_REMEMBERED)
@@ -90,16 +92,11 @@ class BasePublisher(Generic[M]):
         return len(self._topic.queues) + sum(remote.reachable for remote in self._topic.remote_subscribers)
 
     async def wait_subscriber(self) -> None:
-        """Wait until the topic has a subscriber. Raises Closed if the publisher is closed before."""
+        """Wait until the topic has a subscriber. Raises Closed if the publisher is closed, before or meanwhile."""
+        if self in self._topic.publishers and not self.subscribers:
+            await self._subscriber_came.wait()
         if self not in self._topic.publishers:
             raise self._is_closed()
-        if not self.subscribers:
-            waiter = self._space.loop.create_future()
-            self._waiters.append(waiter)
-            try:
-                await waiter
-            finally:
-                self._waiters.remove(waiter)
 
     @property
     def guarantees(self) -> dict[str, str]:
@@ -129,9 +126,7 @@ class BasePublisher(Generic[M]):
             self._encode = self._closed  # so that publish() does not have to look each time
             self._space.release(self._topic)
             self.node.forget(self)
-            for waiter in self._waiters:
-                if not waiter.done():
-                    waiter.set_exception(self._is_closed())
+            pulse(self._subscriber_came)
 
     def _closed(self, message: M) -> NoReturn:
         raise self._is_closed()
@@ -145,9 +140,7 @@ class BasePublisher(Generic[M]):
         """Send a latched value: a subscriber joined, or came back after a reboot."""
         if self._last is not None:
             sink.offer_latched(self._last)
-        for waiter in self._waiters:
-            if not waiter.done():
-                waiter.set_result(None)
+        pulse(self._subscriber_came)
 
     def link_degraded(self, link: str, reason: str) -> None:
         """Report that a link no longer carries the topic, or has lost its slots."""

@@ -2,37 +2,22 @@
 
 import asyncio
 
-from r2p.messages import Layout
 from r2p.runtime.backpressure import CANCELLED, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M
 from r2p.runtime.qos import NonRealTime
-from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, checkpoint
+from r2p.runtime.queues import YIELD_EVERY, checkpoint
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import Topic, TopicSpace
 
 _NRT = PublisherClass.NON_REAL_TIME
 
 
-class Publisher(BasePublisher[M]):
+class Publisher(BasePublisher[M, NonRealTime]):
     """A publisher of messages that do not expire: `publish()` waits for slow subscribers, up to the stall time.
 
     Made by `Node.advertise` with `NonRealTime`, its default.
     """
 
     publisher_class = PublisherClass.NON_REAL_TIME
-
-    def __init__(
-        self,
-        space: TopicSpace,
-        node: EndpointOwner,
-        topic: Topic,
-        layout: Layout[M],
-        klass: NonRealTime,
-        *,
-        latch: bool,
-    ) -> None:
-        super().__init__(space, node, topic, layout, klass, latch=latch)
-        self._stall = klass.stall
 
     async def publish(self, message: M) -> None:
         """Publish a message, and wait until all queues and links that keep up have it.
@@ -88,7 +73,8 @@ class Publisher(BasePublisher[M]):
                 return
         loop = self._space.loop
         delivery = _WaitingDelivery(sample, blocked, loop.create_future())
-        timer = loop.call_later(self._stall, delivery.expire, f"no room for {self._stall} s")
+        stall = self._class.stall
+        timer = loop.call_later(stall, delivery.expire, f"no room for {stall} s")
         try:
             await delivery.over
         finally:

@@ -26,7 +26,7 @@ from r2p.units import SECOND
 _LATE_SHARE = 2  # a message is late by more than 1/2 of its period: it is nearer to the next one
 
 
-class PeriodicPublisher(BasePublisher[M], SlotPublisher):
+class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
     """A time-triggered publisher: it has no `publish()`; the `fill` of its class is called at every period.
 
     Made by `Node.advertise` with `Periodic`.
@@ -51,10 +51,8 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         """Periods that passed without a message because the event loop was blocked."""
         self.lead = klass.lead
         """Seconds before a slot at which `fill` is called."""
-        self._fill = klass.fill
-        self._own_period = klass.period
         self._slot_link: object = None
-        self._waiting: _PeriodDelivery[M] | None = None
+        self._pending: _PeriodDelivery[M] | None = None
         self._ticker = Ticker(space.loop, round(klass.period * SECOND), self.tick, background=True)
 
     def start(self) -> None:
@@ -72,10 +70,6 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         self._give_up("publisher closed")
 
     def use_slot_clock(self, slot_link: object, period: float) -> bool:
-        """Let a link call `tick` at its slots, each `period` seconds, instead of the clock; again: another period.
-
-        False if the slots of another link are the clock, or the publisher is closed.
-        """
         if self._slot_link not in (None, slot_link) or self not in self._topic.publishers:
             return False
         self._slot_link = slot_link
@@ -84,10 +78,9 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
         return True
 
     def use_own_clock(self, slot_link: object) -> None:
-        """Go on with the publisher's own clock and period, if it used the slots of this link."""
         if self._slot_link is slot_link:
             self._slot_link = None
-            self.period = self._own_period
+            self.period = self._class.period
             if not self.node.ending:
                 self._ticker.start()
 
@@ -106,7 +99,7 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
             reason = f"{skipped} period(s) skipped, the next one late" if skipped else "late"
             self._report(Missed(self.topic, reason, late=late / SECOND, count=skipped), self._on_late)
         try:
-            message = self._fill()
+            message = self._class.fill()
             if message is None or self._encode == self._closed:  # fill may have closed it
                 return None
             sample = self._sample(message)
@@ -122,10 +115,10 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
     def _deliver_later(self, sample: Sample, blocked: list[Sink]) -> None:
         """Let full queues drop one at once; a full link, which may be busy for a moment, has until the next period."""
         queues = [sink for sink in blocked if isinstance(sink, SubscriberQueue)]
-        waiting = [sink for sink in blocked if sink not in queues and sink.reachable]
-        down = [sink for sink in blocked if sink not in queues and sink not in waiting]
-        if waiting:
-            self._waiting = _PeriodDelivery(self, sample, waiting, self._clock.monotonic())
+        links = [sink for sink in blocked if sink not in queues and sink.reachable]
+        down = [sink for sink in blocked if sink not in queues and sink not in links]
+        if links:
+            self._pending = _PeriodDelivery(self, sample, links, self._clock.monotonic())
         if queues:
             for sink in queues:
                 sink.force(sample)
@@ -144,7 +137,7 @@ class PeriodicPublisher(BasePublisher[M], SlotPublisher):
 
     def _give_up(self, reason: str) -> None:
         """Withdraw what still waits from the period before: it is stale."""
-        delivery, self._waiting = self._waiting, None
+        delivery, self._pending = self._pending, None
         without = delivery.withdraw() if delivery is not None else []
         if delivery is not None and without:
             for sink in without:

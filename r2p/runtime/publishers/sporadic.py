@@ -15,7 +15,7 @@ from r2p.units import SECOND
 _TOO_LATE = "no room by the deadline"
 
 
-class SporadicPublisher(BasePublisher[M]):
+class SporadicPublisher(BasePublisher[M, Sporadic]):
     """A publisher of events that are due by a deadline: `publish()` never waits.
 
     Made by `Node.advertise` with `Sporadic`.
@@ -28,8 +28,6 @@ class SporadicPublisher(BasePublisher[M]):
     ) -> None:
         super().__init__(space, node, topic, layout, klass, latch=latch)
         self._deadline = round(klass.deadline * SECOND)
-        self._limit = klass.pending
-        self._send_late = klass.late == "send"
         self._pending: list[_EventDelivery[M]] = []
         self._alarm = Alarm(space.loop, self._overdue)
 
@@ -50,15 +48,15 @@ class SporadicPublisher(BasePublisher[M]):
         Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """
         sample = self._sample(message, self._deadline)
-        sample.drop_late = not self._send_late
+        sample.drop_late = self._class.late == "drop"
         blocked = self._topic.deliver(sample)
         if blocked is None:
             return True
-        waiting = [sink for sink in blocked if sink.reachable]
-        if waiting:
-            self._wait(_EventDelivery(self, sample, waiting, self._clock.monotonic() + self._deadline))
-        if len(waiting) < len(blocked):
-            self._miss_unreachable(sample, [sink for sink in blocked if sink not in waiting])
+        reachable = [sink for sink in blocked if sink.reachable]
+        if reachable:
+            self._wait(_EventDelivery(self, sample, reachable, self._clock.monotonic() + self._deadline))
+        if len(reachable) < len(blocked):
+            self._miss_unreachable(sample, [sink for sink in blocked if sink not in reachable])
         return False
 
     def close(self) -> None:
@@ -69,7 +67,7 @@ class SporadicPublisher(BasePublisher[M]):
 
     def _wait(self, event: "_EventDelivery[M]") -> None:
         self._pending.append(event)
-        if len(self._pending) > self._limit:
+        if len(self._pending) > self._class.pending:
             self._give_up(self._pending[0], "too many wait")  # the oldest: it is due first, and worth least
         self._arm()
 
@@ -87,7 +85,7 @@ class SporadicPublisher(BasePublisher[M]):
     def _overdue(self) -> None:
         now = self._clock.monotonic()
         for event in [event for event in self._pending if event.due <= now and not event.overdue]:
-            if self._send_late:
+            if self._class.late == "send":
                 event.overdue = True
                 self.late += 1
                 late = (now - event.due) / SECOND
