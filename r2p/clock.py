@@ -19,7 +19,7 @@ import random
 import re
 import sys
 import time
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeGuard
 
 from r2p.errors import MessageError
 from r2p.units import MILLISECOND, SECOND
@@ -204,8 +204,10 @@ class Alarm:
 class ExactAlarm(Alarm):
     """An alarm that comes some ten microseconds late where the system has timerfds. Has to be closed."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, callback: Callable[[], object]) -> None:
-        super().__init__(loop, callback)
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, callback: Callable[[], object], *, background: bool = False
+    ) -> None:
+        super().__init__(loop, callback, background=background)
         self._fd: int | None = None
         self._inexact = self._clock.virtual or sys.platform != "linux"
 
@@ -223,12 +225,12 @@ class ExactAlarm(Alarm):
             super()._arm(deadline, delay)
             return
         self._armed = deadline
-        _set_timerfd(self._fd, max(deadline, 1), 0)  # an instant of 0 would switch it off
+        _set_timerfd(self._fd, max(deadline, 1))  # an instant of 0 would switch it off
 
     def _disarm(self) -> None:
         super()._disarm()
         if self._fd is not None:
-            _set_timerfd(self._fd, 0, 0)
+            _set_timerfd(self._fd, 0)
 
     def _open(self) -> None:
         try:
@@ -266,12 +268,10 @@ class Ticker:
         """`period` is in ns, `background` as in `Alarm`. Raises ValueError for a period of less than 1000 ns."""
         if period < _SHORTEST_PERIOD:
             raise ValueError(f"a period of {period} ns is too short: the shortest is {_SHORTEST_PERIOD} ns")
-        self._loop = loop
         self._period = period
         self._callback = callback
         self._clock = clock_of(loop)
-        self._alarm = Alarm(loop, self._tick, background=background)
-        self._fd: int | None = None
+        self._alarm = ExactAlarm(loop, self._tick, background=background)
         self._start = 0
         self._next = 1
 
@@ -280,50 +280,20 @@ class Ticker:
         self.close()
         self._start = self._clock.monotonic()
         self._next = 1
-        first = self._start + self._period
-        if self._clock.virtual or not self._start_timerfd(first):
-            self._alarm.set(first)
+        self._alarm.set(self._start + self._period)
 
     def close(self) -> None:
         """Stop: no callback comes after this."""
         self._alarm.close()
-        if self._fd is not None:
-            self._loop.remove_reader(self._fd)
-            os.close(self._fd)
-            self._fd = None
-
-    def _start_timerfd(self, first: int) -> bool:
-        """Use a timerfd. Returns False, and leaves it to loop timers, off Linux or without descriptors."""
-        if sys.platform != "linux":
-            return False
-        try:
-            fd = _open_timerfd(first, self._period)
-        except _NO_TIMERFD:
-            return False
-        self._loop.add_reader(fd, self._readable, fd)
-        self._fd = fd
-        return True
-
-    def _readable(self, fd: int) -> None:
-        os.read(fd, 8)
-        self._tick()
 
     def _tick(self) -> None:
         now = self._clock.monotonic()
         due = (now - self._start) // self._period
         skipped = due - self._next
         self._next = due + 1
-        if self._fd is None:
-            self._alarm.set(self._start + self._next * self._period)
+        self._alarm.set(self._start + self._next * self._period)
         scheduled = self._start + due * self._period
         self._callback(scheduled, now - scheduled, skipped)  # last: the next tick is safe whatever it raises
-
-
-def _open_timerfd(first: int, period: int) -> int:
-    """A descriptor that becomes readable at `first` and every `period` after it, in ns of the monotonic clock."""
-    fd = _new_timerfd()
-    _set_timerfd(fd, first, period)
-    return fd
 
 
 if sys.version_info >= (3, 13):
@@ -331,8 +301,8 @@ if sys.version_info >= (3, 13):
     def _new_timerfd() -> int:
         return os.timerfd_create(time.CLOCK_MONOTONIC, flags=os.TFD_NONBLOCK | os.TFD_CLOEXEC)
 
-    def _set_timerfd(fd: int, first: int, period: int) -> None:
-        os.timerfd_settime_ns(fd, flags=os.TFD_TIMER_ABSTIME, initial=first, interval=period)
+    def _set_timerfd(fd: int, instant: int) -> None:
+        os.timerfd_settime_ns(fd, flags=os.TFD_TIMER_ABSTIME, initial=instant)
 
 else:
 
@@ -350,9 +320,9 @@ else:
             raise OSError(ctypes.get_errno(), "timerfd_create")
         return fd
 
-    def _set_timerfd(fd: int, first: int, period: int) -> None:
+    def _set_timerfd(fd: int, instant: int) -> None:
         ctypes, libc = _ctypes()
-        times = (ctypes.c_long * 4)(*divmod(period, SECOND), *divmod(first, SECOND))  # struct itimerspec
+        times = (ctypes.c_long * 4)(0, 0, *divmod(instant, SECOND))  # struct itimerspec: no period, the instant
         libc.timerfd_settime(fd, 1, times, None)  # 1: TFD_TIMER_ABSTIME
 
 
@@ -372,17 +342,17 @@ def duration(text: str) -> float:
 
 def check_seconds(what: str, value: object, *, least: float) -> None:
     """Raise MessageError for what is not a duration of `least` seconds or more that a clock can count."""
-    if not _is_number(value) or not least <= value <= LONGEST:  # type: ignore[operator]
+    if not _is_number(value) or not least <= value <= LONGEST:
         raise MessageError(f"{what} is in seconds, {least:g} to {LONGEST:g}, not {value!r}{_hint(value)}")
 
 
 def check_timeout(what: str, value: object) -> None:
     """Raise MessageError for what is neither None (for ever) nor a number of seconds; 0 or less is over at once."""
-    if value is not None and (not _is_number(value) or not value <= LONGEST):  # type: ignore[operator]
+    if value is not None and (not _is_number(value) or not value <= LONGEST):
         raise MessageError(f"{what} is in seconds, or None to wait for ever, not {value!r}{_hint(value)}")
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: object) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

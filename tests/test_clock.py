@@ -204,6 +204,8 @@ async def test_alarm_is_never_early_on_a_real_loop(delay: int, kind: type[Alarm]
 
 @pytest.fixture(params=["timerfd", "no timerfd"])
 def exact(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alarms and tickers with a timerfd, and where there is none."""
+
     def no_descriptors() -> NoReturn:
         raise OSError(errno.EMFILE, "no descriptor")
 
@@ -280,17 +282,8 @@ async def test_ticks_are_exact_under_virtual_time() -> None:
     assert await ticks(333_333, 5000) == [(123_456_700 + k * 333_333, 0, 0) for k in range(1, 5001)]
 
 
-@pytest.fixture(params=["timerfd", "loop timers"])
-def source(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_descriptors(first: int, period: int) -> NoReturn:
-        raise OSError(errno.EMFILE, f"no descriptor for {first} + k * {period}")
-
-    if request.param == "loop timers":
-        monkeypatch.setattr(r2p.clock, "_open_timerfd", no_descriptors)
-
-
 @pytest.mark.anyio
-@pytest.mark.usefixtures("source")
+@pytest.mark.usefixtures("exact")
 @pytest.mark.parametrize("period", [2 * MS, 100_000])
 async def test_ticks_keep_their_phase_on_a_real_loop(period: int) -> None:
     before = clock_of().monotonic()
@@ -300,7 +293,7 @@ async def test_ticks_keep_their_phase_on_a_real_loop(period: int) -> None:
 
 
 @pytest.mark.anyio
-@pytest.mark.usefixtures("source")
+@pytest.mark.usefixtures("exact")
 async def test_ticks_are_skipped_while_the_loop_is_blocked() -> None:
     seen = await ticks(1 * MS, 4, work=5 * MS)
     assert seen[1][2] >= 4
@@ -308,7 +301,7 @@ async def test_ticks_are_skipped_while_the_loop_is_blocked() -> None:
 
 
 @pytest.mark.anyio
-@pytest.mark.usefixtures("source")
+@pytest.mark.usefixtures("exact")
 async def test_the_shortest_period_leaves_the_loop_to_others() -> None:
     ticking = asyncio.create_task(ticks(1000, 500))
     turns = 0
@@ -320,7 +313,7 @@ async def test_the_shortest_period_leaves_the_loop_to_others() -> None:
 
 
 @pytest.mark.anyio
-@pytest.mark.usefixtures("source")
+@pytest.mark.usefixtures("exact")
 async def test_an_exception_is_reported_and_the_ticker_goes_on() -> None:
     loop = asyncio.get_running_loop()
     reported: list[object] = []
