@@ -49,15 +49,13 @@ class Clock(Protocol):
     """A source of time."""
 
     virtual: bool
-    """True when time is simulated: it stands still while code runs, and only loop timers know it."""
+    """Whether time is simulated: then it stands still while code runs, and only loop timers know it."""
 
     def now(self) -> int:
         """UTC in ns since 1970. Never jumps back, even when the computer's clock is set back."""
-        ...
 
     def monotonic(self) -> int:
         """Ns since an arbitrary instant; cannot be set: for deadlines and intervals."""
-        ...
 
 
 class SystemClock:
@@ -163,7 +161,7 @@ class Alarm:
         self._armed: int | None = None  # when the loop calls; earlier than the deadline, if that was put off
 
     def set(self, deadline: int | None) -> None:
-        """Move to this instant of `Clock.monotonic()` in ns; one in the past is as soon as possible. None: off."""
+        """Move to this instant of `Clock.monotonic()` in ns; one in the past is as soon as possible, None is off."""
         self._deadline = deadline
         if self._armed is not None:
             if deadline is not None and self._armed <= deadline:
@@ -357,7 +355,7 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 def _hint(value: object) -> str:
-    """What to write for a text as URLs have it."""
+    """A remedy for a text such as URLs have: the number of seconds."""
     try:
         return f": write {duration(value):g}" if isinstance(value, str) else ""
     except ValueError:

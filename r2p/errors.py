@@ -62,7 +62,7 @@ class Broken(TransportError):
 
 
 class NodeCrashed(Error, ExceptionGroup[Exception]):
-    """What the nodes of a module raised: one exception for each node, with a note that names the node."""
+    """The exceptions of a module's nodes: one for each node that crashed, with a note that names the node."""
 
     # Without the overload for BaseException: nodes raise Exceptions, so parts of this group hold nothing else.
     def derive(self, excs: Sequence[Exception]) -> "NodeCrashed":  # type: ignore[override]

@@ -56,7 +56,7 @@ class LineLimit:
         """Of each kind: the start of its period (ns), and how many lines there would have been since."""
 
     def suffix(self, kind: str, now: int) -> str | None:
-        """What to append to one more line at `now` (monotonic ns). None: leave the line out."""
+        """The text to append to one more line at `now` (monotonic ns); None if the line is left out."""
         lines = self._lines.get(kind)
         if lines is not None and now - lines[0] < self._period:  # first, as this is so for most lines of a flood
             lines[1] += 1

@@ -155,11 +155,11 @@ def _checked(whole: re.Match[bytes]) -> Line | None:
 
 
 class _Unfinished(Exception):
-    """The message is valid so far, and its rest has yet to come."""
+    """Raised while a message is valid so far, and its rest has yet to come."""
 
 
 class _Wrong(Exception):
-    """These bytes are not a message; the argument is the reason."""
+    """Raised for bytes that are not a message; the argument is the reason."""
 
 
 class _Fields:

@@ -4,6 +4,8 @@ Addresses are in the module's memory, lengths in bytes; both are unsigned 32-bit
 full size in both directions: how much of them is used depends on the messages before.
 """
 
+from typing import dataclass_transform
+
 import msgspec
 
 from r2p.codecs._records import Codec, Record
@@ -31,7 +33,12 @@ FLAGS_WORD = 0xFFFFFFFF  # ParamRequest.offset of the app's flags, a u16
 CHUNK = 16  # bytes of an IhexRecord or a ParamChunk
 
 
-class Nack(msgspec.Struct, frozen=True, gc=False):
+@dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
+class Loader(msgspec.Struct, frozen=True, gc=False):
+    """A message of a loader, or to one."""
+
+
+class Nack(Loader):
     """Refuse. `line` is the line of the firmware's source that refused: the only field that firmware fills."""
 
     line: int = 0
@@ -40,19 +47,19 @@ class Nack(msgspec.Struct, frozen=True, gc=False):
     value: bytes = bytes(24)
 
 
-class Ack(msgspec.Struct, frozen=True, gc=False):
+class Ack(Loader):
     """Accept, and ask for the next message."""
 
 
-class BeginLoader(msgspec.Struct, frozen=True, gc=False):
+class BeginLoader(Loader):
     """Open a session that loads or removes apps."""
 
 
-class EndLoader(msgspec.Struct, frozen=True, gc=False):
+class EndLoader(Loader):
     """Close the session."""
 
 
-class LinkingSetup(msgspec.Struct, frozen=True, gc=False):
+class LinkingSetup(Loader):
     """The lengths of an app's sections and stack, its name (8 characters), and FLAG_ENABLED or 0."""
 
     pgmlen: int
@@ -63,7 +70,7 @@ class LinkingSetup(msgspec.Struct, frozen=True, gc=False):
     flags: int = 0
 
 
-class LinkingAddresses(msgspec.Struct, frozen=True, gc=False):
+class LinkingAddresses(Loader):
     """The addresses that an app is to be linked to."""
 
     infoadr: int
@@ -74,7 +81,7 @@ class LinkingAddresses(msgspec.Struct, frozen=True, gc=False):
     nextadr: int
 
 
-class LinkingOutcome(msgspec.Struct, frozen=True, gc=False):
+class LinkingOutcome(Loader):
     """The addresses and lengths that came out of linking."""
 
     mainadr: int
@@ -86,7 +93,7 @@ class LinkingOutcome(msgspec.Struct, frozen=True, gc=False):
     dtorslen: int
 
 
-class IhexRecord(msgspec.Struct, frozen=True, gc=False):
+class IhexRecord(Loader):
     """One record of an Intel hex file: `kind` is its record type, `checksum` its own, `data` 16 bytes.
 
     The record's bytes are the first `count` of `data`; a faulty peer may say more than 16.
@@ -99,23 +106,23 @@ class IhexRecord(msgspec.Struct, frozen=True, gc=False):
     checksum: int
 
 
-class RemoveLast(msgspec.Struct, frozen=True, gc=False):
+class RemoveLast(Loader):
     """Remove the app that was loaded last."""
 
 
-class RemoveAll(msgspec.Struct, frozen=True, gc=False):
+class RemoveAll(Loader):
     """Remove all apps."""
 
 
-class BeginAppinfo(msgspec.Struct, frozen=True, gc=False):
+class BeginAppinfo(Loader):
     """Open a listing of the apps."""
 
 
-class EndAppinfo(msgspec.Struct, frozen=True, gc=False):
+class EndAppinfo(Loader):
     """Close the listing."""
 
 
-class AppinfoSummary(msgspec.Struct, frozen=True, gc=False):
+class AppinfoSummary(Loader):
     """The number of installed apps, and the bounds of the memory for apps."""
 
     numapps: int
@@ -126,23 +133,23 @@ class AppinfoSummary(msgspec.Struct, frozen=True, gc=False):
     ramendadr: int
 
 
-class BeginSetparam(msgspec.Struct, frozen=True, gc=False):
+class BeginSetparam(Loader):
     """Open the setting of a parameter."""
 
 
-class EndSetparam(msgspec.Struct, frozen=True, gc=False):
+class EndSetparam(Loader):
     """Close the setting."""
 
 
-class BeginGetparam(msgspec.Struct, frozen=True, gc=False):
+class BeginGetparam(Loader):
     """Open the reading of a parameter."""
 
 
-class EndGetparam(msgspec.Struct, frozen=True, gc=False):
+class EndGetparam(Loader):
     """Close the reading."""
 
 
-class ParamRequest(msgspec.Struct, frozen=True, gc=False):
+class ParamRequest(Loader):
     """Select a parameter: `length` bytes at `offset` in the configuration of an app, or its flags (FLAGS_WORD)."""
 
     offset: int
@@ -150,33 +157,11 @@ class ParamRequest(msgspec.Struct, frozen=True, gc=False):
     length: int
 
 
-class ParamChunk(msgspec.Struct, frozen=True, gc=False):
+class ParamChunk(Loader):
     """The next 16 bytes of a parameter."""
 
     data: bytes
 
-
-Loader = (
-    Nack
-    | Ack
-    | BeginLoader
-    | EndLoader
-    | LinkingSetup
-    | LinkingAddresses
-    | LinkingOutcome
-    | IhexRecord
-    | RemoveLast
-    | RemoveAll
-    | BeginAppinfo
-    | EndAppinfo
-    | AppinfoSummary
-    | BeginSetparam
-    | EndSetparam
-    | BeginGetparam
-    | EndGetparam
-    | ParamRequest
-    | ParamChunk
-)
 
 _CODEC = Codec[Loader](
     SIZE,

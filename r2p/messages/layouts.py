@@ -90,7 +90,7 @@ class Timestamp(Message):
 
 
 class ClockOffset(msgspec.Struct, frozen=True, gc=False):
-    """How a stamp was translated to UTC from another clock, that of the RTCAN network `epoch`.
+    """The translation of a stamp to UTC from another clock, that of the RTCAN network `epoch`.
 
     UTC = that clock + `offset` (ns), known to +-`error` (ns).
     """

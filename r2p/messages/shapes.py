@@ -139,7 +139,7 @@ S = TypeVar("S", bound=msgspec.Struct)  # a message class; these are defined on 
 
 
 class Layout(msgspec.Struct, Generic[S], frozen=True, eq=False):
-    """How the messages of one class are laid out in bytes.
+    """The layout of the messages of one class in bytes.
 
     `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with their path where
     they are nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` is its BLAKE2b-64 (8 bytes). `encode`

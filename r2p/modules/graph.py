@@ -1,4 +1,4 @@
-"""What a module knows of the network: topics, nodes and modules, its own and those that its links have discovered.
+"""The network as a module knows it: topics, nodes and modules, its own and those that its links have discovered.
 
 r2p modules announce all of it at once. Firmware announces its name and its topics, one of them each half second, and
 not the nodes that they belong to. The views have ages, which say how old the knowledge is.
@@ -72,7 +72,7 @@ class NetworkView:
         self._opened = opened
 
     def modules(self) -> list[ModuleView]:
-        """All modules, this one first, then by name; observers included."""
+        """List the modules, this one first, then by name; observers included."""
         module = self._opened()
         now = module.space.clock.monotonic()
         state = _state(module.flags, observer=module.observer)
@@ -81,7 +81,7 @@ class NetworkView:
         return [own, *sorted(others, key=lambda view: (view.name, view.link))]
 
     def topics(self) -> dict[str, TopicView]:
-        """All topics by name, in order."""
+        """Return the topics by name, in order."""
         module = self._opened()
         views: dict[str, TopicView] = {}
         for topic in module.space.topics.values():
@@ -102,7 +102,7 @@ class NetworkView:
         return dict(sorted(table.items()))
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
-        """A message class of this layout, from a module on the network that has it. May take a second; None: no answer.
+        """Ask the modules on the network for a message class of this layout; None without an answer. May take a second.
 
         Only links that carry such questions are asked (zenoh).
         """

@@ -104,7 +104,7 @@ class LinkManager:
             self._bridging = self.bridge = Bridge(space, self.instance, bridge, self._port_changed)
             space.make_topic = self.bridge.make_topic
         else:
-            self._bridging = MultihomedModule(space, self.instance, self._link_chosen)
+            self._bridging = MultihomedModule(space, self.instance, self.link_notice)
 
     def set_flags(self, flags: int) -> None:
         """Announce another state of the module."""
@@ -174,7 +174,7 @@ class LinkManager:
         logger.warning("link %s: %s; trying again", link.title, reason)
         self._events.emit(LinkWaits(link.name, reason))
 
-    def link_notice(self, link: Link, kind: str, text: str, *, trouble: bool) -> None:
+    def link_notice(self, link: Link, kind: str, text: str, trouble: bool) -> None:
         """Report something else about a link."""
         logger.log(logging.WARNING if trouble else logging.INFO, "link %s: %s", link.title, text)
         self._events.emit(LinkNotice(link.name, kind, text))
@@ -209,7 +209,9 @@ class LinkManager:
                 self._log_limited(link, logging.ERROR, "names", text)
                 self._events.emit(event)
             case EchoDetected():
-                logger.error("link %s gives back what we send: switch off local echo at the other end", link.title)
+                logger.error(
+                    "link %s gives back what this module sends: switch off local echo at the other end", link.title
+                )
             case ModuleChanged():
                 self._link_accepted(link)
                 self._suspect_conflict(link, event.info)
@@ -219,11 +221,8 @@ class LinkManager:
 
     # Called by the bridge
 
-    def _link_chosen(self, link: Link, kind: str, text: str, trouble: bool) -> None:
-        self.link_notice(link, kind, text, trouble=trouble)
-
     def _port_changed(self, link: Link, kind: str, text: str, trouble: bool) -> None:
-        self.link_notice(link, f"gateway: {kind}", text, trouble=trouble)
+        self.link_notice(link, f"gateway: {kind}", text, trouble)
 
     # Reports
 
@@ -352,7 +351,7 @@ class LinkManager:
 
 
 def describe_mismatch(event: Mismatched) -> str:
-    """What is wrong, and what to do about it."""
+    """Say how the types differ, and what to do about it."""
     role = "publish" if event.role == ROLE_PUBLISHES else "subscribe"
     if event.ours.size != event.theirs.size:
         what = f"messages of {event.theirs.size} bytes, here they have {event.ours.size}"

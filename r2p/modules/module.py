@@ -86,7 +86,7 @@ class Module:
         self.refused: dict[str, int] = {}
         """Commands from the network that it refused, by name: how many."""
         self.network = NetworkView(lambda: self._opened)
-        """What it knows of the network."""
+        """The network as this module knows it."""
         self._via = _urls(via)
         self._remap = _checked_remap(remap)
         self._with_watchdog = watchdog
@@ -151,7 +151,7 @@ class Module:
             error.add_note(f"before that: {crash!r} {' '.join(crash.__notes__)}")
 
     def gateway_statistics(self) -> GatewayStatistics:
-        """What it has forwarded so far, and where.
+        """Return how many messages it has forwarded so far, and where.
 
         Raises Closed unless it is open, and Error if it is not a gateway (`bridge`).
         """

@@ -21,7 +21,7 @@ from r2p.names import NODE_MAX, node_name
 from r2p.runtime.node import Node
 
 NodeFunction = Callable[..., Awaitable[object]]
-"""What `Module.start` runs: `async def blink(node: r2p.Node) -> None`; further arguments are those given to `start`."""
+"""A function for `Module.start`: `async def blink(node: r2p.Node) -> None`, with the further arguments of `start`."""
 
 _FIRST_RESTART, _LONGEST_RESTART = 0.5, 30.0  # seconds
 _STABLE = 60.0  # seconds without a crash after which the pause before a restart is the first one again
@@ -59,7 +59,7 @@ class Supervisor:
     ) -> None:
         self.node = make_node()
         self.error: Exception | None = None
-        """What the node raised, if that ended it."""
+        """The exception that ended the node, if one did."""
         self.restarts = 0
         """Times that it was started again after a crash."""
         self._function = function
@@ -228,7 +228,7 @@ class _Attempt:
             self._timer.cancel()
 
     def result(self, error: Exception | None) -> Exception | None:
-        """What ended the node. An error outside of the function came first, and caused what the function raised."""
+        """The error that ended the node: one from outside of the function came first, and caused what that raised."""
         if self.error is None:
             return error
         if self._cancelled:

@@ -150,14 +150,11 @@ class Watchdog:
             last = stack[-1]
             logger.warning(AGAIN, who, self._limit * 1e3, suffix, f"{last.filename}:{last.lineno}, {last.name}")
         else:
-            self._remember(text)
+            if len(self._known) >= _REMEMBERED:
+                self._known.clear()
+            self._known.add(text)
             logger.warning(BLOCKED, who, self._limit * 1e3, suffix, text)
         return True
-
-    def _remember(self, stack: str) -> None:
-        if len(self._known) >= _REMEMBERED:
-            self._known.clear()
-        self._known.add(stack)
 
 
 def _used() -> float:

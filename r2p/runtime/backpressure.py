@@ -138,7 +138,7 @@ _Line = deque[tuple[Sink, PendingDelivery]]
 
 
 class WaitQueue:
-    """What waits for places that one or several sinks share."""
+    """The deliveries that wait for places, which one or several sinks share."""
 
     __slots__ = ("non_real_time", "real_time", "recoveries")
 
@@ -146,7 +146,7 @@ class WaitQueue:
         self.real_time: _Line = deque()
         self.non_real_time: _Line = deque()
         self.recoveries: list[Callable[[], None]] = []
-        """What to call when there is plenty of room: from those that went on without waiting."""
+        """Called when there is plenty of room, for publishers that went on without waiting."""
 
     def __bool__(self) -> bool:
         return bool(self.real_time or self.non_real_time or self.recoveries)
@@ -179,7 +179,7 @@ class WaitQueue:
                 sink, delivery = first
                 try:
                     accepted = sink.offer(delivery.sample)
-                except Exception:
+                except Exception:  # raised again: the link, or the reader, that serves counts it
                     delivery.complete(sink, INTERNAL_ERROR)  # nothing else would ever end the wait
                     raise
                 if not accepted:

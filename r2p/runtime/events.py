@@ -1,4 +1,4 @@
-"""What happens to a module's links and on its network, as events that programs and tools iterate over.
+"""Events about a module's links and its network, which programs and tools iterate over.
 
 A listener is a bounded queue that lives as long as its iterator: one that is not read is garbage-collected.
 """

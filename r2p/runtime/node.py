@@ -304,9 +304,9 @@ class Node:
         return self._space.clock.now()
 
     def network_time(self) -> int | None:
-        """The time in ns that all nodes on the module's RTCAN bus share; of several buses, the first one's.
+        """Return the time in ns that all nodes on the module's RTCAN bus share; of several buses, the first one's.
 
-        None: there is no bus, or it has no master.
+        None without a bus, and while the bus has no master.
         """
         return next((time for link in self._space.links if (time := link.network_time()) is not None), None)
 

@@ -64,7 +64,7 @@ class WakeScheduler:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._readers: list[tuple[int, int, asyncio.Future[None]]] = []
-        """What is to be woken: negated priority, a running number, the future of a reader."""
+        """A heap of readers to wake: negated priority, a running number, the reader's future."""
         self._order = itertools.count()
         self._running = False
         self._priorities: dict[int, int] = {}

@@ -84,7 +84,7 @@ class Subscriber(Generic[T]):
         self.topic = topic.name
         """Its name, after remapping."""
         self.callback: Callback[T] | None = options.callback
-        """What `Node.spin` calls with each message; None: messages are read by iteration or `fetch`."""
+        """The function that `Node.spin` calls with each message; None if they are read by iteration or `fetch`."""
         self.undecodable = 0
         """Messages whose bytes don't decode as the type; skipped."""
         self.stale = 0
@@ -244,7 +244,7 @@ class Subscriber(Generic[T]):
         self._sink.waiter = waiter
 
     def wait_no_more(self, waiter: asyncio.Future[None]) -> None:
-        """Take the future back, if it has not been woken."""
+        """Stop waiting by this future."""
         if self._sink.waiter is waiter:
             self._sink.waiter = None
 

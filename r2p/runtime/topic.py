@@ -170,7 +170,7 @@ class Topic:
         return blocked if blocked is None else self._remaining(blocked)
 
     def _remaining(self, sinks: list[Sink]) -> list[Sink] | None:
-        """Those that have not left while a sample was on its way: nothing would ever make room in the others."""
+        """Leave out sinks that left while a sample was on its way: nothing would ever make room in them."""
         return [sink for sink in sinks if sink in self.queues or sink in self.remote_subscribers] or None
 
     def _send(
@@ -217,7 +217,7 @@ class Topic:
         sink.get_wait_queue().drop_sink(sink)
 
     def publisher_of(self, sample: Sample) -> PublisherHandle | None:
-        """The publisher of this module that a link reports to what became of the sample. None: it came by a link."""
+        """The publisher of this module to which a link reports the fate of the sample; None if it came by a link."""
         if sample.source.link:
             return None
         for publisher in self.publishers:
@@ -253,16 +253,16 @@ class LinkView(Protocol):
     def name(self) -> str: ...
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
-        """What the class means on this link for the topic, for people."""
+        """Describe, for people, how well this link serves the topic in this class."""
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
         """Whether the link gives less than the class asks for."""
 
     def refusal(self, size: int) -> str | None:
-        """Why messages of `size` bytes can't be sent on this link."""
+        """Return the reason why messages of `size` bytes can't be sent on this link, if there is one."""
 
     def inadmissible(self, size: int, period: float) -> str | None:
-        """Why there can never be slots for messages of `size` bytes each `period` seconds."""
+        """Return the reason why slots for `size` bytes each `period` seconds are impossible, if there is one."""
 
     def network_time(self) -> int | None:
         """The time (ns) that all nodes of the link's network share; None if it has no such time, or it is not known."""
@@ -272,7 +272,7 @@ class LinkView(Protocol):
 
 
 class TopicSpace:
-    """All topics of one module, by name; its links are informed of changes by `changed`."""
+    """The topics of one module, by name; its links are informed of changes by `changed`."""
 
     def __init__(self, module: str, loop: asyncio.AbstractEventLoop, clock: Clock) -> None:
         self.module = module

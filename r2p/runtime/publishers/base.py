@@ -1,4 +1,4 @@
-"""What all publishers share: their topic, their counters, and how they report what was missed or late.
+"""The part that all publishers share: their topic, their counters, and how they report what was missed or late.
 
     _miss      a message has not reached a queue or a link: `missed`, and `on_missed`
     link_late  a message was sent after its deadline: `late`, and `on_late`; publishers report their own delays likewise
@@ -34,7 +34,7 @@ _REMEMBERED = 64  # sequence numbers of messages that were missed last: several 
 
 
 class BasePublisher(Generic[M, C]):
-    """What all publishers share: made by `Node.advertise`, closed by `close()` or when their node ends."""
+    """The base of all publishers: made by `Node.advertise`, closed by `close()` or when their node ends."""
 
     publisher_class: PublisherClass
 
@@ -100,7 +100,7 @@ class BasePublisher(Generic[M, C]):
 
     @property
     def guarantees(self) -> dict[str, str]:
-        """What the publisher's class means on each link, in words, by the name of the link; "" is this module."""
+        """The meaning of the publisher's class on each link, in words, by the link's name; "" is this module."""
         local = {
             PublisherClass.NON_REAL_TIME: "waits for room in every queue",
             PublisherClass.SPORADIC: "in every queue by the deadline, or signalled",
