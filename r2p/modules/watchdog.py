@@ -31,7 +31,7 @@ LIMIT = 0.1
 
 _REPORTS = 1  # a second
 _REMEMBERED = 256  # stacks that were logged
-_MOST_STOPPED = 1.0  # seconds that the process may be stopped without a line of the log
+_STOPPED_MAX = 1.0  # seconds that the process may be stopped without a line of the log
 _IDLE = 0.5  # of a processor: code that blocks by working uses more than that, and a process that waits less
 
 STOPPED = "this process did not run for %.1f s: it was stopped, or the computer slept or was busy"
@@ -120,7 +120,7 @@ class Watchdog:
         start, used = self._clock.monotonic(), _used()
         if self._ended.wait(self._limit / 4):
             return True
-        if self._was_stopped(start, used, _MOST_STOPPED):
+        if self._was_stopped(start, used, _STOPPED_MAX):
             self._log_stopped(start)
         return False
 

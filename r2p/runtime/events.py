@@ -63,6 +63,7 @@ class EventHub:
     """Hands events to all listeners, until it is closed."""
 
     def __init__(self) -> None:
+        # By number, not in a WeakSet: so listeners are woken in the same order in every run under virtual time.
         self._listeners: weakref.WeakValueDictionary[int, _Listener] = weakref.WeakValueDictionary()
         self._numbers = itertools.count()
         self._closed = False

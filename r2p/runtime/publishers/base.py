@@ -29,7 +29,7 @@ C = TypeVar("C", bound=NonRealTime | Sporadic | Periodic[Any])
 
 _LOG_LINES = 1  # a second about what is missed or late
 _CALLBACK_PAUSE = 0.001  # seconds between callbacks where one causes the next: else the event loop would stand still
-_MOST_DEFERRED = 4  # callbacks that wait for that one by one; what comes on top is added to the last one
+_DEFERRED_MAX = 4  # callbacks that wait for that one by one; what comes on top is added to the last one
 _REMEMBERED = 64  # sequence numbers of messages that were missed last: several links may report one message
 
 
@@ -233,7 +233,7 @@ class BasePublisher(Generic[M, C]):
         """Report later: a callback has published a message that is missed as well, and must not be called in itself."""
         if not self._deferred:
             self._space.loop.call_later(_CALLBACK_PAUSE, self._call_deferred)
-        elif len(self._deferred) >= _MOST_DEFERRED and self._deferred[-1][0] is callback:
+        elif len(self._deferred) >= _DEFERRED_MAX and self._deferred[-1][0] is callback:
             missed = structs.replace(missed, count=self._deferred.pop()[1].count + missed.count)
         self._deferred.append((callback, missed))
 
