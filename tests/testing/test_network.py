@@ -72,7 +72,7 @@ async def test_a_gateway_joins_two_networks(r2p_network: Network) -> None:
         r2p_network.node("PC1") as node,
     ):
         imu.start(blink)
-        assert (await node.subscribe("leds", Led).fetch(timeout=30)).value == 1
+        assert (await node.subscribe("leds", Led).fetch(timeout=30)).led == 3
 
 
 async def test_each_test_has_a_network_of_its_own(r2p_network: Network) -> None:

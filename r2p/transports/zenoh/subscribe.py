@@ -106,7 +106,7 @@ class RxStream:
 
     def add_session(self, session: int) -> None:
         """Remember a publisher's module: it gets a final credit even if nothing of what it sent has come yet."""
-        self._window(session, int(_NRT))
+        self._window(session, _NRT)
 
     def remove_sender(self, sender: Hashable) -> None:
         """Forget a publisher's module: should it come back, what it repeats is as good as new."""

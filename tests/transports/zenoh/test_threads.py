@@ -179,7 +179,7 @@ async def test_whether_messages_reach_a_subscriber_is_asked_in_the_thread() -> N
     session: Any = SimpleNamespace(outbound=out, declare_publisher=lambda *_: Publisher(busy))
     publishers.connect(session, "r2p/lab/topic/")
     assert not publishers.reaches("leds")
-    publishers._publisher("leds", 1)
+    publishers._publisher("leds", PublisherClass.NON_REAL_TIME)
     out.set_token_count(MANY_TOKENS)
     assert not publishers.reaches("leds")
     assert not publishers.reaches("leds")
