@@ -78,7 +78,8 @@ class VirtualClock:
     virtual = True
 
     def __init__(self) -> None:
-        self.elapsed = 0  # ns
+        self.elapsed = 0
+        """Ns since the start; set by the loop."""
 
     def now(self) -> int:
         """Return UTC in ns; it starts at 2013-01-01."""
@@ -87,10 +88,6 @@ class VirtualClock:
     def monotonic(self) -> int:
         """Return the ns since the start."""
         return self.elapsed
-
-    def move_to(self, instant: int) -> None:
-        """Jump to this instant (ns since the start)."""
-        self.elapsed = instant
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
@@ -194,7 +191,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         if self._turns >= _BUSY and self._scheduled and not self._jobs:
             when = self._scheduled[0].when()
             if when < _HORIZON:
-                self.clock.move_to(max(self.clock.elapsed, _nanoseconds(when)))
+                self.clock.elapsed = max(self.clock.elapsed, _nanoseconds(when))
 
     def _idle(self) -> bool:
         """Jump to the next timer: nothing is left to do at this instant. True: wait for a job in a thread instead."""
@@ -209,7 +206,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             self._checked, self._waited_for = instant, None
         elif instant - self._checked >= _IDLE_CHECK:
             self._check_progress(instant)
-        self.clock.move_to(instant)
+        self.clock.elapsed = instant
         return False
 
     def _give_up(self, later: bool) -> NoReturn:

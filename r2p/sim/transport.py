@@ -108,13 +108,13 @@ class SimPort(CanPort):
         self._timeline = shared.bus.timeline
         self._clock = self.controller.clock
         self.now = self._clock.monotonic if self._clock.virtual else self._present
-        self._user: CanPortListener | None = None
+        self._listener: CanPortListener | None = None
         self._up = False
 
-    async def run(self, user: CanPortListener, opened: Callable[[], object]) -> None:
-        self._user = user
+    async def run(self, listener: CanPortListener, opened: Callable[[], object]) -> None:
+        self._listener = listener
         controller = self.controller
-        controller.on_receive = user.received
+        controller.on_receive = listener.received
         controller.on_sent = self._sent
         controller.on_lost = self._lost
         controller.on_error = self._failed
@@ -125,12 +125,12 @@ class SimPort(CanPort):
                 self._goes_up()
             else:
                 controller.power_off()
-                user.waits(_NO_POWER)
+                listener.waits(_NO_POWER)
             opened()
             await asyncio.get_running_loop().create_future()
         finally:
             self._up = False
-            self._user = None
+            self._listener = None
             controller.on_receive = ignore
 
     def transmit(self, order: Transmit) -> None:
@@ -169,47 +169,52 @@ class SimPort(CanPort):
         self._timeline.catch_up()
         return self._clock.monotonic()
 
+    # `_sent` and `_lost` are called for each frame, and spare the call of `_confirm`.
+
     def _sent(self, frame: Frame, stamp: int) -> None:
-        if self._user is not None and self._up:
-            self._user.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _SENT, stamp - self.receive_latency)
+        if self._listener is not None and self._up:
+            self._listener.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _SENT, stamp - self.receive_latency)
 
     def _lost(self, frame: Frame, stamp: int) -> None:
-        if self._user is not None and self._up:
-            self._user.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _LOST, stamp)
+        if self._listener is not None and self._up:
+            self._listener.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _LOST, stamp)
 
     def _late(self, frame: Frame, stamp: int) -> None:
         self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], _LATE, stamp)
 
     def _failed(self, frame: Frame, kind: ErrorKind, stamp: int) -> None:
-        if self._user is not None and self._up:
-            self._user.fault(kind.value)
+        if self._listener is not None and self._up:
+            self._listener.fault(kind.value)
         self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], Outcome.ERROR, stamp)
 
     def _confirm(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        if self._user is not None and self._up:
-            self._user.confirmed(mailbox, outcome, at)
+        if self._listener is not None and self._up:
+            self._listener.confirmed(mailbox, outcome, at)
 
     def _state(self, state: ControllerState, _stamp: int) -> None:
         if state is ControllerState.BUS_OFF:
             self._goes_down(state.value)
         elif state is ControllerState.ACTIVE:
             self._goes_up()
-        elif self._user is not None:
-            self._user.fault(state.value)
+        elif self._listener is not None:
+            self._listener.fault(state.value)
 
     def _goes_up(self) -> None:
-        if self._user is not None and not self._up:
+        if self._listener is not None and not self._up:
             self._up = True
-            self._user.up()
+            self._listener.up()
 
     def _goes_down(self, reason: str) -> None:
-        if self._user is not None and self._up:
+        if self._listener is not None and self._up:
             self._up = False
-            self._user.down(reason)
+            self._listener.down(reason)
 
 
 class SimTransport(Transport):
-    """The connection of one module to a simulated bus: to `shared`, or to the running loop's bus of that name."""
+    """The connection of one module to a simulated bus: to `shared`, or to the running loop's bus of that name.
+
+    `node` are fields of `CanNode`; `bus` are options of `SimCan`, if this transport makes it.
+    """
 
     def __init__(
         self,
@@ -218,19 +223,17 @@ class SimTransport(Transport):
         node: dict[str, Any] | None = None,
         *,
         shared: SimCan | None = None,
-        noise: float = 0.0,
-        seed: int | None = None,
+        **bus: Any,
     ) -> None:
         self._name = name
         self._options = options
         self._node = node or {}
         self._shared = shared
-        self._noise = noise
-        self._seed = seed
+        self._bus = bus
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         options = self._options
-        shared = self._shared or can_bus(self._name, bitrate=options.bitrate, noise=self._noise, seed=self._seed)
+        shared = self._shared or can_bus(self._name, bitrate=options.bitrate, **self._bus)
         if shared.bus.bit * options.bitrate != SECOND:
             raise TransportError(f"sim:{self._name} has {SECOND // shared.bus.bit} bit/s, not {options.bitrate}")
         node = CanNode(hub.space.module, **{"one_shot": True} | self._node)
@@ -272,7 +275,8 @@ def from_url(url: Url) -> SimTransport:
     node = {"transmit": latency, "receive": latency}
     node |= {field: values[key] for key, field in _FIELDS.items() if key in values}
     options = apply_options(str(url), known, DEFAULTS)
-    return SimTransport(url.address, options, node, noise=values.get("noise", 0.0), seed=values.get("seed"))
+    bus = {key: values[key] for key in ("noise", "seed") if key in values}
+    return SimTransport(url.address, options, node, **bus)
 
 
 def _nanoseconds(text: str) -> int:

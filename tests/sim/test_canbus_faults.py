@@ -9,7 +9,7 @@ import pytest
 
 from r2p.codecs.rtcan import Frame, encode_identifier, wire_bits
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, FrameRecord
-from r2p.sim.can.faults import bits_until_noticed, error_frame_bits, first_difference, flip
+from r2p.sim.can.bus import bits_until_noticed, error_frame_bits, first_difference, flip
 from tests import can_watch
 
 BIT = 1000  # ns at 1 Mbit/s
@@ -53,7 +53,7 @@ def counters(controller: CanController) -> tuple[int, int]:
 
 def test_how_long_error_flags_overlap() -> None:
     wire = wire_bits(FRAME)
-    assert error_frame_bits("0101", wire, active=True, others=False) == 6 + 8  # nobody else to notice
+    assert error_frame_bits("0101", wire, active=True, others=False) == 6 + 8  # no other node has to notice
     assert error_frame_bits("0101", wire, active=True, others=True) == 12 + 8  # noticed with the 6th dominant bit
     assert error_frame_bits("0100", wire, active=True, others=True) == 10 + 8  # two were dominant before the flag
     assert error_frame_bits("0" * 6, wire, active=True, others=True) == 6 + 8  # noticed by all at once
@@ -132,7 +132,7 @@ async def test_noise_at_one_node_destroys_frames_for_all_until_it_is_error_passi
 
 
 @pytest.mark.virtual_time
-async def test_without_another_node_nobody_acknowledges() -> None:
+async def test_a_node_that_is_alone_gets_no_acknowledge() -> None:
     watch = Watch()
     a = watch.attach("A", one_shot=True)
     a.request(FRAME)

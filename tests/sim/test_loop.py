@@ -315,7 +315,7 @@ def test_a_program_that_repeats_itself_has_the_time_of_its_limit() -> None:
     assert ended == [100 * SECOND]  # its last second was the 99th
 
 
-def test_a_finished_job_wakes_nobody_else() -> None:
+def test_a_finished_job_wakes_no_other_task() -> None:
     async def main() -> None:
         await asyncio.to_thread(int)
         await forever()

@@ -12,14 +12,13 @@ events keep their exact instants on the bus, and run as soon as the loop gets to
 Work is done per frame, not per bit: the winner of an arbitration is the lowest of a few integers, and the codec counts
 (and caches) the length of its frame. The same seed gives the same run: each node has its own random numbers.
 
-Read `node` (settings and records) first, then `bus` (arbitration, frames) and `controller` (mailboxes, callbacks);
-`timeline` has the events and clocks, `faults` error frames and error counters, `statistics` the bus load.
+Read `records` first (settings, and what is recorded), then `bus` (arbitration, frames, error frames), `controller`
+(mailboxes, callbacks, error counters) and `timeline` (events and clocks).
 """
 
 from r2p.sim.can.bus import CanBus
 from r2p.sim.can.controller import CanController
-from r2p.sim.can.node import CanNode, ControllerState, ErrorKind, FrameRecord, Latency
-from r2p.sim.can.statistics import Count, Statistics
+from r2p.sim.can.records import CanNode, ControllerState, Count, ErrorKind, FrameRecord, Latency, Statistics
 from r2p.sim.can.timeline import LocalAlarm, LocalClock, Timeline, TimelineTimer
 
 __all__ = [

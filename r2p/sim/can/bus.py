@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from r2p.codecs.rtcan import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
-from r2p.sim.can.controller import CanController
-from r2p.sim.can.faults import RECESSIVE_BITS, bits_until_noticed, error_frame_bits, first_difference, flip
-from r2p.sim.can.node import CanNode, ControllerState, ErrorKind, FrameRecord
-from r2p.sim.can.statistics import Statistics
+from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController
+from r2p.sim.can.records import CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
 from r2p.sim.can.timeline import Timeline
 from r2p.units import NEVER, SECOND
 
@@ -27,6 +25,8 @@ if TYPE_CHECKING:
     from r2p.codecs.rtcan import Frame
     from r2p.sim.can.controller import ControllerMailboxes, Request
 
+_FLAG: Final = 6  # bits of an error flag
+_DELIMITER: Final = 8  # recessive bits that end an error frame
 _SUSPEND: Final = 8  # bits that an error passive sender waits longer before its next frame
 _BITS_AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge slot
 _RECOVERY_SEQUENCES: Final = 128  # times 11 recessive bits, until a controller leaves bus-off
@@ -49,7 +49,7 @@ class _Transfer(msgspec.Struct, eq=False):
         return [request.owner for request in self.requests]
 
 
-class CanBus:
+class CanBus(BusWire):
     """A CAN 2.0B bus with extended identifiers.
 
     `timeline` is true time. `statistics` counts from the start. `observers` are called with a `FrameRecord` at the end
@@ -111,15 +111,14 @@ class CanBus:
         """Drop all events, so that nothing further happens on this bus."""
         self.timeline.close()
 
-    # For controllers (`BusWire`)
+    # For controllers: `BusWire` says what these do
 
     def contend(self, request: Request) -> bool:
-        """Send this frame as soon as the bus is free. False: the bus is busy, or the frame would start too late."""
         mailboxes = request.owner.mailboxes
         self._contenders[mailboxes] = None
         if self._busy:
             return False
-        start = self._free  # comparisons instead of max(): this runs for each frame
+        start = self._free  # comparisons instead of max(), which takes longer: this runs for each frame
         if start < request.ready:
             start = request.ready
         if start < mailboxes.not_before:
@@ -131,19 +130,16 @@ class CanBus:
         return True
 
     def is_starting(self, request: Request) -> bool:
-        """Return whether the start bit of this frame has begun, and arbitration is still open."""
         start = self._start
         if start is None or self.timeline.now() < max(start, request.ready):
             return False
         return request.owner.mailboxes.choose(start, start + self.bit) is request
 
     def request_withdrawn(self) -> None:
-        """Plan the next frame anew: one has left its mailbox."""
         if not self._busy:
             self._plan_anew()
 
     def disconnected(self, controller: CanController) -> None:
-        """Leave this controller out from now on: it has no power, or is in bus-off."""
         self._listeners.leave(controller)
         if controller.state is ControllerState.DOWN:
             self._recovery.forget(controller)
@@ -152,15 +148,12 @@ class CanBus:
         self.request_withdrawn()
 
     def connected(self, controller: CanController) -> None:
-        """Let this controller send and receive again."""
         self._listeners.join(controller)
 
     def filters_changed(self) -> None:
-        """Forget which controllers are concerned by which frames."""
-        self._listeners.concerned.clear()
+        self._listeners.filters_changed()
 
     def recover(self, controller: CanController) -> None:
-        """Let this controller leave bus-off after enough recessive bits."""
         self._recovery.begin(controller, max(self.timeline.now(), self._free))
 
     # The start of a frame
@@ -214,12 +207,10 @@ class CanBus:
         lowest = min([request.frame.id for request in contestants])
         for request in contestants:
             if request.frame.id != lowest:
-                self._lose(request, lowest, start)
+                at = start + bits_until_lost(lowest, request.frame.id) * self.bit
+                self.statistics.add_lost(request.owner.name, request.frame.id)
+                request.owner.lost_arbitration(request, at)
         return [request for request in contestants if request.frame.id == lowest]
-
-    def _lose(self, request: Request, winner: int, start: int) -> None:
-        self.statistics.add_lost(request.owner.name, request.frame.id)
-        request.owner.lost_arbitration(request, start + bits_until_lost(winner, request.frame.id) * self.bit)
 
     # A frame
 
@@ -239,7 +230,7 @@ class CanBus:
     def _transfer_of(self, requests: list[Request], start: int, excluded: Sequence[CanController]) -> _Transfer:
         frame, owner = requests[0].frame, requests[0].owner
         if len(requests) == 1 and not excluded:
-            names, receivers = self._listeners.audience[owner]
+            names, receivers = self._listeners.audience(owner)
         else:
             owners = [request.owner for request in requests]
             names = tuple([owner.name for owner in owners])
@@ -252,7 +243,7 @@ class CanBus:
         frame = transfer.frame
         for request in transfer.requests:
             request.owner.sent(request, end)
-        for node in self._listeners.concerned[frame.id]:
+        for node in self._listeners.concerned(frame.id):
             if node in transfer.receivers:
                 node.arrived(frame, end)
         self._over(transfer, transfer.bits, None, end)
@@ -349,54 +340,41 @@ class CanBus:
 
 
 class Listeners:
-    """The live controllers in the order of their connection, and two caches: needed for each frame, seldom changed.
-
-    `audience[controller]`: its name, and the receivers of what it sends alone. `concerned[identifier]`: the controllers
-    that a good frame with this identifier concerns.
-    """
+    """The live controllers in the order of their connection, and two caches: used for each frame, seldom changed."""
 
     def __init__(self) -> None:
         self.live: list[CanController] = []
-        self.audience = _Audience(self.live)
-        self.concerned = _Concerned(self.live)
+        self._audiences: dict[CanController, tuple[tuple[str, ...], list[CanController]]] = {}
+        self._concerned: dict[int, list[CanController]] = {}  # by identifier
 
     def join(self, controller: CanController) -> None:
-        """Add a controller."""
         self.live.append(controller)
-        self.audience.clear()
-        self.concerned.clear()
+        self._audiences.clear()
+        self._concerned.clear()
 
     def leave(self, controller: CanController) -> None:
-        """Remove a controller, if it is here."""
         if controller in self.live:
             self.live.remove(controller)
-            self.audience.clear()
-            self.concerned.clear()
+            self._audiences.clear()
+            self._concerned.clear()
 
+    def filters_changed(self) -> None:
+        self._concerned.clear()
 
-class _Audience(dict["CanController", tuple[tuple[str, ...], list["CanController"]]]):
-    """The name of a controller, and all others; worked out at the first look-up."""
-
-    def __init__(self, live: list[CanController]) -> None:
-        super().__init__()
-        self._live = live
-
-    def __missing__(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController]]:
-        audience = self[owner] = (owner.name,), [each for each in self._live if each is not owner]
+    def audience(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController]]:
+        """The name of a controller, and the receivers of what it sends alone."""
+        audience = self._audiences.get(owner)
+        if audience is None:
+            audience = self._audiences[owner] = (owner.name,), [each for each in self.live if each is not owner]
         return audience
 
-
-class _Concerned(dict[int, list["CanController"]]):
-    """The controllers that an identifier concerns; worked out at the first look-up."""
-
-    def __init__(self, live: list[CanController]) -> None:
-        super().__init__()
-        self._live = live
-
-    def __missing__(self, identifier: int) -> list[CanController]:
-        if len(self) >= _CACHED_IDENTIFIERS:
-            self.clear()
-        concerned = self[identifier] = [each for each in self._live if each.concerned(identifier)]
+    def concerned(self, identifier: int) -> list[CanController]:
+        """The controllers that a good frame with this identifier concerns."""
+        concerned = self._concerned.get(identifier)
+        if concerned is None:
+            if len(self._concerned) >= _CACHED_IDENTIFIERS:
+                self._concerned.clear()
+            concerned = self._concerned[identifier] = [each for each in self.live if each.concerned(identifier)]
         return concerned
 
 
@@ -420,7 +398,6 @@ class Recovery:
         self._wait(controller)
 
     def forget(self, controller: CanController) -> None:
-        """Drop a controller that has lost power."""
         self.remaining.pop(controller, None)
 
     def busy(self, start: int) -> None:
@@ -445,3 +422,38 @@ class Recovery:
     def _check(self, controller: CanController, idle: int) -> None:
         if idle == self._idle and self.remaining.pop(controller, None) is not None:
             controller.restarted()
+
+
+# Error frames, bit by bit: slow, but needed only when an error happens.
+#
+# An error active node answers an error with an active error flag, 6 dominant bits. The other nodes notice the error
+# when the flag breaks a rule of theirs - a sixth equal bit, or a dominant one after the CRC - and send their own flags:
+# one to twelve bits of flags in all. The flag of an error passive node is recessive, so the others see it only if that
+# node was the sender, which falls silent. 8 recessive bits, the delimiter, end the error frame.
+
+
+def flip(wire: str, bit: int) -> str:
+    """Return the bus up to bit `bit`, counted from 1, with that bit inverted."""
+    return wire[: bit - 1] + ("1" if wire[bit - 1] == "0" else "0")
+
+
+def first_difference(wires: Sequence[str]) -> int:
+    """Return the number, counted from 1, of the first bit in which senders of one identifier differ."""
+    return next(number for number, bits in enumerate(zip(*wires, strict=False), start=1) if len(set(bits)) > 1)
+
+
+def error_frame_bits(bus: str, wire: str, *, active: bool, others: bool) -> int:
+    """Return the bits from the detection of an error to the end of the error frame.
+
+    `bus`: the levels so far; `wire`: the whole frame as its sender wanted it. `active`: a node that detected the error
+    is error active; `others`: a node that has yet to notice it is.
+    """
+    noticed = bits_until_noticed(bus, wire, "0" if active else "1") if others else 0
+    return noticed + _FLAG + _DELIMITER
+
+
+def bits_until_noticed(bus: str, wire: str, level: str) -> int:
+    """Return how many more bits of this level must follow `bus` until every node has noticed the error."""
+    if len(bus) >= len(wire) - TAIL:
+        return 1
+    return max(0, _FLAG - (len(bus) - len(bus.rstrip(level))))

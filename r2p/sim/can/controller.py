@@ -1,4 +1,4 @@
-"""The CAN controller of a node: mailboxes, callbacks, and a clock.
+"""The CAN controller of a node: mailboxes, callbacks, error counters, and a clock.
 
 `CanController` is what the node's software uses; `BusWire` is what the controller needs of the bus. Instants inside are
 true time; the stamps that callbacks get are those of the node's clock.
@@ -13,8 +13,7 @@ import msgspec
 
 from r2p.codecs.rtcan import FRAME_MAX, IDENTIFIER_BITS
 from r2p.errors import MessageError
-from r2p.sim.can.faults import RECESSIVE_BITS, Confinement
-from r2p.sim.can.node import ControllerState, ErrorKind
+from r2p.sim.can.records import ControllerState, ErrorKind
 from r2p.sim.can.timeline import LocalAlarm, LocalClock
 from r2p.units import NEVER
 
@@ -22,27 +21,32 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from r2p.codecs.rtcan import Frame
-    from r2p.sim.can.node import CanNode
+    from r2p.sim.can.records import CanNode
     from r2p.sim.can.timeline import Timeline, TimelineTimer
-
 
 _BABBLE: Final = -1
 """The mailbox of the frame that a babbling node sends over and over."""
 
+RECESSIVE_BITS: Final = 11
+"""Recessive bits in a row after which a controller takes the bus for idle."""
+
+# Limits of the error counters (ISO 11898-1, fault confinement)
+_PASSIVE_ABOVE: Final = 127
+_BUS_OFF_ABOVE: Final = 255  # of the transmit counter only
+_AFTER_GOOD_FRAME: Final = 119  # a receive counter above 127 goes back to 119 to 127: here to the lowest
+
 
 class BusWire(Protocol):
-    """What a controller needs of its bus: a Protocol, because the bus is a layer above and makes the controllers."""
+    """What a controller needs of its bus, which is a layer above: it makes the controllers."""
 
     timeline: Timeline
     bit: int
 
     def contend(self, request: Request) -> bool:
         """Send this frame as soon as the bus is free. False: the bus is busy, or the frame would start too late."""
-        ...
 
     def is_starting(self, request: Request) -> bool:
         """Return whether the start bit of this frame has begun, and arbitration is still open."""
-        ...
 
     def request_withdrawn(self) -> None:
         """Plan the next frame anew: one has left its mailbox."""
@@ -309,6 +313,54 @@ class CanController:
     def _babble(self) -> None:
         if self._babbled and self.live:
             self._put(Request(self, self._babbled, _BABBLE, self._timeline.now(), NEVER))
+
+
+class Confinement:
+    """The two error counters of a controller, and the state that follows from them.
+
+    `on_change` is called with each new state.
+    """
+
+    def __init__(self, on_change: Callable[[ControllerState], object]) -> None:
+        self.state = ControllerState.ACTIVE
+        self.live = True
+        """Whether the controller sends and receives: it is neither down nor in bus-off."""
+        self.passive = False
+        self.transmit = 0
+        self.receive = 0
+        self._on_change = on_change
+
+    def transmitted(self) -> None:
+        """Count a frame that was sent without an error."""
+        self._count(self.transmit - 1, self.receive)
+
+    def received(self) -> None:
+        """Count a frame that was received without an error."""
+        self._count(self.transmit, self.receive - 1 if self.receive <= _PASSIVE_ABOVE else _AFTER_GOOD_FRAME)
+
+    def failed(self, *, transmit: int = 0, receive: int = 0) -> None:
+        """Count a frame that was destroyed while it was sent or received."""
+        self._count(self.transmit + transmit, self.receive + receive)
+
+    def restart(self) -> None:
+        self.transmit = self.receive = 0
+        self.enter(ControllerState.ACTIVE)
+
+    def enter(self, state: ControllerState) -> None:
+        if state is not self.state:
+            self.state = state
+            self.live = state is ControllerState.ACTIVE or state is ControllerState.PASSIVE
+            self.passive = state is ControllerState.PASSIVE
+            self._on_change(state)
+
+    def _count(self, transmit: int, receive: int) -> None:
+        self.transmit = max(0, transmit)
+        self.receive = max(0, receive)
+        if self.transmit > _BUS_OFF_ABOVE:
+            self.enter(ControllerState.BUS_OFF)
+        else:
+            passive = max(self.transmit, self.receive) > _PASSIVE_ABOVE
+            self.enter(ControllerState.PASSIVE if passive else ControllerState.ACTIVE)
 
 
 class Request(msgspec.Struct, eq=False):

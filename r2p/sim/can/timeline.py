@@ -48,7 +48,6 @@ class TimelineSource(Protocol):
     @property
     def elapsed(self) -> int:
         """Monotonic ns."""
-        ...
 
 
 class Timeline:
