@@ -2,10 +2,9 @@
 
 In the order in which to read it:
 
-    port          what RTCAN needs of a controller, and what ports to real interfaces share
-    tx_mailboxes  mailboxes in software, for drivers that queue frames
-    socketcan     Linux's CAN interfaces: rawsocket (batches of frames), errorframes, netlink (state of the interface)
-    pythoncan     the adapters that python-can knows
+    port       what RTCAN needs of a controller; what ports to real interfaces share: life, and mailboxes in software
+    socketcan  Linux's CAN interfaces: rawsocket (batches of frames, error frames), netlink (state of the interface)
+    pythoncan  the adapters that python-can knows
 
 The simulated controller is in `r2p.sim`.
 """

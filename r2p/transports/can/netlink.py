@@ -93,7 +93,8 @@ def list_interfaces() -> list[Interface]:
                 if kind == _DUMP_DONE:
                     return found
                 if kind == _ERROR:
-                    raise OSError(_errno(body), "rtnetlink")
+                    error = struct.unpack_from("=i", body)[0]  # in the byte order of this machine, as all of netlink
+                    raise OSError(-error, "rtnetlink")
                 interface = _parse_interface(body) if kind == _NEWLINK else None
                 if interface is not None:
                     found.append(interface)
@@ -113,14 +114,8 @@ def _split_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
         data = data[_aligned(length) :]
 
 
-def _errno(body: bytes) -> int:
-    """The error number in an error message, which has the byte order of this machine, as all of netlink has."""
-    error: int = struct.unpack_from("=i", body)[0]
-    return -error
-
-
 def _parse_interface(body: bytes) -> Interface | None:
-    """Parse the interface that a link message describes. None if it is not for CAN."""
+    """Parse the interface that a link message describes; None if it is not for CAN."""
     _, kind, _, flags, _ = _LINK.unpack_from(body)
     if kind != ARPHRD_CAN:
         return None
@@ -158,7 +153,7 @@ def _aligned(length: int) -> int:
 
 
 def _u32(data: bytes | None, index: int = 0) -> int | None:
-    """The 32-bit number at this index of an attribute. None if the attribute is missing or too short."""
+    """The 32-bit number at this index of an attribute; None if the attribute is missing or too short."""
     if data is None or len(data) < 4 * (index + 1):
         return None
     number: int = struct.unpack_from("=I", data, 4 * index)[0]

@@ -16,11 +16,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from r2p.clock import Backoff, ExactAlarm, random_of
+from r2p.clock import Backoff, random_of
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome
-from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface, PortAlarm
+from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -36,13 +36,13 @@ CONFIRM_TIMEOUT_NS = SECOND
 """Ns until a confirmation is given up."""
 
 QUEUE_MAX = 4096
-"""Frames that wait for the event loop at most."""
+"""Frames that wait for the event loop at most: half a second of a saturated bus of 1 Mbit/s."""
 
-_BATCH = 64  # frames that one turn of the event loop handles
-_SEND_TIMEOUT = 0.5  # seconds
-_READ_TIMEOUT = 0.1  # seconds; closing takes as long
-_STAMP_AGE_MAX = 10.0  # seconds; a stamp that seems older is by another clock than the computer's
-_LONGEST_WAIT = 2.0  # seconds between attempts to open the interface
+_BATCH = 64  # frames that one turn of the event loop handles: other tasks wait for so long
+_SEND_TIMEOUT_S = 0.5  # for a driver that waits for room in its queue
+_READ_TIMEOUT_S = 0.1  # closing takes as long
+_STAMP_AGE_MAX_S = 10.0  # a stamp that seems older is by another clock than the computer's
+_RETRY_MAX_S = 2.0  # between attempts to open the interface
 _LATENCY = 300_000  # ns that two changes of thread take, about
 
 
@@ -65,16 +65,13 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
         self._bitrate = bitrate
 
     async def run(self, listener: CanPortListener, opened: Callable[[], object]) -> None:
-        backoff = Backoff(random_of(), longest=_LONGEST_WAIT)
+        backoff = Backoff(random_of(), longest=_RETRY_MAX_S)
         while True:
-            if await self._use(listener, opened):
+            if await self._serve(listener, opened):
                 backoff.reset()
             await asyncio.sleep(backoff.delay())
 
-    def alarm(self, callback: Callable[[], object]) -> PortAlarm:
-        return ExactAlarm(asyncio.get_running_loop(), callback)
-
-    async def _use(self, listener: CanPortListener, opened: Callable[[], object]) -> bool:
+    async def _serve(self, listener: CanPortListener, opened: Callable[[], object]) -> bool:
         """Use the interface until it fails. False if it can't be opened now."""
         bus = _PythonCanBus(self._can, listener, echo=self._interface in ECHO_ON_REQUEST | ECHO_ALWAYS)
         try:
@@ -83,12 +80,8 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
             if problem:
                 listener.waits(problem)
                 return False
-            bus.set_filters(self._filters)
-            self._bus = bus
-            listener.up()
-            reason = await bus.ended
+            reason = await self._use(bus, listener)
         finally:
-            self._bus = None
             await bus.aclose()
         listener.down(reason)
         return True
@@ -104,10 +97,10 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
         return ""
 
     def _make(self) -> "can.BusABC":
-        options: dict[str, Any] = {"receive_own_messages": True} if self._interface in ECHO_ON_REQUEST else {}
-        bus: can.BusABC = self._can.Bus(
-            interface=self._interface, channel=self._channel, bitrate=self._bitrate, **options
-        )
+        options: dict[str, Any] = {"interface": self._interface, "channel": self._channel, "bitrate": self._bitrate}
+        if self._interface in ECHO_ON_REQUEST:
+            options["receive_own_messages"] = True
+        bus: can.BusABC = self._can.Bus(**options)
         return bus
 
 
@@ -118,7 +111,7 @@ bit rate. Other errors may pass, such as those of an adapter that is not plugged
 
 
 class _PythonCanBus(OpenInterface):
-    """An open interface. What runs in other threads stands at the end; all else runs in the event loop."""
+    """An open interface. All runs in the event loop but the last methods, which run in other threads."""
 
     def __init__(self, library: Any, listener: CanPortListener, *, echo: bool) -> None:
         super().__init__(listener, latency=_LATENCY, confirm_timeout=CONFIRM_TIMEOUT_NS)
@@ -163,12 +156,12 @@ class _PythonCanBus(OpenInterface):
         if self._bus is None or self.ended.done():
             return False
         message = self._can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=True)
-        send = partial(self._bus.send, message, _SEND_TIMEOUT)
+        send = partial(self._bus.send, message, _SEND_TIMEOUT_S)
         self._call_in_thread(send, partial(self._handed_over, frame, mailbox))
         return True
 
     def _handed_over(self, frame: Frame, mailbox: Mailbox, error: BaseException | None) -> None:
-        """The driver has the frame, or raised."""
+        """Confirm a frame that the driver has, unless it shows own frames; `error` is what it raised."""
         now = self._clock.monotonic()
         if isinstance(error, self._can.CanTimeoutError):  # the driver may send it all the same
             self._mailboxes.failed(mailbox, Outcome.UNKNOWN, now)
@@ -186,7 +179,7 @@ class _PythonCanBus(OpenInterface):
             message, read_at = self._queue.popleft()
             age = utc - message.timestamp  # python-can stamps in UTC, but some adapters from when they were plugged in
             try:
-                self._receive(message, now - round(age * SECOND) if 0.0 <= age < _STAMP_AGE_MAX else read_at)
+                self._receive(message, now - round(age * SECOND) if 0.0 <= age < _STAMP_AGE_MAX_S else read_at)
             except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
                 self._listener.internal_error(error)
         while self._reported < self._dropped:
@@ -225,7 +218,7 @@ class _PythonCanBus(OpenInterface):
 
     def _open_in_thread(self, make: Callable[[], "can.BusABC"]) -> None:
         self._bus = make()
-        self._notifier = self._can.Notifier(self._bus, [self], _READ_TIMEOUT)
+        self._notifier = self._can.Notifier(self._bus, [self], _READ_TIMEOUT_S)
 
     def _close_in_thread(self) -> None:
         if self._notifier is not None:
@@ -243,7 +236,7 @@ class _PythonCanBus(OpenInterface):
             self._schedule_batch()
 
     def on_error(self, error: Exception) -> None:
-        """The Notifier can't read. It would try again at once, without end: block it until it is stopped."""
+        """End: the Notifier can't read. It would try again at once, without end: block it until it is stopped."""
         if not self._closed.is_set():
             self._loop.call_soon_threadsafe(self._failed, error)
             self._closed.wait()

@@ -1,7 +1,10 @@
-"""A CAN_RAW socket that reads up to 64 frames with one system call.
+"""A CAN_RAW socket that reads up to 64 frames with one system call, and what its error frames say.
 
-That call is `recvmmsg`: it returns a batch of frames, each with its flags (own or not) and its stamp. Python's socket
+The call is `recvmmsg`: it returns a batch of frames, each with its flags (own or not) and its stamp. Python's socket
 module lacks it; the module's `recvmsg` returns one frame only, and asks the kernel for the interface's name each time.
+
+Error frames report what a driver knows of the bus and of the controller (linux/can/error.h). Not every driver reports
+everything: many never report that arbitration was lost, or only with `berr-reporting on`.
 """
 
 import ctypes
@@ -12,6 +15,8 @@ import struct
 import time
 from collections.abc import Iterable
 from typing import Any
+
+import msgspec
 
 from r2p.codecs.rtcan import Frame
 from r2p.units import SECOND
@@ -180,3 +185,69 @@ class _Batch:
             dropped = control[8]
         ctypes.memmove(self._messages, self._unused, count * ctypes.sizeof(_MMsgHdr))
         return received, dropped
+
+
+# Error frames
+
+# Classes of errors: bits of the identifier
+_TRANSMIT_TIMEOUT, _LOST_ARBITRATION, _CONTROLLER, _PROTOCOL, _NO_ACKNOWLEDGE, _BUS_OFF = 0x1, 0x2, 0x4, 0x8, 0x20, 0x40
+_CLASSES = {
+    _TRANSMIT_TIMEOUT: "transmit time-out",
+    _LOST_ARBITRATION: "arbitration lost",
+    0x10: "transceiver",
+    _NO_ACKNOWLEDGE: "no acknowledge",
+    _BUS_OFF: "bus-off",
+    0x80: "bus error",
+    0x100: "restarted",
+}
+# Bits of the second and of the third byte: the state of the controller, and errors of the protocol
+_CONTROLLERS = {
+    0x01: "receive overflow",
+    0x02: "transmit overflow",
+    0x04: "error-warning (receive)",
+    0x08: "error-warning (transmit)",
+    0x10: "error-passive (receive)",
+    0x20: "error-passive (transmit)",
+    0x40: "error-active",
+}
+_PROTOCOLS = {
+    0x01: "bit error",
+    0x02: "form error",
+    0x04: "stuff error",
+    0x08: "dominant bit error",
+    0x10: "recessive bit error",
+    0x20: "overload",
+    0x40: "active error",
+}
+_TRANSMITTING = 0x80  # bit of the protocol errors: this node was sending the frame
+
+
+class ErrorReport(msgspec.Struct, frozen=True):
+    """The kinds of errors that a frame reports, and whether a frame of this node lost arbitration or was destroyed."""
+
+    kinds: tuple[str, ...]
+    arbitration_lost: bool = False
+    destroyed: bool = False
+
+    @property
+    def bus_off(self) -> bool:
+        return _CLASSES[_BUS_OFF] in self.kinds
+
+
+def decode_error(identifier: int, data: bytes) -> ErrorReport:
+    """Decode an error frame: its identifier, without the flags, and its 8 bytes."""
+    kinds = _names(identifier, _CLASSES)
+    if identifier & _CONTROLLER:
+        kinds += _names(data[1], _CONTROLLERS) or ["controller"]
+    if identifier & _PROTOCOL:
+        kinds += _names(data[2], _PROTOCOLS) or ["protocol error"]
+    own = identifier & _PROTOCOL and data[2] & _TRANSMITTING
+    return ErrorReport(
+        tuple(kinds) or (f"error {identifier:#x}",),
+        arbitration_lost=bool(identifier & _LOST_ARBITRATION),
+        destroyed=bool(own or identifier & (_NO_ACKNOWLEDGE | _TRANSMIT_TIMEOUT)),
+    )
+
+
+def _names(bits: int, names: dict[int, str]) -> list[str]:
+    return [name for bit, name in names.items() if bits & bit]

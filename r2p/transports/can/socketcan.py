@@ -8,17 +8,16 @@ what became of the own frames.
 r2p never configures an interface: it waits until it can be used, and reports which command would make it so.
 """
 
-import asyncio
 import errno
 import os
 import socket
 from collections.abc import Callable
 
-from r2p.clock import Backoff, ExactAlarm, clock_of, random_of
+from r2p.clock import Backoff, clock_of, random_of
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import TransportError
 from r2p.protocols.rtcan.events import Mailbox, Outcome
-from r2p.transports.can import errorframes, netlink, rawsocket
+from r2p.transports.can import netlink, rawsocket
 from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface, PortAlarm
 from r2p.transports.can.rawsocket import RawSocket
 from r2p.units import SECOND
@@ -34,14 +33,14 @@ CONFIRM_TIMEOUT_ONE_SHOT_NS = 20_000_000
 
 _MASK = socket.CAN_EFF_MASK
 _BATCHES_MAX = 16  # more than the socket's receive queue holds
-_LONGEST_WAIT = 2.0  # seconds between looks at an interface that is not there; changes are noticed earlier
+_CHECK_MAX_S = 2.0  # between checks of an interface that is not there; changes are noticed earlier
 
 
 class SocketCanPort(InterfacePort["_SocketCanBus"]):
     """The interface `name`, such as "can0"."""
 
-    transmit_latency = 100_000
-    receive_latency = 50_000
+    transmit_latency = 100_000  # ns: the event loop, the kernel's queue, and the driver
+    receive_latency = 50_000  # ns: the kernel stamps in its interrupt, not the event loop
     coarse = True
 
     def __init__(self, name: str) -> None:
@@ -49,7 +48,7 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
         self._monotonic = clock_of().monotonic
 
     def now(self) -> int:
-        """While a batch of frames is handed out, the instant when it was read: one look at the clock per batch."""
+        """The instant when the batch was read that is being handed out: the clock is read once for each batch."""
         bus = self._bus
         return self._monotonic() if bus is None or bus.read_at is None else bus.read_at
 
@@ -59,58 +58,50 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
         if netlink.find_interface(self.name) is None:
             raise TransportError(f"rtcan:{self.name}: no CAN interface has this name; r2p doctor lists those there are")
         opened()
-        backoff = Backoff(random_of(), longest=_LONGEST_WAIT)
+        backoff = Backoff(random_of(), longest=_CHECK_MAX_S)
         async with netlink.InterfaceWatch() as watch:
             while True:
-                if await self._use(listener):
+                if await self._serve(listener):
                     backoff.reset()
                 await watch.wait(backoff.delay())
 
     def alarm(self, callback: Callable[[], object]) -> PortAlarm:
-        """Reads what has come in before it goes off: no time-out may outrun a frame that waits in the kernel."""
+        """A timer that reads what has come in before it goes off: no time-out may outrun a frame in the kernel."""
 
         def read_and_call() -> None:
             if self._bus is not None:
                 self._bus.read_all()
             callback()
 
-        return ExactAlarm(asyncio.get_running_loop(), read_and_call)
+        return super().alarm(read_and_call)
 
-    async def _use(self, listener: CanPortListener) -> bool:
+    async def _serve(self, listener: CanPortListener) -> bool:
         """Use the interface until it is gone. False if it can't be used now."""
-        try:
-            interface = self._usable_interface()
-            bus = _SocketCanBus(RawSocket(self.name), listener, one_shot=interface.one_shot)
-        except _Unusable as error:
-            listener.waits(str(error))
+        bus = self._open(listener)
+        if isinstance(bus, str):
+            listener.waits(bus)
             return False
-        except OSError as error:
-            listener.waits(f"{self.name}: {_reason(error)}")
-            return False
-        self.one_shot = interface.one_shot  # read each time: the interface may have been configured anew while down
-        bus.set_filters(self._filters)
-        self._bus = bus
+        bus.start()
         try:
-            bus.start()
-            listener.up()
-            reason = await bus.ended
+            reason = await self._use(bus, listener)
         finally:
-            self._bus = None
             bus.close()
         listener.down(reason)
         return True
 
-    def _usable_interface(self) -> netlink.Interface:
-        interface = netlink.find_interface(self.name)
-        if interface is None:
-            raise _Unusable(f"{self.name} is not there: plug it in (ip link)")
-        if interface.problem:
-            raise _Unusable(interface.problem)
-        return interface
-
-
-class _Unusable(Exception):
-    """The interface can't be used now. The text says why, and what to do."""
+    def _open(self, listener: CanPortListener) -> "_SocketCanBus | str":
+        """Open the interface, or return why it can't be used now, and what to do."""
+        try:
+            interface = netlink.find_interface(self.name)
+            if interface is None:
+                return f"{self.name} is not there: plug it in (ip link)"
+            if interface.problem:
+                return interface.problem
+            # Read each time: the interface may have been configured anew while it was down.
+            self.one_shot = interface.one_shot
+            return _SocketCanBus(RawSocket(self.name), listener, one_shot=interface.one_shot)
+        except OSError as error:
+            return f"{self.name}: {_reason(error)}"
 
 
 class _SocketCanBus(OpenInterface):
@@ -131,7 +122,6 @@ class _SocketCanBus(OpenInterface):
         self._dropped = 0
 
     def start(self) -> None:
-        """Read from now on."""
         self._loop.add_reader(self._socket.fileno(), self._read_batch)
 
     def close(self) -> None:
@@ -179,7 +169,7 @@ class _SocketCanBus(OpenInterface):
         return len(frames)
 
     def _hand_out(self, frames: list[rawsocket.ReceivedFrame]) -> None:
-        # Runs for every frame on the bus: all names are local, and the most frequent kind comes first.
+        # Runs for every frame on the bus: names are local to save look-ups, and the most frequent kind comes first.
         received, mask, own = self._listener.received, _MASK, rawsocket.OWN
         flags_of_id, data_frame = rawsocket.FLAGS, rawsocket.DATA
         for identifier, data, flags, stamp in frames:
@@ -210,7 +200,7 @@ class _SocketCanBus(OpenInterface):
         self._listener.other(frame, stamp)
 
     def _error_frame(self, identifier: int, data: bytes) -> None:
-        report = errorframes.decode(identifier, data)
+        report = rawsocket.decode_error(identifier, data)
         for kind in report.kinds:
             self._listener.fault(kind)
         if report.bus_off:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
-from r2p.transports.can.tx_mailboxes import RETRY_INTERVAL, TxMailboxes
+from r2p.transports.can.port import RETRY_INTERVAL, TxMailboxes
 from r2p.units import NEVER
 
 HRT, SRT, NRT = Mailbox

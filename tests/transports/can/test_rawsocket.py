@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from r2p.transports.can.errorframes import ErrorReport, decode
+from r2p.transports.can.rawsocket import ErrorReport, decode_error
 
 
 @pytest.mark.parametrize(
@@ -28,9 +28,9 @@ from r2p.transports.can.errorframes import ErrorReport, decode
     ],
 )
 def test_kinds(identifier: int, data: str, expected: ErrorReport) -> None:
-    assert decode(identifier, bytes.fromhex(data).ljust(8, b"\0")) == expected
+    assert decode_error(identifier, bytes.fromhex(data).ljust(8, b"\0")) == expected
 
 
 def test_bus_off_is_reported() -> None:
-    assert decode(0x44, bytes(8)).bus_off
-    assert not decode(0x3F, bytes(8)).bus_off
+    assert decode_error(0x44, bytes(8)).bus_off
+    assert not decode_error(0x3F, bytes(8)).bus_off
