@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 
 from r2p.protocols.rtcan.events import Fate, Outcome
-from r2p.transports.can import errorframes
+from r2p.transports.can import rawsocket
 from tests.docs.blocks import ROOT
 
 COUNTERS = {"lost", "losses", "counts", "dropped", "drops", "faults", "missed", "errors", "self"}
@@ -21,9 +21,9 @@ COUNTERS = {"lost", "losses", "counts", "dropped", "drops", "faults", "missed", 
 
 _FATES = {fate.value for fate in Fate} - {Fate.SENT.value, Fate.UNKNOWN.value, Fate.DISCARDED.value}  # no losses
 _ERROR_FRAMES = {
-    *errorframes._CLASSES.values(),
-    *errorframes._CONTROLLERS.values(),
-    *errorframes._PROTOCOLS.values(),
+    *rawsocket._CLASSES.values(),
+    *rawsocket._CONTROLLERS.values(),
+    *rawsocket._PROTOCOLS.values(),
     "controller",
     "protocol error",
 }
@@ -36,7 +36,6 @@ ELSEWHERE = {
     ("r2p/transports/can/socketcan.py", "kind"): _ERROR_FRAMES,
     ("r2p/protocols/rtcan/engine.py", "fate.value"): _FATES | {Fate.DISCARDED.value},
     ("r2p/transports/rtcan/tx.py", "done.fate.value"): _FATES,
-    ("r2p/transports/rtcan/slots.py", "done.fate.value"): _FATES,
 }
 """(File, key): what the key may be."""
 

@@ -7,7 +7,7 @@ How a miss is reported, always by `_miss` or `_report` of the base:
     _give_up             a link still had no room when that began (`on_missed`)
     delivery_completed   a link had room, but late in the period (`on_late`)
     link_missed          a link accepted the message, and could not send it in its slot (`on_missed`): an RTCAN slot,
-                         from `SlottedTopics.completed` in r2p/transports/rtcan/slots.py
+                         from `SlottedTopics.completed` in r2p/transports/rtcan/tx.py
     link_degraded        a link, or its slots, are lost (`on_degraded`)
 """
 

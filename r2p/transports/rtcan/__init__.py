@@ -4,10 +4,8 @@ The protocol itself is the engine in `r2p.protocols.rtcan`, which does no I/O; t
 `r2p.transports.can`. This package joins both, and makes a link of them. In the order in which to read it:
 
     transport    what a URL names: its options, the port, and the life of the link
-    driver       the loop that drives the engine: feed it, act on what it returns, re-arm one timer
-    link         the link of a module on a bus
+    driver       the loop that drives the engine: feed it, act on what it returns, re-arm one timer; UTC of the network
+    link         the link of a module on a bus, and what users read about it
     message_ids  which message ids to receive, and whose they are
-    tx           messages on their way out
-    slots        periodic publishers in slots of their own
-    status       what users read: guarantees and notices
+    tx           messages on their way out: in slots of their own, or by their deadlines
 """

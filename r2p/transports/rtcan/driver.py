@@ -6,6 +6,8 @@
 
 What an action brings about comes after the actions before it: a port may confirm from within `transmit`, and the owner
 may publish from within `act`. Both end in `carry_out`, which then only queues.
+
+`UtcEstimator` translates the engine's network time to UTC.
 """
 
 import asyncio
@@ -13,11 +15,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+from r2p.clock import clock_of
+from r2p.codecs.attachment import ClockOffset
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can.port import CanPort
 from r2p.transports.stats import RETRY_AFTER_ERROR
+
+_MEASURE_INTERVAL = 100_000_000  # ns between two measurements of UTC
+_MEASUREMENTS = 32  # that count: those of the last 3 s
+_UTC_ERROR_MIN = 1_000  # ns
 
 
 class DriverOwner(Protocol):
@@ -53,7 +61,9 @@ class EngineDriver:
         self.port = port
         self.now = port.now
         """The clock of the engine and of all its instants (ns)."""
-        self.internal_error = owner.internal_error
+        self.clock = clock_of()
+        """The module's clock."""
+        self.waits, self.fault, self.internal_error = owner.bus_waits, owner.bus_fault, owner.internal_error
         self._owner = owner
         self._port_actions: dict[type, Callable[[Any], object]] = {Transmit: port.transmit, Withdraw: port.withdraw}
         self._timer = port.alarm(self._poll)
@@ -99,14 +109,8 @@ class EngineDriver:
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
 
-    def waits(self, reason: str) -> None:
-        self._owner.bus_waits(reason)
-
-    def fault(self, kind: str) -> None:
-        self._owner.bus_fault(kind)
-
     def other(self, frame: OtherFrame, stamp: int) -> None:
-        """Ignore it: it does not concern RTCAN."""
+        pass  # it does not concern RTCAN
 
     # Act, and re-arm the timer
 
@@ -157,3 +161,37 @@ class EngineDriver:
         """Stop the engine and the timer."""
         self.carry_out(self.engine.stop(self.now()))
         self._timer.close()
+
+
+class UtcEstimator:
+    """Estimates the offset of UTC, by the module's clock, from the network's time.
+
+    Each measurement is off by an unknown delay, so the estimate is the middle of the last ones, and their spread is how
+    far it may be off.
+    """
+
+    def __init__(self, driver: EngineDriver) -> None:
+        self._driver = driver
+        self._measured: deque[int] = deque(maxlen=_MEASUREMENTS)
+        self._measured_at = -_MEASURE_INTERVAL
+        self._offset: ClockOffset | None = None
+
+    def offset(self, now: int) -> ClockOffset | None:
+        """The estimate at this instant of the engine's clock (ns); None while there is no network time."""
+        if now - self._measured_at >= _MEASURE_INTERVAL:
+            self._measured_at = now
+            self._measure()
+        return self._offset
+
+    def _measure(self) -> None:
+        engine = self._driver.engine
+        network_time, epoch = engine.network_time(self._driver.now()), engine.network.epoch
+        if network_time is None or epoch is None:
+            self._measured.clear()
+            self._offset = None
+            return
+        if self._offset is not None and self._offset.epoch != epoch:
+            self._measured.clear()  # another run of the network: its time starts anew
+        self._measured.append(self._driver.clock.now() - network_time)
+        low, high = min(self._measured), max(self._measured)
+        self._offset = ClockOffset(epoch, (low + high) // 2, max((high - low + 1) // 2, _UTC_ERROR_MIN))

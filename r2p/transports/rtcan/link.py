@@ -24,7 +24,9 @@ from r2p.protocols.rtcan.events import (
     Due,
     EngineSettings,
     IdConflict,
+    LostSync,
     Mailbox,
+    NewMaster,
     ParameterMismatch,
     ParametersMatch,
     Profile,
@@ -41,11 +43,16 @@ from r2p.runtime.topic import Topic
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, unique_name
-from r2p.transports.rtcan.driver import EngineDriver
+from r2p.transports.rtcan.driver import EngineDriver, UtcEstimator
 from r2p.transports.rtcan.message_ids import FIRMWARE, R2P, MessageIdMap, address_of, publisher_in
-from r2p.transports.rtcan.slots import SlottedTopic, SlottedTopics, inadmissible
-from r2p.transports.rtcan.status import LinkStatus, UtcEstimator
-from r2p.transports.rtcan.tx import ResponseHandle, SampleHandle, Transmitter, TxAccounting
+from r2p.transports.rtcan.tx import (
+    ResponseHandle,
+    SampleHandle,
+    SlottedTopic,
+    SlottedTopics,
+    Transmitter,
+    inadmissible,
+)
 from r2p.transports.senders import SenderLookup
 from r2p.transports.stats import LoggedCounter
 from r2p.units import LONG_AGO, MILLISECOND
@@ -96,17 +103,14 @@ class RtcanLink(BufferedLink):
         self.stats.faults = self.engine.counts  # one counter for what goes wrong in the engine and on the bus
         self.driver = EngineDriver(self.engine, port, self)
         self._utc_error = utc_error
-        self._utc = UtcEstimator(self.driver, self._clock)
+        self._utc = UtcEstimator(self.driver)
+        self._utc_offset = 0  # of UTC from the monotonic clock (ns)
+        self._utc_offset_until = LONG_AGO
         self._topic_ids = TopicIdAllocator()
         self._senders = SenderLookup(discovery, name, shared=(FIRMWARE, R2P))
-        self._utc_offset = 0
-        """UTC minus the monotonic clock (ns), and until when it is used."""
-        self._utc_offset_until = LONG_AGO
-        self._message_ids = MessageIdMap(self.engine, self, self._space, self.stats.lost)
-        self._slotted = SlottedTopics(self, self.driver, self._clock, self._has_subscribers)
-        self._status = LinkStatus(self.driver, settings)
-        self._accounting = TxAccounting(name, self.stats)
-        self._transmitter = Transmitter(self.driver, self._accounting, self._slotted, self._clock)
+        self._message_ids = MessageIdMap(self, self.engine, self._space)
+        self._slotted = SlottedTopics(self, self.driver, self._has_subscribers)
+        self._transmitter = Transmitter(self, self.driver, self._slotted)
         self._on_bus = False
 
     # What the driver calls
@@ -164,7 +168,7 @@ class RtcanLink(BufferedLink):
                 self._set_utc()
 
     def _notice(self, event: Action) -> str:
-        kind, text, trouble = self._status.notice(event)
+        kind, text, trouble = describe_event(event, fixed_id=self.engine.settings.id8 is not None)
         self._hub.link_notice(self, kind, text, trouble=trouble)
         return text
 
@@ -260,10 +264,10 @@ class RtcanLink(BufferedLink):
 
     @property
     def full(self) -> bool:
-        return self._accounting.full
+        return self._transmitter.full
 
     def has_room_for(self, sample: Sample) -> bool:
-        return self._accounting.has_room(sample)
+        return self._transmitter.has_room_for(sample)
 
     def write(self, topic: str, sample: Sample) -> None:
         high = self._topic_ids.pick(topic)
@@ -292,7 +296,7 @@ class RtcanLink(BufferedLink):
             case SlottedTopic() as slotted:
                 self._slotted.completed(slotted, done)
             case SampleHandle() as handle:
-                self._accounting.remove(handle, done)
+                self._transmitter.completed(handle, done)
                 if self.wait_queue:
                     self.made_room()
             case ResponseHandle() as response:
@@ -323,7 +327,7 @@ class RtcanLink(BufferedLink):
             self._topic_ids.drop(topic.name)
             self._slotted.update(topic, None)
         elif self.engine.ready:
-            self._slotted.update(topic, None if self._status.no_slots else self._topic_ids.pick(topic.name))
+            self._slotted.update(topic, None if no_slots(self.engine) else self._topic_ids.pick(topic.name))
 
     # What the link guarantees
 
@@ -338,21 +342,22 @@ class RtcanLink(BufferedLink):
         return self._slotted.by_topic
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
-        return self._status.guarantee(publisher_class, self._slotted.by_topic.get(topic))
+        return describe_guarantee(self.driver, publisher_class, self._slotted.by_topic.get(topic))
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
-        return publisher_class == PublisherClass.PERIODIC and bool(self._status.no_slots)
+        return publisher_class == PublisherClass.PERIODIC and bool(no_slots(self.engine))
 
     def inadmissible(self, size: int, period: float) -> str | None:
         return inadmissible(self.engine.timing, size, period)
 
     async def admission(self, topic: str) -> None:
         """Wait until a periodic topic sends in slots of its own, if it ever can."""
-        await self._slotted.wait_until(lambda: not self._undecided(topic))
+        while self._undecided(topic):
+            await self._slotted.wait_for_change()
 
     def _undecided(self, topic: str) -> bool:
         known = self._space.topics.get(topic)
-        if known is None or not self._on_bus or self._status.no_slots or self._closed:
+        if known is None or not self._on_bus or no_slots(self.engine) or self._closed:
             return False
         return self._slotted.undecided(known)
 
@@ -362,7 +367,7 @@ class RtcanLink(BufferedLink):
         return self.engine.network_time(self.driver.now())
 
     def translation(self) -> ClockOffset | None:
-        return self._utc.offset(self._clock.monotonic())
+        return self._utc.offset(self.driver.now())
 
     def utc(self) -> tuple[int, int] | None:
         """UTC by the RTCAN master, and how far off it may be (both ns). None: not known."""
@@ -385,7 +390,7 @@ class RtcanLink(BufferedLink):
 
     async def drain(self, timeout: float) -> None:
         """Wait until the samples that the engine has are on the bus, at most `timeout` seconds."""
-        await self.driver.drain(timeout, lambda: self._accounting.waiting)
+        await self.driver.drain(timeout, lambda: self._transmitter.pending)
 
     def close(self) -> None:
         """Release the slots and announce the end. The bus takes its time for that: see `driver.drain`."""
@@ -393,3 +398,68 @@ class RtcanLink(BufferedLink):
             self._slotted.close()
             super().close()
             self._slotted.wake_waiters()
+
+
+# What users read
+
+
+def no_slots(engine: Engine) -> str:
+    """Why periodic messages never get slots on this node's bus; empty if they may."""
+    if not engine.settings.reserves:
+        slot = engine.timing.slot // 1000
+        return f"slots of {slot} us are too short for a port that does not hit them; choose slots= and cycle="
+    if engine.profile is Profile.FIRMWARE:
+        return "firmware of 2014 keeps no cycle"
+    return ""
+
+
+def describe_guarantee(driver: EngineDriver, publisher_class: PublisherClass, slotted: SlottedTopic | None) -> str:
+    """What a publisher class means for a topic now; `slotted` if the topic is periodic and may have slots."""
+    engine = driver.engine
+    if engine.network.mismatch is not None:
+        return f"nothing is sent: {engine.network.mismatch}"
+    if not engine.ready:
+        return "nothing yet: not on the bus"
+    match publisher_class:
+        case PublisherClass.PERIODIC:
+            return _periodic_guarantee(engine, slotted)
+        case PublisherClass.SPORADIC:
+            laxity = "fresh at each try" if driver.port.one_shot else "fixed when a frame is handed to the controller"
+            return f"soft real-time, least laxity first, {laxity}; late ones are signalled"
+        case _:
+            return "non real-time: what the others leave of the bus; waits for room"
+
+
+def _periodic_guarantee(engine: Engine, slotted: SlottedTopic | None) -> str:
+    soft = "soft real-time with the period as deadline"
+    if reason := no_slots(engine):
+        return f"best effort: {reason}; {soft}"
+    if slotted is None:
+        return f"best effort: another publisher of the topic has the slots; {soft}"
+    if slotted.period and slotted.is_clock:
+        return slotted.describe()
+    if slotted.clock_elsewhere:
+        return f"best effort: the slots of another link are its clock; {soft}"
+    master = "" if engine.network.master is not None else ": there is no master yet"
+    return f"{slotted.describe()}{master}; meanwhile {soft}"
+
+
+def describe_event(event: Action, *, fixed_id: bool) -> tuple[str, str, bool]:
+    """Describe an event on the bus: its kind, a text, and whether it is trouble. `fixed_id`: this node has one id."""
+    match event:
+        case IdConflict(id8, yielded):
+            then = "waits until it is free" if fixed_id else "takes another one"
+            then = f"the other node keeps it, this module {then}" if yielded else "the other one should yield"
+            return "id conflict", f"another node uses the id {id8} of this one: {then}", True
+        case NewMaster(_, epoch, own=True):
+            return "master", f"this module is the RTCAN master (epoch {epoch:08x})", False
+        case NewMaster(id8):
+            return "master", f"{'firmware' if id8 is None else f'node {id8}'} is the RTCAN master", False
+        case LostSync(reason):
+            return "no master", f"no RTCAN master: {reason}", True
+        case ParameterMismatch(reason):
+            return "other parameters", f"nothing is sent: {reason}", True
+        case ParametersMatch():
+            return "own parameters", "the network's parameters are those of this module again", False
+        case _:
+            raise TypeError(f"not an event of the network: {event}")

@@ -4,7 +4,7 @@ A publisher is known by its 16-bit message id, which it announces. The low byte 
 knows its module. Modules of 2014 send management with one id for all of them, so they share one address.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import Advertise, Alive, ManagementType, SubscribeResponse
@@ -21,10 +21,7 @@ FIRMWARE = 0
 R2P = 256
 """The address of all r2p modules on a bus with firmware of 2014; other modules have their id8 as address, 1 to 255."""
 
-_LINGER = SECOND  # ns in which what still comes from a publisher that has left is counted as lost
-
-
-# Who sent it
+_LINGER = SECOND  # ns during which what still comes from a publisher that has left is counted as lost
 
 
 def address_of(data: bytes, modules: dict[str, ModuleInfo]) -> int:
@@ -55,31 +52,24 @@ def publisher_in(data: bytes, source: int) -> tuple[str, int] | None:
 
 
 def _decoded(data: bytes) -> management.Management | None:
-    """The message, or None where discovery would count it as undecodable. The codec remembers it for discovery."""
+    """The message; None where discovery will count it as undecodable. The codec remembers it for discovery."""
     try:
         return management.decode(data)
     except DecodeError:
         return None
 
 
-# Which message ids to receive
-
-
 class MessageIdMap:
-    """The message ids of remote publishers, for which the engine and the link receive messages.
+    """The message ids of remote publishers, for which the engine and the link receive messages."""
 
-    `lost` counts publishers that can't be received.
-    """
-
-    def __init__(self, engine: Engine, link: BufferedLink, space: TopicSpace, lost: Counter[str]) -> None:
+    def __init__(self, link: BufferedLink, engine: Engine, space: TopicSpace) -> None:
         self.topics: dict[int, bytes] = {}
         """Names of topics by message id."""
         self.lingering: dict[int, int] = {}
         """Ids of publishers that have left, and until when (monotonic ns) what still comes from them is counted."""
-        self._engine = engine
         self._link = link
+        self._engine = engine
         self._space = space
-        self._lost = lost
         self._ids: defaultdict[tuple[str, PeerAddress], set[int]] = defaultdict(set)
 
     def add(self, now: int, name: str, source: PeerAddress, params: bytes, size: int) -> None:
@@ -90,7 +80,7 @@ class MessageIdMap:
         size = topic.layout.size if topic.layout is not None else size
         message_id = management.rtcan_message_id(params)
         if not self._plausible(message_id, source) or not 1 <= size <= rtcan.PAYLOAD_MAX:
-            self._lost["impossible publisher"] += 1
+            self._link.stats.lost["impossible publisher"] += 1
             return
         self._assign(now, message_id, name, source)
         self.lingering.pop(message_id, None)

@@ -30,7 +30,7 @@ INTERFACES = frozenset({
 of these names is `rtcan:socketcan:NAME`.
 """
 
-_SLOT_MIN_COARSE = 500_000  # ns of the shortest slot that a port holds which can't hit an instant exactly
+_SLOT_MIN_COARSE = 500_000  # ns of the shortest slot that a port keeps to which can't hit an instant exactly
 _CAPACITY = 1024  # messages in the engine's queue: more than a link passes to it
 _DRAIN_TIMEOUT = 0.5  # seconds for the last messages: subscribers accept none after the announced end of the link
 _LEAVE_TIMEOUT = 0.5  # seconds for the announcement of the end
@@ -61,11 +61,6 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     def holds_slots_on_coarse_port(self) -> bool:
         """Whether the slots are so long that a port which can't hit an instant exactly stays inside of them."""
         return self.timing.slot >= _SLOT_MIN_COARSE
-
-    @property
-    def utc_error(self) -> int | None:
-        """`utc` in ns."""
-        return None if self.utc is None else round(self.utc * SECOND)
 
     @property
     def _cycle(self) -> int:
@@ -114,7 +109,8 @@ class RtcanTransport(Transport):
 async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanPort, options: RtcanOptions) -> None:
     """Run a link on a port until cancelled. The port is closed after the link's last messages and its announced end."""
     settings = options.settings(hub.random.getrandbits(64), port)
-    link = RtcanLink(name, hub, port, settings, options.utc_error)
+    utc_error = None if options.utc is None else round(options.utc * SECOND)
+    link = RtcanLink(name, hub, port, settings, utc_error)
     hub.attach(link)
     running = asyncio.create_task(port.run(link.driver, opened), name=f"{name} port")
     try:

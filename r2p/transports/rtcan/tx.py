@@ -1,25 +1,26 @@
-"""What goes out over an RTCAN bus: samples by their deadlines, and management as this network wants it.
+"""What goes out over an RTCAN bus: samples by their deadlines, slots, and management as this network wants it.
 
 NonRealTime  laxity 63: what the others leave of the bus
 Sporadic     soft real-time, least laxity first
-Periodic     hard real-time in slots (see `slots`); without slots soft real-time, with the period as deadline
+Periodic     hard real-time in slots, which are its publisher's clock (`SlottedTopics`); without slots soft
+             real-time, with the period as deadline
 """
 
-from collections.abc import Sequence
+import asyncio
+from collections.abc import Callable, Sequence
 
 import msgspec
 
-from r2p.clock import Clock
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import ManagementType
-from r2p.protocols.rtcan.events import Action, Done, Fate, Profile
+from r2p.protocols.rtcan.calendar import Calendar, Refusal
+from r2p.protocols.rtcan.cycle import Timing
+from r2p.protocols.rtcan.events import Action, Done, Due, Fate, Profile, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import PublisherHandle
-from r2p.transports.link import LinkSubscriber
+from r2p.runtime.topic import PublisherHandle, SlotPublisher, Topic
+from r2p.transports.link import Link, LinkSubscriber
 from r2p.transports.rtcan.driver import EngineDriver
-from r2p.transports.rtcan.slots import SlottedTopics
-from r2p.transports.stats import LinkStats
 from r2p.units import NEVER, SECOND
 
 NRT_FRAMES_MAX = 128
@@ -35,6 +36,184 @@ _NRT = PublisherClass.NON_REAL_TIME
 _SENT = (Fate.SENT, Fate.UNKNOWN)
 
 
+# Periodic messages in slots
+
+
+class SlottedTopic(msgspec.Struct, eq=False):
+    """A periodic topic and its slots. `period` and `phase` are in slots (0: none granted), `interval` in ns.
+
+    `is_clock`: these slots are the publisher's clock; `clock_elsewhere`: those of another link are. `sent` and `missed`
+    count messages since the grant; `earliest` and `latest` are when they ended, in ns from the start of their first
+    slot on: the difference is the jitter.
+    """
+
+    topic: Topic
+    publisher: SlotPublisher
+    high: int
+    period: int = 0
+    phase: int = 0
+    interval: int = 0
+    refusal: str = ""
+    is_clock: bool = False
+    clock_elsewhere: bool = False
+    due: int = 0
+    sent: int = 0
+    missed: int = 0
+    earliest: int = 0
+    latest: int = 0
+
+    def measure(self, ended: int) -> None:
+        """Count a message whose last frame ended at this instant."""
+        after = ended - self.due
+        self.earliest = min(self.earliest, after) if self.sent else after
+        self.latest = max(self.latest, after) if self.sent else after
+        self.sent += 1
+
+    def describe(self) -> str:
+        """Describe the slots and how well they are kept, for users."""
+        if not self.period:
+            return f"refused: {self.refusal}" if self.refusal else "waiting for admission"
+        text = f"a slot every {self.period} slots ({self.interval / 1e6:g} ms), phase {self.phase}"
+        if self.publisher.size > rtcan.FRAME_MAX:
+            text = text.replace("a slot", f"{rtcan.fragment_count(self.publisher.size)} slots", 1)
+        jitter = (self.latest - self.earliest) // 1000
+        if jitter or self.missed:
+            text += f"; jitter {jitter} us, {self.missed} of {self.sent + self.missed} missed their slot"
+        return text
+
+
+def inadmissible(timing: Timing, size: int, period: float) -> str | None:
+    """Why there can never be slots for messages of `size` bytes each `period` seconds. None: there may be."""
+    wanted = round(period * SECOND) // timing.slot
+    fragments = rtcan.fragment_count(size)
+    any_message = rtcan.message_id(rtcan.FIRST_TOPIC, 0)
+    answer = Calendar(timing.slots).admit(any_message, wanted, fragments, round_down=True)
+    return answer.text if isinstance(answer, Refusal) else None
+
+
+class SlottedTopics:
+    """The periodic topics of one link.
+
+    A slot is requested as soon as a topic is advertised, subscribed or not: admission must not depend on subscribers.
+    It is used only while there are some. Until the master grants it, and when it is lost, the publisher's own ticker
+    sends, as for every other link, and the link makes soft real-time messages of that.
+    """
+
+    def __init__(self, link: Link, driver: EngineDriver, has_subscribers: Callable[[str], bool]) -> None:
+        """`has_subscribers` says whether a topic has any on the bus that can be reached."""
+        self.by_topic: dict[str, SlottedTopic] = {}
+        self._link = link
+        self._driver = driver
+        self._has_subscribers = has_subscribers
+        self._by_high: dict[int, SlottedTopic] = {}
+        self._changed = asyncio.Event()
+
+    def update(self, topic: Topic, high: int | None) -> None:
+        """Request and release slots after a change of a topic's publishers, or of its high byte (None: it has none).
+
+        Of the publishers that can use slots the first gets them.
+        """
+        publisher = next(iter(topic.slot_publishers), None)
+        known = self.by_topic.get(topic.name)
+        if known is not None and (known.publisher, known.high) != (publisher, high):
+            self._release(known)  # slots belong to a message id, and are as long as the publisher's messages
+            known = None
+        if known is None and publisher is not None and high is not None:
+            self._reserve(SlottedTopic(topic, publisher, high))
+
+    async def wait_for_change(self) -> None:
+        self._changed.clear()  # tasks that wait already were woken by `set`
+        await self._changed.wait()
+
+    def wake_waiters(self) -> None:
+        """Wake the tasks that wait for slots: something about them, or about the bus, has changed."""
+        self._changed.set()
+
+    def close(self) -> None:
+        for each in list(self.by_topic.values()):
+            self._release(each)
+
+    def undecided(self, topic: Topic) -> bool:
+        """Whether a topic wants slots, and may still get some."""
+        if not any(isinstance(each, SlotPublisher) for each in topic.publishers):
+            return False
+        slotted = self.by_topic.get(topic.name)
+        return slotted is None or not (slotted.is_clock or slotted.clock_elsewhere)
+
+    def slots_changed(self, event: SlotsGranted | SlotsRefused | SlotsLost) -> None:
+        """Note that a topic got slots, was refused some, or lost them."""
+        each = self._by_high.get(event.high)
+        if each is None:
+            return
+        if isinstance(event, SlotsGranted):
+            each.period, each.phase, each.interval = event.period, event.phase, event.interval
+            each.refusal, each.due, each.sent, each.missed = "", 0, 0, 0
+            return
+        self._lose_slots(each)
+        if isinstance(event, SlotsRefused):
+            each.refusal = event.reason
+        elif self._link.up:  # else the link tells the publisher that it is down
+            each.publisher.link_degraded(self._link.name, f"slots lost: {event.reason}")
+
+    def fill(self, due: Due) -> None:
+        """Give the engine the data of a slot, or none where a tick is due and there is no slot."""
+        each = self._by_high.get(due.high)
+        payload = self._payload(each, due) if each is not None and due.slotted else None
+        self._driver.carry_out(self._driver.engine.fill(self._driver.now(), due.high, payload))
+
+    def completed(self, each: SlottedTopic, done: Done) -> None:
+        """Count what became of the data of a slot."""
+        if done.fate in _SENT:
+            each.measure(done.at)
+            return
+        each.missed += 1
+        self._link.stats.sent -= 1
+        if done.fate is Fate.ABANDONED:
+            self._link.stats.lost[done.fate.value] += 1
+            if self.by_topic.get(each.topic.name) is each:  # else its publisher is closed
+                each.publisher.link_missed(self._link.name, done.fate.value)
+
+    def _payload(self, each: SlottedTopic, due: Due) -> bytes | None:
+        """Let the publisher make the message of this slot."""
+        if not each.is_clock:  # its first slot: until here its own clock went on
+            each.is_clock = each.publisher.use_slot_clock(self._link, each.interval / SECOND)
+            each.clock_elsewhere = not each.is_clock
+            self.wake_waiters()
+            if each.clock_elsewhere:
+                return None  # the other link's clock makes the messages, which go from here as soft real-time ones
+        since = round((due.at - each.due) / each.interval) if each.due else 1  # periods since the last slot
+        each.due = due.at
+        scheduled = self._driver.port.monotonic(due.at)
+        late = max(0, self._driver.clock.monotonic() - scheduled)
+        sample = each.publisher.tick(scheduled, late, max(0, since - 1))
+        if sample is None or not self._has_subscribers(each.topic.name):
+            return None
+        self._link.stats.sent += 1
+        self._link.stats.bytes_sent += len(sample.data)
+        return sample.data
+
+    def _reserve(self, each: SlottedTopic) -> None:
+        self.by_topic[each.topic.name] = self._by_high[each.high] = each
+        interval, lead = round(each.publisher.period * SECOND), round(each.publisher.lead * SECOND)
+        engine, now = self._driver.engine, self._driver.now()
+        self._driver.carry_out(engine.reserve(now, each.high, each.publisher.size, interval, lead=lead, handle=each))
+
+    def _release(self, each: SlottedTopic) -> None:
+        self._lose_slots(each)
+        del self.by_topic[each.topic.name]
+        del self._by_high[each.high]
+        self._driver.carry_out(self._driver.engine.release(self._driver.now(), each.high))
+
+    def _lose_slots(self, each: SlottedTopic) -> None:
+        each.period = 0
+        if each.is_clock:
+            each.is_clock = False
+            each.publisher.use_own_clock(self._link)
+
+
+# All other messages
+
+
 class SampleHandle(msgspec.Struct, eq=False):
     """A sample in the engine. `deadline` is by the engine's clock (ns), NEVER if it does not expire."""
 
@@ -46,20 +225,23 @@ class SampleHandle(msgspec.Struct, eq=False):
 class ResponseHandle(msgspec.Struct, eq=False):
     """A SUBSCRIBE_RESPONSE in the engine."""
 
-    sent: bool = False
 
+class Transmitter:
+    """Passes to the engine what a link sends, counts what the engine has, and reports what was late or lost."""
 
-class TxAccounting:
-    """Counts the samples of one link that are in the engine, and reports to publishers what was late or lost."""
-
-    def __init__(self, link: str, stats: LinkStats) -> None:
-        self._link = link
-        self._stats = stats
-        self._frames = 0
-        self._messages = 0
+    def __init__(self, link: Link, driver: EngineDriver, slotted: SlottedTopics) -> None:
+        self._name = link.name
+        self._stats = link.stats
+        self._driver = driver
+        self._engine = driver.engine
+        self._slotted = slotted
+        self._frames = 0  # of non real-time messages in the engine
+        self._messages = 0  # soft real-time ones in the engine
+        self._response: ResponseHandle | None = None  # the last one, until it is on the bus
+        self._awaited: dict[str, ResponseHandle] = {}  # by topic: the response that its subscribers need first
 
     @property
-    def waiting(self) -> bool:
+    def pending(self) -> bool:
         """Whether any sample is in the engine."""
         return bool(self._frames or self._messages)
 
@@ -68,65 +250,34 @@ class TxAccounting:
         """Whether there is no room for messages that do not expire."""
         return self._frames >= NRT_FRAMES_MAX
 
-    def has_room(self, sample: Sample) -> bool:
+    def has_room_for(self, sample: Sample) -> bool:
         """Whether there is room for this sample."""
         return self._frames < NRT_FRAMES_MAX if sample.publisher_class == _NRT else self._messages < SRT_MESSAGES_MAX
 
-    def add(self, publisher: PublisherHandle | None, sample: Sample, deadline: int) -> SampleHandle:
-        """Count a sample that the engine gets now."""
-        frames = rtcan.fragment_count(len(sample.data))
-        self._stats.sent += 1
-        self._stats.bytes_sent += len(sample.data)
-        if deadline == NEVER:
+    def send(self, subscriber: LinkSubscriber | None, topic: str, high: int, sample: Sample) -> Sequence[Action]:
+        """Send a sample of a topic, which has this high byte, and a `subscriber` if this module has the topic."""
+        now, data = self._driver.now(), sample.data
+        publisher = subscriber.topic.publisher_of(sample) if subscriber is not None else None
+        frames = rtcan.fragment_count(len(data))
+        if sample.publisher_class == _NRT:
+            deadline = NEVER
             self._frames += frames
         else:
+            deadline = now + self._time_left(topic, sample, publisher)
             self._messages += 1
-        return SampleHandle(publisher, frames, deadline)
+        self._stats.sent += 1
+        self._stats.bytes_sent += len(data)
+        handle = SampleHandle(publisher, frames, deadline)
+        return self._engine.publish(now, high, data, deadline=deadline, drop=sample.drop_late, handle=handle)
 
-    def remove(self, handle: SampleHandle, done: Done) -> None:
+    def completed(self, handle: SampleHandle, done: Done) -> None:
         """Count that the engine has sent a sample, or given it up."""
         if handle.deadline == NEVER:
             self._frames -= handle.frames
         else:
             self._messages -= 1
         if done.missed or done.fate not in _SENT:
-            self._missed(handle, done)
-
-    def _missed(self, handle: SampleHandle, done: Done) -> None:
-        publisher, late = handle.publisher, max(0, done.at - handle.deadline) / SECOND
-        if done.fate in _SENT:
-            if publisher is not None:
-                publisher.link_late(self._link, "sent after its deadline", late)
-            return
-        self._stats.sent -= 1
-        if done.fate is Fate.DISCARDED:  # the link is down, which its publishers learn from the link
-            self._stats.lost[LINK_DOWN] += 1
-            return
-        self._stats.lost[done.fate.value] += 1
-        # REPLACED by newer data in a slot is no miss: until there were slots, nothing was promised.
-        if publisher is not None and done.fate is not Fate.REPLACED:
-            publisher.link_missed(self._link, done.fate.value, late)
-
-
-class Transmitter:
-    """Passes to the engine what a link sends. `clock` is the module's."""
-
-    def __init__(self, driver: EngineDriver, accounting: TxAccounting, slotted: SlottedTopics, clock: Clock) -> None:
-        self._engine = driver.engine
-        self._now = driver.now
-        self._accounting = accounting
-        self._slotted = slotted
-        self._clock = clock
-        self._response: ResponseHandle | None = None  # the last one
-        self._waiting: dict[str, ResponseHandle] = {}  # topics whose subscribers wait for a response
-
-    def send(self, subscriber: LinkSubscriber | None, topic: str, high: int, sample: Sample) -> Sequence[Action]:
-        """Send a sample of a topic, which has this high byte, and a `subscriber` if this module has the topic."""
-        now, drop = self._now(), sample.drop_late
-        publisher = subscriber.topic.publisher_of(sample) if subscriber is not None else None
-        deadline = NEVER if sample.publisher_class == _NRT else now + self._time_left(topic, sample, publisher)
-        handle = self._accounting.add(publisher, sample, deadline)
-        return self._engine.publish(now, high, sample.data, deadline=deadline, drop=drop, handle=handle)
+            self._report_missed(handle, done)
 
     def send_management(self, data: bytes, *, urgent: bool) -> Sequence[Action]:
         """Send a management message, marked as r2p's where all modules have one id."""
@@ -135,34 +286,50 @@ class Transmitter:
             handle = self._response = ResponseHandle()
         if self._engine.profile is Profile.FIRMWARE:
             data = management.mark(data)
-        return self._engine.manage(self._now(), data, urgent=urgent, handle=handle)
+        return self._engine.manage(self._driver.now(), data, urgent=urgent, handle=handle)
 
     def waits_for_response(self, topic: str) -> bool:
         """Whether a topic has to wait until the last response is on the bus.
 
         A message with little laxity would overtake the response, and its subscriber does not know the id before.
         """
-        if self._response is None or self._response.sent:
+        if self._response is None:
             return False
-        self._waiting[topic] = self._response
+        self._awaited[topic] = self._response
         return True
 
     def response_sent(self, response: ResponseHandle) -> list[str]:
-        """Note that a response is on the bus. Returns the topics that waited for it."""
-        response.sent = True
-        topics = [topic for topic, awaited in self._waiting.items() if awaited is response]
+        """Note that a response is on the bus, or lost. Returns the topics that waited for it."""
+        if response is self._response:
+            self._response = None
+        topics = [topic for topic, awaited in self._awaited.items() if awaited is response]
         for topic in topics:
-            del self._waiting[topic]
+            del self._awaited[topic]
         return topics
 
     def remove_topic(self, topic: str) -> None:
         """Let a topic wait no longer: it has lost its subscribers."""
-        self._waiting.pop(topic, None)
+        self._awaited.pop(topic, None)
+
+    def _report_missed(self, handle: SampleHandle, done: Done) -> None:
+        publisher, late = handle.publisher, max(0, done.at - handle.deadline) / SECOND
+        if done.fate in _SENT:
+            if publisher is not None:
+                publisher.link_late(self._name, "sent after its deadline", late)
+            return
+        self._stats.sent -= 1
+        if done.fate is Fate.DISCARDED:  # the link is down, which its publishers learn from the link
+            self._stats.lost[LINK_DOWN] += 1
+            return
+        self._stats.lost[done.fate.value] += 1
+        # REPLACED by newer data in a slot is no miss: until there were slots, nothing was promised.
+        if publisher is not None and done.fate is not Fate.REPLACED:
+            publisher.link_missed(self._name, done.fate.value, late)
 
     def _time_left(self, topic: str, sample: Sample, publisher: PublisherHandle | None) -> int:
         """Ns until the deadline. A latched value that is sent once more gets a new one."""
         # A sample from another computer has `expires`, its deadline by the clock here.
-        left = sample.due - self._clock.now() if sample.deadline else 0
+        left = sample.due - self._driver.clock.now() if sample.deadline else 0
         if left > 0 or (sample.deadline and not (publisher is not None and publisher.latch)):
             return left
         slotted = self._slotted.by_topic.get(topic)

@@ -26,7 +26,7 @@ from r2p.protocols.rtcan.events import (
 from r2p.runtime.sample import PublisherClass
 from r2p.transports.can.port import CanPort, PortAlarm
 from r2p.transports.rtcan.driver import EngineDriver
-from r2p.transports.rtcan.status import LinkStatus
+from r2p.transports.rtcan.link import describe_guarantee, no_slots
 from r2p.transports.rtcan.transport import RtcanOptions
 from tests.faults import once
 
@@ -169,21 +169,19 @@ async def test_a_port_that_is_not_exact_asks_for_slots_only_where_they_are_coars
     ):
         settings = options.settings(1, port)
         assert settings.reserves == reserves
-        status = LinkStatus(EngineDriver(Engine(settings), port, Owner()), settings)
-        assert bool(status.no_slots) is not reserves
+        assert bool(no_slots(Engine(settings))) is not reserves
     port.coarse = False
     assert RtcanOptions().settings(1, port).reserves
 
 
 async def test_what_a_class_means_depends_on_the_controller() -> None:
     driver, port, _ = make()
-    status = LinkStatus(driver, EngineSettings(number=5))
-    assert status.guarantee(PublisherClass.SPORADIC, None) == "nothing yet: not on the bus"
+    assert describe_guarantee(driver, PublisherClass.SPORADIC, None) == "nothing yet: not on the bus"
     driver.up()
     await asyncio.sleep(3.0)
-    assert "fixed when a frame is handed to the controller" in status.guarantee(PublisherClass.SPORADIC, None)
+    assert "fixed when a frame is handed to the controller" in describe_guarantee(driver, PublisherClass.SPORADIC, None)
     port.one_shot = True
-    assert "fresh at each try" in status.guarantee(PublisherClass.SPORADIC, None)
+    assert "fresh at each try" in describe_guarantee(driver, PublisherClass.SPORADIC, None)
 
 
 @pytest.mark.parametrize("call", ["poll", "receive", "transmitter.mailboxes.confirm"])
