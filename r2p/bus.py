@@ -14,7 +14,6 @@ The port is the one that a module would use, with a `Monitor` behind it in place
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from r2p.clock import SHORTEST, check_seconds, clock_of
@@ -45,9 +44,8 @@ __all__ = [
     "timing",
 ]
 
-QUEUE = 8192
-"""Frames that wait for an iteration at most; then the oldest are dropped, and counted."""
-
+QUEUE_MAX = 8192
+"""Frames that wait for an iteration at most: a second of a saturated bus. Then the oldest are dropped and counted."""
 
 # After a period, frames of it may still have to be read. These decide when there are none left.
 _CHECK_INTERVAL = 10_000_000  # ns
@@ -111,9 +109,7 @@ class BusMonitor:
             waiting.cancel()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the bus, and wait until it is closed."""
         await self._close()
 
@@ -161,7 +157,7 @@ class BusMonitor:
 
     async def __aiter__(self) -> AsyncIterator[SeenFrame]:
         """Iterate over every frame from now on. Raises Closed outside of the `async with` block."""
-        queue: deque[SeenFrame] = deque(maxlen=QUEUE)
+        queue: deque[SeenFrame] = deque(maxlen=QUEUE_MAX)
         self._queues.append(queue)
         try:
             while True:
@@ -230,11 +226,9 @@ class BusMonitor:
     # What the port calls (`CanPortListener`)
 
     def received(self, frame: Frame, stamp: int) -> None:
-        """A frame was on the bus until `stamp`."""
         self._saw(self._monitor.frame(frame, stamp))
 
     def other(self, frame: OtherFrame, stamp: int) -> None:
-        """A frame that RTCAN does not use was on the bus until `stamp`."""
         self._saw(self._monitor.other(frame, stamp))
 
     def _saw(self, seen: SeenFrame) -> None:
@@ -246,27 +240,22 @@ class BusMonitor:
             self._arrived.set()
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        """Do nothing: nothing is sent, so nothing is confirmed."""
+        pass  # nothing is sent, so nothing is confirmed
 
     def up(self) -> None:
-        """The bus can be used."""
         self._waits_for = ""
         self._report(f"{self.via} is up")
 
     def down(self, reason: str) -> None:
-        """Note that the bus can no longer be used."""
         self._report(f"{self.via} is down: {reason}")
 
     def waits(self, reason: str) -> None:
-        """The bus can't be used yet: report each reason once."""
-        if reason != self._waits_for:
+        if reason != self._waits_for:  # each reason is reported once
             self._waits_for = reason
             self._report(f"{self.via}: {reason}; trying again")
 
     def fault(self, kind: str) -> None:
-        """There was an error frame."""
         self._monitor.fault(kind)
 
     def internal_error(self, error: Exception) -> None:
-        """The handling of a frame raised: log it. The next frame follows."""
         self._errors.internal_error(error)

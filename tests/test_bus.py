@@ -90,7 +90,7 @@ async def test_the_slots_show_their_owner_also_one_that_died() -> None:
 
 
 async def test_slow_iterations_lose_the_oldest_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("r2p.bus.QUEUE", 500)
+    monkeypatch.setattr("r2p.bus.QUEUE_MAX", 500)
     async with robot() as (_, listener):
         frames = aiter(listener)
         first = await anext(frames)
@@ -101,7 +101,7 @@ async def test_slow_iterations_lose_the_oldest_counted(monkeypatch: pytest.Monke
 
 
 async def test_an_iteration_that_ended_keeps_and_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("r2p.bus.QUEUE", 500)
+    monkeypatch.setattr("r2p.bus.QUEUE_MAX", 500)
     async with robot() as (_, listener):
         stamps = []
         async for seen in listener:
