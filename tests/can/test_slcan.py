@@ -69,7 +69,7 @@ async def test_both_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
             assert (kernel.frames, python.outcomes) == ([FRAME], [(Mailbox.NRT, Outcome.SENT)])
 
 
-async def test_what_the_kernel_tells_of_it() -> None:
+async def test_what_the_kernel_reports_of_it() -> None:
     main, device = os.openpty()
     async with adapter(os.ttyname(device)) as name:
         there = netlink.find_interface(name)

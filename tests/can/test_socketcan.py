@@ -88,7 +88,7 @@ async def test_own_frames_pass_the_filters_and_are_not_received(vcan: str) -> No
         port.transmit(order(SRT))
         await listener.until(lambda: listener.outcomes)
         await other.until(lambda: other.frames)
-        cansend(vcan, f"{SRT:08X}#")  # the same frame, of somebody else
+        cansend(vcan, f"{SRT:08X}#")  # the same frame, of another sender
         await listener.until(lambda: listener.frames)
         assert (listener.frames, listener.outcomes) == ([Frame(SRT, b"")], [(Mailbox.SRT, Outcome.SENT)])
 

@@ -78,7 +78,7 @@ async def test_every_message_type_both_ways(cable: Cable) -> None:
 
 
 @conforms
-async def test_the_handshake_whoever_comes_first(cable: Cable) -> None:
+async def test_the_handshake_in_either_order(cable: Cable) -> None:
     async with two_nodes(cable) as (alice, bob):
         late_publisher = bob.subscribe("one", Led)
         late_subscriber = alice.advertise("two", Led, latch=True)
@@ -103,7 +103,7 @@ async def test_the_handshake_when_both_were_there_before_the_link(cable: Cable) 
 
 
 @conforms
-async def test_nothing_is_sent_that_nobody_subscribes(cable: Cable) -> None:
+async def test_nothing_is_sent_without_a_subscriber(cable: Cable) -> None:
     async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
         silent, heard = alice.advertise("silent", Led), alice.advertise("heard", Led)
         subscriber = bob.subscribe("heard", Led)
@@ -219,12 +219,12 @@ async def test_the_source_of_a_sample(cable: Cable) -> None:
 
 
 @conforms
-async def test_another_size_is_refused_and_both_are_told(cable: Cable) -> None:
+async def test_another_size_is_refused_and_both_ends_report_it(cable: Cable) -> None:
     await _mismatch(cable, PWM2, Speed3)
 
 
 @conforms
-async def test_another_layout_of_the_same_size_is_refused_and_both_are_told(cable: Cable) -> None:
+async def test_another_layout_of_the_same_size_is_refused_and_both_ends_report_it(cable: Cable) -> None:
     await _mismatch(cable, PWM2, r2p.msg.Float32)
 
 
@@ -245,7 +245,7 @@ async def _mismatch(cable: Cable, ours: type[Message], theirs: type[Message]) ->
 
 
 @conforms
-async def test_two_modules_of_one_name_are_both_told(cable: Cable) -> None:
+async def test_two_modules_of_one_name_both_learn_of_it(cable: Cable) -> None:
     a, b = module("X", cable.a()), module("X", cable.b())
     told = a.events(), b.events()
     async with a, b:

@@ -222,7 +222,7 @@ async def test_what_was_on_the_way_when_the_line_broke_is_unknown() -> None:
         assert script.link.losses == {"unknown at disconnect": 3}
 
 
-async def test_whoever_waits_for_a_line_that_breaks_waits_no_more() -> None:
+async def test_publishers_stop_waiting_for_a_line_that_breaks() -> None:
     """A message without a deadline as well as an event with one: both are lost, counted."""
     async with scripted() as (script, _, node):
         filler = node.advertise("text", Text, r2p.NonRealTime(stall=3600.0))
@@ -367,7 +367,7 @@ async def test_what_a_line_that_is_down_does_not_get() -> None:
         assert script.link.losses["link down"] == 8
 
 
-async def test_the_outage_is_told() -> None:
+async def test_the_outage_is_reported() -> None:
     async with scripted() as (script, module, node):
         events = module.events()
         publisher = node.advertise("leds", Led)

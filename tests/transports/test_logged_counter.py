@@ -43,7 +43,7 @@ async def test_the_sum_of_closed_links_is_not_logged_again(caplog: pytest.LogCap
     assert lines(caplog) == ["link lab drops: garbage (1 so far)"] * 2
 
 
-async def test_bad_bytes_and_bad_management_are_told(caplog: pytest.LogCaptureFixture) -> None:
+async def test_bad_bytes_and_bad_management_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, logger="r2p.link")
     script = Script()
     async with r2p.Module("PC1", via=script):
@@ -53,7 +53,7 @@ async def test_bad_bytes_and_bad_management_are_told(caplog: pytest.LogCaptureFi
     assert lines(caplog) == ["link script drops: garbage (1 so far)", "link script drops: undecodable (1 so far)"]
 
 
-async def test_nothing_is_told_unless_somebody_debugs(caplog: pytest.LogCaptureFixture) -> None:
+async def test_nothing_is_logged_unless_debug_is_enabled(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, logger="r2p.link")
     losses = LoggedCounter("lab", clock_of())
     losses["garbage"] += 1

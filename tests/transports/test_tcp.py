@@ -233,7 +233,7 @@ async def test_a_connection_to_itself_is_none() -> None:
     assert connection.link is None
 
 
-async def test_a_name_that_nobody_has_is_told_as_that() -> None:
+async def test_a_name_without_an_address_is_reported_as_that() -> None:
     module = r2p.Module("A", via="tcp:nosuch.invalid:23", watchdog=False)
     events = module.events()
     async with asyncio.timeout(GUARD), module:
@@ -250,7 +250,7 @@ async def test_an_address_in_use_is_an_error_that_says_so() -> None:
                 raise AssertionError("it is open")
 
 
-async def test_a_host_that_nobody_knows() -> None:
+async def test_an_unknown_host() -> None:
     with pytest.raises(TransportError, match=r"can't listen: .*(not known|resolution|address)"):
         async with r2p.Module("A", via="tcp-listen:no.such.host.invalid:0", watchdog=False):
             raise AssertionError("it is open")

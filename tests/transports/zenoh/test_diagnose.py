@@ -17,7 +17,7 @@ from tests.transports.zenoh.cable import Net, guarded, module
 pytestmark = pytest.mark.anyio
 
 NOWHERE = "nosuch.invalid"  # RFC 2606: no computer is ever called so
-FAR = "192.0.2.1"  # RFC 5737: nobody's address
+FAR = "192.0.2.1"  # RFC 5737: an address for documentation
 
 
 def tool(name: str, via: str) -> r2p.Module:
@@ -43,7 +43,7 @@ async def test_a_port_in_use() -> None:
         ("unixsock-stream//tmp/nothing", "^$"),
     ],
 )
-async def test_where_nobody_can_listen(endpoint: str, says: str) -> None:
+async def test_addresses_that_cannot_be_listened_on(endpoint: str, says: str) -> None:
     assert re.search(says, diagnose_listening(ConnectionSettings([], listens=[endpoint])))
 
 
@@ -63,7 +63,7 @@ async def test_the_port_of_datagrams_is_another_one() -> None:
         ("tcp/127.0.0.1:7447#iface=nosuch0", "there is no network interface nosuch0 here"),
     ],
 )
-async def test_where_nobody_can_connect(endpoint: str, says: str) -> None:
+async def test_addresses_that_cannot_be_connected_to(endpoint: str, says: str) -> None:
     assert says in await diagnose_connection(ConnectionSettings([endpoint]))
 
 

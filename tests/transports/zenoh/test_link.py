@@ -174,7 +174,7 @@ async def test_a_node_that_joins_a_tool_in_its_module_is_waited_for_from_then_on
         await until(
             lambda: link_of(alice).sender.publishers.window("leds", r2p.PublisherClass.NON_REAL_TIME).limit != NO_LIMIT
         )
-        for number in range(2 * WINDOW):  # would take 30 s if it waited for credit that nobody thinks of
+        for number in range(2 * WINDOW):  # would take 30 s if it waited for credit that is never sent
             await publisher.publish(Led(number))
         await until(lambda: len(subscriber.queue) >= 2 * WINDOW)
         assert publisher.missed == 0
@@ -292,7 +292,7 @@ async def test_networks_of_different_names_stay_apart() -> None:
 
 @guarded
 async def test_a_router_that_asks_who_is_there_is_not_stopped_by_many_answers() -> None:
-    """They come in the call that asks, which must not wait for somebody to take them."""
+    """They come in the call that asks, which must not wait until they are read."""
     async with nodes(net := Net(), "A") as (alice,), alien_on(net) as alien:
         live = alien.liveliness()
         tokens = [live.declare_token(f"r2p/full/live/1/{n:x}/module/M{n}/{n:x}/0/0") for n in range(1, 1001)]
@@ -373,7 +373,7 @@ async def test_modules_share_no_wildcard_of_which_zenoh_would_keep_memory(monkey
 
 
 @guarded
-async def test_garbage_and_foreign_keys_are_counted_and_harm_nobody() -> None:
+async def test_garbage_and_foreign_keys_are_counted_and_do_no_harm() -> None:
     net = Net()
     async with nodes(net, "A", "B") as (alice, bob), alien_on(net) as alien:
         publisher, subscriber = alice.advertise("leds", Led), bob.subscribe("leds", Led)
@@ -408,7 +408,7 @@ async def test_garbage_and_foreign_keys_are_counted_and_harm_nobody() -> None:
             await put(alien, f"r2p/lab/{key}", huge, good)
         assert set(link_of(bob).losses) == {"wrong size", "unknown type", "foreign", "undecodable"}
         await put(alien, "r2p/lab/topic/leds", layout(Led).encode(Led(9)), good)
-        assert await subscriber.fetch() == Led(9)  # it could be an r2p module, as far as anybody can tell
+        assert await subscriber.fetch() == Led(9)  # it could be an r2p module, as far as can be seen here
         await publisher.publish(Led(1))
         assert await subscriber.fetch() == Led(1)
         assert not subscriber.queue
@@ -472,7 +472,7 @@ async def test_what_comes_by_two_links_comes_once() -> None:
 
 @guarded
 async def test_what_two_gateways_send_comes_once() -> None:
-    """They never should; but whoever says who published it, and as which, is recognised."""
+    """They never should; but a message that names its publisher and class is recognised."""
     net = Net()
     async with nodes(net, "A") as (alice,), alien_on(net) as alien:
         subscriber = alice.subscribe("leds", Led)
@@ -566,7 +566,7 @@ async def test_when_a_publisher_leaves_the_others_are_still_known() -> None:
 @guarded
 async def test_a_type_whose_code_is_elsewhere_is_asked_for() -> None:
     class Wheel(r2p.Message):
-        """Nobody else has it."""
+        """No other module has it."""
 
         speed: r2p.f32 = 0.0
         currents: tuple[r2p.f32, r2p.f32] = (0.0, 0.0)

@@ -111,7 +111,7 @@ async def _confirmed(publisher: r2p.Publisher[Float32], subscriber: r2p.Subscrib
 
 
 async def _flow(module: r2p.Module, node: r2p.Node, publisher: r2p.Publisher[Float32], enough: asyncio.Event) -> int:
-    """Publish until it is enough. How many messages had no subscriber: back on the network, nobody heard of yet."""
+    """Publish until it is enough. How many messages had no subscriber: back on the network, none is known yet."""
     unwanted = 0
     async for _ in node.every(0.001):
         unwanted += module.links[0].up and not publisher.subscribers
@@ -135,7 +135,7 @@ async def test_what_a_dead_process_had_is_gone_at_once() -> None:
 
 
 @guarded
-async def test_a_process_that_hangs_is_gone_and_nobody_else_notices() -> None:
+async def test_a_process_that_hangs_is_gone_without_effect_on_the_others() -> None:
     """Stopped with everything open; the others go on, and it is back when it goes on itself."""
     net = Net()
     async with (

@@ -126,7 +126,7 @@ async def test_a_link_that_goes_down_takes_along_what_waits() -> None:
     await turns(FLOOD_TURNS)
     assert wire.sent == [b"1"]
     wire.add(b"4")
-    assert [each.serial for each in wire.headers] == [1, 2]  # it was counted here, so nobody else has to
+    assert [each.serial for each in wire.headers] == [1, 2]  # it was counted here, so no other end has to
 
 
 async def test_what_zenoh_does_not_take_is_counted() -> None:
@@ -135,7 +135,7 @@ async def test_what_zenoh_does_not_take_is_counted() -> None:
         wire.add(data)
     wire.batcher.flush()
     assert wire.sent == [b"1", b"long", b"2"]
-    assert [each.serial for each in wire.headers] == [1, 2, 3]  # they were counted here, so nobody else has to
+    assert [each.serial for each in wire.headers] == [1, 2, 3]  # they were counted here, so no other end has to
     assert wire.streams[False].window.serial == 3
     assert (wire.stats.sent, dict(wire.stats.lost)) == (3, {"link down": 2})
 

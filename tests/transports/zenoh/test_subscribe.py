@@ -175,7 +175,7 @@ async def test_a_message_of_the_wrong_size_is_counted_once() -> None:
 
 
 @pytest.mark.parametrize("queue", [4 * WINDOW, 1])
-async def test_messages_that_nobody_can_use_earn_credit(queue: int) -> None:
+async def test_messages_that_cannot_be_used_earn_credit(queue: int) -> None:
     """Else a publisher would wait for those who will never take them. They do so behind what waits for room."""
     ring = Ring(queue=queue)
     ring.put(1, 2)
@@ -225,7 +225,7 @@ async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
     assert ring.stats.lost["seen before"] == 1
 
 
-async def test_what_eight_publishers_may_send_is_kept_where_nobody_reads() -> None:
+async def test_what_eight_publishers_may_send_is_kept_while_nothing_is_read() -> None:
     ring = Ring(queue=1)
     for sender in range(1, 9):
         for serial in range(1, WINDOW, 64):
@@ -329,7 +329,7 @@ async def test_what_was_sent_before_a_topic_is_subscribed_again_is_not_lost() ->
     ring.put(1, 3)
     await turns()
     reconnect(ring)
-    ring.receiver.unsubscribe("leds")  # nobody here subscribes it any more
+    ring.receiver.unsubscribe("leds")  # no subscriber is left here
     ring.receiver.subscribe(ring.topic)
     ring.idle()
     ring.put(10)
@@ -361,7 +361,7 @@ async def test_a_topic_that_went_on_after_an_outage_begins_anew_when_it_was_clos
     ring.put(6)
     await turns()
     assert ring.stats.lost == {"on the way": 2}
-    ring.receiver.unsubscribe("leds")  # nobody here subscribes it any more
+    ring.receiver.unsubscribe("leds")  # no subscriber is left here
     ring.receiver.subscribe(ring.topic)
     ring.idle()
     ring.put(500)
@@ -369,7 +369,7 @@ async def test_a_topic_that_went_on_after_an_outage_begins_anew_when_it_was_clos
     assert ring.stats.lost == {"on the way": 2}
 
 
-async def test_a_later_outage_does_not_count_what_was_sent_before_it_to_nobody_here() -> None:
+async def test_a_later_outage_does_not_count_what_was_sent_before_it_without_a_subscriber() -> None:
     ring = Ring(queue=16)
     ring.put(1, 3)
     await turns()

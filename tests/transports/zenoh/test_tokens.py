@@ -65,7 +65,7 @@ async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile(monkeypa
     assert not believer.there
 
 
-async def test_what_has_no_room_before_the_link_is_up_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_what_has_no_room_before_the_link_is_up_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tokens, "TOKENS_MAX", 2)
     believer = Believer(up=False)
     for key in ("a", "b", "b", "c", "d"):
