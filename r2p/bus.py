@@ -64,7 +64,7 @@ class BusMonitor:
     def __init__(self, via: "str | CanPort", *, on_status: Callable[[str], object] | None = None) -> None:
         self.via = via if isinstance(via, str) else via.name
         self.since = 0
-        """When the bus was opened."""
+        """The instant when the bus was opened."""
         self.lost = 0
         """Frames that were dropped as an iteration was too slow."""
         self._port = None if isinstance(via, str) else via

@@ -104,7 +104,7 @@ class CanController:
 
     @property
     def live(self) -> bool:
-        """Whether it sends and receives: it is neither down nor in bus-off."""
+        """Whether the controller sends and receives: it is neither down nor in bus-off."""
         return self.confinement.live
 
     # For the node's software
@@ -169,7 +169,7 @@ class CanController:
     # Faults of the node
 
     def babble(self, frame: Frame | None) -> None:
-        """Send this frame over and over, as a babbling idiot does. None: stop."""
+        """Send this frame over and over, as a babbling idiot does; None stops it."""
         self._babbled = frame
         self.mailboxes.requests.pop(_BABBLE, None)
         self._bus.request_withdrawn()

@@ -1,4 +1,4 @@
-"""What users of a simulated bus read and write: the settings of a node, states, records of frames, and their counts."""
+"""The values of a simulated bus: the settings of a node, states, records of frames, and counts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ControllerState(Enum):
 
 
 class ErrorKind(Enum):
-    """Why a frame was not transmitted."""
+    """The reason why a frame was not transmitted."""
 
     ACK = "no acknowledge"  # no other node is on the bus
     BIT = "bit error"  # the bus had another level than the sender: noise, or a second sender
@@ -79,7 +79,7 @@ class CanNode(msgspec.Struct, frozen=True):
 
 
 class FrameRecord(msgspec.Struct, frozen=True, gc=False):
-    """What happened on the wire: one frame, or one attempt that ended with an error frame.
+    """An event on the wire: one frame, or one attempt that ended with an error frame.
 
     `start` and `end` are true time, in ns: start of frame, and end of the frame or of the error frame; `bits` lie
     between them. With several senders, they sent the same bits or collided.

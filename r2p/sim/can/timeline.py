@@ -62,7 +62,7 @@ class Timeline:
         self._running = False
         self._now = 0
         self.source: TimelineSource = self if self._virtual is None else self._virtual.clock
-        """What `now` reads. For hot paths: `source.elapsed` is the same without a call."""
+        """The source of `now`; for hot paths, as `source.elapsed` is the same without a call."""
         self.now: Callable[[], int] = self.clock.monotonic if self._virtual else self._present
         """The instant of the event that is running; between events, the time."""
 
@@ -169,7 +169,7 @@ class LocalAlarm:
         self._armed = NEVER  # the instant of the scheduled event; may be earlier
 
     def set(self, deadline: int | None) -> None:
-        """Set the deadline, in local ns; one in the past is now. None: off."""
+        """Set the deadline, in local ns; one in the past is now; None switches the timer off."""
         if deadline == self._deadline:
             return
         self._deadline = deadline

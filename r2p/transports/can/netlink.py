@@ -60,7 +60,7 @@ class Interface(msgspec.Struct, frozen=True):
 
     @property
     def problem(self) -> str:
-        """Why the interface can't be used, and what to do. Empty if it can."""
+        """The reason why the interface can't be used, and what to do; empty if it can."""
         if not self.up:
             return f"{self.name} is down: {self.command_up()}"
         if self.state == BUS_OFF and self.restart_ms:

@@ -28,43 +28,41 @@ RETRY_INTERVAL = 500_000
 
 
 class CanPortListener(Protocol):
-    """What a port calls, in the event loop, also from within `transmit` and `withdraw`. None of these raises."""
+    """The calls of a port, in the event loop, also from within `transmit` and `withdraw`. None of these raises."""
 
     def received(self, frame: Frame, stamp: int) -> None:
-        """A frame of another node came in. `stamp` is the end of the frame plus `receive_latency`."""
+        """Handle a frame of another node. `stamp` is the end of the frame plus `receive_latency`."""
 
     def other(self, frame: OtherFrame, stamp: int) -> None:
-        """A frame that RTCAN does not use was on the bus. Called only while there are no filters."""
+        """Handle a frame that RTCAN does not use. Called only while there are no filters."""
 
     def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        """The frame in this mailbox is done, and the mailbox is empty. `at` is the frame's end if it was SENT.
+        """Note that the frame in this mailbox is done, and the mailbox empty. `at` is the frame's end if it was SENT.
 
         Called exactly once for each `transmit` while the port is up; `down` ends all of them without a call.
         """
 
     def up(self) -> None:
-        """The bus can be used."""
+        """Begin to use the bus."""
 
     def down(self, reason: str) -> None:
-        """The bus can no longer be used: interface down or gone, or bus-off. All mailboxes are empty, and none of
-        their frames is sent later.
-        """
+        """Stop using the bus: interface down or gone, or bus-off. No frame that is in a mailbox is sent later."""
 
     def waits(self, reason: str) -> None:
-        """The bus can't be used yet. The port goes on trying."""
+        """Report that the bus can't be used yet. The port goes on trying."""
 
     def fault(self, kind: str) -> None:
-        """Something went wrong on the bus, such as an error frame. Faults are counted by kind."""
+        """Count a fault of the bus by its kind, such as what an error frame reports."""
 
     def internal_error(self, error: Exception) -> None:
-        """The handling of a frame or of a timer raised: count and log it. The port goes on with the next one."""
+        """Count and log what the handling of a frame or of a timer raised. The port goes on with the next one."""
 
 
 class PortAlarm(Protocol):
     """One timer that can be moved."""
 
     def set(self, deadline: int | None) -> None:
-        """Go off once at this instant of the port's clock (ns), at once if it is over. None: do not go off."""
+        """Go off once at this instant of the port's clock (ns), at once if it is over; None switches it off."""
 
     def close(self) -> None:
         """Never go off again."""
@@ -217,7 +215,7 @@ class InterfacePort(CanPort, Generic[B]):
 # Mailboxes in software
 
 
-class _WaitingFrame(msgspec.Struct, eq=False):
+class _PendingFrame(msgspec.Struct, eq=False):
     """A frame in a mailbox."""
 
     order: Transmit
@@ -255,12 +253,12 @@ class TxMailboxes:
         self._latency = latency
         self._confirm_timeout = confirm_timeout
         self._one_at_a_time = one_at_a_time
-        self._frames: dict[Mailbox, _WaitingFrame] = {}
+        self._frames: dict[Mailbox, _PendingFrame] = {}
 
     @property
     def handed_over(self) -> list[Mailbox]:
         """The mailboxes whose frame was handed over."""
-        return [mailbox for mailbox, waiting in self._frames.items() if waiting.handed_over]
+        return [mailbox for mailbox, pending in self._frames.items() if pending.handed_over]
 
     def put(self, now: int, order: Transmit) -> None:
         """Put a frame into an empty mailbox.
@@ -270,21 +268,21 @@ class TxMailboxes:
         """
         due = order.not_before - self._latency
         latest = order.not_after - self._latency if order.not_after < NEVER else NEVER
-        waiting = self._frames[order.mailbox] = _WaitingFrame(order, due, latest)
+        pending = self._frames[order.mailbox] = _PendingFrame(order, due, latest)
         if now <= latest:
-            self._offer(now, order.mailbox, waiting)
+            self._offer(now, order.mailbox, pending)
 
     def withdraw(self, now: int, mailbox: Mailbox) -> None:
         """Take a frame back, unless it was handed over."""
-        waiting = self._frames.get(mailbox)
-        if waiting is not None and not waiting.handed_over:
+        pending = self._frames.get(mailbox)
+        if pending is not None and not pending.handed_over:
             self._end(mailbox, Outcome.LATE, now)
 
     def seen(self, identifier: int, data: bytes, at: int, now: int) -> bool:
         """Confirm an own frame that was on the bus. False if it is none of those that were handed over."""
-        for mailbox, waiting in self._frames.items():
-            frame = waiting.order.frame
-            if waiting.handed_over and frame.id == identifier and frame.data == data:
+        for mailbox, pending in self._frames.items():
+            frame = pending.order.frame
+            if pending.handed_over and frame.id == identifier and frame.data == data:
                 self._end(mailbox, Outcome.SENT, at)
                 self.poll(now)
                 return True
@@ -301,7 +299,7 @@ class TxMailboxes:
         self._frames.clear()
 
     def next_deadline(self) -> int | None:
-        """When to call `poll`."""
+        """The instant at which to call `poll`."""
         blocked = self._one_at_a_time and bool(self.handed_over)
         due = min((self._due(each, blocked=blocked) for each in self._frames.values()), default=NEVER)
         return due if due < NEVER else None
@@ -309,31 +307,31 @@ class TxMailboxes:
     def poll(self, now: int) -> None:
         """Hand over what is due, the most urgent class first; give up what is too late."""
         for mailbox in Mailbox:  # in the order of urgency
-            waiting = self._frames.get(mailbox)
-            if waiting is None:
+            pending = self._frames.get(mailbox)
+            if pending is None:
                 continue
-            if waiting.handed_over:
-                if waiting.due <= now:
+            if pending.handed_over:
+                if pending.due <= now:
                     self._end(mailbox, Outcome.UNKNOWN, now)
-            elif waiting.latest < now:
+            elif pending.latest < now:
                 self._end(mailbox, Outcome.LATE, now)
             else:
-                self._offer(now, mailbox, waiting)
+                self._offer(now, mailbox, pending)
 
-    def _offer(self, now: int, mailbox: Mailbox, waiting: _WaitingFrame) -> None:
-        if waiting.due > now or (self._one_at_a_time and self.handed_over):
+    def _offer(self, now: int, mailbox: Mailbox, pending: _PendingFrame) -> None:
+        if pending.due > now or (self._one_at_a_time and self.handed_over):
             return
-        if self._send(waiting.order.frame, mailbox):
-            waiting.handed_over = True
-            waiting.due = now + self._confirm_timeout
+        if self._send(pending.order.frame, mailbox):
+            pending.handed_over = True
+            pending.due = now + self._confirm_timeout
         else:
-            waiting.due = now + RETRY_INTERVAL
+            pending.due = now + RETRY_INTERVAL
 
-    def _due(self, waiting: _WaitingFrame, *, blocked: bool) -> int:
-        if waiting.handed_over:
-            return waiting.due
-        too_late = waiting.latest + 1  # a frame that waits for its turn behind another one can only become too late
-        return too_late if blocked else min(waiting.due, too_late)
+    def _due(self, pending: _PendingFrame, *, blocked: bool) -> int:
+        if pending.handed_over:
+            return pending.due
+        too_late = pending.latest + 1  # a frame that waits for its turn behind another one can only become too late
+        return too_late if blocked else min(pending.due, too_late)
 
     def _end(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         # The mailbox is empty before its listener hears of it, which may put the next frame there at once.

@@ -105,8 +105,8 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
 
 
 _PERMANENT_ERRORS = (NotImplementedError, ValueError, TypeError)
-"""What python-can raises where waiting does not help: the driver is not installed, or there can't be such a channel or
-bit rate. Other errors may pass, such as those of an adapter that is not plugged in.
+"""Errors after which waiting does not help: the driver is not installed, or there is no such channel or bit rate. All
+others may pass, such as those of an adapter that is not plugged in.
 """
 
 
@@ -127,7 +127,7 @@ class _PythonCanBus(OpenInterface):
         self._reported = 0
 
     async def open(self, make: Callable[[], "can.BusABC"]) -> None:
-        """Raises what python-can raises."""
+        """Open it. Raises what python-can raises."""
         await self._loop.run_in_executor(self._thread, self._open_in_thread, make)
 
     async def aclose(self) -> None:

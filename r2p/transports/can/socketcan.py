@@ -116,7 +116,7 @@ class _SocketCanBus(OpenInterface):
             one_at_a_time=one_shot,
         )
         self.read_at: int | None = None
-        """When the batch was read that is being handed out."""
+        """The instant when the batch was read that is being handed out; None outside of batches."""
         self._socket = sock
         self._one_shot = one_shot
         self._dropped = 0

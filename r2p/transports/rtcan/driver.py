@@ -29,25 +29,25 @@ _UTC_ERROR_MIN = 1_000  # ns
 
 
 class DriverOwner(Protocol):
-    """What an engine's messages and events go to: a link, or a node of a benchmark."""
+    """The receiver of an engine's messages and events: a link, or a node of a benchmark."""
 
     def act(self, action: Action) -> None:
         """Handle a message or an event: any action but `Transmit` and `Withdraw`."""
 
     def bus_up(self) -> None:
-        """The engine has started: `Ready` will follow."""
+        """Note that the engine has started: `Ready` will follow."""
 
     def bus_down(self, reason: str) -> None:
-        """The engine has stopped. What it discards follows."""
+        """Note that the engine has stopped. What it discards follows."""
 
     def bus_waits(self, reason: str) -> None:
-        """The port can't be used yet."""
+        """Report that the port can't be used yet."""
 
     def bus_fault(self, kind: str) -> None:
-        """Something went wrong on the bus."""
+        """Count a fault of the bus by its kind."""
 
     def internal_error(self, error: Exception) -> None:
-        """A frame or an action raised: count and log it. The next one follows."""
+        """Count and log what the handling of a frame or an action raised. The next one follows."""
 
 
 class EngineDriver:

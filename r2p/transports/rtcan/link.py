@@ -84,7 +84,7 @@ class ReceivedMessage(msgspec.Struct, frozen=True, gc=False):
 
 
 class RtcanLink(BufferedLink):
-    """A module's link to an RTCAN bus. `utc_error` (ns): how well the module knows UTC; None: not at all."""
+    """A module's link to an RTCAN bus. `utc_error` (ns): how well the module knows UTC, None if it does not."""
 
     max_payload: ClassVar[int] = rtcan.PAYLOAD_MAX
     has_slots: ClassVar[bool] = True
@@ -216,7 +216,7 @@ class RtcanLink(BufferedLink):
         )
 
     def _started(self, received: Received) -> int:
-        """When the first frame began. A coarse port does not know that to the bit: don't spend time counting bits."""
+        """The start of the first frame; roughly on a coarse port, whose stamps are not worth the counting of bits."""
         bit = self.engine.timing.bit
         if self.driver.port.coarse:
             return received.stamp - rtcan.frame_bits_max(min(len(received.payload), rtcan.FRAME_MAX)) * bit
@@ -370,7 +370,7 @@ class RtcanLink(BufferedLink):
         return self._utc.offset(self.driver.now())
 
     def utc(self) -> tuple[int, int] | None:
-        """UTC by the RTCAN master, and how far off it may be (both ns). None: not known."""
+        """UTC by the RTCAN master, and how far off it may be (both ns); None if it is not known."""
         return self.engine.utc(self.driver.now())
 
     def _set_utc(self) -> None:
@@ -404,7 +404,7 @@ class RtcanLink(BufferedLink):
 
 
 def no_slots(engine: Engine) -> str:
-    """Why periodic messages never get slots on this node's bus; empty if they may."""
+    """The reason why periodic messages never get slots on this bus; empty if they may."""
     if not engine.settings.reserves:
         slot = engine.timing.slot // 1000
         return f"slots of {slot} us are too short for a port that does not hit them; choose slots= and cycle="
@@ -414,7 +414,7 @@ def no_slots(engine: Engine) -> str:
 
 
 def describe_guarantee(driver: EngineDriver, publisher_class: PublisherClass, slotted: SlottedTopic | None) -> str:
-    """What a publisher class means for a topic now; `slotted` if the topic is periodic and may have slots."""
+    """Say what a publisher class means for a topic now; `slotted` if the topic is periodic and may have slots."""
     engine = driver.engine
     if engine.network.mismatch is not None:
         return f"nothing is sent: {engine.network.mismatch}"

@@ -1,4 +1,4 @@
-"""What an `rtcan:` URL names: the options of a node, the port to its CAN controller, and the life of its link.
+"""The meaning of an `rtcan:` URL: the options of a node, the port to its CAN controller, and the life of its link.
 
 The options are those of every RTCAN transport, the simulated one included: who the node is, and what all nodes of its
 network have to agree on.

@@ -1,4 +1,4 @@
-"""What goes out over an RTCAN bus: samples by their deadlines, slots, and management as this network wants it.
+"""The way out over an RTCAN bus: samples by their deadlines, slots, and management as this network wants it.
 
 NonRealTime  laxity 63: what the others leave of the bus
 Sporadic     soft real-time, least laxity first
@@ -83,7 +83,7 @@ class SlottedTopic(msgspec.Struct, eq=False):
 
 
 def inadmissible(timing: Timing, size: int, period: float) -> str | None:
-    """Why there can never be slots for messages of `size` bytes each `period` seconds. None: there may be."""
+    """The reason why messages of `size` bytes each `period` seconds can never have slots; None if they may."""
     wanted = round(period * SECOND) // timing.slot
     fragments = rtcan.fragment_count(size)
     any_message = rtcan.message_id(rtcan.FIRST_TOPIC, 0)
@@ -109,7 +109,7 @@ class SlottedTopics:
         self._changed = asyncio.Event()
 
     def update(self, topic: Topic, high: int | None) -> None:
-        """Request and release slots after a change of a topic's publishers, or of its high byte (None: it has none).
+        """Request and release slots after a change of a topic's publishers, or of its high byte, None without one.
 
         Of the publishers that can use slots the first gets them.
         """
