@@ -8,7 +8,7 @@ the frame, which is the next event. So a frame is two events here, and one for e
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
@@ -30,7 +30,10 @@ _DELIMITER: Final = 8  # recessive bits that end an error frame
 _SUSPEND: Final = 8  # bits that an error passive sender waits longer before its next frame
 _BITS_AFTER_ACK: Final = TAIL - 2  # bits that follow the acknowledge slot
 _RECOVERY_SEQUENCES: Final = 128  # times 11 recessive bits, until a controller leaves bus-off
-_CACHED_IDENTIFIERS: Final = 4096  # for which it is known which controllers they concern
+_CACHED_MAX: Final = 4096  # identifiers for which it is known which controllers they concern
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 
 class _Transfer(msgspec.Struct, eq=False):
@@ -151,7 +154,7 @@ class CanBus(BusWire):
         self._listeners.join(controller)
 
     def filters_changed(self) -> None:
-        self._listeners.filters_changed()
+        self._listeners.concerned.clear()
 
     def recover(self, controller: CanController) -> None:
         self._recovery.begin(controller, max(self.timeline.now(), self._free))
@@ -230,7 +233,7 @@ class CanBus(BusWire):
     def _transfer_of(self, requests: list[Request], start: int, excluded: Sequence[CanController]) -> _Transfer:
         frame, owner = requests[0].frame, requests[0].owner
         if len(requests) == 1 and not excluded:
-            names, receivers = self._listeners.audience(owner)
+            names, receivers = self._listeners.audience[owner]
         else:
             owners = [request.owner for request in requests]
             names = tuple([owner.name for owner in owners])
@@ -243,7 +246,7 @@ class CanBus(BusWire):
         frame = transfer.frame
         for request in transfer.requests:
             request.owner.sent(request, end)
-        for node in self._listeners.concerned(frame.id):
+        for node in self._listeners.concerned[frame.id]:
             if node in transfer.receivers:
                 node.arrived(frame, end)
         self._over(transfer, transfer.bits, None, end)
@@ -344,38 +347,41 @@ class Listeners:
 
     def __init__(self) -> None:
         self.live: list[CanController] = []
-        self._audiences: dict[CanController, tuple[tuple[str, ...], list[CanController]]] = {}
-        self._concerned: dict[int, list[CanController]] = {}  # by identifier
+        self.audience = _Cache(self._find_audience)
+        """By controller: its name, and the receivers of what it sends alone."""
+        self.concerned = _Cache(self._find_concerned)
+        """By identifier: the controllers that a good frame concerns."""
 
     def join(self, controller: CanController) -> None:
         self.live.append(controller)
-        self._audiences.clear()
-        self._concerned.clear()
+        self.audience.clear()
+        self.concerned.clear()
 
     def leave(self, controller: CanController) -> None:
         if controller in self.live:
             self.live.remove(controller)
-            self._audiences.clear()
-            self._concerned.clear()
+            self.audience.clear()
+            self.concerned.clear()
 
-    def filters_changed(self) -> None:
-        self._concerned.clear()
+    def _find_audience(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController]]:
+        return (owner.name,), [each for each in self.live if each is not owner]
 
-    def audience(self, owner: CanController) -> tuple[tuple[str, ...], list[CanController]]:
-        """The name of a controller, and the receivers of what it sends alone."""
-        audience = self._audiences.get(owner)
-        if audience is None:
-            audience = self._audiences[owner] = (owner.name,), [each for each in self.live if each is not owner]
-        return audience
+    def _find_concerned(self, identifier: int) -> list[CanController]:
+        return [each for each in self.live if each.concerned(identifier)]
 
-    def concerned(self, identifier: int) -> list[CanController]:
-        """The controllers that a good frame with this identifier concerns."""
-        concerned = self._concerned.get(identifier)
-        if concerned is None:
-            if len(self._concerned) >= _CACHED_IDENTIFIERS:
-                self._concerned.clear()
-            concerned = self._concerned[identifier] = [each for each in self.live if each.concerned(identifier)]
-        return concerned
+
+class _Cache(dict[K, V]):
+    """Values that are found at the first look-up; a look-up costs no call after that, which counts for each frame."""
+
+    def __init__(self, find: Callable[[K], V]) -> None:
+        super().__init__()
+        self._find = find
+
+    def __missing__(self, key: K) -> V:
+        if len(self) >= _CACHED_MAX:
+            self.clear()
+        value = self[key] = self._find(key)
+        return value
 
 
 class Recovery:

@@ -63,7 +63,7 @@ class EngineDriver:
         """The clock of the engine and of all its instants (ns)."""
         self.clock = clock_of()
         """The module's clock."""
-        self.waits, self.fault, self.internal_error = owner.bus_waits, owner.bus_fault, owner.internal_error
+        self.internal_error = owner.internal_error
         self._owner = owner
         self._port_actions: dict[type, Callable[[Any], object]] = {Transmit: port.transmit, Withdraw: port.withdraw}
         self._timer = port.alarm(self._poll)
@@ -108,6 +108,12 @@ class EngineDriver:
             self.carry_out(discarded)
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
+
+    def waits(self, reason: str) -> None:
+        self._owner.bus_waits(reason)
+
+    def fault(self, kind: str) -> None:
+        self._owner.bus_fault(kind)
 
     def other(self, frame: OtherFrame, stamp: int) -> None:
         pass  # it does not concern RTCAN
