@@ -6,7 +6,7 @@ import json
 from collections.abc import AsyncIterator, Callable
 
 import pytest
-import typer
+from typer.testing import CliRunner
 
 import r2p
 from r2p.bus import BusLoad, BusMonitor, FrameKind
@@ -16,11 +16,9 @@ from r2p.protocols.rtcan.events import Transmit, Withdraw
 from r2p.protocols.rtcan.monitor import TrafficCount
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimCan, SimPort
-from r2p.tools.bus import dump as bus_dump
-from r2p.tools.bus import load as bus_load
-from r2p.tools.bus import schedule as bus_schedule
-from r2p.tools.bus.load import listen
-from r2p.tools.session import UsageError
+from r2p.tools.bus import app, slots
+from r2p.tools.bus.traffic import frame_line, frame_record, listen, load_record, load_text, trouble
+from r2p.tools.session import Settings, UsageError
 from r2p.transports.can.port import CanPort, CanPortListener
 
 pytestmark = pytest.mark.virtual_time
@@ -80,11 +78,11 @@ async def test_the_slots_show_their_owner_also_one_that_died() -> None:
         assert await listener.cycles(20, timeout=1.0)
         owned = [slot for slot in listener.slots if "encoder" in slot.owners]
         assert [(slot.reserved, slot.missed) for slot in owned] == [(20, 0)]
-        cells = bus_schedule.cells_of(listener)
+        cells = slots.cells_of(listener)
         assert [cell.owner for cell in cells].count("encoder") == 1
         assert cells[0].owner == "sync"
         assert [cell.owner for cell in cells].count("reserved but not used: no subscriber, or the owner is gone") == 1
-        assert [row["used"] for row in bus_schedule.rows(listener) if row["owner"] == "encoder"] == [20]
+        assert [row["used"] for row in slots.rows(listener) if row["owner"] == "encoder"] == [20]
         bus.power_off()
         assert not await listener.cycles(20, timeout=1.0)
 
@@ -141,8 +139,8 @@ async def test_what_the_commands_print() -> None:
     async with robot() as (_, listener):
         lines, records = [], []
         async for seen in listener:
-            lines.append(bus_dump.line(seen, listener.since))
-            records.append(json.loads(json.dumps(bus_dump.record(seen, listener.since))))
+            lines.append(frame_line(seen, listener.since))
+            records.append(json.loads(json.dumps(frame_record(seen, listener.since))))
             if len(lines) == 200:
                 break
         encoder = next(record for record in records if record["topic"] == "encoder")
@@ -151,11 +149,11 @@ async def test_what_the_commands_print() -> None:
         assert encoder["data"] == "0700000000"
         assert any("hrt" in line and "encoder" in line and "MOTOR" in line and "1/1" in line for line in lines)
         load = await anext(listener.loads(2.0))
-        text = bus_load.text(load)
+        text = load_text(load)
         assert text.startswith("load ")
         assert any("encoder" in line and "MOTOR" in line for line in text.splitlines())
-        assert bus_load.trouble(load) is None
-        assert bus_load.record(load)["load"] == pytest.approx(load.total, abs=1e-6)
+        assert trouble(load) is None
+        assert load_record(load)["load"] == pytest.approx(load.total, abs=1e-6)
 
 
 async def test_a_crowded_bus_is_reported() -> None:
@@ -177,7 +175,7 @@ async def test_a_crowded_bus_is_reported() -> None:
             await asyncio.sleep(2)
             load = await anext(listener.loads(0.2))
         assert load.free_used > 0.95
-        assert "starve" in str(bus_load.trouble(load))
+        assert "starve" in str(trouble(load))
 
 
 async def test_a_bus_that_can_not_be_opened_is_an_error() -> None:
@@ -206,14 +204,15 @@ async def test_what_it_waits_for_is_reported_once() -> None:
 
 
 def test_an_invalid_topic_is_a_usage_error() -> None:
-    with pytest.raises(typer.BadParameter, match="letters, digits and underscores"):
-        bus_dump.dump(topic=["no-name"], via=["rtcan:can0"])
+    result = CliRunner().invoke(app, ["dump", "--topic", "no-name", "--via", "rtcan:can0"])
+    assert result.exit_code == 2
+    assert "letters, digits and underscores" in result.stderr
 
 
 @pytest.mark.parametrize("via", [["memory:lab"], ["rtcan:can0", "rtcan:can1"]])
 async def test_the_commands_take_one_can_bus(via: list[str]) -> None:
     with pytest.raises(UsageError, match="give one CAN bus"):
-        async with listen(via):
+        async with listen(Settings(via=via)):
             pass
 
 
@@ -267,4 +266,4 @@ async def test_the_load_is_right_after_the_process_stood_still(stopped_at: float
 async def test_an_impossible_load_is_reported() -> None:
     tallies = {("", "", FrameKind.OTHER): TrafficCount(1, 2000)}
     load = BusLoad(1_000_000, 1000, tallies, {}, 0.0, 0.0, None)
-    assert "200% is more than the bus can carry" in str(bus_load.trouble(load))
+    assert "200% is more than the bus can carry" in str(trouble(load))

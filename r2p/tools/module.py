@@ -15,25 +15,21 @@ import r2p
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.names import module_path
 from r2p.tools import session
-from r2p.tools.options import Format, Timeout, Wait
-from r2p.tools.output import Output
-from r2p.tools.session import Session, TimedOut, UsageError
+from r2p.tools.options import All, Format, Timeout, Wait
+from r2p.tools.output import Output, notify
+from r2p.tools.session import Session, TimedOut, UsageError, wait_until
 
 TIMEOUT = 10.0
 """Seconds in which a command must be confirmed: firmware with many topics sends ALIVE that rarely."""
 
 _FIRST_STATE = 1.0  # seconds to learn the module's state before the first command
 _ROUND = 5.0  # seconds in which firmware sends ALIVE at least once
-_POLL = 0.02  # seconds
 _REPEAT = 1.0  # seconds between two commands
 _PROMPT = 0.2  # seconds: firmware sends ALIVE 10 ms after a command to restart
 
 app = session.group("List, stop and restart modules.")
 
-ALL_SHOWS_TOOLS = "; use --all to include tools"
-
 Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
-All = Annotated[bool, typer.Option("--all", "-a", help="Include tools, whose names begin with _.")]
 
 
 @session.command(app, "list")
@@ -48,7 +44,7 @@ async def list_(session: Session, *, all: All = False, wait: Wait = None, format
     columns = ["module", "state", "rebooted", "kind", "link", "age"]
     await output.table([_row(view) for view in views], columns, units={"age": "s"})
     if not views:
-        session.notify(f"no modules found on {session.network_name}{ALL_SHOWS_TOOLS if known else ''}")
+        session.report_none("modules", hidden=bool(known))
 
 
 async def _wait_for_firmware(session: Session) -> None:
@@ -59,18 +55,7 @@ async def _wait_for_firmware(session: Session) -> None:
         return all(link.name in known for link in session.module.links if link.up and link.passes_probes)
 
     with session.waiting("ALIVE of firmware"):
-        await _wait_until(named, _ROUND)
-
-
-async def _wait_until(condition: Callable[[], bool], timeout: float) -> bool:
-    """Wait until the condition is true; False if it is not after `timeout` seconds."""
-    loop = asyncio.get_running_loop()
-    end = loop.time() + timeout
-    while not condition():
-        if loop.time() >= end:
-            return False
-        await asyncio.sleep(_POLL)
-    return True
+        await wait_until(named, _ROUND)
 
 
 @session.command(app, "stop")
@@ -143,7 +128,7 @@ async def _send_command(
         raise watch.refused
     if watch.denied:
         raise TimedOut(watch.denied)
-    session.notify(f"{name}: {_DONE[command]} after {loop.time() - started:.1f} s")
+    notify(f"{name}: {_DONE[command]} after {loop.time() - started:.1f} s")
 
 
 async def _watch_events(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str, watch: _CommandWatch) -> None:
@@ -161,7 +146,7 @@ async def _repeat_until_done(
 ) -> None:
     """Send the command, and repeat it until the module confirms it or a gateway denies it."""
     loop = asyncio.get_running_loop()
-    await _wait_until(lambda: bool(watch.flags), _FIRST_STATE)
+    await wait_until(lambda: bool(watch.flags), _FIRST_STATE)
     sent_at = loop.time()
 
     def is_done() -> bool:
@@ -176,7 +161,7 @@ async def _repeat_until_done(
             watch.refused = error
             return
         sent_at = loop.time()
-        if await _wait_until(is_done, _REPEAT):
+        if await wait_until(is_done, _REPEAT):
             return
 
 

@@ -3,17 +3,16 @@
 Firmware announces its topics, but not which of its nodes have them: they are listed under `MODULE/?`.
 """
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 import r2p
 from r2p.tools import session
-from r2p.tools.module import ALL_SHOWS_TOOLS
-from r2p.tools.options import CLASS_NAMES, Format, Wait
+from r2p.tools.options import CLASS_NAMES, All, Format, Wait
 from r2p.tools.output import Output
 from r2p.tools.session import Session
-from r2p.tools.types import Types, type_name
+from r2p.tools.types import Types
 
 app = session.group("List and inspect nodes.")
 
@@ -21,13 +20,7 @@ Table = dict[tuple[str, str], tuple[list[str], list[str]]]
 
 
 @session.command(app, "list")
-async def list_(
-    session: Session,
-    *,
-    all: Annotated[bool, typer.Option("--all", "-a", help="Include the nodes of tools.")] = False,
-    wait: Wait = None,
-    format: Format = None,
-) -> None:
+async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
     """List the nodes, and the topics that they publish and subscribe."""
     output = Output(format)
     await session.settle(wait)
@@ -39,7 +32,7 @@ async def list_(
     ]
     await output.table(rows, ["node", "publishes", "subscribes"])
     if not rows:
-        session.notify(f"no nodes found on {session.network_name}{ALL_SHOWS_TOOLS if nodes else ''}")
+        session.report_none("nodes", hidden=bool(nodes))
 
 
 @session.command(app, "info")
@@ -65,8 +58,8 @@ async def info(
             "node": f"{module}/{name}",
             "module": None if view is None else view.state,
             "link": None if view is None else view.link,
-            "publishes": [_topic(types, views[topic]) | {"class": _class(views[topic], node)} for topic in publishes],
-            "subscribes": [_topic(types, views[topic]) for topic in subscribes],
+            "publishes": [types.describe(views[topic]) | {"class": _class(views[topic], node)} for topic in publishes],
+            "subscribes": [types.describe(views[topic]) for topic in subscribes],
         }
     )
 
@@ -94,11 +87,6 @@ def _find(wanted: str, nodes: Table) -> tuple[str, str]:
     if found:
         raise r2p.Error(f"there are several nodes {wanted}: choose one of {paths}")
     raise r2p.Error(f"there is no node {wanted}; nodes found: {paths or 'none'}")
-
-
-def _topic(types: Types, view: r2p.TopicView) -> dict[str, Any]:
-    cls = types.of(view)
-    return {"topic": view.name, "type": None if cls is None else type_name(cls), "size": view.size or None}
 
 
 def _class(view: r2p.TopicView, node: str) -> str | None:

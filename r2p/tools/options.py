@@ -9,6 +9,7 @@ import msgspec
 import typer
 
 import r2p
+from r2p.names import topic_name
 from r2p.transports.url import duration
 
 CLASS_NAMES = {
@@ -44,6 +45,14 @@ def class_choice(text: str) -> ClassChoice:
     if name not in by_name or (name == "nrt") == bool(time):
         raise typer.BadParameter(f"{text!r}: write nrt, periodic:10ms or sporadic:20ms")
     return ClassChoice(by_name[name], seconds(time) if time else 0.0)
+
+
+def valid_topic(text: str) -> str:
+    """Parse the name of a topic."""
+    try:
+        return topic_name(text)
+    except r2p.InvalidName as error:
+        raise typer.BadParameter(str(error)) from error
 
 
 def hertz(text: str) -> float:
@@ -84,6 +93,7 @@ Wait = Annotated[
 ]
 Count = Annotated[int | None, typer.Option("--count", "-n", min=1, metavar="N", help="End after N.")]
 Once = Annotated[bool, typer.Option("--once", help="End after one.")]
+All = Annotated[bool, typer.Option("--all", "-a", help="Include tools, whose names begin with _.")]
 Rate: Any = Annotated[
     float | None, typer.Option("--rate", "-r", parser=hertz, metavar="HZ", help="Messages per second; default: 1.")
 ]

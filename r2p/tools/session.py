@@ -39,6 +39,8 @@ from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout, log_to_stde
 from r2p.transports.url import open_transport
 
 B = TypeVar("B", bound=Callable[..., Awaitable[None]])
+Opening = Callable[["Settings"], contextlib.AbstractAsyncContextManager[Any]]
+"""Opens what a command works on instead of a Session."""
 
 CONFIG = "r2p.toml"
 REPORT_WAITING_AFTER = 1.0
@@ -49,7 +51,8 @@ _SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer ha
 _SETTLED_ON_BUS = 0.6  # ... on a bus, where modules announce in turn
 _FIRMWARE = 1.5  # seconds in which firmware, which announces one item each half second, is heard at least once
 _SETTLE_MAX = 8.0  # seconds to listen while announcements arrive: a bus of 1 Mbit/s carries 100 of them a second
-_POLL = 0.05  # seconds
+_POLL = 0.02  # seconds between two checks of a condition
+_SETTLE_POLL = 0.05  # ... and between two counts of what was announced, which take longer
 _LOOPBACK = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 _LINK_UP = 5.0  # seconds to wait for the first link
 
@@ -62,19 +65,10 @@ class TimedOut(Exception):
     """Something did not happen in time: exit code 3."""
 
 
-class Settings(msgspec.Struct):
-    """The settings from the command line, R2P_VIA and r2p.toml. `types` are "package.module:Class" by topic."""
+class Settings(msgspec.Struct, forbid_unknown_fields=True):
+    """The keys of r2p.toml; `via` can also come from R2P_VIA or the command line. `types`: "package.module:Class"."""
 
     via: list[str] = []
-    types: dict[str, str] = {}
-    remap: dict[str, str] = {}
-    module: str | None = None
-
-
-class _File(msgspec.Struct, forbid_unknown_fields=True):
-    """The keys of r2p.toml."""
-
-    via: str | list[str] = []
     module: str | None = None
     types: dict[str, str] = {}
     remap: dict[str, str] = {}
@@ -87,9 +81,9 @@ def settings(via: list[str] | None = None, directory: Path | None = None, *, too
     Raises UsageError for an r2p.toml that can't be read, or that other users can write.
     """
     file = _read(directory)
-    from_file = [file.via] if isinstance(file.via, str) else file.via
-    shared = os.environ.get("R2P_VIA", "").split() or from_file
-    return Settings(via or [_local_peer(url) if tool else url for url in shared], file.types, file.remap, file.module)
+    shared = os.environ.get("R2P_VIA", "").split() or file.via
+    file.via = via or [_local_peer(url) if tool else url for url in shared]
+    return file
 
 
 def check_urls(via: list[str]) -> None:
@@ -114,21 +108,24 @@ def _local_peer(url: str) -> str:
     return f"tcp:{_LOOPBACK.get(host, host)}:{port}"
 
 
-def _read(directory: Path | None) -> _File:
+def _read(directory: Path | None) -> Settings:
     try:
         path = (directory or Path.cwd()) / CONFIG
     except FileNotFoundError:  # the working directory has been removed
-        return _File()
+        return Settings()
     try:
         with path.open(encoding="utf-8") as file:
             check_owned(path, os.fstat(file.fileno()))
-            return msgspec.convert(tomllib.loads(file.read()), _File)
+            table = tomllib.loads(file.read())
+        if isinstance(url := table.get("via"), str):
+            table["via"] = [url]
+        return msgspec.convert(table, Settings)
     except FileNotFoundError:
-        return _File()
+        return Settings()
     except RecursionError as error:
         raise UsageError(f"{path} is nested too deeply") from error
     except msgspec.ValidationError as error:
-        raise UsageError(f"{path}: {error}; the keys are {', '.join(_File.__struct_fields__)}") from error
+        raise UsageError(f"{path}: {error}; the keys are {', '.join(Settings.__struct_fields__)}") from error
     except (OSError, ValueError) as error:  # unreadable, or not TOML
         raise UsageError(f"{path}: {error}") from error
 
@@ -200,8 +197,19 @@ async def patience(what: str, timeout: float | None) -> AsyncIterator[Callable[[
         raise TimedOut(f"nothing received on {what} for {timeout:g} s") from None
 
 
+async def wait_until(condition: Callable[[], bool], timeout: float) -> bool:
+    """Wait until the condition is true; return False if it is not after `timeout` seconds."""
+    loop = asyncio.get_running_loop()
+    end = loop.time() + timeout
+    while not condition():
+        if loop.time() >= end:
+            return False
+        await asyncio.sleep(_POLL)
+    return True
+
+
 class Session:
-    """A command on the network: its module, and its messages to the user (on stderr; stdout is for output only)."""
+    """A command on the network: its module, its node, and what it waits for."""
 
     def __init__(self, module: r2p.Module, settings: Settings, *, name: str = "tool", verbose: int = 0) -> None:
         self.module = module
@@ -219,16 +227,16 @@ class Session:
         """The network that the command is on, for messages."""
         return ", ".join(self.settings.via) or "this tool alone"
 
-    def notify(self, text: str) -> None:
-        """Print a message for the user on stderr."""
-        notify(text)
+    def report_none(self, things: str, *, hidden: bool = False) -> None:
+        """Report that there are no topics, nodes or modules; `hidden`: only those of tools, which are not shown."""
+        notify(f"no {things} found on {self.network_name}{'; use --all to include tools' if hidden else ''}")
 
     @contextlib.contextmanager
     def waiting(self, what: str | Callable[[], str]) -> Iterator[None]:
         """Report what the block waits for if it takes more than a second; a function is called for the text then."""
 
         def report() -> None:
-            self.notify(f"waiting for {what if isinstance(what, str) else what()} on {self.network_name}")
+            notify(f"waiting for {what if isinstance(what, str) else what()} on {self.network_name}")
 
         with call_after(REPORT_WAITING_AFTER, report):
             yield
@@ -248,18 +256,18 @@ class Session:
         """
         if not self.settings.via:
             return
-        await self._link_up()
+        with self.waiting("a link"):
+            if not await wait_until(lambda: any(link.up for link in self.module.links), _LINK_UP):
+                raise r2p.TransportError(f"no connection on {self.network_name}")
         if wait is not None:
             await asyncio.sleep(wait)
             return
         self.module.query()
         settled = await self._settled()
         if self._has_firmware() and (not settled or self._expects_more()):
-            self.notify(
-                f"firmware announces one item every 0.5 s, so there may be more {of}: listen longer with --wait 5"
-            )
+            notify(f"firmware announces one item every 0.5 s, so there may be more {of}: listen longer with --wait 5")
         elif not settled:
-            self.notify(f"announcements kept arriving, so there may be more {of}: listen longer with --wait 20")
+            notify(f"announcements kept arriving, so there may be more {of}: listen longer with --wait 20")
 
     async def _settled(self) -> bool:
         """Wait until no new announcements arrive; False if they still did after the longest time."""
@@ -270,19 +278,10 @@ class Session:
         while (now := loop.time()) - start < _SETTLE_MAX:
             if now - changed_at > quiet and (now - start > _FIRMWARE or not self._expects_more()):
                 return True
-            await asyncio.sleep(_POLL)
+            await asyncio.sleep(_SETTLE_POLL)
             if (count := self._known()) != known:
                 known, changed_at = count, loop.time()
         return False
-
-    async def _link_up(self) -> None:
-        loop = asyncio.get_running_loop()
-        end = loop.time() + _LINK_UP
-        with self.waiting("a link"):
-            while not any(link.up for link in self.module.links):
-                if loop.time() > end:
-                    raise r2p.TransportError(f"no connection on {self.network_name}")
-                await asyncio.sleep(_POLL)
 
     def _known(self) -> int:
         topics = self.module.network.topics().values()
@@ -335,29 +334,30 @@ async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> A
         yield Session(module, settings, name=name, verbose=verbose)
 
 
-def command(app: typer.Typer, name: str) -> Callable[[B], B]:
+def command(app: typer.Typer, name: str, *, opening: Opening | None = None) -> Callable[[B], B]:
     """Make a command of `app` from the coroutine function that this decorates, and return the function unchanged.
 
-    The function takes a Session first, then its own arguments and options.
+    The function takes a Session first, or what `opening` opens, then its own arguments and options.
     """
 
     def register(body: B) -> B:
-        app.command(name)(tool(body))
+        app.command(name)(_as_command(body, opening))
         return body
 
     return register
 
 
-def tool(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
-    """Return the command of such a coroutine function, as Typer expects it."""
+def _as_command(body: Callable[..., Awaitable[None]], opening: Opening | None) -> Callable[..., None]:
+    """Return the function that Typer expects, with the options of all commands."""
     name = body.__name__.strip("_")
 
     def run(**given: Any) -> None:
         via, verbose, quiet = (given.pop(name) for name in _COMMON)
 
         async def main() -> None:
-            async with join(settings(via, tool=True), name=name, verbose=verbose) as session:
-                await body(session, **given)
+            chosen = settings(via, tool=True)
+            async with join(chosen, name=name, verbose=verbose) if opening is None else opening(chosen) as opened:
+                await body(opened, **given)
 
         execute(main, verbose=verbose, quiet=quiet)
 

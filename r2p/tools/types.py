@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 import r2p
 from r2p.tools.run import load_module
@@ -72,6 +73,11 @@ class Types:
         if stated is not None or view.fingerprint is None:
             return stated
         return self.by_fingerprint(view.fingerprint) or self._learnt.get(view.fingerprint)
+
+    def describe(self, view: r2p.TopicView) -> dict[str, Any]:
+        """Return name, type and size of a topic as a record; None is what is unknown."""
+        cls = self.of(view)
+        return {"topic": view.name, "type": None if cls is None else type_name(cls), "size": view.size or None}
 
     async def learn(self, session: Session, view: r2p.TopicView) -> type[r2p.Message] | None:
         """Return the type of a topic, and query the network for an unknown one, if the transport carries types."""

@@ -79,7 +79,9 @@ def test_what_the_file_holds(tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text(
         'via = ["tcp:a", "tcp:b"]\nmodule = "PC1"\n[types]\nleds = "r2p.msg:Led"\n[remap]\nencoder = "enc1"\n'
     )
-    assert settings() == Settings(["tcp:a", "tcp:b"], {"leds": "r2p.msg:Led"}, {"encoder": "enc1"}, "PC1")
+    assert settings() == Settings(
+        via=["tcp:a", "tcp:b"], module="PC1", types={"leds": "r2p.msg:Led"}, remap={"encoder": "enc1"}
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
 """`r2p bus`: what an RTCAN bus carries, how its slots are used, and what still fits. All commands only listen.
 
-`load`, `dump`, `schedule` and `admit` are the commands; `load` also has how they open a bus, `picture` draws slots.
+`traffic` has `load`, `dump`, and how a command opens a bus; `slots` has `schedule` and `admit`, and draws the cycle.
 """
 
 from r2p.tools import session
-from r2p.tools.bus import admit, dump, load, schedule
+from r2p.tools.bus import slots, traffic
 
 app = session.group("Inspect an RTCAN bus: load, frames, slots.")
-for _body in (load.load, dump.dump, schedule.schedule, admit.admit):
-    app.command()(_body)
+session.command(app, "load", opening=traffic.listen)(traffic.load)
+session.command(app, "dump", opening=traffic.listen)(traffic.dump)
+session.command(app, "schedule", opening=traffic.listen)(slots.schedule)
+app.command()(slots.admit)

@@ -1,6 +1,5 @@
 """The robot of `r2p demo line`, the PC that drives it, and counters of what passes between them."""
 
-import asyncio
 import contextlib
 import math
 from collections import deque
@@ -13,12 +12,12 @@ from r2p.clock import clock_of
 from r2p.messages import Message
 from r2p.msg import Encoder, Led, StampedIMURaw9, StampedVelocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
+from r2p.tools.session import wait_until
 from r2p.units import SECOND
 
 _WINDOW = 2_000_000_000  # ns, of the rate
 _LATENCIES = 10_000  # the newest are kept
 _GRAVITY = 1000  # counts of 1 mg
-_POLL = 0.02  # seconds
 _IN_FLIGHT = 1.0  # seconds to wait for messages that were sent
 
 
@@ -117,14 +116,9 @@ class Robot:
         await self._stack.aclose()
 
     async def finish(self) -> None:
-        """Stop to send, and wait for messages in flight."""
+        """Stop sending, and wait for messages in flight."""
         self._over = True
-        loop = asyncio.get_running_loop()
-        end = loop.time() + _IN_FLIGHT
-        while loop.time() < end:
-            await asyncio.sleep(_POLL)
-            if all(counter.received == counter.sent for counter in self.updated_counters()):
-                return
+        await wait_until(lambda: all(each.received == each.sent for each in self.updated_counters()), _IN_FLIGHT)
 
     def updated_counters(self) -> Iterator[TopicCounter]:
         """Yield the counters, with what was sent so far."""

@@ -10,7 +10,7 @@ import typer
 import r2p
 from r2p.names import topic_name
 from r2p.tools.options import Count, Format, Once, Timeout
-from r2p.tools.output import Output
+from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, UsageError, patience
 from r2p.tools.topic.watching import Topics, TypeName, received_samples
 from r2p.tools.types import Types, suggestion
@@ -110,9 +110,9 @@ class _TopicReader:
     def report_losses(self) -> None:
         """Report what is missing in the output."""
         if self._subscriber.lost:
-            self._session.notify(f"{self._subscriber.lost} messages of {self.topic} lost: the output was too slow")
+            notify(f"{self._subscriber.lost} messages of {self.topic} lost: the output was too slow")
         if self._subscriber.undecodable:
-            self._session.notify(f"{self._subscriber.undecodable} messages of {self.topic} were of another type")
+            notify(f"{self._subscriber.undecodable} messages of {self.topic} were of another type")
 
     async def _record(self, sample: r2p.Sample) -> dict[str, Any]:
         record = self._decoded(sample)
@@ -141,9 +141,7 @@ class _TopicReader:
         if self._cls is None and not self._reported:
             self._reported = True
             size = len(sample.data)
-            self._session.notify(
-                f"the type of {self.topic} is unknown, so bytes are shown in hex; give --type{suggestion(size)}"
-            )
+            notify(f"the type of {self.topic} is unknown, so bytes are shown in hex; give --type{suggestion(size)}")
 
 
 def _meta(topic: str, sample: r2p.Sample) -> dict[str, Any]:

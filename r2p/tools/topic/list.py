@@ -8,10 +8,10 @@ import typer
 import r2p
 from r2p.names import topic_name
 from r2p.tools.options import CLASS_NAMES, Format, Wait
-from r2p.tools.output import Output
+from r2p.tools.output import Output, notify
 from r2p.tools.session import Session
 from r2p.tools.topic.watching import Topic, suggest_topics
-from r2p.tools.types import Types, load_type, of_size, type_name
+from r2p.tools.types import Types, load_type, of_size
 
 _COLUMNS = ["topic", "type", "size", "publishers", "subscribers"]
 
@@ -25,7 +25,7 @@ async def list_(session: Session, *, wait: Wait = None, format: Format = None) -
     rows = [_row(session, view, types) for view in views]
     await output.table(rows, _COLUMNS)
     if not rows:
-        session.notify(f"no topics found on {session.network_name}")
+        session.report_none("topics")
 
 
 async def info(session: Session, topic: Topic, *, wait: Wait = None, format: Format = None) -> None:
@@ -43,7 +43,7 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
         known = question or f"; known topics: {', '.join(views) or 'none'}"
         raise r2p.Error(f"{topic} has no publisher and no subscriber{known}")
     if view.mismatch:
-        session.notify(f"{topic} has different types: some of these nodes can't exchange messages")
+        notify(f"{topic} has different types: some of these nodes can't exchange messages")
     details = await _details(session, view)
     if session.verbose:
         age = None if view.age is None else round(view.age, 3)
@@ -92,11 +92,7 @@ def _match(view: r2p.TopicView, size: int, fingerprint: bytes | None) -> str | N
 
 
 def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
-    cls = types.of(view)
-    return {
-        "topic": view.name,
-        "type": None if cls is None else type_name(cls),
-        "size": view.size or None,
+    return types.describe(view) | {
         "publishers": [each["node"] for each in _endpoints(session, view.publishers, view.published_on)],
         "subscribers": [each["node"] for each in _endpoints(session, view.subscribers, view.subscribed_on)],
     }
@@ -118,13 +114,11 @@ def _class_name(endpoint: r2p.Endpoint) -> str | None:
 
 
 async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
-    cls = await Types(session.settings).learn(session, view)
+    types = Types(session.settings)
+    cls = await types.learn(session, view)
     publishers = _endpoints(session, view.publishers, view.published_on)
     subscribers = _endpoints(session, view.subscribers, view.subscribed_on)
-    details: dict[str, Any] = {
-        "topic": view.name,
-        "type": None if cls is None else type_name(cls),
-        "size": view.size or None,
+    details = types.describe(view) | {
         "fingerprint": None if view.fingerprint is None else view.fingerprint.hex(),
         "publishers": publishers,
         "subscribers": [{key: each[key] for key in ("node", "link")} for each in subscribers],

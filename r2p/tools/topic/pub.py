@@ -11,7 +11,7 @@ import typer
 
 import r2p
 from r2p.tools.options import ClassChoice, Count, Once, Rate, Timeout, class_choice
-from r2p.tools.output import waitable
+from r2p.tools.output import notify, waitable
 from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError
 from r2p.tools.topic.watching import Topic, TypeName, hint, is_subscribed, suggest_topics, wait_until_passed_on
 from r2p.tools.types import find
@@ -163,7 +163,7 @@ class _Publication:
     def _report_no_subscriber(self, publisher: _AnyPublisher) -> None:
         if not publisher.subscribers:
             question = suggest_topics(self._session, self._topic, is_subscribed)
-            self._session.notify(f"{self._topic} has no subscriber yet, publishing anyway{question}")
+            notify(f"{self._topic} has no subscriber yet, publishing anyway{question}")
 
 
 async def read_lines(stream: TextIO | None = None) -> AsyncIterator[str]:

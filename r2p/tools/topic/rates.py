@@ -7,16 +7,17 @@ lost.
 
 import asyncio
 import statistics
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Sequence
-from typing import Annotated, Any, Protocol
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from typing import Annotated, Any
 
 import typer
 
 import r2p
 from r2p.names import topic_name
 from r2p.tools.options import Count, Format, Once, Timeout
-from r2p.tools.output import Output
+from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, patience
 from r2p.tools.topic.watching import Topic, TypeName, received_samples
 from r2p.tools.types import Types
@@ -34,111 +35,85 @@ Window = Annotated[int, typer.Option("--window", "-w", min=2, metavar="N", help=
 Report = dict[str, Any]
 
 
-async def hz(
-    session: Session,
-    topic: Topic,
-    *,
-    type: TypeName = None,
-    window: Window = 1000,
-    count: Count = None,
-    once: Once = False,
-    timeout: Timeout = None,
-    format: Format = None,
-) -> None:
-    """Measure the rate of a topic, and losses.
+class _Meter(ABC):
+    """One kind of measurement, over the last `window` messages. Its docstring is the help of its command."""
 
-    Reports once a second. Periods (s) are the publisher's if it stamps its messages, otherwise those of reception;
-    `gaps` are pauses of the publisher; `lost_on_way` needs numbered messages. -n and --once count reports.
-    """
-    await _measure(session, topic, type, _Rate(window), 1 if once else count, timeout, Output(format))
-
-
-async def bw(
-    session: Session,
-    topic: Topic,
-    *,
-    type: TypeName = None,
-    window: Window = 1000,
-    count: Count = None,
-    once: Once = False,
-    timeout: Timeout = None,
-    format: Format = None,
-) -> None:
-    """Measure the bandwidth of a topic.
-
-    Reports payload bytes once a second. -n and --once count reports.
-    """
-    await _measure(session, topic, type, _Bandwidth(window), 1 if once else count, timeout, Output(format))
-
-
-async def delay(
-    session: Session,
-    topic: Topic,
-    *,
-    type: TypeName = None,
-    window: Window = 1000,
-    count: Count = None,
-    once: Once = False,
-    timeout: Timeout = None,
-    format: Format = None,
-) -> None:
-    """Measure how long messages take.
-
-    Reports the time from publish() to this tool once a second. Needs a link that carries stamps, and synchronized
-    clocks. -n and --once count reports.
-    """
-    await _measure(session, topic, type, _Delay(window), 1 if once else count, timeout, Output(format))
-
-
-class _Meter(Protocol):
-    """One kind of measurement."""
+    def __init__(self, window: int) -> None:
+        self.fresh = 0
+        """Messages since the last report."""
+        self._arrivals: deque[int] = deque(maxlen=window)  # UTC ns
 
     def add(self, sample: r2p.Sample, now: int) -> None:
         """Measure a message that was received at `now` (UTC ns). Raises r2p.Error if it can't be measured."""
+        self.fresh += 1
+        self._arrivals.append(now if sample.stamped else sample.stamp)
 
+    @abstractmethod
     def report(self, lost: int) -> tuple[Report, str] | None:
-        """Return the record and its text; None: too little is known. `lost`: messages that this tool lost itself."""
+        """Return the record and its text, or None if too little is known. `lost`: messages that this tool lost."""
 
     def restart(self) -> None:
         """Start new averages with the next message, after a silence; counters go on."""
+        self._arrivals.clear()
+
+    def _per_second(self, amount: int) -> float | None:
+        """Return the amount per second between the first and the last arrival; None if no time has passed."""
+        span = (self._arrivals[-1] - self._arrivals[0]) / SECOND if self._arrivals else 0.0
+        return amount / span if span > 0 else None
 
 
-async def _measure(
-    session: Session,
-    topic: str,
-    given: str | None,
-    meter: _Meter,
-    reports: int | None,
-    timeout: float | None,
-    output: Output,
+def _command(name: str, kind: type[_Meter]) -> Callable[..., Coroutine[Any, Any, None]]:
+    """Return the command for a kind of measurement, whose docstring is the help."""
+
+    async def command(
+        session: Session,
+        topic: Topic,
+        *,
+        type: TypeName = None,
+        window: Window = 1000,
+        count: Count = None,
+        once: Once = False,
+        timeout: Timeout = None,
+        format: Format = None,
+    ) -> None:
+        cls = Types(session.settings).stated(topic_name(topic), type)
+        subscriber: r2p.Subscriber[Any] = session.node.subscribe(topic, cls, queue=QUEUE, lossy=True)
+        samples = received_samples(session, subscriber, typed=cls is not None)
+        meter, output = kind(window), Output(format)
+        async with output.while_read(), patience(topic, timeout) as received, asyncio.TaskGroup() as tasks:
+            reading = tasks.create_task(_read(session.node, samples, meter, received))
+            await _print(session.node, subscriber, meter, output, 1 if once else count)
+            reading.cancel()
+
+    command.__name__, command.__doc__ = name, kind.__doc__
+    return command
+
+
+async def _read(
+    node: r2p.Node, samples: AsyncIterator[r2p.Sample], meter: _Meter, received: Callable[[], None]
 ) -> None:
-    cls = Types(session.settings).stated(topic_name(topic), given)
-    subscriber: r2p.Subscriber[Any] = session.node.subscribe(topic, cls, queue=QUEUE, lossy=True)
-    fresh = 0
+    async for sample in samples:
+        received()
+        meter.add(sample, node.now())
 
-    async def read() -> None:
-        nonlocal fresh
-        async for sample in received_samples(session, subscriber, typed=cls is not None):
-            received()
-            fresh += 1
-            meter.add(sample, session.node.now())
 
-    async with output.while_read(), patience(topic, timeout) as received, asyncio.TaskGroup() as tasks:
-        reading = tasks.create_task(read())
-        measured = False
-        async for _ in session.node.every(1.0):
-            report = meter.report(subscriber.lost) if fresh else None
-            if report is not None:
-                record, text = report
-                await output.put({"topic": subscriber.topic} | record, text)
-                reports = None if reports is None else reports - 1
-                if reports == 0:
-                    break
-            elif measured and not fresh:
-                session.notify(f"no new messages of {topic}")
-                meter.restart()
-            measured, fresh = report is not None, 0
-        reading.cancel()
+async def _print(
+    node: r2p.Node, subscriber: r2p.Subscriber[Any], meter: _Meter, output: Output, count: int | None
+) -> None:
+    """Print `count` reports (None: no end), once a second."""
+    printed, measured = 0, False
+    async for _ in node.every(1.0):
+        report = meter.report(subscriber.lost) if meter.fresh else None
+        if report is not None:
+            record, text = report
+            await output.put({"topic": subscriber.topic} | record, text)
+            printed += 1
+            if printed == count:
+                return
+        elif measured and not meter.fresh:
+            notify(f"no new messages of {subscriber.topic}")
+            meter.restart()
+        measured, meter.fresh = report is not None, 0
 
 
 class _Sequences:
@@ -169,11 +144,15 @@ class _Sequences:
         return not gap and last > 0
 
 
-class _Rate:
-    """Rate, periods, gaps and losses."""
+class _Rate(_Meter):
+    """Measure the rate of a topic, and losses.
+
+    Reports once a second. Periods (s) are the publisher's if it stamps its messages, otherwise those of reception;
+    `gaps` are pauses of the publisher; `lost_on_way` needs numbered messages. -n and --once count reports.
+    """
 
     def __init__(self, window: int) -> None:
-        self._arrivals: deque[int] = deque(maxlen=window)
+        super().__init__(window)
         self._periods: deque[float] = deque(maxlen=window)
         self._sequences: dict[r2p.Source, _Sequences] = {}
         self._stamps: dict[r2p.Source, int] = {}
@@ -185,7 +164,7 @@ class _Rate:
 
     def add(self, sample: r2p.Sample, now: int) -> None:
         source = sample.source
-        self._arrivals.append(now if sample.stamped else sample.stamp)
+        super().add(sample, now)
         self._stamped = sample.stamped
         follows = source in self._stamps
         if sample.sequence:
@@ -196,7 +175,7 @@ class _Rate:
         self._stamps[source] = sample.stamp
 
     def restart(self) -> None:
-        self._arrivals.clear()
+        super().restart()
         self._periods.clear()
         self._silent.update(self._stamps)
 
@@ -210,7 +189,7 @@ class _Rate:
         self._periods.append(period)
 
     def report(self, lost: int) -> tuple[Report, str] | None:
-        rate = _per_second(self._arrivals, len(self._arrivals) - 1)
+        rate = self._per_second(len(self._arrivals) - 1)
         if rate is None or not self._periods:
             return None
         missing = sum(each.missing for each in self._sequences.values())
@@ -230,25 +209,28 @@ class _Rate:
         return record, text
 
 
-class _Bandwidth:
-    """Bytes of payload and messages a second."""
+class _Bandwidth(_Meter):
+    """Measure the bandwidth of a topic.
+
+    Reports payload bytes once a second. -n and --once count reports.
+    """
 
     def __init__(self, window: int) -> None:
-        self._arrivals: deque[int] = deque(maxlen=window)
+        super().__init__(window)
         self._sizes: deque[int] = deque(maxlen=window)
 
     def add(self, sample: r2p.Sample, now: int) -> None:
-        self._arrivals.append(now if sample.stamped else sample.stamp)
+        super().add(sample, now)
         self._sizes.append(len(sample.data))
 
     def restart(self) -> None:
-        self._arrivals.clear()
+        super().restart()
         self._sizes.clear()
 
     def report(self, lost: int) -> tuple[Report, str] | None:
         total = sum(self._sizes) - self._sizes[0] if self._sizes else 0
-        bandwidth = _per_second(self._arrivals, total)
-        rate = _per_second(self._arrivals, len(self._arrivals) - 1)
+        bandwidth = self._per_second(total)
+        rate = self._per_second(len(self._arrivals) - 1)
         if bandwidth is None or rate is None:
             return None
         record = {
@@ -265,10 +247,15 @@ class _Bandwidth:
         return record, text
 
 
-class _Delay:
-    """Time from publish() to this tool."""
+class _Delay(_Meter):
+    """Measure how long messages take.
+
+    Reports the time from publish() to this tool once a second. Needs a link that carries stamps, and synchronized
+    clocks. -n and --once count reports.
+    """
 
     def __init__(self, window: int) -> None:
+        super().__init__(window)
         self._delays: deque[float] = deque(maxlen=window)
         self._link = ""
         self._origins: dict[str, None] = {}
@@ -280,6 +267,7 @@ class _Delay:
                 f"no stamps: link {sample.source.link} does not carry when a message was published, so its delay is "
                 "unknown"
             )
+        super().add(sample, now)
         self._link = sample.source.link
         origin = _origin(sample)
         if origin in self._origins or len(self._origins) < _ORIGINS:
@@ -288,6 +276,7 @@ class _Delay:
         self._delays.append((now - sample.stamp) / SECOND)
 
     def restart(self) -> None:
+        super().restart()
         self._delays.clear()
 
     def report(self, lost: int) -> tuple[Report, str] | None:
@@ -319,12 +308,6 @@ def _origin(sample: r2p.Sample) -> str:
     return f"{sample.source}'s {where}"
 
 
-def _per_second(arrivals: Sequence[int], amount: int) -> float | None:
-    """Return the amount per second between the first and the last arrival; None if no time has passed."""
-    span = (arrivals[-1] - arrivals[0]) / SECOND if arrivals else 0.0
-    return amount / span if span > 0 else None
-
-
 def _spread(values: Sequence[float]) -> Report:
     return {
         "min": round(min(values), _DIGITS),
@@ -348,3 +331,8 @@ def _bytes(count: float) -> str:
             return f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.1f} MB"
+
+
+hz = _command("hz", _Rate)
+bw = _command("bw", _Bandwidth)
+delay = _command("delay", _Delay)

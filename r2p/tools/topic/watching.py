@@ -12,7 +12,8 @@ from typing import Annotated, Any
 import typer
 
 import r2p
-from r2p.tools.session import Session, call_after, settings
+from r2p.tools.output import notify
+from r2p.tools.session import Session, call_after, settings, wait_until
 from r2p.tools.types import complete_type
 
 
@@ -71,7 +72,7 @@ async def received_samples(
 def _report_unadvertised(session: Session, topic: str) -> None:
     view = session.module.network.topics().get(topic)
     if session.may_have_firmware() and not (view and is_published(view)):
-        session.notify(f"{topic} has not been advertised: firmware may announce nothing, then give --type to subscribe")
+        notify(f"{topic} has not been advertised: firmware may announce nothing, then give --type to subscribe")
 
 
 def suggest_topics(session: Session, topic: str, fits: Callable[[r2p.TopicView], bool]) -> str:
@@ -102,7 +103,7 @@ def hint(session: Session, text: str, topic: str, fits: Callable[[r2p.TopicView]
         view = session.module.network.topics().get(topic)
         question = suggest_topics(session, topic, fits)
         if question and not (view and fits(view)):
-            session.notify(f"{text}{question}")
+            notify(f"{text}{question}")
 
     with call_after(HINT_AFTER, report):
         yield
@@ -114,13 +115,13 @@ async def wait_until_passed_on(session: Session, topic: str) -> None:
     It may be a gateway of firmware, which forwards messages only after a second request (PROTOCOL.md 4).
     """
     lines = [link for link in session.module.links if link.point_to_point and link.up and not _is_r2p(link)]
-    asked = {link: _requested_at(link, topic) for link in lines}
-    end = asyncio.get_running_loop().time() + _SECOND_ROUND
-    while any(at is not None and link.up and _requested_at(link, topic) == at for link, at in asked.items()):
-        if asyncio.get_running_loop().time() >= end:
-            return  # a build of the firmware that repeats nothing, or its answer was lost
-        await asyncio.sleep(_GRACE)
-    if any(at is not None for at in asked.values()):
+    asked = {link: at for link in lines if (at := _requested_at(link, topic)) is not None}
+
+    def repeated() -> bool:
+        return not any(link.up and _requested_at(link, topic) == at for link, at in asked.items())
+
+    # In vain for a build of the firmware that repeats nothing, or if its answer was lost.
+    if asked and await wait_until(repeated, _SECOND_ROUND):
         await asyncio.sleep(_GRACE)
 
 
@@ -143,7 +144,7 @@ def _reporting_departure(session: Session, subscriber: r2p.Subscriber[Any]) -> I
             await asyncio.sleep(_POLL)
             before, present = present, subscriber.publishers > 0
             if before and not present:
-                session.notify(f"{subscriber.topic} has no publisher any more")
+                notify(f"{subscriber.topic} has no publisher any more")
 
     watching = asyncio.create_task(watch())
     try:

@@ -1,4 +1,4 @@
-"""`r2p bus admit`: the answer of the master's calendar to a plan."""
+"""`r2p bus admit`: the answer of the calendar to a plan, and the drawing of a cycle."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import typer
 from typer.testing import CliRunner
 
 from r2p.protocols.rtcan.calendar import Calendar
-from r2p.tools.bus import app, picture
-from r2p.tools.bus.admit import Wanted, admit_all, cells_of, grid, parse, summary
-from r2p.tools.bus.picture import Cell
+from r2p.tools.bus import app
+from r2p.tools.bus.slots import Cell, Wanted, admit_all, drawing, grid, parse, planned_cells, summary, svg_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -107,16 +106,15 @@ def test_the_drawing_shows_every_slot(tmp_path: Path) -> None:
 
 def test_the_picture_marks_what_was_missed_and_what_events_use() -> None:
     cells = [Cell("sync"), Cell("imu"), Cell("imu", missed=2), Cell(shared=3), Cell()]
-    assert picture.text(cells) == "  0  S  A  A! +  ."
+    assert drawing(cells)[0] == "  0  S  A  A! +  ."
     calendar = Calendar(60)
-    wanted = [parse("a:8@996us")]
-    admit_all(calendar, wanted, grid(60, None, 1_000_000))
-    assert [i for i, cell in enumerate(cells_of(calendar, wanted, grid(60, None, 1_000_000))) if cell.owner == "a"] == [
-        *range(1, 60, 6)
-    ]
+    wanted, timing = [parse("a:8@996us")], grid(60, None, 1_000_000)
+    admit_all(calendar, wanted, timing)
+    planned = planned_cells(calendar, wanted, timing)
+    assert [i for i, cell in enumerate(planned) if cell.owner == "a"] == [*range(1, 60, 6)]
 
 
 def test_more_owners_than_letters_are_still_drawn() -> None:
     cells = [Cell(f"t{i}") for i in range(80)]
-    assert len(picture.text(cells).splitlines()) == 4
-    assert picture.svg(cells, "x", {}).count("<title>") == 80
+    assert drawing(cells).index("") == 4
+    assert svg_of(cells, "x").count("<title>") == 80
