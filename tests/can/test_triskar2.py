@@ -18,7 +18,7 @@ import r2p
 from r2p.clock import clock_of
 from r2p.msg import Odometry
 from r2p.sim.robots.emulated import MODULES, Triskar2
-from r2p.sim.robots.square import REST, square
+from r2p.sim.robots.triskar2 import REST, square
 from r2p.testing.network import node_in
 from r2p.transports.can import rawsocket
 

@@ -9,15 +9,22 @@
 `power` has `Powered`, which runs it in an event loop and connects it: by a `wire` inside the process, which works under
 virtual time, by TCP, or by a pseudo terminal in place of a serial port.
 
-`boards` and `imu` have the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s with
+`boards` has the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s with
 nodes around a model of `r2p.sim.physics`, on any transport. `Plant` advances the models. `r2p.sim.robots` assembles
 modules to robots.
 """
 
-from r2p.sim.modules.boards import Board, GatewayModule, IoModule, MotorModule, PowerModule, ProximityModule
+from r2p.sim.modules.boards import (
+    Board,
+    GatewayModule,
+    ImuModule,
+    IoModule,
+    MotorModule,
+    Plant,
+    PowerModule,
+    ProximityModule,
+)
 from r2p.sim.modules.firmware import FirmwareModule, Publishes, Subscribes
-from r2p.sim.modules.imu import ImuModule
-from r2p.sim.modules.plant import Plant
 from r2p.sim.modules.power import Powered, Wire
 
 __all__ = [

@@ -1,33 +1,91 @@
-"""The hardware modules of the thesis (chapter 7), emulated: motor, proximity, input/output, power supply and gateway.
+"""The hardware modules of the thesis (chapter 7), emulated: motor, proximity, IMU, input/output, power and gateway.
 
 Each is a `Board`, an `r2p.Module` that starts its nodes by itself when it is opened. The nodes are ordinary ones around
-a model of `r2p.sim.physics`, so a board runs on any transport, and sends the same messages as a real one.
+a model of `r2p.sim.physics`, so a board runs on any transport, and sends the same messages as a real one. A `Plant`
+advances the models.
 """
 
+import asyncio
 import functools
+import math
 import random
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import msgspec
 
 import r2p
 from r2p.bridge import BridgeOptions
+from r2p.clock import Ticker
 from r2p.modules.supervisor import NodeFunction
+from r2p.msg import IMU, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
 from r2p.msg import Battery as BatteryMessage
-from r2p.msg import Encoder, Float32, Led, Proximity, Setpoint
+from r2p.sim.physics.inertial import (
+    ACCELEROMETER,
+    GRAVITY,
+    GYROSCOPE,
+    MAGNETOMETER,
+    Barometer,
+    ComplementaryFilter,
+    MemsSensor,
+    Vector,
+    altitude_at,
+)
 from r2p.sim.physics.motor import Battery, Drive
 from r2p.sim.physics.world import RangeFinder, RangeSpec
 from r2p.transports.link import Transport
+from r2p.units import SECOND
 
 Via = str | Transport | Iterable[str | Transport] | None
 DistanceTo = Callable[[int], float]
 """Returns the distance in mm to what sensor 0 to 3 sees, or infinity."""
 
+_CATCH_UP = 1.0  # s of physics to make up for after the loop was blocked; more would hang after a long sleep
 _ADC = 4095  # counts of 12 bits
 _REFERENCE = 3.3  # V
 _VOLTAGE_COUNT = 36_000 / _ADC  # mV per count: a divider turns 36 V into 3.3 V
 _CURRENT_COUNT = 50_000 / _ADC  # mA per count
+_MDPS = math.degrees(1.0) * 1000  # mdps in one rad/s
+_MG = 1000 / GRAVITY  # mg in one m/s^2
+_BARO = 0.04  # seconds: the barometer makes 25 measurements a second
+
+
+class Part(Protocol):
+    """Something that changes with time."""
+
+    def step(self, dt: float) -> object:
+        """Advance by `dt` seconds."""
+
+
+class Plant:
+    """The clock of the physics: steps its parts in order, every `dt` seconds of the loop's clock, in `async with`."""
+
+    def __init__(self, parts: Iterable[Part] = (), *, dt: float = 0.001) -> None:
+        self.parts = list(parts)
+        self.dt = dt
+        self.steps = 0
+        """The number of steps so far."""
+        self._ticker: Ticker | None = None
+
+    async def __aenter__(self) -> Self:
+        self._ticker = Ticker(asyncio.get_running_loop(), round(self.dt * SECOND), self._tick, background=True)
+        self._ticker.start()
+        return self
+
+    async def __aexit__(self, *_exception: object) -> None:
+        if self._ticker is not None:
+            self._ticker.close()
+
+    def step(self, count: int = 1) -> None:
+        """Do `count` steps at once."""
+        dt, parts = self.dt, self.parts
+        for _ in range(count):
+            for part in parts:
+                part.step(dt)
+        self.steps += count
+
+    def _tick(self, _scheduled: int, _late: int, skipped: int) -> None:
+        self.step(1 + min(skipped, round(_CATCH_UP / self.dt)))
 
 
 class Board(r2p.Module):
@@ -167,6 +225,103 @@ class ProximityModule(Board):
         self.sensors = sensors
         node = functools.partial(proximity, sensors=self.sensors, topic=topic, period=period)
         super().__init__(name, via=via, remap=remap, nodes={"prox": node})
+
+
+class Motion(msgspec.Struct, frozen=True):
+    """The true values that the sensors measure, in the frame of the module (x forward, y to the left, z up)."""
+
+    force: Vector = (0.0, 0.0, GRAVITY)
+    """Specific force (acceleration minus gravity), upwards at rest, m/s^2."""
+    rates: Vector = (0.0, 0.0, 0.0)
+    """rad/s."""
+    field: Vector = (220.0, 0.0, -400.0)
+    """Magnetic field, mgauss; by default x points north."""
+    altitude: float = 120.0
+    """m."""
+
+
+class InertialUnit:
+    """The inertial sensors, which return counts at their own rates, and the filter; it is a part of a `Plant`."""
+
+    def __init__(self, motion: Callable[[], Motion], noise: random.Random) -> None:
+        self.attitude = ComplementaryFilter()
+        self._motion = motion
+        self._acc = MemsSensor(ACCELEROMETER, noise)
+        self._gyro = MemsSensor(GYROSCOPE, noise)
+        self._mag = MemsSensor(MAGNETOMETER, noise)
+        self._barometer = Barometer(noise)
+
+    def step(self, dt: float) -> None:
+        """Advance by `dt` seconds; the filter advances at each sample of the gyroscope."""
+        motion = self._motion()
+        fx, fy, fz = motion.force
+        gx, gy, gz = motion.rates
+        self._acc.step((fx * _MG, fy * _MG, fz * _MG), dt)
+        self._mag.step(motion.field, dt)
+        if self._gyro.step((gx * _MDPS, gy * _MDPS, gz * _MDPS), dt) and self._mag.samples:
+            self.attitude.step(self._rates(), self._acc.values, self._mag.values, 1 / GYROSCOPE.rate)
+
+    def imu(self) -> IMU:
+        """Return attitude and rates, filtered."""
+        roll, pitch, yaw = self.attitude.angles
+        x, y, z = (rate - bias for rate, bias in zip(self._rates(), self.attitude.bias, strict=True))
+        return IMU(roll=roll, pitch=pitch, yaw=yaw, roll_rate=x, pitch_rate=y, yaw_rate=z)
+
+    def raw(self) -> IMURaw9:
+        """Return the counts of the sensors."""
+        return IMURaw9(*self._acc.counts, *self._gyro.counts, *self._mag.counts)
+
+    def tilt(self) -> Tilt:
+        """Return the pitch: what a robot that balances on two wheels needs."""
+        return Tilt(angle=self.attitude.angles[1])
+
+    def pressure(self) -> Pressure:
+        """Return the air pressure, and its altitude."""
+        pressure = self._barometer.read(self._motion().altitude)
+        return Pressure(pressure=pressure, altitude=altitude_at(pressure))
+
+    def _rates(self) -> Vector:
+        x, y, z = self._gyro.values
+        return x / _MDPS, y / _MDPS, z / _MDPS
+
+
+async def readings(
+    node: r2p.Node, topic: str, type: type[r2p.Message], fill: Callable[[], r2p.Message], period: float
+) -> None:
+    """Publish readings, time-triggered."""
+    node.advertise(topic, type, r2p.Periodic(period, fill))
+    await asyncio.Event().wait()
+
+
+class ImuModule(Board):
+    """The inertial measurement unit (thesis 7.4): publishes `imu`, `imu_raw`, `tilt` and `pressure`.
+
+    `unit` is its hardware, which the caller steps in a `Plant`.
+    """
+
+    def __init__(
+        self,
+        name: str = "IMU1",
+        *,
+        unit: InertialUnit,
+        period: float = 0.01,
+        topics: Iterable[str] = ("imu", "imu_raw", "tilt", "pressure"),
+        via: Via = None,
+        remap: dict[str, str] | None = None,
+    ) -> None:
+        """`period` in seconds, of all topics but `pressure`, which has 25 Hz; `topics`: those to publish."""
+        self.unit = unit
+        streams: dict[str, tuple[type[r2p.Message], Callable[[], r2p.Message], float]] = {
+            "imu": (IMU, unit.imu, period),
+            "imu_raw": (IMURaw9, unit.raw, period),
+            "tilt": (Tilt, unit.tilt, period),
+            "pressure": (Pressure, unit.pressure, _BARO),
+        }
+        nodes: dict[str, NodeFunction] = {}
+        for topic in topics:
+            message, fill, each = streams[topic]
+            nodes[topic] = functools.partial(readings, topic=topic, type=message, fill=fill, period=each)
+        super().__init__(name, via=via, remap=remap, nodes=nodes)
 
 
 class Pins:

@@ -8,7 +8,6 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Callable
-from types import TracebackType
 from typing import Protocol, Self, cast
 
 from r2p.clock import Alarm, clock_of
@@ -28,12 +27,8 @@ _CHUNK = 4096
 class LineEnd(Protocol):
     """The end of a line at the module."""
 
-    @property
-    def waiting(self) -> int:
-        """Bytes that the peer has not read."""
-
     def send(self, data: bytes) -> None:
-        """Send bytes of the module, or drop them if the peer does not read."""
+        """Send bytes of the module, or drop them if the peer does not read; a `Wire` leaves that to its link."""
 
     def close(self) -> None:
         """Close the line."""
@@ -57,9 +52,7 @@ class Powered:
         self.reset()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_exception: object) -> None:
         self._alarm.close()
         for server in self._servers:
             server.close()
@@ -130,12 +123,8 @@ class _Client(asyncio.Protocol):
         self._power = power
         self._reader = debug.Reader(power.module.drops)
 
-    @property
-    def waiting(self) -> int:
-        return self._transport.get_write_buffer_size()
-
     def send(self, data: bytes) -> None:
-        if self.waiting < BUFFER:
+        if self._transport.get_write_buffer_size() < BUFFER:
             self._transport.write(data)
 
     def close(self) -> None:
@@ -169,12 +158,8 @@ class _Pty:
         os.set_blocking(self._master, False)
         self._loop.add_reader(self._master, self._read)
 
-    @property
-    def waiting(self) -> int:
-        return len(self._unsent)
-
     def send(self, data: bytes) -> None:
-        if self.waiting >= BUFFER:
+        if len(self._unsent) >= BUFFER:
             return
         if not self._unsent:
             self._loop.add_writer(self._master, self._write)
@@ -268,8 +253,6 @@ class Wire(Transport, Carrier):
 
 class _WireEnd:
     """The end at the emulated module."""
-
-    waiting = 0  # the link at the other end has a buffer of its own
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire

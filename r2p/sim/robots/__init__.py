@@ -1,5 +1,5 @@
 """Emulated robots: modules, nodes, and a body that the wheels drive.
 
-`triskar2` has the nodes of the robot, `emulated` assembles it with its hardware; `latest` is what its nodes share,
-`square` a node that drives it, and `figures` its state for displays.
+`triskar2` has the nodes of the robot and one that drives it along a square, `emulated` assembles the robot with its
+hardware, and `figures` reads its state for displays.
 """

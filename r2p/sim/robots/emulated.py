@@ -28,17 +28,16 @@ from r2p.sim.modules.boards import (
     GatewayModule,
     MotorConfig,
     MotorModule,
+    Plant,
     PowerModule,
     ProximityModule,
     RangeArray,
     Setpoints,
 )
-from r2p.sim.modules.plant import Plant
 from r2p.sim.physics.motor import Battery, Drive, Gains, Motor, speed_gains
 from r2p.sim.physics.omni import OmniBody, OmniSpec, Triple
 from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
-from r2p.sim.robots.latest import Traffic
 from r2p.transports.link import Transport
 
 if TYPE_CHECKING:
@@ -106,7 +105,7 @@ class Triskar2:
         *,
         seed: object = 0,
         world: World | None = None,
-        traffic: Traffic | None = None,
+        traffic: triskar2.Traffic | None = None,
         modules: Iterable[str] | None = None,
         outside: Iterable[str | Transport] = (),
         options: BridgeOptions | None = None,

@@ -8,17 +8,25 @@ They use only the public API, so each of them runs on any module, of this robot 
 
     r2p run r2p.sim.robots.triskar2:inverse_kinematics=invkin --via rtcan:can0
 
+A node of the chain keeps the newest message of each input (`Latest`), and sends its output (`sender`): periodically if
+it is hard real-time, otherwise with each new input. `square` is a node for a PC, which drives the robot.
+
 `r2p.sim.robots.emulated` puts the whole robot together, with its modules and its body.
 """
 
 import functools
 import math
+from collections.abc import Callable
+from typing import Generic, Literal, TypeVar
 
 import r2p
 from r2p.msg import Battery, Encoder, Odometry, Pose3, Proximity, Speed3, Velocity3
 from r2p.sim.physics.motor import BatterySpec, MotorSpec
 from r2p.sim.physics.omni import OmniSpec
-from r2p.sim.robots.latest import Latest, Traffic, sender
+
+M = TypeVar("M", bound=r2p.Message)
+Traffic = Literal["hrt", "srt", "nrt"]
+"""How messages of the chain are sent: hard real-time (`Periodic`), soft real-time (`Sporadic`), non real-time."""
 
 BODY = OmniSpec()
 MOTOR = MotorSpec()
@@ -39,12 +47,70 @@ SIDES = {"prox_front": 0.0, "prox_rear": 180.0}
 BEARINGS = (67.5, 22.5, -22.5, -67.5)
 """Directions of the four sensors of each module, degrees from there."""
 
+REST = 0.5
+"""Seconds that a robot rests at each corner of the square."""
+DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+"""Of the sides of the square, in the robot's frame."""
+
+_DEADLINE = 0.05  # s, of soft real-time messages
 _STOP = 0.15  # m: closer than this a sensor's reading always stops the robot
 _BRAKING = 0.4  # s: plus this distance for each m/s
 _AHEAD = math.cos(math.radians(60))
 _BACKLOG = 250  # encoder readings, five seconds: a lost one would distort the odometry
 _ROUNDS = 5  # encoder readings per message of odometry: 10 Hz, thesis table 4.1
 _LOW = 20  # percent
+
+
+class Latest(Generic[M]):
+    """The newest message of a topic, while it is fresh; `changed` is called for each, in the node's task."""
+
+    def __init__(
+        self,
+        node: r2p.Node,
+        topic: str,
+        type: type[M],
+        *,
+        fresh: float,
+        changed: Callable[[], object] = lambda: None,
+    ) -> None:
+        """`fresh` in seconds. The node has to `spin()`."""
+        self._node = node
+        self._fresh = round(fresh * 1e9)
+        self._changed = changed
+        self._message: M | None = None
+        self._at = 0
+        node.subscribe(topic, type, self._received, queue=1, lossy=True)
+
+    @property
+    def message(self) -> M | None:
+        """The newest message; None if it is not fresh."""
+        return self._message if self._node.now() - self._at <= self._fresh else None
+
+    def _received(self, message: M) -> None:
+        self._message = message
+        self._at = self._node.now()
+        self._changed()
+
+
+def sender(
+    node: r2p.Node, topic: str, type: type[M], fill: Callable[[], M | None], *, traffic: Traffic, period: float
+) -> Callable[[], object]:
+    """Publish what `fill` returns, None for nothing: every `period` seconds ("hrt"), or when the result is called."""
+    if traffic == "hrt":
+        node.advertise(topic, type, r2p.Periodic(period, fill))
+        return lambda: None
+    publisher = (
+        node.advertise(topic, type, r2p.Sporadic(deadline=_DEADLINE))
+        if traffic == "srt"
+        else node.advertise(topic, type)
+    )
+
+    def send() -> None:
+        message = fill()
+        if message is not None:
+            publisher.publish_nowait(message)
+
+    return send
 
 
 async def obstacle_avoidance(node: r2p.Node, traffic: Traffic = "srt") -> None:
@@ -146,3 +212,31 @@ async def battery_monitor(node: r2p.Node) -> None:
         if charge < _LOW and not warned:
             node.log.warning("battery is down to %d %%: %.1f V", charge, reading.voltage / 1000)
         warned = charge < _LOW
+
+
+async def square(
+    node: r2p.Node,
+    side: float = 1.0,
+    speed: float = 0.5,
+    laps: float = math.inf,
+    traffic: Traffic = "srt",
+    wait: float = 1.0,
+) -> None:
+    """Publish `velocity_cmd`: after `wait` seconds drive `laps` squares, and then stand still.
+
+    It drives by the clock, not by odometry, so that command and position can be compared.
+    """
+    start = node.now()
+    leg = side / speed + REST  # s
+
+    def command() -> Velocity3:
+        elapsed = (node.now() - start) / 1e9 - wait
+        number, within = divmod(elapsed, leg)
+        if not 0 <= elapsed < laps * len(DIRECTIONS) * leg or within >= side / speed:
+            return Velocity3()
+        x, y = DIRECTIONS[int(number) % len(DIRECTIONS)]
+        return Velocity3(x=speed * x, y=speed * y)
+
+    send = sender(node, "velocity_cmd", Velocity3, command, traffic=traffic, period=PERIOD)
+    async for _ in node.every(COMMANDS):
+        send()

@@ -18,7 +18,7 @@ from r2p.sim import SimCan, can_bus
 from r2p.sim.physics.world import World, box
 from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.robots.figures import Figures, FiguresReader
-from r2p.sim.robots.square import square
+from r2p.sim.robots.triskar2 import square
 from r2p.tools.simulator.screen import SimulatorScreen
 
 SIDE, SPEED, WAIT = 2.0, 0.5, 1.0

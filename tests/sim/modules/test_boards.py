@@ -1,4 +1,4 @@
-"""The emulated hardware modules, each alone on a network: names, topics and defaults of thesis 7."""
+"""The emulated hardware modules, each alone on a network: names, topics and defaults of thesis 7; and their `Plant`."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ import pytest
 from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
 from r2p.sim.modules.boards import (
     GatewayModule,
+    ImuModule,
+    InertialUnit,
     IoModule,
+    Motion,
     MotorConfig,
     MotorModule,
     Pins,
+    Plant,
     PowerModule,
     ProximityModule,
     RangeArray,
     leds,
     sample,
 )
-from r2p.sim.modules.imu import ImuModule, InertialUnit, Motion
-from r2p.sim.modules.plant import Plant
 from r2p.sim.physics.motor import Axle, Drive, Gains, Motor, MotorSpec, speed_gains, step_response
 from r2p.sim.physics.motor import Battery as Cells
 from r2p.sim.physics.world import NOTHING
@@ -265,3 +267,45 @@ def test_the_io_modules_converters_have_12_bits() -> None:
     pins.write(0, 2048)
     pins.write(1, 9999)
     assert pins.outputs == pytest.approx((1.65, 3.3), abs=1e-3)
+
+
+class Count:
+    """Adds up its steps."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def step(self, dt: float) -> None:
+        self.time += dt
+
+
+async def test_the_plant_goes_as_the_loops_time_goes_and_ends_with_its_block() -> None:
+    count = Count()
+    async with Plant([count], dt=0.002) as plant:
+        await asyncio.sleep(1.0005)
+        assert plant.steps == 500
+        assert count.time == pytest.approx(1.0)
+    await asyncio.sleep(1)
+    assert plant.steps == 500
+
+
+def test_parts_step_in_their_order() -> None:
+    order: list[str] = []
+
+    class Named:
+        def __init__(self, name: str) -> None:
+            self._name = name
+
+        def step(self, dt: float) -> None:
+            order.append(self._name)
+
+    Plant([Named("drive"), Named("body")]).step(2)
+    assert order == ["drive", "body", "drive", "body"]
+
+
+def test_what_a_blocked_loop_missed_is_made_up_for_within_reason() -> None:
+    plant = Plant(dt=0.01)
+    plant._tick(0, 0, 20)
+    assert plant.steps == 21
+    plant._tick(0, 0, 1_000_000)
+    assert plant.steps == 21 + 101

@@ -8,7 +8,7 @@ import math
 from typing import TYPE_CHECKING
 
 from r2p.msg import Odometry
-from r2p.sim.robots.square import REST
+from r2p.sim.robots.triskar2 import REST
 from r2p.testing.network import node_in
 
 if TYPE_CHECKING:

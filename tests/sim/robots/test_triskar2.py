@@ -16,7 +16,7 @@ from r2p.msg import Battery, Encoder, Odometry, Velocity3
 from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.emulated import MOTORS, Hardware, Triskar2
-from r2p.sim.robots.square import square
+from r2p.sim.robots.triskar2 import square
 from r2p.testing.network import node_in
 from r2p.tools.run import load
 from r2p.transports.memory import network

@@ -16,8 +16,7 @@ from r2p.msg import Velocity3
 from r2p.sim.physics.world import World
 from r2p.sim.robots import triskar2
 from r2p.sim.robots.emulated import MOTORS, Triskar2
-from r2p.sim.robots.latest import Traffic, sender
-from r2p.sim.robots.square import square
+from r2p.sim.robots.triskar2 import Traffic, sender, square
 from tests.sim.robots.rig import WAIT, odometry_of, until_at_rest, until_driving
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import pytest
 import r2p
 from r2p.msg import Odometry
 from r2p.sim.robots.emulated import Triskar2
-from r2p.sim.robots.square import square
+from r2p.sim.robots.triskar2 import square
 from r2p.testing.network import node_in
 
 ROOT = Path(__file__).parents[3]

@@ -22,7 +22,7 @@ from r2p.sim import can_bus
 from r2p.sim.physics.world import World, box
 from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, TopicFigures, WheelFigures
-from r2p.sim.robots.square import square
+from r2p.sim.robots.triskar2 import square
 from r2p.tools.main import app
 from r2p.tools.simulator import default_links, screen
 from r2p.tools.simulator.screen import Map
