@@ -208,6 +208,17 @@ async def wait_until(condition: Callable[[], bool], timeout: float) -> bool:
     return True
 
 
+async def moments(duration: float | None, period: float) -> AsyncIterator[float]:
+    """Yield the seconds since the start, once each period and at the end; None: there is no end."""
+    loop = asyncio.get_running_loop()
+    start = loop.time()
+    time = 0.0
+    while duration is None or time < duration:
+        await asyncio.sleep(period if duration is None else min(period, duration - time))
+        time = loop.time() - start
+        yield time
+
+
 class Session:
     """A command on the network: its module, its node, and what it waits for."""
 

@@ -1,24 +1,83 @@
-"""The robot of `r2p demo line`, the PC that drives it, and counters of what passes between them."""
+"""`r2p demo`: r2p at work on one computer, with emulated hardware and real links.
+
+`r2p demo` shows a whole robot, Triskar2: seven modules on a simulated RTCAN bus, and a PC that drives it along a square
+through the robot's gateway (`r2p.tools.simulator`). `r2p demo line` starts two modules with the firmware of 2014, IMU1
+on a TCP connection and MOTOR1 on a pseudo terminal, as on a serial cable, and a module PC1 that talks to both over the
+debug line (`Robot`); `DemoScreen` shows what they do, live at a terminal, otherwise as lines of plain text.
+"""
 
 import contextlib
 import math
 from collections import deque
 from collections.abc import Iterator
 from statistics import median, quantiles
-from typing import Self
+from typing import Annotated, Literal, Self
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
 
 import r2p
 from r2p.clock import clock_of
 from r2p.messages import Message
 from r2p.msg import Encoder, Led, StampedIMURaw9, StampedVelocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
-from r2p.tools.session import wait_until
+from r2p.tools.options import Quiet, Verbose, seconds
+from r2p.tools.session import execute, moments, wait_until
+from r2p.tools.simulator import default_links, program, simulate
 from r2p.units import SECOND
 
-_WINDOW = 2_000_000_000  # ns, of the rate
+_ROBOT, _LINE = 20.0, 10.0  # seconds
+_WINDOW = 2 * SECOND  # of the rate
 _LATENCIES = 10_000  # the newest are kept
 _GRAVITY = 1000  # counts of 1 mg
 _IN_FLIGHT = 1.0  # seconds to wait for messages that were sent
+_REFRESH = 0.25  # seconds
+_LINES = 2.0  # seconds between two rounds of lines, without a terminal
+
+Row = tuple[str, ...]
+
+_HEADER: Row = ("TOPIC", "LINK", "HZ", "LATENCY", "LAST VALUE", "COUNT", "LOST")
+_WIDTHS = (-12, -10, 5, 12, -22, 6, 4)  # negative: to the left
+
+_NEXT = """
+Try next, in two terminals: the same robot, and a program that drives it by keys
+  {r2p} sim triskar2 --via tcp-listen:2323
+  {r2p} run examples/teleop.py:keys --via tcp:127.0.0.1:2323
+Or: {r2p} demo line, and with your own robot: {r2p} doctor"""
+
+
+def command(
+    what: Annotated[
+        Literal["robot", "line"],
+        typer.Argument(help="robot: on a simulated CAN bus; line: the debug line, on TCP and on a serial port."),
+    ] = "robot",
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            "--duration", parser=seconds, metavar="TIME", help="How long; default: 20 s (robot), 10 s (line)."
+        ),
+    ] = None,
+    verbose: Verbose = 0,
+    quiet: Quiet = 0,
+) -> None:
+    """Show r2p at work, without hardware: live for a few seconds, then a summary."""
+
+    async def line() -> None:
+        screen = DemoScreen()
+        async with Robot() as robot:
+            screen.print_introduction(robot)
+            await screen.watch(robot, duration or _LINE)
+            await robot.finish()
+        screen.print_summary(robot)
+
+    async def robot() -> None:
+        await simulate(duration=duration or _ROBOT, outside=default_links(), laps=1)
+        typer.echo(_NEXT.format(r2p=program()))
+
+    execute(robot if what == "robot" else line, verbose=verbose, quiet=quiet + 2)
 
 
 class TopicCounter:
@@ -47,7 +106,7 @@ class TopicCounter:
         recent = self._recent
         while recent and recent[0] <= now - _WINDOW:
             recent.popleft()
-        return (len(recent) - 1) * 1e9 / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
+        return (len(recent) - 1) * SECOND / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
 
     @property
     def median(self) -> float | None:
@@ -194,3 +253,97 @@ class Robot:
         node.subscribe("leds", Led, lit)
         while True:
             await node.spin()
+
+
+class DemoScreen:
+    """Standard output as the demo uses it."""
+
+    def __init__(self) -> None:
+        self.console = Console(highlight=False)
+        self._sent: dict[str, int] = {}
+
+    def print_introduction(self, robot: Robot) -> None:
+        self._print(
+            f"IMU1, an emulated R2P module, serves the debug line on tcp:{robot.address}",
+            f"MOTOR1, another one, serves it on serial:{robot.device}",
+            "PC1, in Python, talks to both. Watch them from a second terminal:",
+            f"  r2p topic hz imu_raw --via tcp:{robot.address}",
+            "",
+        )
+
+    async def watch(self, robot: Robot, duration: float) -> None:
+        """Show the topics for `duration` seconds."""
+        if not self.console.is_terminal:
+            self._print(_text(_HEADER))
+            async for _ in moments(duration, _LINES):
+                self._print(*(_text(row) for row in self._rows(robot)))
+            return
+        with Live(console=self.console, auto_refresh=False) as live:
+            async for _ in moments(duration, _REFRESH):
+                live.update(_table(self._rows(robot)), refresh=True)
+
+    def print_summary(self, robot: Robot) -> None:
+        self._print("")
+        for link, what in (("tcp", f"tcp:{robot.address}"), ("serial", f"serial:{robot.device}")):
+            counters = [counter for counter in robot.updated_counters() if counter.link.startswith(link)]
+            sent, received = sum(counter.sent for counter in counters), sum(counter.received for counter in counters)
+            self._print(f"{what}: {sent} messages sent, {received} received, {sent - received} lost")
+            self._print(*(f"  {_times(counter)}" for counter in counters if counter.latencies))
+        self._print(
+            "",
+            "Try next, without hardware, in two terminals:",
+            "  r2p topic pub leds --type Led led=3 value=1 -r 2 --via tcp-listen:2323",
+            "  r2p topic echo leds --via tcp:127.0.0.1:2323",
+            "With a robot: r2p doctor, then r2p topic list --via serial:/dev/ttyUSB0",
+        )
+
+    def _rows(self, robot: Robot) -> list[Row]:
+        """Return a row for each topic. Lost: sent before the last display, and still not received."""
+        rows: list[Row] = []
+        for counter in robot.updated_counters():
+            lost = max(0, self._sent.get(counter.topic, 0) - counter.received)
+            self._sent[counter.topic] = counter.sent
+            rate = f"{counter.rate(robot.clock.now()):.1f}"
+            value, received = _value(counter.last), str(counter.received)
+            rows.append((counter.topic, counter.link, rate, _latency(counter), value, received, str(lost)))
+        return rows
+
+    def _print(self, *lines: str) -> None:
+        for line in lines:
+            self.console.print(line, markup=False, soft_wrap=True)
+
+
+def _table(rows: list[Row]) -> Table:
+    table = Table(box=None, pad_edge=False, collapse_padding=True, header_style="bold")
+    for name, width in zip(_HEADER, _WIDTHS, strict=True):
+        table.add_column(name, justify="right" if width > 0 else "left", min_width=abs(width), no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _text(row: Row) -> str:
+    cells = (cell.rjust(width) if width > 0 else cell.ljust(-width) for cell, width in zip(row, _WIDTHS, strict=True))
+    return " ".join(cells)
+
+
+def _latency(counter: TopicCounter) -> str:
+    if counter.median is None:
+        return ""
+    return f"{counter.median:.2f} ms" + (" rtt" if counter.round_trip else "    ")
+
+
+def _value(message: Message | None) -> str:
+    """Return the fields without the timestamp; if they are too long, without those that are zero."""
+    if message is None:
+        return "nothing yet"
+    fields = {name: value for name, value in msgspec.structs.asdict(message).items() if name != "timestamp"}
+    texts = [f"{name}={value:.3g}" for name, value in fields.items()]
+    if len(" ".join(texts)) > abs(_WIDTHS[4]):
+        texts = [text for text, value in zip(texts, fields.values(), strict=True) if value]
+    return " ".join(texts)
+
+
+def _times(counter: TopicCounter) -> str:
+    what = "there and back" if counter.round_trip else "one way"
+    return f"{counter.topic:<12} {what}: {counter.median:.2f} ms (median), {counter.slowest:.2f} ms (99 %)"

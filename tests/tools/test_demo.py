@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from r2p.msg import Led, StampedIMURaw9, StampedVelocity3
-from r2p.tools.demo.robot import Robot, TopicCounter
-from r2p.tools.demo.screen import _value
+from r2p.tools.demo import Robot, TopicCounter, _value
 from tests.tools.rig import process
 
 if TYPE_CHECKING:

@@ -23,10 +23,9 @@ from r2p.sim.physics.world import World, box
 from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, TopicFigures, WheelFigures
 from r2p.sim.robots.triskar2 import square
+from r2p.tools import simulator
 from r2p.tools.main import app
-from r2p.tools.simulator import default_links, screen
-from r2p.tools.simulator.screen import Map
-from r2p.tools.simulator.simulation import SimulationOptions, program, simulate
+from r2p.tools.simulator import Map, default_links, program, simulate
 from tests.tools.rig import process
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ async def test_what_was_missed_before_does_not_count_and_what_is_off_says_so() -
     assert [wheel.on for wheel in figures.wheels] == [True, False, True]
     assert figures.odometry is None
     assert figures.bus is None
-    text = "\n".join(screen.state(figures))
+    text = "\n".join(simulator.state(figures))
     assert "MOTOR2    switched off" in text
     assert "a network in memory" in text
 
@@ -91,7 +90,7 @@ def test_what_its_gateway_takes_from_outside(monkeypatch: pytest.MonkeyPatch, al
     def robot(_via: str, *, options: BridgeOptions, **_others: object) -> Triskar2:
         raise r2p.Error(f"control: {options.allow_control}")
 
-    monkeypatch.setattr("r2p.tools.simulator.simulation.Triskar2", robot)
+    monkeypatch.setattr("r2p.tools.simulator.Triskar2", robot)
     result = CliRunner().invoke(app, ["sim", "--via", "memory:lab", *(["--allow-control"] if allowed else [])])
     assert (result.exit_code, result.stderr) == (1, f"r2p: control: {allowed}\n")
 
@@ -117,7 +116,7 @@ def test_the_map_grows_with_the_way() -> None:
 
 
 def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureFixture[str]) -> None:
-    sim.run(simulate(SimulationOptions(duration=20.0, seed=4, laps=1, fast=True, bus=True)), seed=4)
+    sim.run(simulate(duration=20.0, seed=4, laps=1, fast=True, bus=True), seed=4)
     fast = capsys.readouterr().out
     lines = fast.splitlines()
     assert max(len(line) for line in lines) <= 80
@@ -137,7 +136,7 @@ def test_the_state_fits_beside_the_map() -> None:
     bus = BusFigures(1.0, 7654.3, 999_999, 99, 10.5, 60)
     odometry = Odometry(Pose3(-10.5, -10.5, -3.0))
     figures = Figures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, 0.123, wheels, (25.6, 10.0, 1.0), [], bus)
-    lines = screen.state(figures)
+    lines = simulator.state(figures)
     assert len(lines) == 9
     assert max(len(line) for line in lines) <= 48
 
@@ -159,8 +158,8 @@ def test_it_fits_the_terminal_and_always_says_what_to_do(
 ) -> None:
     """A small one has no map, then fewer topics."""
     text = io.StringIO()
-    monkeypatch.setattr(screen, "Console", functools.partial(Console, file=text, width=width, height=height))
-    shown = screen.SimulatorScreen(World(box(0, 0, 4, 4)), duration=20.0)
+    monkeypatch.setattr(simulator, "Console", functools.partial(Console, file=text, width=width, height=height))
+    shown = simulator.SimulatorScreen(World(box(0, 0, 4, 4)), duration=20.0)
     shown.print_hints("Try:", "  r2p topic list")
     assert text.getvalue() == "Try:\n  r2p topic list\n"
     shown.console.print(shown.draw(moment()))
@@ -178,8 +177,8 @@ def test_at_a_terminal_the_figures_stay_where_they_are(monkeypatch: pytest.Monke
     console = functools.partial(
         Console, file=text, width=80, height=24, force_terminal=True, _environ={"TERM": "xterm"}
     )
-    monkeypatch.setattr(screen, "Console", console)
-    with screen.SimulatorScreen(World()) as shown:
+    monkeypatch.setattr(simulator, "Console", console)
+    with simulator.SimulatorScreen(World()) as shown:
         shown.print_hints("Try:", "  r2p topic list")
         for _ in range(3):
             shown.show(moment())
