@@ -4,11 +4,10 @@ A command may get lost, so it is repeated until the module's ALIVE confirms it. 
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from itertools import pairwise
 from typing import Annotated, Any
 
-import msgspec
 import typer
 
 import r2p
@@ -61,108 +60,100 @@ async def _wait_for_firmware(session: Session) -> None:
 @session.command(app, "stop")
 async def stop(session: Session, module: Name, *, timeout: Timeout = None) -> None:
     """Stop a module's nodes; reboot starts them again. Not an emergency stop: it may take a second, or get lost."""
-    await _send_command(session, r2p.Command.STOP, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_STOPPED))
+    await _send(session, r2p.Command.STOP, module, timeout)
 
 
 @session.command(app, "reboot")
 async def reboot(session: Session, module: Name, *, timeout: Timeout = None) -> None:
     """Restart a module's firmware, or the nodes of an r2p module."""
-    await _send_command(session, r2p.Command.REBOOT, module, timeout, _has_rebooted)
+    await _send(session, r2p.Command.REBOOT, module, timeout)
 
 
 @session.command(app, "bootload")
 async def bootload(session: Session, module: Name, *, timeout: Timeout = None) -> None:
     """Restart a module into its boot loader; reboot leaves it. Programs on a PC have no boot loader, and refuse."""
-    await _send_command(session, r2p.Command.BOOTLOAD, module, timeout, lambda watch: bool(watch.flags[-1] & FLAG_BOOT))
-
-
-class _CommandWatch(msgspec.Struct):
-    """What is known of the module since the command: its flags in order, and the delay (s) until firmware answered.
-
-    `denied`: why a gateway does not forward the command; `refused`: why this module does not send it at all.
-    """
-
-    flags: list[int]
-    delay: float | None = None
-    denied: str = ""
-    refused: r2p.Error | None = None
-
-
-def _has_rebooted(watch: _CommandWatch) -> bool:
-    """Return whether the flags show a restart; firmware that had been rebooted before shows it by a prompt ALIVE."""
-    if not _restarted(watch.flags[-1]):
-        return False
-    changed = any(_restarted(after) and not _restarted(before) for before, after in pairwise(watch.flags))
-    return changed or (watch.delay is not None and 0 <= watch.delay < _PROMPT)
-
-
-def _restarted(flags: int) -> bool:
-    return flags & (FLAG_REBOOTED | FLAG_STOPPED | FLAG_BOOT) == FLAG_REBOOTED
+    await _send(session, r2p.Command.BOOTLOAD, module, timeout)
 
 
 _DONE = {r2p.Command.STOP: "stopped", r2p.Command.REBOOT: "rebooted", r2p.Command.BOOTLOAD: "in its boot loader"}
 
 
-async def _send_command(
-    session: Session, command: r2p.Command, name: str, timeout: float | None, done: Callable[[_CommandWatch], bool]
-) -> None:
+async def _send(session: Session, command: r2p.Command, name: str, timeout: float | None) -> None:
     module_path(name)
     if not session.settings.via:
         raise UsageError("no network to send a command on: give --via tcp:HOST:PORT or set R2P_VIA")
     await session.settle(wait=0)
     loop = asyncio.get_running_loop()
-    started = loop.time()
-    watch = _CommandWatch([])
-    with session.waiting(f"{name} to confirm {command.name}"):
-        try:
-            async with asyncio.timeout(timeout or TIMEOUT), asyncio.TaskGroup() as tasks:
-                watch.flags += [_flags(view) for view in [_find(session, name)] if view is not None]
-                watcher = tasks.create_task(
-                    _watch_events(session.module.events(), name, f"{command.name} denied", watch)
-                )
-                await _repeat_until_done(session, command, name, watch, done)
-                watcher.cancel()
-        except TimeoutError:
-            raise TimedOut(_timeout_text(session, command, name, timeout or TIMEOUT)) from None
-    if watch.refused:
-        raise watch.refused
-    if watch.denied:
-        raise TimedOut(watch.denied)
+    started, limit = loop.time(), timeout or TIMEOUT
+    sender = _CommandSender(session, command, name)
+    watching = asyncio.create_task(sender.watch(session.module.events()))
+    try:
+        with session.waiting(f"{name} to confirm {command.name}"):
+            async with asyncio.timeout(limit):
+                await sender.repeat_until_confirmed()
+    except TimeoutError:
+        raise TimedOut(_timeout_text(session, command, name, limit)) from None
+    finally:
+        watching.cancel()
     notify(f"{name}: {_DONE[command]} after {loop.time() - started:.1f} s")
 
 
-async def _watch_events(events: AsyncIterator[r2p.ModuleEvent], name: str, denial: str, watch: _CommandWatch) -> None:
-    """Note each change of the module's flags, and whether a gateway denies the command."""
-    async for event in events:
-        match event:
-            case r2p.ModuleChanged(info=info) if info.name == name:
-                watch.flags.append(info.flags)
-            case r2p.LinkNotice(kind=kind, text=text) if kind == denial:
-                watch.denied = text
+class _CommandSender:
+    """Sends one command to a module, and watches what the module does since."""
+
+    def __init__(self, session: Session, command: r2p.Command, name: str) -> None:
+        self._session = session
+        self._command = command
+        self._name = name
+        self._flags = [_flags(view) for view in [_find(session, name)] if view is not None]  # in order
+        self._sent_at = 0.0
+        self._denied = ""  # why a gateway does not forward the command
+
+    async def watch(self, events: AsyncIterator[r2p.ModuleEvent]) -> None:
+        """Note each change of the module's flags, and whether a gateway denies the command."""
+        async for event in events:
+            match event:
+                case r2p.ModuleChanged(info=info) if info.name == self._name:
+                    self._flags.append(info.flags)
+                case r2p.LinkNotice(kind=kind, text=text) if kind == f"{self._command.name} denied":
+                    self._denied = text
+
+    async def repeat_until_confirmed(self) -> None:
+        """Send the command until the module confirms it. Raises TimedOut if a gateway denies it."""
+        await wait_until(lambda: bool(self._flags), _FIRST_STATE)
+        while True:
+            self._session.module.command(self._command, self._name)
+            self._sent_at = asyncio.get_running_loop().time()
+            if await wait_until(lambda: bool(self._denied) or self._confirmed(), _REPEAT):
+                break
+        if self._denied:
+            raise TimedOut(self._denied)
+
+    def _confirmed(self) -> bool:
+        if not self._flags:
+            return False
+        match self._command:
+            case r2p.Command.STOP:
+                return bool(self._flags[-1] & FLAG_STOPPED)
+            case r2p.Command.BOOTLOAD:
+                return bool(self._flags[-1] & FLAG_BOOT)
+            case _:
+                return self._has_rebooted()
+
+    def _has_rebooted(self) -> bool:
+        """Return whether the flags show a restart; firmware that was rebooted before shows it by a prompt ALIVE."""
+        if not _restarted(self._flags[-1]):
+            return False
+        if any(_restarted(after) and not _restarted(before) for before, after in pairwise(self._flags)):
+            return True
+        view = _find(self._session, self._name)
+        if view is None or view.instance is not None:
+            return False
+        return 0 <= asyncio.get_running_loop().time() - view.age - self._sent_at < _PROMPT
 
 
-async def _repeat_until_done(
-    session: Session, command: r2p.Command, name: str, watch: _CommandWatch, done: Callable[[_CommandWatch], bool]
-) -> None:
-    """Send the command, and repeat it until the module confirms it or a gateway denies it."""
-    loop = asyncio.get_running_loop()
-    await wait_until(lambda: bool(watch.flags), _FIRST_STATE)
-    sent_at = loop.time()
-
-    def is_done() -> bool:
-        view = _find(session, name)
-        watch.delay = None if view is None or view.instance is not None else loop.time() - view.age - sent_at
-        return bool(watch.denied) or (bool(watch.flags) and done(watch))
-
-    while not watch.denied:
-        try:
-            session.module.command(command, name)
-        except r2p.Error as error:
-            watch.refused = error
-            return
-        sent_at = loop.time()
-        if await wait_until(is_done, _REPEAT):
-            return
+def _restarted(flags: int) -> bool:
+    return flags & (FLAG_REBOOTED | FLAG_STOPPED | FLAG_BOOT) == FLAG_REBOOTED
 
 
 def _flags(view: r2p.ModuleView) -> int:

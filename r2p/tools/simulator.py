@@ -26,8 +26,7 @@ import r2p
 from r2p import sim
 from r2p.bridge import BridgeOptions
 from r2p.msg import Odometry
-from r2p.sim.physics.omni import Triple
-from r2p.sim.physics.world import Wall, World, box
+from r2p.sim.physics.world import Triple, Wall, World, box
 from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, TopicFigures, WheelFigures
 from r2p.sim.robots.triskar2 import square

@@ -22,17 +22,18 @@ from r2p.msg import IMU, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Se
 from r2p.msg import Battery as BatteryMessage
 from r2p.sim.physics.inertial import (
     ACCELEROMETER,
+    BAROMETER_NOISE,
     GRAVITY,
     GYROSCOPE,
     MAGNETOMETER,
-    Barometer,
     ComplementaryFilter,
     MemsSensor,
     Vector,
     altitude_at,
+    pressure_at,
 )
 from r2p.sim.physics.motor import Battery, Drive
-from r2p.sim.physics.world import RangeFinder, RangeSpec
+from r2p.sim.physics.world import ADC_MAX, ADC_REFERENCE, RangeFinder, RangeSpec, adc_counts
 from r2p.transports.link import Transport
 from r2p.units import SECOND
 
@@ -41,10 +42,8 @@ DistanceTo = Callable[[int], float]
 """Returns the distance in mm to what sensor 0 to 3 sees, or infinity."""
 
 _CATCH_UP = 1.0  # s of physics to make up for after the loop was blocked; more would hang after a long sleep
-_ADC = 4095  # counts of 12 bits
-_REFERENCE = 3.3  # V
-_VOLTAGE_COUNT = 36_000 / _ADC  # mV per count: a divider turns 36 V into 3.3 V
-_CURRENT_COUNT = 50_000 / _ADC  # mA per count
+_VOLTAGE_COUNT = 36_000 / ADC_MAX  # mV per count: a divider turns 36 V into 3.3 V
+_CURRENT_COUNT = 50_000 / ADC_MAX  # mA per count
 _MDPS = math.degrees(1.0) * 1000  # mdps in one rad/s
 _MG = 1000 / GRAVITY  # mg in one m/s^2
 _BARO = 0.04  # seconds: the barometer makes 25 measurements a second
@@ -111,18 +110,15 @@ class Board(r2p.Module):
         return self
 
 
-class Setpoints(msgspec.Struct, frozen=True):
-    """The source of setpoints: a topic, its type, and how to convert a message to ticks or ticks/s."""
-
-    topic: str = "setpoint"
-    message: type[r2p.Message] = Setpoint
-    ticks: Callable[[Any], float] = lambda message: message.ticks
-
-
 class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
     """The configuration of the motor module, which firmware has in its flash memory."""
 
-    setpoints: Setpoints = Setpoints()
+    setpoint: str = "setpoint"
+    """Topic of the setpoints."""
+    message: type[r2p.Message] = Setpoint
+    """Their type."""
+    ticks: Callable[[Any], float] = lambda message: message.ticks
+    """Converts such a message to ticks or ticks/s."""
     timeout: float = 0.2
     """Seconds without a setpoint after which the motor stops."""
     encoder: str = "encoder"
@@ -139,15 +135,15 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
     """Control the motor: the node of the DC motor controller module."""
 
     def command(message: r2p.Message) -> None:
-        drive.setpoint = config.setpoints.ticks(message)
+        drive.setpoint = config.ticks(message)
 
-    source = config.setpoints
+    def moved() -> Encoder:
+        return Encoder(delta=float(drive.take_ticks()))
+
     node.subscribe(
-        source.topic, source.message, command, queue=1, lossy=True, timeout=config.timeout, on_timeout=drive.stop
+        config.setpoint, config.message, command, queue=1, lossy=True, timeout=config.timeout, on_timeout=drive.stop
     )
-    node.advertise(
-        config.encoder, Encoder, r2p.Periodic(config.period, lambda: Encoder(delta=float(drive.take_ticks())))
-    )
+    node.advertise(config.encoder, Encoder, r2p.Periodic(config.period, moved))
     try:
         while True:
             await node.spin()
@@ -177,11 +173,10 @@ class MotorModule(Board):
         via: Via = None,
         remap: dict[str, str] | None = None,
     ) -> None:
-        self.drive = drive
-        self.config = config or MotorConfig()
+        config = config or MotorConfig()
         nodes = {
-            "motor": functools.partial(motor, drive=drive, config=self.config),
-            "monitor": functools.partial(monitor, drive=drive, config=self.config),
+            "motor": functools.partial(motor, drive=drive, config=config),
+            "monitor": functools.partial(monitor, drive=drive, config=config),
         }
         super().__init__(name, via=via, remap=remap, nodes=nodes)
 
@@ -189,9 +184,9 @@ class MotorModule(Board):
 class RangeArray:
     """Four sensors of the same kind, and their inputs of the A/D converter."""
 
-    def __init__(self, distance_to: DistanceTo, noise: random.Random, spec: RangeSpec | None = None) -> None:
+    def __init__(self, distance_to: DistanceTo, noise: random.Random) -> None:
         self._distance_to = distance_to
-        self._sensors = [RangeFinder(spec or RangeSpec(), noise) for _ in range(4)]
+        self._sensors = [RangeFinder(RangeSpec(), noise) for _ in range(4)]
 
     def read(self) -> Proximity:
         """Read all four, corrected, in mm."""
@@ -222,8 +217,7 @@ class ProximityModule(Board):
         remap: dict[str, str] | None = None,
     ) -> None:
         """`period` in seconds: the sensors need 40 ms for a measurement."""
-        self.sensors = sensors
-        node = functools.partial(proximity, sensors=self.sensors, topic=topic, period=period)
+        node = functools.partial(proximity, sensors=sensors, topic=topic, period=period)
         super().__init__(name, via=via, remap=remap, nodes={"prox": node})
 
 
@@ -249,7 +243,7 @@ class InertialUnit:
         self._acc = MemsSensor(ACCELEROMETER, noise)
         self._gyro = MemsSensor(GYROSCOPE, noise)
         self._mag = MemsSensor(MAGNETOMETER, noise)
-        self._barometer = Barometer(noise)
+        self._noise = noise
 
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds; the filter advances at each sample of the gyroscope."""
@@ -277,7 +271,7 @@ class InertialUnit:
 
     def pressure(self) -> Pressure:
         """Return the air pressure, and its altitude."""
-        pressure = self._barometer.read(self._motion().altitude)
+        pressure = pressure_at(self._motion().altitude) + self._noise.gauss(0, BAROMETER_NOISE)
         return Pressure(pressure=pressure, altitude=altitude_at(pressure))
 
     def _rates(self) -> Vector:
@@ -310,7 +304,6 @@ class ImuModule(Board):
         remap: dict[str, str] | None = None,
     ) -> None:
         """`period` in seconds, of all topics but `pressure`, which has 25 Hz; `topics`: those to publish."""
-        self.unit = unit
         streams: dict[str, tuple[type[r2p.Message], Callable[[], r2p.Message], float]] = {
             "imu": (IMU, unit.imu, period),
             "imu_raw": (IMURaw9, unit.raw, period),
@@ -337,16 +330,16 @@ class Pins:
     @property
     def outputs(self) -> tuple[float, float]:
         """Voltages at the analog outputs, V."""
-        one, two = (counts * _REFERENCE / _ADC for counts in self._outputs)
+        one, two = (counts * ADC_REFERENCE / ADC_MAX for counts in self._outputs)
         return one, two
 
     def read(self, channel: int) -> int:
         """Return the counts of the A/D converter, 12 bits for 3.3 V."""
-        return max(0, min(_ADC, round(self.inputs[channel] / _REFERENCE * _ADC)))
+        return adc_counts(self.inputs[channel])
 
     def write(self, channel: int, counts: int) -> None:
         """Set the counts of the D/A converter, 12 bits for 3.3 V."""
-        self._outputs[channel] = max(0, min(_ADC, counts))
+        self._outputs[channel] = max(0, min(ADC_MAX, counts))
 
 
 async def leds(node: r2p.Node, pins: Pins) -> None:
@@ -365,7 +358,7 @@ async def sample(node: r2p.Node, pins: Pins, channel: int = 0, topic: str = "ana
     """Publish the voltage at an analog input every `period` seconds."""
     voltages = node.advertise(topic, Float32)
     async for _ in node.every(period):
-        await voltages.publish(Float32(data=pins.read(channel) * _REFERENCE / _ADC))
+        await voltages.publish(Float32(data=pins.read(channel) * ADC_REFERENCE / ADC_MAX))
 
 
 class IoModule(Board):
@@ -383,7 +376,6 @@ class IoModule(Board):
         via: Via = None,
         remap: dict[str, str] | None = None,
     ) -> None:
-        self.pins = pins
         programs = {each: functools.partial(function, pins=pins) for each, function in (nodes or {}).items()}
         super().__init__(name, via=via, remap=remap, nodes=programs)
 
@@ -422,7 +414,6 @@ class PowerModule(Board):
         remap: dict[str, str] | None = None,
     ) -> None:
         """`period` in seconds."""
-        self.battery = battery
         node = functools.partial(power, battery=battery, topic=topic, period=period)
         super().__init__(name, via=via, remap=remap, nodes={"power": node})
 

@@ -43,6 +43,8 @@ GYROSCOPE = MemsSpec(resolution=8.75, full_scale=250_000.0, rate=400.0, density=
 """L3G4200D, 250 dps, in mdps."""
 MAGNETOMETER = MemsSpec(resolution=0.9, full_scale=1300.0, rate=220.0, density=0.2, bias=5.0)
 """LSM303DLHC, +-1.3 gauss, in mgauss."""
+BAROMETER_NOISE = 2.0
+"""LPS331AP, one sigma, Pa."""
 
 
 class MemsSensor:
@@ -79,17 +81,6 @@ class MemsSensor:
         spec = self.spec
         reading = value + bias + self._noise.gauss(0, spec.sigma)
         return round(max(-spec.full_scale, min(spec.full_scale, reading)) / spec.resolution)
-
-
-class Barometer:
-    """LPS331AP: pressure with 2 Pa of noise."""
-
-    def __init__(self, noise: random.Random) -> None:
-        self._noise = noise
-
-    def read(self, altitude: float) -> float:
-        """Return the pressure (Pa) at an altitude (m) in the standard atmosphere, with noise."""
-        return pressure_at(altitude) + self._noise.gauss(0, 2.0)
 
 
 def pressure_at(altitude: float) -> float:

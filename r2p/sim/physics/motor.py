@@ -163,18 +163,6 @@ def speed_gains(spec: MotorSpec, load: float, *, frequency: float, damping: floa
     return Gains((2 * damping * frequency * time - 1) / gain, frequency**2 * time / gain, limit=spec.voltage)
 
 
-def step_response(spec: MotorSpec, load: float, gains: Gains, time: float) -> float:
-    """Return the speed `time` seconds after a step of the setpoint from 0 to 1, as theory predicts for `speed_gains`.
-
-    It holds for a damping below 1, without saturation of voltage or current, and without dry friction.
-    """
-    gain, tau = spec.gain * spec.ticks_per_radian, spec.time_constant(load)
-    decay = (1 + gain * gains.kp) / (2 * tau)
-    swing = math.sqrt(gain * gains.ki / tau - decay**2)
-    sine = (gain * gains.kp / tau - decay) / swing
-    return 1 - math.exp(-decay * time) * (math.cos(swing * time) - sine * math.sin(swing * time))
-
-
 class Drive:
     """Closed-loop control of one motor; without a setpoint the winding is shorted, which brakes."""
 

@@ -32,11 +32,9 @@ from r2p.sim.modules.boards import (
     PowerModule,
     ProximityModule,
     RangeArray,
-    Setpoints,
 )
 from r2p.sim.physics.motor import Battery, Drive, Gains, Motor, speed_gains
-from r2p.sim.physics.omni import OmniBody, OmniSpec, Triple
-from r2p.sim.physics.world import World
+from r2p.sim.physics.world import OmniBody, OmniSpec, Triple, World
 from r2p.sim.robots import triskar2
 from r2p.transports.link import Transport
 
@@ -216,7 +214,9 @@ class Triskar2:
         wheel = MOTORS.index(name)
         ticks = triskar2.MOTOR.ticks_per_radian
         config = MotorConfig(
-            setpoints=Setpoints("speed", Speed3, lambda speeds: speeds.value[wheel] * ticks),
+            setpoint="speed",
+            message=Speed3,
+            ticks=lambda speeds: speeds.value[wheel] * ticks,
             timeout=triskar2.TIMEOUT,
             encoder=f"encoder{wheel + 1}",
             period=triskar2.PERIOD,

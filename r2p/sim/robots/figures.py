@@ -11,7 +11,7 @@ import r2p
 from r2p.msg import Odometry
 from r2p.runtime.publishers import AnyPublisher
 from r2p.sim import SimCan
-from r2p.sim.physics.omni import Triple
+from r2p.sim.physics.world import Triple
 from r2p.sim.robots.emulated import MOTORS, Triskar2
 from r2p.transports.rtcan.link import RtcanLink
 

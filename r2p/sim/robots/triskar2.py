@@ -22,7 +22,7 @@ from typing import Generic, Literal, TypeVar
 import r2p
 from r2p.msg import Battery, Encoder, Odometry, Pose3, Proximity, Speed3, Velocity3
 from r2p.sim.physics.motor import BatterySpec, MotorSpec
-from r2p.sim.physics.omni import OmniSpec
+from r2p.sim.physics.world import OmniSpec
 
 M = TypeVar("M", bound=r2p.Message)
 Traffic = Literal["hrt", "srt", "nrt"]

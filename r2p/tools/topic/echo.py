@@ -1,7 +1,7 @@
 """`r2p topic echo`: print messages as they arrive."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
 import msgspec
@@ -46,48 +46,36 @@ async def echo(
         raise UsageError("--format csv has one header, so it allows only one topic")
     types = Types(session.settings)
     readers = [_TopicReader(session, name, types, type) for name in names]
-    echoing = _Echo(output, 1 if once else count, field or [], meta=meta or len(names) > 1)
+    with_meta, left = meta or len(names) > 1, 1 if once else count
+
+    async def print_all(reader: _TopicReader) -> None:
+        nonlocal left
+        async for record, sample in reader.records():
+            received()
+            if left == 0:
+                return
+            if left is not None:
+                left -= 1
+            await output.put(_chosen(record, field) | (_meta(reader.topic, sample) if with_meta else {}))
+            if left == 0:
+                for task in tasks:
+                    task.cancel()
+
     try:
-        async with output.while_read():
-            await echoing.run(readers, timeout)
+        async with output.while_read(), patience(", ".join(names), timeout) as received, asyncio.TaskGroup() as group:
+            tasks = [group.create_task(print_all(reader)) for reader in readers]
     finally:
         for reader in readers:
             reader.report_losses()
 
 
-class _Echo:
-    """Prints the messages of all readers, at most `count` of them."""
-
-    def __init__(self, output: Output, count: int | None, fields: list[str], *, meta: bool) -> None:
-        self._output = output
-        self._left = count
-        self._fields = fields
-        self._meta = meta
-
-    async def run(self, readers: list["_TopicReader"], timeout: float | None) -> None:
-        topics = ", ".join(reader.topic for reader in readers)
-        async with patience(topics, timeout) as received, asyncio.TaskGroup() as tasks:
-            self._tasks = [tasks.create_task(self._print(reader, received)) for reader in readers]
-
-    async def _print(self, reader: "_TopicReader", received: Callable[[], None]) -> None:
-        async for record, sample in reader.records():
-            received()
-            if self._left == 0:
-                return
-            if self._left is not None:
-                self._left -= 1
-            await self._output.put(self._chosen(record) | (_meta(reader.topic, sample) if self._meta else {}))
-            if self._left == 0:
-                for task in self._tasks:
-                    task.cancel()
-
-    def _chosen(self, record: dict[str, Any]) -> dict[str, Any]:
-        if not self._fields:
-            return record
-        try:
-            return {path: pick(record, path) for path in self._fields}
-        except KeyError as error:
-            raise UsageError(error.args[0]) from error
+def _chosen(record: dict[str, Any], fields: list[str] | None) -> dict[str, Any]:
+    if not fields:
+        return record
+    try:
+        return {path: pick(record, path) for path in fields}
+    except KeyError as error:
+        raise UsageError(error.args[0]) from error
 
 
 class _TopicReader:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, TextIO
 
+import msgspec
 import typer
 
 import r2p
@@ -74,48 +75,39 @@ async def pub(
         await publication.publish(value, DEFAULT_RATE if rate is None else rate)
 
 
-class _Publication:
-    """Publishes messages of one topic."""
+class _Publication(msgspec.Struct):
+    """Publishes messages of one topic. `count`: how many; `timeout`: seconds to wait for a subscriber."""
 
-    def __init__(
-        self,
-        session: Session,
-        topic: str,
-        message_class: type[r2p.Message],
-        choice: ClassChoice,
-        count: int | None,
-        timeout: float | None,
-    ) -> None:
-        self._session = session
-        self._topic = topic
-        self._message_class = message_class
-        self._choice = choice
-        self._count = count
-        self._timeout = timeout
+    session: Session
+    topic: str
+    message_class: type[r2p.Message]
+    choice: ClassChoice
+    count: int | None
+    timeout: float | None
 
     async def publish(self, message: r2p.Message, rate: float) -> None:
         """Publish the same message over and over."""
         publisher = self._advertise()
-        ticks = self._session.node.every(1 / rate)
-        await self._wait_subscriber(publisher, needed=self._count is not None)
+        ticks = self.session.node.every(1 / rate)
+        await self._wait_subscriber(publisher, needed=self.count is not None)
         await publisher.publish(message)
-        while publisher.sent != self._count:
+        while publisher.sent != self.count:
             await anext(ticks)
             await publisher.publish(message)
 
     async def publish_periodically(self, message: r2p.Message) -> None:
         """Publish the same message over and over, timed by a periodic publisher."""
         done = asyncio.Event()
-        ready = self._count is None
+        ready = self.count is None
 
         def fill() -> r2p.Message | None:
-            if publisher.sent == self._count:
+            if publisher.sent == self.count:
                 done.set()
                 return None
             return message if ready else None
 
-        periodic = r2p.Periodic(self._choice.time, fill)
-        publisher = self._session.node.advertise(self._topic, self._message_class, periodic)
+        periodic = r2p.Periodic(self.choice.time, fill)
+        publisher = self.session.node.advertise(self.topic, self.message_class, periodic)
         await self._wait_subscriber(publisher, needed=not ready)
         ready = True
         await done.wait()
@@ -124,46 +116,46 @@ class _Publication:
         """Publish one message for each line of stdin."""
         publisher = self._advertise()
         await self._wait_subscriber(publisher, needed=True)
-        ticks = None if rate is None else self._session.node.every(1 / rate)
+        ticks = None if rate is None else self.session.node.every(1 / rate)
         number = 0
         async for line in read_lines():
             number += 1
             if not line.strip():
                 continue
             try:
-                message = parse_line(self._message_class, line)
+                message = parse_line(self.message_class, line)
             except r2p.MessageError as error:
                 raise r2p.MessageError(f"line {number}: {error}") from error
             await publisher.publish(message)
-            if publisher.sent == self._count:
+            if publisher.sent == self.count:
                 return
             if ticks is not None:
                 await anext(ticks)
 
     def _advertise(self) -> r2p.Publisher[Any] | r2p.SporadicPublisher[Any]:
-        if self._choice.publisher_class is r2p.PublisherClass.SPORADIC:
-            return self._session.node.advertise(self._topic, self._message_class, r2p.Sporadic(self._choice.time))
-        return self._session.node.advertise(self._topic, self._message_class)
+        if self.choice.publisher_class is r2p.PublisherClass.SPORADIC:
+            return self.session.node.advertise(self.topic, self.message_class, r2p.Sporadic(self.choice.time))
+        return self.session.node.advertise(self.topic, self.message_class)
 
     async def _wait_subscriber(self, publisher: _AnyPublisher, *, needed: bool) -> None:
         """Wait for a subscriber if one is needed; otherwise only report after a second that there is none."""
         if not needed:
             asyncio.get_running_loop().call_later(REPORT_WAITING_AFTER, self._report_no_subscriber, publisher)
             return
-        missing = f"{self._topic} has no subscriber"
-        waiting = self._session.waiting(f"a subscriber of {self._topic}")
-        with waiting, hint(self._session, missing, self._topic, is_subscribed):
+        missing = f"{self.topic} has no subscriber"
+        waiting = self.session.waiting(f"a subscriber of {self.topic}")
+        with waiting, hint(self.session, missing, self.topic, is_subscribed):
             try:
-                async with asyncio.timeout(self._timeout):
+                async with asyncio.timeout(self.timeout):
                     await publisher.wait_subscriber()
-                    await wait_until_passed_on(self._session, publisher.topic)
+                    await wait_until_passed_on(self.session, publisher.topic)
             except TimeoutError:
-                raise TimedOut(f"{self._topic} had no subscriber for {self._timeout:g} s") from None
+                raise TimedOut(f"{self.topic} had no subscriber for {self.timeout:g} s") from None
 
     def _report_no_subscriber(self, publisher: _AnyPublisher) -> None:
         if not publisher.subscribers:
-            question = suggest_topics(self._session, self._topic, is_subscribed)
-            notify(f"{self._topic} has no subscriber yet, publishing anyway{question}")
+            question = suggest_topics(self.session, self.topic, is_subscribed)
+            notify(f"{self.topic} has no subscriber yet, publishing anyway{question}")
 
 
 async def read_lines(stream: TextIO | None = None) -> AsyncIterator[str]:

@@ -28,9 +28,10 @@ from r2p.sim.modules.boards import (
     leds,
     sample,
 )
-from r2p.sim.physics.motor import Axle, Drive, Gains, Motor, MotorSpec, speed_gains, step_response
+from r2p.sim.physics.motor import Axle, Drive, Gains, Motor, MotorSpec, speed_gains
 from r2p.sim.physics.motor import Battery as Cells
 from r2p.sim.physics.world import NOTHING
+from tests.sim.physics.theory import step_response
 
 if TYPE_CHECKING:
     import r2p

@@ -1,10 +1,11 @@
-"""Motor and PID against the theory of what they are made of."""
+"""Motor and PID against the theory of what they are made of; and the battery."""
 
 import math
 
 import pytest
 
-from r2p.sim.physics.motor import Axle, Gains, Motor, MotorSpec, Pid, speed_gains, step_response
+from r2p.sim.physics.motor import Axle, Battery, BatterySpec, Gains, Motor, MotorSpec, Pid, speed_gains
+from tests.sim.physics.theory import step_response
 
 DT = 1e-4
 LOAD = 0.03  # kg m^2 at the wheel
@@ -136,3 +137,24 @@ def test_reset_forgets() -> None:
     pid.step(1.0, 0.0, 1.0)
     pid.reset()
     assert pid.step(0.0, 5.0, 1.0) == -5.0  # the new error's own integral, no slope
+
+
+def test_a_battery_empties_with_the_charge_that_it_gives() -> None:
+    battery = Battery()
+    battery.current = 7.2
+    for _ in range(1800):
+        battery.step(1.0)
+    assert battery.charge == pytest.approx(0.5)
+    assert battery.voltage == pytest.approx(24.4 - 7.2 * 0.06)
+    for _ in range(2000):
+        battery.step(1.0)
+    assert battery.charge == 0.0
+
+
+def test_a_charger_fills_it_and_no_more() -> None:
+    battery = Battery(charge=0.9)
+    battery.current = -7.2
+    assert battery.voltage > BatterySpec().full
+    for _ in range(1000):
+        battery.step(1.0)
+    assert battery.charge == 1.0

@@ -21,7 +21,7 @@ from tests.sim.robots.rig import WAIT, odometry_of, until_at_rest, until_driving
 
 if TYPE_CHECKING:
     from r2p.sim.can import FrameRecord
-    from r2p.sim.physics.omni import Triple
+    from r2p.sim.physics.world import Triple
 
 pytestmark = pytest.mark.virtual_time
 
