@@ -1,6 +1,7 @@
 """RTCAN: the engine alone, and the simulated bus against real time."""
 
 import asyncio
+import functools
 import time
 from collections.abc import Callable, Iterator
 
@@ -121,7 +122,7 @@ def spent(function: Callable[[], object]) -> float:
 def rows() -> Iterator[Row]:
     cyphal = typical(3, cyphal_rate)
     for size, what in ((8, "of one frame"), (64, "of 8 frames")):
-        ours = typical(5, lambda size=size: engine_rate(size))  # type: ignore[misc]
+        ours = typical(5, functools.partial(engine_rate, size))
         yield Row(
             f"RTCAN engine, 8-byte frames to messages {what}",
             rate(ours),

@@ -70,7 +70,8 @@ def command(format: Format = None, verbose: Verbose = 0, quiet: Quiet = 0) -> No
 
 def checks(root: Path = _ROOT) -> Iterator[Check]:
     """Yield all checks but the measurement; `root` is the folder that contains `sys` and `dev`."""
-    yield Check("python", True, f"{platform.python_implementation()} {platform.python_version()} on {_system()}")
+    system = f"{platform.system()} {platform.release()} {platform.machine()}"
+    yield Check("python", True, f"{platform.python_implementation()} {platform.python_version()} on {system}")
     yield Check("r2p", True, f"{r2p.__version__}, default module name {module_name_from(socket.gethostname())}")
     yield configured()
     yield package("uvloop", "uvloop", "without it messages take about twice as long")
@@ -83,10 +84,6 @@ def checks(root: Path = _ROOT) -> Iterator[Check]:
     yield priority()
     yield governor(root)
     yield clock()
-
-
-def _system() -> str:
-    return f"{platform.system()} {platform.release()} {platform.machine()}"
 
 
 def configured() -> Check:

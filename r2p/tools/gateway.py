@@ -18,7 +18,7 @@ import msgspec
 import typer
 
 import r2p
-from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics
+from r2p.bridge import BridgeOptions, GatewayStatistics
 from r2p.bridge.options import check_prefix, is_link, parse_rule
 from r2p.msg import GatewayStatus
 from r2p.names import module_name_from
@@ -103,11 +103,12 @@ def command(
             read_only=_links(read_only, "--read-only", chosen.via),
             prefix=_prefix(prefix),
             prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or ("zenoh",),
-            classes={topic: _class(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
+            classes={topic: class_choice(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
             reserve=tuple(reserve or ()),
             allow_control=allow_control,
         )
-        await serve(name or chosen.module or default_name(), chosen.via, options, Output(format), quiet=format is None)
+        own = name or chosen.module or f"GW_{module_name_from(socket.gethostname())[:4]}"
+        await serve(own, chosen.via, options, Output(format), quiet=format is None)
 
     execute(main, verbose=verbose, quiet=quiet)
 
@@ -118,11 +119,6 @@ async def serve(name: str, via: list[str], options: BridgeOptions, output: Outpu
         logger.info("gateway %s joins %s; Ctrl-C ends it", name, ", ".join(via))
         module.start(_report, module, None if quiet and output.format != "text" else output, name="gateway")
         await module.wait()
-
-
-def default_name() -> str:
-    """Return GW_ and the start of the host name."""
-    return f"GW_{module_name_from(socket.gethostname())[:4]}"
 
 
 def _rules(given: _Rules, option: str, via: list[str]) -> tuple[str, ...]:
@@ -169,11 +165,6 @@ def _pairs(given: _Rules, option: str, form: str) -> Iterable[tuple[str, str]]:
         if not (topic and equals and value):
             raise UsageError(f"{option} {text}: write it as {form}")
         yield topic, value
-
-
-def _class(text: str) -> ClassOf:
-    choice = class_choice(text)
-    return ClassOf(choice.publisher_class, choice.time)
 
 
 class Row(msgspec.Struct, frozen=True):
@@ -267,7 +258,7 @@ class LiveTable:
         logging.getLogger("r2p").addHandler(self._logged)
 
     def close(self) -> None:
-        """Stop to count log lines."""
+        """Stop counting log lines."""
         logging.getLogger("r2p").removeHandler(self._logged)
 
     async def draw(self, rows: list[Row]) -> None:
@@ -319,7 +310,9 @@ async def _report(node: r2p.Node, module: r2p.Module, output: Output | None) -> 
             rows = rates.rows(module.gateway_statistics(), node.now())
             seconds += 1
             if status.subscribers:
-                await _publish(status, rows)
+                for row in rows:
+                    status.publish_nowait(row.status())
+                    await asyncio.sleep(0)  # a big network has hundreds of rows: let the gateway forward in between
             if live is not None:
                 await live.draw(rows)
             elif output is not None:
@@ -327,12 +320,6 @@ async def _report(node: r2p.Node, module: r2p.Module, output: Output | None) -> 
                     await output.put(msgspec.to_builtins(row))
             elif seconds % _SUMMARY == 0:
                 _summarise(rows)
-
-
-async def _publish(status: r2p.Publisher[GatewayStatus], rows: list[Row]) -> None:
-    for row in rows:
-        status.publish_nowait(row.status())
-        await asyncio.sleep(0)  # a big network has hundreds of rows: let the gateway forward in between
 
 
 def _summarise(rows: list[Row]) -> None:

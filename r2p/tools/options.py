@@ -5,10 +5,10 @@ Each is a type for a parameter of a command, as Typer reads it: `async def echo(
 
 from typing import Annotated, Any, Literal
 
-import msgspec
 import typer
 
 import r2p
+from r2p.bridge import ClassOf
 from r2p.names import topic_name
 from r2p.transports.url import duration
 
@@ -31,20 +31,13 @@ def seconds(text: str) -> float:
     return value
 
 
-class ClassChoice(msgspec.Struct, frozen=True):
-    """A publisher class, and its period or deadline in seconds."""
-
-    publisher_class: r2p.PublisherClass
-    time: float = 0.0
-
-
-def class_choice(text: str) -> ClassChoice:
+def class_choice(text: str) -> ClassOf:
     """Parse `nrt`, `periodic:10ms` or `sporadic:20ms`."""
     name, _, time = text.partition(":")
     by_name = {name: publisher_class for publisher_class, name in CLASS_NAMES.items()}
     if name not in by_name or (name == "nrt") == bool(time):
         raise typer.BadParameter(f"{text!r}: write nrt, periodic:10ms or sporadic:20ms")
-    return ClassChoice(by_name[name], seconds(time) if time else 0.0)
+    return ClassOf(by_name[name], seconds(time) if time else 0.0)
 
 
 def valid_topic(text: str) -> str:

@@ -195,7 +195,9 @@ def _yaml_dumper() -> Callable[[Any, bool], str]:
 
     base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
-    dumper: Any = type("Dumper", (base,), {})  # our own class: representers would be added to all users of PyYAML's
+    dumper: Any = type(
+        "Dumper", (base,), {}
+    )  # a class of its own: representers would be added to all users of PyYAML's
 
     def represent(to: Any, items: Iterable[Any]) -> Any:
         """Lists of plain values on one line."""

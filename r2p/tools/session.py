@@ -209,7 +209,7 @@ async def wait_until(condition: Callable[[], bool], timeout: float) -> bool:
 
 
 async def moments(duration: float | None, period: float) -> AsyncIterator[float]:
-    """Yield the seconds since the start, once each period and at the end; None: there is no end."""
+    """Yield the seconds since the start, once each period and at the end; without `duration` there is none."""
     loop = asyncio.get_running_loop()
     start = loop.time()
     time = 0.0

@@ -93,7 +93,7 @@ async def test_texts_from_outside_do_nothing_to_a_terminal(format: Any) -> None:
 async def test_json_and_yaml_hold_the_exact_text_and_csv_one_line() -> None:
     lines, documents, cells = io.StringIO(), io.StringIO(), io.StringIO()
     for stream, form in ((lines, "json"), (documents, "yaml"), (cells, "csv")):
-        await Output(form, stream).put({"text": HOSTILE})  # type: ignore[arg-type]
+        await Output(form, stream).put({"text": HOSTILE})  # type: ignore[arg-type]  # `form` is one of the literals
     assert json.loads(lines.getvalue()) == {"text": HOSTILE}
     assert next(iter(yaml.safe_load_all(documents.getvalue()))) == {"text": HOSTILE}
     assert cells.getvalue().splitlines() == [

@@ -149,10 +149,9 @@ class FirmwareModule:
         if self._step_at is not None and now >= self._step_at:
             self._step(now)
         for topic, publisher in self._publishers.items():
-            if publisher.is_due(now):
-                message = publisher.next_message(now, self._booted)
-                if message is not None:
-                    self._publish(now, topic, message)
+            message = publisher.next_message(now, self._booted)
+            if message is not None:
+                self._publish(now, topic, message)
         return self._drain()
 
     def next_deadline(self) -> int | None:
@@ -261,8 +260,8 @@ class FirmwareModule:
             self.drops["undecodable"] += 1
             return
         match message:
-            case management.Advertise():
-                self._on_advertise(now, message.topic)
+            case management.Advertise() if message.topic in self._subscribers and self._nodes_running:
+                self._send(now, self._subscribers[message.topic].request)
             case management.SubscribeRequest():
                 self._on_subscribe_request(now, message)
             case management.SubscribeResponse() if message.topic in self._subscribers:
@@ -273,11 +272,6 @@ class FirmwareModule:
                 self._restart(now, FLAG_REBOOTED)
             case management.Bootload() if message.module == self.name:
                 self._restart(now, FLAG_REBOOTED | FLAG_BOOT)
-
-    def _on_advertise(self, now: int, topic: str) -> None:
-        subscriber = self._subscribers.get(topic)
-        if subscriber is not None and self._nodes_running:
-            self._send(now, subscriber.request)
 
     def _on_subscribe_response(self, now: int, subscriber: "_FirmwareSubscriber") -> None:
         """Accept data of a publisher, from when on the response takes effect."""
@@ -376,12 +370,9 @@ class _FirmwarePublisher:
     def start(self, now: int) -> None:
         self.next_at = None if self._period is None else now + self._period
 
-    def is_due(self, now: int) -> bool:
-        return self.next_at is not None and now >= self.next_at
-
     def next_message(self, now: int, booted: int) -> Message | None:
-        """Return the message of this period, and schedule the next one; missed periods are skipped."""
-        if self.next_at is None or self._period is None or self._fill is None:
+        """Return the message that is due, and schedule the next one; missed periods are skipped."""
+        if self.next_at is None or now < self.next_at or self._period is None or self._fill is None:
             return None
         self.next_at += ((now - self.next_at) // self._period + 1) * self._period
         return self._fill(now - booted) if self.joined else None

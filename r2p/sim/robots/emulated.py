@@ -34,7 +34,7 @@ from r2p.sim.modules.boards import (
     RangeArray,
 )
 from r2p.sim.physics.motor import Battery, Drive, Gains, Motor, speed_gains
-from r2p.sim.physics.world import OmniBody, OmniSpec, Triple, World
+from r2p.sim.physics.world import OmniBody, Triple, World
 from r2p.sim.robots import triskar2
 from r2p.transports.link import Transport
 
@@ -53,19 +53,20 @@ MODULES = (*MOTORS, *PROXIMITY, "PS", "GW")
 
 _SENSORS_AT = 0.12  # m from the centre: an object that touches the robot is at the sensors' shortest range
 _BEAM = (-8.0, 0.0, 8.0)  # degrees: rays that model the width of a sensor's beam
-_POLL, _SETTLED = 0.02, 0.5  # seconds
+_POLL = 0.02  # s
+_SETTLED = 0.5  # s for which everything has to stay ready
 _ELECTRONICS = 0.25  # A: the current of the modules
 
 
 class Hardware:
     """The body, its motors and its battery in the world: everything that is not a module."""
 
-    def __init__(self, seed: object = 0, world: World | None = None, *, spec: OmniSpec = triskar2.BODY) -> None:
+    def __init__(self, seed: object = 0, world: World | None = None) -> None:
         """`seed`: of all random numbers."""
         self.seed = seed
         self.world = world or World()
         self.motors = [Motor(triskar2.MOTOR) for _ in MOTORS]
-        self.body = OmniBody(spec, self.motors, self.noise("body"))
+        self.body = OmniBody(triskar2.BODY, self.motors, self.noise("body"))
         self.gains: Gains = speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING)
         self.drives = [Drive(motor, self.gains) for motor in self.motors]
         self.battery = Battery(triskar2.BATTERY)
@@ -169,7 +170,7 @@ class Triskar2:
                 before = time()
                 for publisher in self.publishers():
                     await publisher.ready()
-                waited = time() > before + _POLL  # waiting on ready publishers takes time, too, but less
+                waited = time() > before + _POLL  # to ask those that are ready takes time, too, but less
                 if waited or not all(link.up for board in self.modules.values() for link in board.links):
                     since = time()
 

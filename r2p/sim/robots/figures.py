@@ -123,7 +123,7 @@ class FiguresReader:
             self._off,
             [self._wheel(wheel, name) for wheel, name in enumerate(MOTORS)],
             (battery.voltage, battery.current, battery.charge),
-            sorted(topics, key=_urgency),
+            sorted(topics, key=lambda topic: (_URGENCY.index(topic.real_time), topic.topic)),
             None if self._bus is None else self._bus_figures(self._bus, now),
         )
 
@@ -186,11 +186,6 @@ class FiguresReader:
 
 def _key(module: r2p.Module, publisher: AnyPublisher) -> tuple[str, str]:
     return module.name, publisher.topic
-
-
-def _urgency(topic: TopicFigures) -> tuple[int, str]:
-    """Return the sort key: hard real-time topics come first."""
-    return _URGENCY.index(topic.real_time), topic.topic
 
 
 def _span(before: _Reading, now: _Reading) -> float:

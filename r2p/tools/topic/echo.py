@@ -93,7 +93,11 @@ class _TopicReader:
     async def records(self) -> AsyncIterator[tuple[dict[str, Any], r2p.Sample]]:
         """Yield each message as a record, with its sample."""
         async for sample in received_samples(self._session, self._subscriber, typed=self._cls is not None):
-            yield await self._record(sample), sample
+            record = self._decoded(sample)
+            if record is None:
+                await self._look_up_type(sample)
+                record = self._decoded(sample)
+            yield {"data": sample.data.hex()} if record is None else record, sample
 
     def report_losses(self) -> None:
         """Report what is missing in the output."""
@@ -101,13 +105,6 @@ class _TopicReader:
             notify(f"{self._subscriber.lost} messages of {self.topic} lost: the output was too slow")
         if self._subscriber.undecodable:
             notify(f"{self._subscriber.undecodable} messages of {self.topic} were of another type")
-
-    async def _record(self, sample: r2p.Sample) -> dict[str, Any]:
-        record = self._decoded(sample)
-        if record is None:
-            await self._look_up_type(sample)
-            record = self._decoded(sample)
-        return {"data": sample.data.hex()} if record is None else record
 
     def _decoded(self, sample: r2p.Sample) -> dict[str, Any] | None:
         if self._cls is None:

@@ -102,15 +102,16 @@ def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) ->
     """Return the known endpoints, and for each other link the only module there, or `?`."""
     covered = {each.link for each in known}
     found = [
-        {"node": f"{each.module or '?'}/{each.node}", "class": _class_name(each), "link": each.link} for each in known
+        {
+            "node": f"{each.module or '?'}/{each.node}",
+            "class": None if each.publisher_class is None else CLASS_NAMES[each.publisher_class],
+            "link": each.link,
+        }
+        for each in known
     ]
     return found + [
         {"node": f"{session.only_module(link)}/?", "class": None, "link": link} for link in links if link not in covered
     ]
-
-
-def _class_name(endpoint: r2p.Endpoint) -> str | None:
-    return None if endpoint.publisher_class is None else CLASS_NAMES[endpoint.publisher_class]
 
 
 async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:

@@ -11,7 +11,8 @@ import msgspec
 import typer
 
 import r2p
-from r2p.tools.options import ClassChoice, Count, Once, Rate, Timeout, class_choice
+from r2p.bridge import ClassOf
+from r2p.tools.options import Count, Once, Rate, Timeout, class_choice
 from r2p.tools.output import notify, waitable
 from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError
 from r2p.tools.topic.watching import Topic, TypeName, hint, is_subscribed, suggest_topics, wait_until_passed_on
@@ -40,7 +41,7 @@ async def pub(
     once: Once = False,
     rate: Rate = None,
     choice: Annotated[
-        ClassChoice | None,
+        ClassOf | None,
         typer.Option(
             "--class",
             parser=class_choice,
@@ -55,7 +56,7 @@ async def pub(
     Fields that are left out are zero. With --once, -n or stdin it first waits for a subscriber, at most --timeout.
     Ctrl-C ends it.
     """
-    choice = choice or ClassChoice(r2p.PublisherClass.NON_REAL_TIME)
+    choice = choice or ClassOf(r2p.PublisherClass.NON_REAL_TIME)
     periodic = choice.publisher_class is r2p.PublisherClass.PERIODIC
     from_stdin = message == [STDIN]
     if periodic and (from_stdin or rate is not None):
@@ -81,7 +82,7 @@ class _Publication(msgspec.Struct):
     session: Session
     topic: str
     message_class: type[r2p.Message]
-    choice: ClassChoice
+    choice: ClassOf
     count: int | None
     timeout: float | None
 

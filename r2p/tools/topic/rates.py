@@ -100,7 +100,7 @@ async def _read(
 async def _print(
     node: r2p.Node, subscriber: r2p.Subscriber[Any], meter: _Meter, output: Output, count: int | None
 ) -> None:
-    """Print `count` reports (None: no end), once a second."""
+    """Print a report once a second, `count` of them or without end."""
     printed, measured = 0, False
     async for _ in node.every(1.0):
         report = meter.report(subscriber.lost) if meter.fresh else None
