@@ -194,10 +194,7 @@ def _yaml_dumper() -> Callable[[Any, bool], str]:
     import yaml
 
     base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-    dumper: Any = type(
-        "Dumper", (base,), {}
-    )  # a class of its own: representers would be added to all users of PyYAML's
+    dumper: Any = type("Dumper", (base,), {})  # because representers apply to everyone who uses the class
 
     def represent(to: Any, items: Iterable[Any]) -> Any:
         """Lists of plain values on one line."""
