@@ -68,13 +68,10 @@ def _nodes(session: Session) -> Table:
     """Return the topics published and subscribed by (module, node); `?` for what was not announced."""
     table = session.module.network.nodes()
     for view in session.module.network.topics().values():
-        for index, (known, links) in enumerate(
-            ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on))
-        ):
-            covered = {endpoint.link for endpoint in known}
-            for link in links:
-                if link not in covered:
-                    table.setdefault((session.only_module(link), "?"), ([], []))[index].append(view.name)
+        sides = ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on))
+        for index, (known, links) in enumerate(sides):
+            for module in session.unannounced(known, links).values():
+                table.setdefault((module, "?"), ([], []))[index].append(view.name)
     return dict(sorted(table.items()))
 
 

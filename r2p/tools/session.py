@@ -24,7 +24,7 @@ import os
 import stat
 import string
 import tomllib
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -252,11 +252,14 @@ class Session:
         with call_after(REPORT_WAITING_AFTER, report):
             yield
 
-    def only_module(self, link: str) -> str:
-        """Return the name of the module at the other end of a link; "?" unless there is exactly one."""
-        views = self.module.network.modules()
-        names = {view.name for view in views if view.link == link and view.state != "observer"}
-        return names.pop() if len(names) == 1 else "?"
+    def unannounced(self, known: Iterable[r2p.Endpoint], links: Iterable[str]) -> dict[str, str]:
+        """Return the links without a known endpoint, each with the only module at its other end, or `?`."""
+        modules = [view for view in self.module.network.modules() if view.state != "observer"]
+        found = {}
+        for link in sorted(set(links) - {each.link for each in known}):
+            names = {view.name for view in modules if view.link == link}
+            found[link] = names.pop() if len(names) == 1 else "?"
+        return found
 
     async def settle(self, wait: float | None = None, *, of: str = "topics") -> None:
         """Listen until the other modules have announced what they have, or for `wait` seconds.

@@ -100,7 +100,6 @@ def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
 
 def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) -> list[dict[str, Any]]:
     """Return the known endpoints, and for each other link the only module there, or `?`."""
-    covered = {each.link for each in known}
     found = [
         {
             "node": f"{each.module or '?'}/{each.node}",
@@ -109,9 +108,8 @@ def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) ->
         }
         for each in known
     ]
-    return found + [
-        {"node": f"{session.only_module(link)}/?", "class": None, "link": link} for link in links if link not in covered
-    ]
+    rest = session.unannounced(known, links).items()
+    return found + [{"node": f"{module}/?", "class": None, "link": link} for link, module in rest]
 
 
 async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
