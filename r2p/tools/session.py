@@ -255,8 +255,8 @@ class Session:
     def unannounced(self, known: Iterable[r2p.Endpoint], links: Iterable[str]) -> dict[str, str]:
         """Return the links without a known endpoint, each with the only module at its other end, or `?`."""
         modules = [view for view in self.module.network.modules() if view.state != "observer"]
-        found = {}
-        for link in sorted(set(links) - {each.link for each in known}):
+        covered, found = {each.link for each in known}, {}
+        for link in (each for each in links if each not in covered):
             names = {view.name for view in modules if view.link == link}
             found[link] = names.pop() if len(names) == 1 else "?"
         return found
