@@ -17,6 +17,7 @@ from r2p.msg import GatewayStatus, Led
 from r2p.testing.network import node_in
 from r2p.tools import gateway
 from r2p.tools.gateway import LiveTable, RateCounter, crop, serve, table
+from r2p.tools.options import class_choice
 from r2p.tools.output import Output
 from r2p.tools.session import UsageError
 
@@ -154,4 +155,4 @@ def test_mistakes_are_told() -> None:
     with pytest.raises(UsageError, match="--rate-limit leds: write it as TOPIC=HZ"):
         list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
     with pytest.raises(typer.BadParameter, match="periodic:10ms"):
-        gateway._class("often")
+        class_choice("often")

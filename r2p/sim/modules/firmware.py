@@ -260,8 +260,8 @@ class FirmwareModule:
             self.drops["undecodable"] += 1
             return
         match message:
-            case management.Advertise() if message.topic in self._subscribers and self._nodes_running:
-                self._send(now, self._subscribers[message.topic].request)
+            case management.Advertise():
+                self._on_advertise(now, message.topic)
             case management.SubscribeRequest():
                 self._on_subscribe_request(now, message)
             case management.SubscribeResponse() if message.topic in self._subscribers:
@@ -272,6 +272,11 @@ class FirmwareModule:
                 self._restart(now, FLAG_REBOOTED)
             case management.Bootload() if message.module == self.name:
                 self._restart(now, FLAG_REBOOTED | FLAG_BOOT)
+
+    def _on_advertise(self, now: int, topic: str) -> None:
+        subscriber = self._subscribers.get(topic)
+        if subscriber is not None and self._nodes_running:
+            self._send(now, subscriber.request)
 
     def _on_subscribe_response(self, now: int, subscriber: "_FirmwareSubscriber") -> None:
         """Accept data of a publisher, from when on the response takes effect."""

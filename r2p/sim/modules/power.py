@@ -27,8 +27,12 @@ _CHUNK = 4096
 class LineEnd(Protocol):
     """The end of a line at the module."""
 
+    @property
+    def waiting(self) -> int:
+        """Bytes that the peer has not read."""
+
     def send(self, data: bytes) -> None:
-        """Send bytes of the module, or drop them if the peer does not read; a `Wire` leaves that to its link."""
+        """Send bytes of the module, or drop them if the peer does not read."""
 
     def close(self) -> None:
         """Close the line."""
@@ -123,8 +127,12 @@ class _Client(asyncio.Protocol):
         self._power = power
         self._reader = debug.Reader(power.module.drops)
 
+    @property
+    def waiting(self) -> int:
+        return self._transport.get_write_buffer_size()
+
     def send(self, data: bytes) -> None:
-        if self._transport.get_write_buffer_size() < BUFFER:
+        if self.waiting < BUFFER:
             self._transport.write(data)
 
     def close(self) -> None:
@@ -158,8 +166,12 @@ class _Pty:
         os.set_blocking(self._master, False)
         self._loop.add_reader(self._master, self._read)
 
+    @property
+    def waiting(self) -> int:
+        return len(self._unsent)
+
     def send(self, data: bytes) -> None:
-        if len(self._unsent) >= BUFFER:
+        if self.waiting >= BUFFER:
             return
         if not self._unsent:
             self._loop.add_writer(self._master, self._write)
@@ -253,6 +265,8 @@ class Wire(Transport, Carrier):
 
 class _WireEnd:
     """The end at the emulated module."""
+
+    waiting = 0  # the link at the other end has a buffer of its own
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
