@@ -179,7 +179,7 @@ class BusMonitor:
         self._check()
         length = round(period * SECOND)
         end = self._now()
-        self._monitor.begin(end, length)
+        self._monitor.reset(end, length)
         while True:
             end += length
             await self._read_until(end)

@@ -308,7 +308,7 @@ class Shaper:
         source = sample.source
         known = self._periods.get((source.module, source.node))
         if known is None:
-            if len(self._periods) >= TimesLeft.MOST:
+            if len(self._periods) >= TimesLeft.PUBLISHERS_MAX:
                 self._periods.clear()
             self._periods[source.module, source.node] = _PublisherPeriod(sample.stamp, len(sample.data))
             return _UNKNOWN_PERIOD

@@ -3,7 +3,7 @@
 Each codec is a pair, `encode` and `decode`, with the layout in its docstrings. A value that does not fit is a mistake
 of the caller (`MessageError`). Bytes that are not such a message raise `DecodeError`: links count them, and go on.
 
-- `debug`: the lines of the debug transport; `rtcan`: the identifiers and frames of RTCAN.
+- `debug`: the lines of the debug transport; `rtcan`: the identifiers and frames of RTCAN; `can_bits`: their length.
 - `management`: the messages of the topic `R2P`; `loader`: those of `BOOT_<module>`; both in terms of `_records`.
 - `attachment`, `liveliness`: what accompanies messages on zenoh, and the tokens there.
 - `schemas`: answers to the question for a type; `probes`: how gateways look for loops.

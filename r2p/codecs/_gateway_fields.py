@@ -21,14 +21,9 @@ def make_part(number: int, last: int) -> int:
     return number << _PART_BITS | last
 
 
-def part_number(part: int) -> int:
-    """The number of this part, from 0."""
-    return part >> _PART_BITS
-
-
-def last_part(part: int) -> int:
-    """The number of the last part."""
-    return part & PARTS_MAX - 1
+def split_part(part: int) -> tuple[int, int]:
+    """The number of this part, from 0, and of the last one."""
+    return part >> _PART_BITS, part & PARTS_MAX - 1
 
 
 def next_serial(serial: int) -> int:

@@ -40,10 +40,10 @@ from r2p.codecs._gateway_fields import decode_heard as decode_heard
 from r2p.codecs._gateway_fields import encode_acks as encode_acks
 from r2p.codecs._gateway_fields import encode_heard as encode_heard
 from r2p.codecs._gateway_fields import is_newer_serial as is_newer_serial
-from r2p.codecs._gateway_fields import last_part, part_number
 from r2p.codecs._gateway_fields import leaf_port as leaf_port
 from r2p.codecs._gateway_fields import make_part as make_part
 from r2p.codecs._gateway_fields import next_serial as next_serial
+from r2p.codecs._gateway_fields import split_part as split_part
 from r2p.codecs._records import Codec, Record
 from r2p.errors import MessageError
 from r2p.names import module_alias
@@ -128,9 +128,9 @@ ANY_TYPE = bytes(8)
 
 QUEUE = 5
 """Entries of a SUBSCRIBE_REQUEST's queue by default."""
-QUEUE_MOST = 16
+QUEUE_MAX = 16
 """Entries of such a queue at most."""
-QUEUE_BYTES = 1024
+QUEUE_BYTES_MAX = 1024
 """Bytes of such a queue at most. Firmware has 20 kB of RAM and takes the queue from its heap; where there is no room
 left it writes to NULL."""
 QUEUE_ENTRY = 8
@@ -147,6 +147,20 @@ DENIED_GATEWAYS = 5  # the server of a debug line accepts no gateway: `order` is
 CLAIM_FIXED = 1  # the module can't take another id8
 CLAIM_ELECTING = 2  # the module knows no master
 
+
+class RefuseReason(enum.IntEnum):
+    """Why a master has no slots: `Refuse.reason`."""
+
+    PERIOD = 1  # not harmonic with the cycle: neither divides the other
+    OTHER = 2  # not harmonic with the period of another message
+    LENGTH = 3  # too short for the fragments, or too long
+    FULL = 4  # not so many slots in a row are free
+    TAKEN = 5  # the slots that it had were given to another message
+    MANY = 6  # no further reservation can be kept
+
+
+EPOCH_MAX = 0xFFFFFFFF  # Network.epoch
+REQUEST_SERIALS = 256  # values of Reserve.serial and Renew.serial
 NO_PHASE = 0xFFFFFFFF  # Reserve.phase: any will do
 RESERVE_ROUND_DOWN = 1  # Reserve.flags: a shorter period will do, the longest possible one
 RENEW_MAX = 24  # high bytes in a Renew
@@ -286,21 +300,11 @@ class Denied(msgspec.Struct, frozen=True, gc=False):
 
 
 class Name(msgspec.Struct, frozen=True, gc=False):
-    """A piece of the name that an alias stands for. `part`: its number (high 4 bits), that of the last (low 4)."""
+    """A piece of the name that an alias stands for. `part` has its number and that of the last one: see `make_part`."""
 
     alias: str
     part: int
     piece: str
-
-    @property
-    def number(self) -> int:
-        """The number of this piece."""
-        return part_number(self.part)
-
-    @property
-    def last(self) -> int:
-        """The number of the last piece."""
-        return last_part(self.part)
 
 
 class Bridge(msgspec.Struct, frozen=True, gc=False):
@@ -321,24 +325,14 @@ class Bridge(msgspec.Struct, frozen=True, gc=False):
 class Mesh(msgspec.Struct, frozen=True, gc=False):
     """The gateways that a gateway hears at its ports, again with a new `serial` when they change.
 
-    `part`: the high four bits are the number of this part, the low four the last. `heard` is 3 times the own port (u8),
-    the other gateway (u32) and its port (u8).
+    `part` has the number of this part and of the last one: see `make_part`. `heard` is 3 times the own port (u8), the
+    other gateway (u32) and its port (u8).
     """
 
     gateway: int
     serial: int
     part: int
     heard: bytes
-
-    @property
-    def number(self) -> int:
-        """The number of this part."""
-        return part_number(self.part)
-
-    @property
-    def last(self) -> int:
-        """The number of the last part."""
-        return last_part(self.part)
 
 
 class Leaf(msgspec.Struct, frozen=True, gc=False):
@@ -411,7 +405,10 @@ class Grant(msgspec.Struct, frozen=True, gc=False):
 
 
 class Refuse(msgspec.Struct, frozen=True, gc=False):
-    """Refuse slots; `reason` and the fields after it are those of `r2p.protocols.rtcan.calendar.Refusal`."""
+    """Refuse slots for `fragments` every `period`. The period `other`, of the message `rival`, is in the way.
+
+    `reason` is a RefuseReason, or a number that a newer version knows.
+    """
 
     message: int
     serial: int
@@ -444,34 +441,11 @@ class Renewed(msgspec.Struct, frozen=True, gc=False):
     highs: bytes
 
 
-Management = (
-    Alive
-    | Stop
-    | Reboot
-    | Bootload
-    | Advertise
-    | SubscribeRequest
-    | SubscribeResponse
-    | Path
-    | Network
-    | Claim
-    | Reserve
-    | Grant
-    | Refuse
-    | Release
-    | Renew
-    | Renewed
-    | Hello
-    | TypeInfo
-    | Unsubscribe
-    | Endpoint
-    | Conflict
-    | Denied
-    | Name
-    | Bridge
-    | Mesh
-    | Leaf
-)
+FirmwareMessage = Alive | Order | Advertise | SubscribeRequest | SubscribeResponse | Path
+RtcanMessage = Network | Claim | Reserve | Grant | Refuse | Release | Renew | Renewed
+R2pMessage = Hello | TypeInfo | Unsubscribe | Endpoint | Conflict | Denied | Name
+GatewayMessage = Bridge | Mesh | Leaf
+Management = FirmwareMessage | RtcanMessage | R2pMessage | GatewayMessage
 
 _PUBSUB = "16s H H 10s"
 _CODEC = Codec[Management](
@@ -540,7 +514,7 @@ def order_type(order: Order) -> int:
 
 def queue_length(size: int, wanted: int = QUEUE) -> int:
     """The entries of a queue to request of firmware, for messages of `size` bytes: 1 to 16, and 1024 bytes at most."""
-    return max(1, min(wanted, QUEUE_MOST, QUEUE_BYTES // (size + QUEUE_ENTRY)))
+    return max(1, min(wanted, QUEUE_MAX, QUEUE_BYTES_MAX // (size + QUEUE_ENTRY)))
 
 
 def alias_messages(name: str) -> list[Name]:

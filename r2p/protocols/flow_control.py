@@ -31,10 +31,6 @@ class _SubscriberWindow(msgspec.Struct):
     waited_for: bool = True
     leaving: bool = False
 
-    def is_full(self, serial: int) -> bool:
-        """Whether the publisher waits for it."""
-        return bool(self.window) and self.waited_for and serial >= self.acknowledged + self.window
-
 
 class SendWindow:
     """What goes out on one topic in one class, and how far each subscriber has come."""
@@ -65,7 +61,7 @@ class SendWindow:
         return 0 if known is None or known.leaving else max(0, self.serial - known.acknowledged)
 
     def set_leaving(self, session: int, *, leaving: bool) -> None:
-        """Note whether a subscriber has ended its subscription; one that grants credit again has come back."""
+        """Note whether a subscriber has ended its subscription; one that grants credit again is back."""
         known = self.subscribers.get(session)
         if known is not None:
             known.leaving = leaving
@@ -83,11 +79,13 @@ class SendWindow:
 
     def skip_full(self) -> list[int]:
         """Stop waiting for subscribers without room, until their next credit; return their sessions."""
-        full = [session for session, each in self.subscribers.items() if each.is_full(self.serial)]
-        for session in full:
-            self.subscribers[session].waited_for = False
+        skipped = []
+        for session, each in self.subscribers.items():
+            if each.window and each.waited_for and self.serial >= each.acknowledged + each.window:
+                each.waited_for = False
+                skipped.append(session)
         self._update()
-        return full
+        return skipped
 
     def unacknowledged(self) -> list[int]:
         """Return the sessions that were sent something, and have not answered since they joined."""
@@ -127,7 +125,7 @@ class ReceiveWindow:
         self.until_credit = min(self.until_credit, self._share)
 
     def restart(self) -> None:
-        """Answer the next message at once: the sender is gone, and will know nothing of us should it come back."""
+        """Answer the next message at once: a sender that is gone will know nothing of this one should it return."""
         self.until_credit = 1
 
     def skip(self, count: int) -> None:

@@ -50,9 +50,9 @@ class TimeLeft:
 
 
 class TimesLeft:
-    """The `TimeLeft` of many publishers, by any key; of at most MOST at a time."""
+    """The `TimeLeft` of many publishers, by any key; of at most PUBLISHERS_MAX at a time."""
 
-    MOST = 1024
+    PUBLISHERS_MAX = 1024
 
     def __init__(self) -> None:
         self._known: dict[object, TimeLeft] = {}
@@ -61,7 +61,7 @@ class TimesLeft:
         """Return that of one publisher."""
         known = self._known.get(publisher)
         if known is None:
-            if len(self._known) >= self.MOST:
+            if len(self._known) >= self.PUBLISHERS_MAX:
                 self._known.clear()  # the least delay is found again within a few messages
             known = self._known[publisher] = TimeLeft()
         return known

@@ -7,11 +7,15 @@ That place is corrected when it comes up.
 import heapq
 from collections.abc import Hashable, Iterator
 
+from r2p.units import NEVER
+
 
 class KeyedTimers:
     """Keys that run out. Setting a key later costs nothing: its place in the heap is corrected when it comes up."""
 
     def __init__(self) -> None:
+        self.due = NEVER
+        """When the next key runs out (ns), or NEVER. Kept up to date: an RTCAN engine looks at it after each frame."""
         self._due: dict[Hashable, int] = {}
         self._heap: list[tuple[int, int, Hashable]] = []
         self._pushed = 0
@@ -25,32 +29,39 @@ class KeyedTimers:
         self._due[key] = due
         if before is None or due < before:
             self._push(key, due)
+        self._update()
 
     def clear(self, key: Hashable) -> None:
         self._due.pop(key, None)
+        self._update()
 
     def next(self) -> int | None:
         """When the next key runs out (ns)."""
-        while self._heap:
-            at, _, key = self._heap[0]
-            due = self._due.get(key)
-            if due == at:
-                return at
-            heapq.heappop(self._heap)
-            if due is not None and due > at:
-                self._push(key, due)
-        return None
+        return self.due if self.due < NEVER else None
 
     def put_off(self, until: int) -> None:
         """Let no key run out before `until` (ns)."""
         self._due = {key: max(due, until) for key, due in self._due.items()}
+        self._update()
 
     def pop(self, now: int) -> Iterator[Hashable]:
         """The keys that have run out; each is cleared."""
-        while (due := self.next()) is not None and due <= now:
+        while self.due <= now:
             key = heapq.heappop(self._heap)[2]
-            del self._due[key]
+            self.clear(key)
             yield key
+
+    def _update(self) -> None:
+        """Correct the places in the heap up to the first one that is true."""
+        while self._heap:
+            self.due, _, key = self._heap[0]
+            due = self._due.get(key)
+            if due == self.due:
+                return
+            heapq.heappop(self._heap)
+            if due is not None and due > self.due:
+                self._push(key, due)
+        self.due = NEVER
 
     def _push(self, key: Hashable, due: int) -> None:
         if len(self._heap) > 2 * len(self._due) + 64:  # keys that come and go: their old places would pile up

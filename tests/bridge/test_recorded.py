@@ -68,9 +68,9 @@ class Bus:
         if record.error is not None or GATEWAY not in record.senders:
             return
         found = rtcan.decode_identifier(record.frame.id)
-        self._parts[found.message] = self._parts.get(found.message, b"") + record.frame.data
+        self._parts[found.message_id] = self._parts.get(found.message_id, b"") + record.frame.data
         if found.left == 0:
-            self.messages.append((found.message, self._parts.pop(found.message)))
+            self.messages.append((found.message_id, self._parts.pop(found.message_id)))
 
     def management(self) -> list[management.Management]:
         return [message for _, data in self.messages if (message := decoded(data)) is not None]

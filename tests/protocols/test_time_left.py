@@ -70,4 +70,4 @@ def test_publishers_are_told_apart_and_bounded() -> None:
     assert times.of("a") is times.of("a") is not times.of("b")
     for n in range(3000):
         times.of(n)
-    assert len(times._known) <= TimesLeft.MOST
+    assert len(times._known) <= TimesLeft.PUBLISHERS_MAX

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from r2p.codecs.rtcan import bits_until_lost
+from r2p.codecs.can_bits import bits_until_lost
 from r2p.sim.can import Latency
 from tests.can_watch import BIT, GAP, HIGH, LOW, MIDDLE, at, length, make
 

@@ -20,6 +20,7 @@ from r2p.codecs.management import (
     is_newer_serial,
     make_part,
     next_serial,
+    split_part,
 )
 from r2p.units import SECOND
 
@@ -67,8 +68,9 @@ class MeshAssembler:
         """Enter a part; return whom the gateway hears once all parts with this serial are there."""
         key = (message.gateway, message.serial)
         pieces = self._pieces.setdefault(key, {})
-        pieces[message.number] = frozenset(decode_heard(message.heard))
-        if set(pieces) != set(range(message.last + 1)):
+        number, last = split_part(message.part)
+        pieces[number] = frozenset(decode_heard(message.heard))
+        if set(pieces) != set(range(last + 1)):
             while len(self._pieces) > _UNFINISHED_MAX:
                 del self._pieces[next(iter(self._pieces))]
             return None

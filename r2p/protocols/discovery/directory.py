@@ -321,12 +321,13 @@ class Aliases:
     def receive(self, message: management.Name) -> str | None:
         """Read a part of a name; returns the name if it is complete now, and new."""
         parts = self._parts.setdefault(message.alias, {})
-        parts[message.number] = message.piece
-        if not set(range(message.last + 1)) <= parts.keys():
+        number, last = management.split_part(message.part)
+        parts[number] = message.piece
+        if not set(range(last + 1)) <= parts.keys():
             _bound(self._parts, _UNFINISHED_MAX)
             return None
         del self._parts[message.alias]
-        name = "".join(parts[each] for each in range(message.last + 1))
+        name = "".join(parts[each] for each in range(last + 1))
         if len(name) > MODULE_PATH_MAX or module_alias(name) != message.alias or self._names.get(message.alias) == name:
             return None
         self._names[message.alias] = name

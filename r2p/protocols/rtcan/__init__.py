@@ -3,17 +3,16 @@
 Begin with `engine`: `Engine` is one node, its docstring says how to drive it, and `Engine._update_mode` decides whether
 and how the node may send. Then, in this order:
 
-    events      the values that go in and out of an engine: settings, actions
-    context     what its parts share: timers, counters, actions
+    events      the values that go in and out of an engine: settings, actions; what its parts share
     node_id     claiming an id8
     network     finding and following a network; master: the election, and being the master
     management  the management messages of the bus
     cycle       slots and cycles by the sync frames, network time
-    leases      asking for slots and granting them; calendar: which slots, at the master; plan: the node's own, by slot
+    leases      periodic messages: asking for slots, granting them, what to do in which; calendar: which slots are taken
     transmitter which frame leaves when; queue: soft and non real-time messages by laxity
     reassembly  frames to messages, and what was lost
     topic_ids   high bytes for topics
     monitor     watching a bus without sending, for tools
 
-The layout of identifiers is in `r2p.codecs.rtcan`.
+The layout of identifiers is in `r2p.codecs.rtcan`, the length of frames in `r2p.codecs.can_bits`.
 """

@@ -8,16 +8,16 @@ within the shorter of the two periods. So the slots that are free for a period a
 Since slot 0 of every cycle is the sync's, the slots of one occurrence never span two cycles.
 """
 
-import enum
 from collections.abc import Iterator
 
 import msgspec
 
+from r2p.codecs.management import RefuseReason
 from r2p.codecs.rtcan import SLOTS_MAX
 
-LONGEST_PERIOD = 1 << 16
+PERIOD_MAX = 1 << 16
 """In slots: about 11 s in slots of 166 us."""
-_MOST = 1024  # reservations: each one makes an admission slower
+_RESERVATIONS_MAX = 1024  # each one makes an admission slower
 
 
 class Reservation(msgspec.Struct, frozen=True):
@@ -33,22 +33,11 @@ class Reservation(msgspec.Struct, frozen=True):
         return number + (self.phase - number) % self.period
 
 
-class Reason(enum.IntEnum):
-    """Why there are no slots; the numbers are those of the wire."""
-
-    PERIOD = 1
-    OTHER = 2
-    LENGTH = 3
-    FULL = 4
-    TAKEN = 5
-    MANY = 6
-
-
 class Refusal(msgspec.Struct, frozen=True):
     """No slots for `fragments` every `period`; `other` is the period, of the message `rival`, that matters."""
 
     message: int
-    reason: Reason
+    reason: RefuseReason
     period: int
     fragments: int = 1
     other: int = 0
@@ -58,22 +47,23 @@ class Refusal(msgspec.Struct, frozen=True):
     def text(self) -> str:
         """The reason in words."""
         match self.reason:
-            case Reason.PERIOD:
+            case RefuseReason.PERIOD:
                 return f"a period of {self.period} slots neither divides the {self.other} of a cycle nor is a multiple"
-            case Reason.OTHER:
+            case RefuseReason.OTHER:
                 return (
                     f"a period of {self.period} slots neither divides the {self.other} of message "
                     f"0x{self.rival:04X} nor is a multiple"
                 )
-            case Reason.LENGTH:
+            case RefuseReason.LENGTH:
                 needed = max(2, self.fragments + 1)
-                return f"a period of {self.period} slots: this message needs one of {needed} to {LONGEST_PERIOD}"
-            case Reason.FULL:
-                return f"no {self.fragments} slots in a row are free every {self.period} slots"
-            case Reason.TAKEN:
+                return f"a period of {self.period} slots: this message needs one of {needed} to {PERIOD_MAX}"
+            case RefuseReason.FULL:
+                run = "slot is" if self.fragments == 1 else f"{self.fragments} slots in a row are"
+                return f"no {run} free every {self.period} slots"
+            case RefuseReason.TAKEN:
                 return "its slots were given to another message"
-            case Reason.MANY:
-                return f"there are {_MOST} reservations"
+            case RefuseReason.MANY:
+                return f"all {_RESERVATIONS_MAX} reservations are in use"
 
 
 class Calendar:
@@ -101,38 +91,33 @@ class Calendar:
 
         A message that has slots of another period or size gives those back first.
         """
-        before = self._entries.get(message)
-        if before is not None:
-            if before.fragments == fragments and self._wanted(message, period, round_down) == before.period:
-                return before
-            self.remove(message)  # its own slots are free for it
         wanted = self._wanted(message, period, round_down)
-        refusal = self._impossible(message, wanted, fragments)
-        if refusal is not None:
+        before = self._entries.get(message)
+        if before is not None and (before.period, before.fragments) == (wanted, fragments):
+            return before
+        self.remove(message)  # its own slots are free for it
+        if (refusal := self._impossible(message, wanted, fragments)) is not None:
             return refusal
         phase = _first_run(self.free(wanted), fragments)
         if phase is None:
-            return Refusal(message, Reason.FULL, wanted, fragments)
+            return Refusal(message, RefuseReason.FULL, wanted, fragments)
         return self._enter(Reservation(message, wanted, phase, fragments))
 
     def readmit(self, reservation: Reservation) -> Reservation | Refusal:
         """Enter a reservation that another master granted, with its phase."""
         message, period, phase, fragments = msgspec.structs.astuple(reservation)
-        before = self._entries.get(message)
-        if before == reservation:
-            return before
-        if before is not None:
-            self.remove(message)
-        refusal = self._impossible(message, period, fragments)
-        if refusal is not None:
+        if self._entries.get(message) == reservation:
+            return reservation
+        self.remove(message)
+        if (refusal := self._impossible(message, period, fragments)) is not None:
             return refusal
         train = (1 << fragments) - 1
         if phase >= period or self.free(period) >> phase & train != train:
-            return Refusal(message, Reason.TAKEN, period, fragments)
+            return Refusal(message, RefuseReason.TAKEN, period, fragments)
         return self._enter(reservation)
 
     def remove(self, message: int) -> bool:
-        """Give back the slots of a message. Returns False if it has no slots."""
+        """Give back the slots of a message; return whether it had any."""
         return self._entries.pop(message, None) is not None
 
     def free(self, period: int) -> int:
@@ -156,7 +141,7 @@ class Calendar:
 
     def _wanted(self, message: int, period: int, round_down: bool) -> int:
         """The period, or the longest up to it that is harmonic with all others; the period itself if there is none."""
-        if not round_down or not 1 < period <= LONGEST_PERIOD:
+        if not round_down or not 1 < period <= PERIOD_MAX:
             return period
         others = {each.period for each in self._entries.values() if each.message != message} | {self.slots}
         for shorter in _candidates(period, self.slots):
@@ -165,14 +150,16 @@ class Calendar:
         return period
 
     def _impossible(self, message: int, period: int, fragments: int) -> Refusal | None:
-        if not 1 < period <= LONGEST_PERIOD or not 0 < fragments < period:
-            return Refusal(message, Reason.LENGTH, period, fragments)
+        if not 1 < period <= PERIOD_MAX or not 0 < fragments < period:
+            return Refusal(message, RefuseReason.LENGTH, period, fragments)
         if not _harmonic(period, self.slots):
-            return Refusal(message, Reason.PERIOD, period, fragments, self.slots)
+            return Refusal(message, RefuseReason.PERIOD, period, fragments, self.slots)
         for each in self._entries.values():
             if not _harmonic(period, each.period):
-                return Refusal(message, Reason.OTHER, period, fragments, each.period, each.message)
-        return Refusal(message, Reason.MANY, period, fragments) if len(self._entries) >= _MOST else None
+                return Refusal(message, RefuseReason.OTHER, period, fragments, each.period, each.message)
+        if len(self._entries) >= _RESERVATIONS_MAX:
+            return Refusal(message, RefuseReason.MANY, period, fragments)
+        return None
 
 
 def occupied(reservation: Reservation, start: int, slots: int) -> int:

@@ -16,13 +16,16 @@ from functools import lru_cache
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import CYCLE_MASK, Frame
+from r2p.codecs.can_bits import INTERMISSION, frame_bits_max, start_of_frame
+from r2p.codecs.rtcan import CYCLE_MASK, FRAME_MAX, Frame
 from r2p.units import SECOND
 
 HOLDOVER = 3
 """Cycles without a sync that a slave bridges."""
 NO_SLOT = 1 << 16
 """After every slot of a cycle."""
+SYNC_ONLY = 1
+"""The mask of a cycle in which no slot is reserved but the sync's."""
 _CATCH_UP = 64  # part of a slot by which a cycle is shortened while network time catches up
 _IN_TIME = 8_000  # ns between plan and stamp of a sync: two calibrated latencies that vary by +-3 us, and a bit more
 _AMBIGUOUS = 128  # cycles: half of what the 8 bits of a sync tell apart
@@ -47,7 +50,7 @@ def timing(slots: int = 60, nominal: int = 10_000_000, bit_rate: int = 1_000_000
     """The slots of a nominal cycle (ns): whole microseconds each. Raises ValueError when no frame fits in."""
     slot = nominal // slots // _MICROSECOND * _MICROSECOND
     bit = SECOND // bit_rate
-    longest = (rtcan.frame_bits_max(rtcan.FRAME_MAX) + rtcan.INTERMISSION) * bit
+    longest = (frame_bits_max(FRAME_MAX) + INTERMISSION) * bit
     if slot < longest:
         raise ValueError(f"slots of {slot // 1000} us are too short for frames of up to {longest // 1000} us")
     return Timing(slots, slot, bit)
@@ -126,9 +129,9 @@ class Cycle:
     # Slave
 
     def on_sync(self, frame: Frame, stamp: int) -> Alignment:
-        """A sync frame was received; `stamp` is the instant of the reception interrupt."""
+        """Follow a sync frame; `stamp` is the instant of the reception interrupt."""
         sync = rtcan.decode_sync(frame)
-        start = stamp - self._latency - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
+        start = start_of_frame(frame, stamp - self._latency, self.timing.bit)
         if self.state is _NONE:
             return self._start(start, sync.cycle, sync.mask)
         cycles, off = self._distance(start)
@@ -157,7 +160,7 @@ class Cycle:
         return self._length, 2 * self._widest // max(1, self.counter - self._first)
 
     def bridge(self) -> bool:
-        """Begin the next cycle without a sync. False: that is one too many, the cycle is lost."""
+        """Begin the next cycle without a sync; return False for one too many, which loses the cycle."""
         self.missed += 1
         if self.missed > HOLDOVER:
             self.stop()
@@ -170,7 +173,7 @@ class Cycle:
         return True
 
     def anchor(self, counter: int) -> bool:
-        """Use the whole counter in a NETWORK, of this cycle or a bit earlier. Says whether ours was another one."""
+        """Use the whole counter of a NETWORK of this cycle or a bit earlier; return whether ours was another one."""
         whole = _nearest(counter, self.counter, _DELAYED)
         changed = self.anchored and whole != self.counter
         self._first += whole - self.counter
@@ -186,31 +189,34 @@ class Cycle:
 
     # Master
 
+    def first_sync(self, now: int, *, inherits: bool) -> tuple[Frame, int, int]:
+        """The first sync of a new master, its start and its count; if it `inherits` a network, grid and count go on."""
+        self.anchored = inherits
+        start, counter = self.upcoming(now)
+        return rtcan.encode_sync(counter, SYNC_ONLY), start, counter
+
     def upcoming(self, now: int) -> tuple[int, int]:
-        """Start and count of the next cycle: the grid and the counter of before go on, if there were any."""
+        """Start and count of the next cycle: by the grid and the counter of before, if there were any."""
         if not self.anchored:
             return now, 1
         cycles = -(-(now - self._grid) // self.timing.cycle)
         return self._grid + cycles * self.timing.cycle, self.counter + cycles
 
     def delay(self, by: int) -> bool:
-        """The first sync of a network that goes on has left `by` ns late. False: too late for its count.
+        """Take into account that the first sync of a network that goes on left `by` ns late.
 
-        Network time can no longer catch up then, and a new network begins.
+        Return False when it was too late for its count: network time can no longer catch up, and a new network begins.
         """
         self._behind += by
         return 2 * self._behind < self.timing.cycle
 
     def lead(self, start: int, counter: int, mask: int | None, *, anew: bool = False) -> None:
-        """Be the master, from the cycle on that began at `start`; `anew`: of a network that was not there before."""
-        self.state = CycleState.LEADING
-        self.reference = self._grid = start
+        """Lead from the cycle on that began at `start`; `anew`: a network that was not there before."""
+        self._begin(CycleState.LEADING, start, mask)
         if anew:
             self._behind = 0
         self.counter = counter
-        self._set_mask(mask)
         self.anchored = True
-        self.missed = 0
 
     def advance(self, mask: int) -> Frame:
         """Begin the next cycle; its sync frame comes back."""
@@ -227,12 +233,12 @@ class Cycle:
         return self._grid + self.timing.cycle - min(self._behind, self._slot // _CATCH_UP)
 
     def on_sync_sent(self, frame: Frame, at: int) -> None:
-        """The master's sync was on the bus until `at`. If it left late, its slaves are late with it, and so is it.
+        """Correct the reference if the master's sync, on the bus until `at`, left late: its slaves are late with it.
 
         What the jitter of latencies explains moves nothing: the plan is as good a guess as the stamp, and keeps the
         slots of the next cycle exactly one cycle later.
         """
-        start = at - rtcan.frame_bits(frame.id, frame.data) * self.timing.bit
+        start = start_of_frame(frame, at, self.timing.bit)
         ours = rtcan.message_of(frame.id) == self.counter & CYCLE_MASK  # it may be confirmed in the next cycle
         if ours and _IN_TIME < start - self._grid <= self._slot:
             self.reference = start
@@ -247,9 +253,12 @@ class Cycle:
         return Alignment.RESUMED if resumed else Alignment.STARTED
 
     def _follow(self, start: int, mask: int) -> None:
-        self.state = CycleState.FOLLOWING
-        self.reference = self._grid = start
+        self._begin(CycleState.FOLLOWING, start, mask)
         self._behind = 0
+
+    def _begin(self, state: CycleState, start: int, mask: int | None) -> None:
+        self.state = state
+        self.reference = self._grid = start
         self._set_mask(mask)
         self.missed = 0
 

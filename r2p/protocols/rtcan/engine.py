@@ -32,11 +32,11 @@ from collections.abc import Hashable, Sequence
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import HIGH_MAX, HIGH_SHIFT, ID8_MAX, MANAGEMENT, MESSAGE_SHIFT, NOT_SYNC, Frame
 from r2p.errors import DecodeError, MessageError
-from r2p.protocols.rtcan.context import EngineContext
 from r2p.protocols.rtcan.events import (
     Action,
     Done,
     Due,
+    EngineContext,
     EngineSettings,
     Fate,
     Mailbox,
@@ -45,12 +45,11 @@ from r2p.protocols.rtcan.events import (
     Ready,
     Received,
 )
-from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
+from r2p.protocols.rtcan.leases import PeriodicMessage, SlotGrants, SlotRequests
 from r2p.protocols.rtcan.management import ManagementHandlers, ManagementSender
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.network import Detector, NetworkMembership
 from r2p.protocols.rtcan.node_id import NodeId, Stage
-from r2p.protocols.rtcan.plan import PeriodicMessage
 from r2p.protocols.rtcan.queue import QueuedMessage
 from r2p.protocols.rtcan.reassembly import Reassembly
 from r2p.protocols.rtcan.transmitter import Mode, SlotTransmitter
@@ -85,7 +84,7 @@ class Engine:
         """The periodic messages of this node by high byte."""
         self.management = ManagementSender(context, self.node_id, self.detector, self.transmitter)
         self.grants = SlotGrants(context)
-        self.requests = SlotRequests(context, self.transmitter.plan, self._ask, self._abandon)
+        self.requests = SlotRequests(context, self.transmitter.plan, self._ask, self.transmitter.abandon)
         self.network = NetworkMembership(
             context, self.transmitter, self.node_id, self.grants, self.requests, self.management.send
         )
@@ -125,18 +124,18 @@ class Engine:
         return self.transmitter.queue.size + len(self._limiter.waiting)
 
     def network_time(self, now: int) -> int | None:
-        """The time that all nodes of the network share (ns). None: not known."""
+        """The time that all nodes of the network share (ns); None while it is not known."""
         return self.cycle.network_time(now)
 
     def utc(self, now: int) -> tuple[int, int] | None:
-        """UTC by the master, and how far off it may be (both ns). None: not known."""
+        """UTC by the master, and how far off it may be (both ns); None while it is not known."""
         time, network = self.network_time(now), self.network
         if time is None or network.utc_error == management.NO_UTC:
             return None
         return time + network.utc_offset, network.utc_error * 1000
 
     def set_utc(self, now: int, utc: int, error: int) -> None:
-        """This node knows UTC (ns, and its error in ns): as the master it sends it to the others."""
+        """Set UTC and its error (both ns), which this node sends to the others while it is the master."""
         time = self.network_time(now)
         if time is not None and self.election.role is Role.MASTER:
             self.network.utc_offset = utc - time
@@ -153,7 +152,7 @@ class Engine:
     # The bus and time
 
     def start(self, now: int) -> Sequence[Action]:
-        """The bus can be used: listen, then join."""
+        """Listen, then join: the bus can be used."""
         self._running = True
         self.node_id.start(now)
         return self._drain()
@@ -168,7 +167,7 @@ class Engine:
         return self._drain()
 
     def receive(self, now: int, frame: Frame, stamp: int) -> Sequence[Action]:
-        """A frame of another node came in; `stamp` is the instant of its reception interrupt."""
+        """Receive a frame of another node; `stamp` is the instant of its reception interrupt."""
         identifier = frame.id
         # The codec's functions are inlined: most frames of a busy bus are for others, and only need these lines.
         if not identifier & NOT_SYNC and self._is_sync(identifier):
@@ -189,7 +188,7 @@ class Engine:
         return self._drain() if self._actions else _NOTHING
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> Sequence[Action]:
-        """What became of a frame that was to be transmitted, and when it was over (for SENT: its end)."""
+        """Take note of what became of a frame that was to be transmitted, and when it was over (for SENT: its end)."""
         self.transmitter.confirm(now, mailbox, outcome, at)
         return self._drain() if self._actions else _NOTHING
 
@@ -279,7 +278,7 @@ class Engine:
         return self._drain()
 
     def fill(self, now: int, high: int, payload: bytes | None) -> Sequence[Action]:
-        """The data that `Due` asked for; None: nothing this time. Raises `ValueError` when the size is another one."""
+        """Give the data that `Due` asked for; None: nothing this time. Raises `ValueError` for data of another size."""
         periodic = self.periodics.get(high)
         if periodic is None or not self.ready:
             return self._drain()
@@ -330,7 +329,7 @@ class Engine:
             self._start_periodic(now, periodic)
 
     def _on_stage(self, now: int) -> None:
-        """The node lost its id8, claims one or owns it."""
+        """Adapt to the new stage of the id8: lost, claimed or owned."""
         stage = self.node_id.stage
         if stage is _LISTENING:
             self._joined = False
@@ -354,10 +353,8 @@ class Engine:
 
     def _send_claim(self, now: int) -> None:
         electing = management.CLAIM_ELECTING if self.network.master is None else 0
-        node = self.node_id
-        self.management.send(
-            now, management.Claim(node.id8, node.number, self.settings.priority, node.flags | electing)
-        )
+        id8, number, flags = self.node_id.id8, self.node_id.number, self.node_id.flags | electing
+        self.management.send(now, management.Claim(id8, number, self.settings.priority, flags))
 
     # Frames
 
@@ -394,7 +391,7 @@ class Engine:
             self.node_id.mark_taken(rtcan.id8_of(message))
 
     def _on_low(self, now: int, frame: Frame, stamp: int) -> None:
-        """A frame of management, or in a network of firmware one of a topic whose high byte is as low as that."""
+        """Handle a frame of management, or among firmware one of a topic whose high byte is as low as that."""
         message = rtcan.message_of(frame.id)
         high = rtcan.high_byte(message)
         firmware = self.profile is _FIRMWARE
@@ -413,7 +410,7 @@ class Engine:
             self._actions.append(received)
 
     def _on_management(self, now: int, received: Received) -> None:
-        """A management message: of the RTCAN bus itself, or of discovery."""
+        """Handle a management message of the RTCAN bus itself; discovery's leave the engine."""
         if management.type_of(received.payload) not in management.RTCAN_TYPES:
             self._actions.append(received)
             return
@@ -422,13 +419,12 @@ class Engine:
         except DecodeError:
             self.counts["undecodable"] += 1
             return
-        if self._handlers.handle(now, message, received.source):
-            self._update_mode(now)
+        self._handlers.handle(now, message, received.source)
+        self._update_mode(now)
 
     # Timers and periodic messages
 
     def _expired(self, now: int, key: Hashable) -> None:
-        """A timer ran out."""
         match key:
             case "listened":
                 self.detector.decide(synced=self.cycle.running)
@@ -468,7 +464,7 @@ class Engine:
         self._start_ticking(now, periodic)
 
     def _start_ticking(self, now: int, periodic: PeriodicMessage) -> None:
-        """Without slots the node's own clock says when a periodic message is due."""
+        """Let the node's own clock say when a periodic message without slots is due."""
         if not periodic.active and self._joined and ("tick", periodic.high) not in self._timers:
             self._timers.set(("tick", periodic.high), now)
 
@@ -485,9 +481,6 @@ class Engine:
                 self.grants.remove(periodic.message)
             else:
                 self.management.send(now, management.Release(periodic.message))
-
-    def _abandon(self, now: int, periodic: PeriodicMessage) -> None:
-        self.transmitter.abandon(now, periodic, "slots lost")
 
     def _ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
         self._handlers.ask(now, wanted)

@@ -1,16 +1,21 @@
 """The values that pass between an RTCAN engine and its owner, besides frames: settings in, actions out. All are frozen.
+The parts of an engine put their actions into the `EngineContext` that they share.
 
 An action is an order to the CAN port (`Transmit`, `Withdraw`), a message, or an event of the node and its network.
 Instants are ns of the node's own monotonic clock. A message id is 16 bits: high byte the topic, low byte the id8.
 """
 
 import enum
+from collections import Counter
 from collections.abc import Hashable
 
 import msgspec
 
 from r2p.codecs import rtcan
+from r2p.codecs.can_bits import start_of_frame
 from r2p.codecs.rtcan import MESSAGE_MAX, MESSAGE_SHIFT, Frame
+from r2p.protocols.rtcan.cycle import Cycle, timing
+from r2p.protocols.timers import KeyedTimers
 from r2p.units import NEVER
 
 
@@ -135,7 +140,7 @@ class Received(msgspec.Struct, frozen=True, gc=False):
 
     def started(self, bit: int) -> int:
         """The start of the first frame, exact to the stuff bits; `bit` is the bit time in ns. Not cheap: about 5 us."""
-        return self.stamp - rtcan.frame_bits(self.identifier, self.payload[: rtcan.FRAME_MAX]) * bit
+        return start_of_frame(Frame(self.identifier, self.payload[: rtcan.FRAME_MAX]), self.stamp, bit)
 
 
 class Done(msgspec.Struct, frozen=True, gc=False):
@@ -219,19 +224,44 @@ class SlotsLost(msgspec.Struct, frozen=True):
     reason: str
 
 
-Action = (
-    Transmit
-    | Withdraw
-    | Received
-    | Done
-    | Due
-    | Ready
-    | IdConflict
-    | NewMaster
-    | LostSync
-    | ParameterMismatch
-    | ParametersMatch
-    | SlotsGranted
-    | SlotsRefused
-    | SlotsLost
-)
+PortAction = Transmit | Withdraw
+NetworkEvent = Ready | IdConflict | NewMaster | LostSync | ParameterMismatch | ParametersMatch
+SlotEvent = SlotsGranted | SlotsRefused | SlotsLost
+Action = PortAction | Received | Done | Due | NetworkEvent | SlotEvent
+
+
+# Inside an engine
+
+
+class EngineContext:
+    """What the parts of one engine share. Raises ValueError for slots that are too short."""
+
+    def __init__(self, settings: EngineSettings) -> None:
+        self.settings = settings
+        self.timing = timing(settings.slots, settings.cycle, settings.bit_rate)
+        self.cycle = Cycle(self.timing, settings.receive_latency)
+        self.timers = KeyedTimers()
+        self.actions: list[Action] = []
+        """What the owner of the engine has to do next, in order."""
+        self.counts: Counter[str] = Counter()
+        self._draws = 0
+
+    def draw(self, below: int) -> int:
+        """The next random number below this one. All follow from `settings.number`, so that a run can be repeated."""
+        self._draws += 1
+        return _mix(self.settings.number + self._draws) % below
+
+    def report(self, handle: Hashable, fate: Fate, *, missed: bool, at: int) -> None:
+        """Report a message that was sent or given up, if its owner wants to know; count a missed one."""
+        if missed:
+            self.counts["missed"] += 1
+        if handle is not None:
+            self.actions.append(Done(handle, fate, missed, at))
+
+
+def _mix(number: int) -> int:
+    """Splitmix64: numbers that look random, from consecutive ones."""
+    number = (number * 0x9E3779B97F4A7C15) & 0xFFFFFFFFFFFFFFFF
+    number = ((number ^ number >> 30) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF
+    number = ((number ^ number >> 27) * 0x94D049BB133111EB) & 0xFFFFFFFFFFFFFFFF
+    return number ^ number >> 31

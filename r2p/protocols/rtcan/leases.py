@@ -1,25 +1,142 @@
-"""Slots on lease: the node asks the master for slots, and says every second which ones it still needs.
+"""Periodic messages and their slots, on lease from the master: asked for, granted, and planned slot by slot.
 
-Both sides are here: `SlotRequests` at the owner of periodic messages, `SlotGrants` at the master. A lease lasts 3 s,
-for its owner from the request on, for the master from the grant on: so an owner without answers stops first. A new
-master of the same epoch renews the grants of the last one; for three cycles it grants nothing else.
+The node says every second which slots it still needs. A lease lasts 3 s, for its owner from the request on, for the
+master from the grant on: so an owner without answers stops first. A new master of the same epoch renews the grants of
+the last one; for three cycles it grants nothing else. `SlotGrants` is the master's side.
+
+At the owner, `SlotRequests` keeps the leases, and `SlotPlan` says what to do in which slot. Slots are the clock of a
+`PeriodicMessage`: `lead` before the first one of each occurrence its data are asked for, then each fragment has its
+slot. Everything lies on slot boundaries, so to wake up in time is to know the next slot.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Hashable, Iterable
+
+import msgspec
 
 from r2p.codecs import management, rtcan
-from r2p.codecs.management import NO_PHASE, Grant, Refuse, Renew, Renewed, Reserve
-from r2p.protocols.rtcan.calendar import Calendar, Reason, Refusal, Reservation
-from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import SlotsGranted, SlotsLost, SlotsRefused
-from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
+from r2p.codecs.management import NO_PHASE, Grant, Refuse, RefuseReason, Renew, Renewed, Reserve
+from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
+from r2p.protocols.rtcan.cycle import Timing, following
+from r2p.protocols.rtcan.events import EngineContext, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
 LEASE = 3_000_000_000  # ns, as the next two: two renewals may be lost
 _RENEWAL = SECOND
 _RETRY = 250_000_000
-_SERIALS = 256  # the serial of a request is a byte
 _AHEAD = 1  # cycles from a grant to its first slot: by then all nodes have the new mask
+
+
+class PeriodicMessage(msgspec.Struct, eq=False):
+    """A message that goes every `interval` ns. `lead`: how long before its slot its data are needed (ns).
+
+    `active`: its slots may be used, from `from_cycle` on. Of an occurrence: `payload` to send, frames `sent`, and
+    `waiting`, the number of the slot for which data were asked but not given yet. Without slots: `tick`, when it is due
+    next, and `ticked`, whether data were asked. Of its requests: `asked`, when each was sent, by serial; `confirmed`,
+    when the one was sent that was granted last; `refused`, the reason of the last `SlotsRefused`.
+    """
+
+    high: int
+    message: int
+    size: int
+    fragments: int
+    interval: int
+    lead: int
+    handle: Hashable
+    reservation: Reservation | None = None
+    active: bool = False
+    from_cycle: int = 0
+    payload: bytes | None = None
+    sent: int = 0
+    waiting: int | None = None
+    unknown: bool = False
+    tick: int | None = None
+    ticked: bool = False
+    asked: dict[int, int] = msgspec.field(default_factory=dict)
+    confirmed: int = LONG_AGO
+    refused: str = ""
+
+    def restart(self, payload: bytes | None = None) -> bool:
+        """Begin the next occurrence, with fresh data; return whether data of the one before were left."""
+        unfinished = self.payload is not None
+        self.payload = payload
+        self.sent = 0
+        self.waiting = None
+        self.unknown = False
+        return unfinished
+
+
+_Sends = dict[int, tuple[PeriodicMessage, int, bool]]
+_Fills = dict[int, list[tuple[PeriodicMessage, int]]]
+
+
+class SlotPlan:
+    """What to do in the slots of the current cycle. Slot 0 of the next cycle counts as the last one of this.
+
+    After the least common multiple of all periods, which is the longest of them, all comes again: each cycle up to
+    there is worked out once.
+    """
+
+    def __init__(self, timing: Timing) -> None:
+        self.periodics: dict[int, PeriodicMessage] = {}
+        """The periodic messages of this node by high byte."""
+        self.sends: _Sends = {}
+        """By slot: a message, its fragment, and whether its data are only asked for now."""
+        self.fills: _Fills = {}
+        """By slot: messages whose data are asked for now, and how many slots ahead of theirs."""
+        self.next = following((), timing.slots)
+        """By slot: the first one after it with something to do."""
+        self.own = 0
+        """A bit for each slot that this node owns."""
+        self._timing = timing
+        self._stale = True
+        self._cycles: dict[int, tuple[_Sends, _Fills, list[int], int]] = {}
+        self._span = 1  # cycles after which all comes again
+
+    def invalidate(self) -> None:
+        """Plan anew from the next cycle on: a message got or lost its slots."""
+        self._stale = True
+
+    def begin_cycle(self, cycle: int) -> None:
+        """Take up the plan of the cycle with this number."""
+        if self._stale:
+            self._restart(cycle)
+        known = self._cycles.get(cycle % self._span)
+        if known is None:
+            known = self._cycles[cycle % self._span] = self._work_out(cycle)
+        self.sends, self.fills, self.next, self.own = known
+
+    def _restart(self, cycle: int) -> None:
+        """Other messages than before have slots, some perhaps only from a later cycle on: then it is stale still."""
+        messages = self.periodics.values()
+        owners = [(each.from_cycle, each.reservation.period) for each in messages if each.active and each.reservation]
+        self._stale = any(begins > cycle for begins, _ in owners)
+        self._span = math.lcm(self._timing.slots, *[period for _, period in owners]) // self._timing.slots
+        self._cycles.clear()
+
+    def _work_out(self, cycle: int) -> tuple[_Sends, _Fills, list[int], int]:
+        sends: _Sends = {}
+        fills: _Fills = {}
+        for each in self.periodics.values():
+            if each.active and each.reservation is not None:
+                self._enter(sends, fills, cycle, each, each.reservation)
+        own = sum(1 << slot for slot in sends)
+        return sends, fills, following(sends.keys() | fills.keys(), self._timing.slots), own
+
+    def _enter(self, sends: _Sends, fills: _Fills, cycle: int, each: PeriodicMessage, reservation: Reservation) -> None:
+        slots = self._timing.slots
+        # Whole slots, rounded up; but not before the occurrence before this one is through.
+        lead = min(-(-each.lead // self._timing.slot), reservation.period - each.fragments)
+        start = cycle * slots
+        if cycle >= each.from_cycle:
+            for slot in _set_bits(occupied(reservation, start, slots)):
+                fragment = (start + slot - reservation.phase) % reservation.period
+                sends[slot] = each, fragment, not lead and not fragment
+        if lead:
+            # Data may be asked for in this cycle for a slot of a later one.
+            first = reservation.first_from(max(start + 1 + lead, each.from_cycle * slots))
+            for number in range(first, start + slots + lead + 1, reservation.period):
+                fills.setdefault(number - lead - start, []).append((each, lead))
 
 
 class SlotGrants:
@@ -52,23 +169,22 @@ class SlotGrants:
             outcome = self.calendar.admit(wanted.message, wanted.period, wanted.fragments, round_down=round_down)
         if isinstance(outcome, Refusal):
             self._timers.clear(("granted", wanted.message))
-            reason = int(outcome.reason)
-            period, fragments, other, rival = outcome.period, outcome.fragments, outcome.other, outcome.rival
-            return Refuse(wanted.message, wanted.serial, reason, fragments, period, other, rival)
+            _, reason, period, fragments, other, rival = msgspec.structs.astuple(outcome)
+            return Refuse(wanted.message, wanted.serial, int(reason), fragments, period, other, rival)
         self._timers.set(("granted", wanted.message), now + LEASE)
-        period, phase, fragments = outcome.period, outcome.phase, outcome.fragments
         start = self._cycle.counter + (0 if outcome == held else _AHEAD)  # what it had is in all masks already
+        _, period, phase, fragments = msgspec.structs.astuple(outcome)
         return Grant(wanted.message, wanted.serial, fragments, period, phase, start, epoch, LEASE // MILLISECOND)
 
     def renew(self, now: int, wanted: Renew, id8: int) -> Renewed:
-        """A module still needs its slots: prolong their leases. Those without a grant are missing in the answer."""
+        """Prolong the leases that a module still needs. Those without a grant are missing in the answer."""
         held = [high for high in wanted.highs if high and self.calendar.get(rtcan.message_id(high, id8)) is not None]
         for high in held:
             self._timers.set(("granted", rtcan.message_id(high, id8)), now + LEASE)
         return Renewed(id8, wanted.serial, LEASE // MILLISECOND, bytes(held).ljust(management.RENEW_MAX, b"\0"))
 
     def remove(self, message: int) -> None:
-        """The slots of a message come free: its owner gave them back, or did not renew the lease."""
+        """Free the slots of a message: its owner gave them back, or did not renew the lease."""
         self.calendar.remove(message)
         self._timers.clear(("granted", message))
 
@@ -84,7 +200,7 @@ class SlotRequests:
         context: EngineContext,
         plan: SlotPlan,
         ask: Callable[[int, Reserve | Renew], None],
-        abandon: Callable[[int, PeriodicMessage], None],
+        abandon: Callable[[int, PeriodicMessage, str], None],
     ) -> None:
         self.has_master = False
         """Whether there is a master to ask."""
@@ -97,12 +213,9 @@ class SlotRequests:
         self._abandon = abandon
         self._enabled = context.settings.reserves
         self._serial = 0
-        self._asked: dict[int, dict[int, int]] = {}  # by high byte: when slots were asked for, by serial
-        self._confirmed: dict[int, int] = {}  # by high byte: when the request was sent that was granted last
-        self._refused: dict[int, str] = {}  # by high byte: the reason of the last `SlotsRefused`
 
     def resume(self, now: int) -> None:
-        """There is a master: ask it for slots."""
+        """Ask for slots, now that there is a master."""
         self.has_master = True
         for each in self._periodics.values():
             self.schedule(now, each)
@@ -114,7 +227,7 @@ class SlotRequests:
             self.suspend(now, each, reason)
 
     def revoke_all(self, now: int, reason: str) -> None:
-        """All slots are gone: they were granted in another network."""
+        """Give up all slots: they were granted in another network."""
         for each in self._periodics.values():
             self.revoke(now, each, reason)
 
@@ -129,15 +242,12 @@ class SlotRequests:
         return periodic if periodic is not None and periodic.message == message else None
 
     def forget(self, periodic: PeriodicMessage) -> bool:
-        """The message ends. Says whether it had slots."""
+        """Drop a message that has ended; return whether it had slots."""
         had = periodic.reservation is not None
         periodic.reservation = None
         periodic.active = False
         for kind in "ask", "lease":
             self._timers.clear((kind, periodic.high))
-        self._asked.pop(periodic.high, None)
-        self._confirmed.pop(periodic.high, None)
-        self._refused.pop(periodic.high, None)
         self._plan.invalidate()
         return had
 
@@ -146,7 +256,7 @@ class SlotRequests:
         if not self.has_master or periodic.active:
             return
         self._timers.set(("ask", periodic.high), now + _RETRY)
-        serial = self._next_serial(now, periodic.high)
+        serial = self._next_serial(now, periodic)
         held = periodic.reservation
         if held is not None:
             self._ask(now, Reserve(periodic.message, serial, held.fragments, held.period, held.phase))
@@ -157,27 +267,26 @@ class SlotRequests:
 
     def renew(self, now: int) -> None:
         """Tell the master which slots are still needed."""
-        highs = [each.high for each in self._periodics.values() if each.active]
-        if not self.has_master or not highs:
+        active = [each for each in self._periodics.values() if each.active]
+        if not self.has_master or not active:
             return
         self._timers.set("renew", now + _RENEWAL)
-        for first in range(0, len(highs), management.RENEW_MAX):
-            part = bytes(highs[first : first + management.RENEW_MAX])
-            serial = self._next_serial(now, *part)
-            self._ask(now, Renew(serial, part.ljust(management.RENEW_MAX, b"\0")))
+        for first in range(0, len(active), management.RENEW_MAX):
+            part = active[first : first + management.RENEW_MAX]
+            highs = bytes(each.high for each in part).ljust(management.RENEW_MAX, b"\0")
+            self._ask(now, Renew(self._next_serial(now, *part), highs))
 
     def on_grant(self, now: int, periodic: PeriodicMessage, grant: Grant) -> None:
-        """The master grants slots. On a full bus that takes time: the lease runs from the request on."""
-        asked = self._asked.get(periodic.high, {}).get(grant.serial)
+        """Use the slots that the master grants. On a full bus that takes time: the lease runs from the request on."""
+        asked = periodic.asked.get(grant.serial)
         if asked is None or grant.fragments != periodic.fragments or grant.period <= grant.fragments:
             return
+        self._confirm(periodic, asked, grant.lease_ms)
         if periodic.active:
-            self._confirm(periodic, asked, grant.lease_ms)
             return
         periodic.reservation = Reservation(periodic.message, grant.period, grant.phase, grant.fragments)
-        self._refused.pop(periodic.high, None)
+        periodic.refused = ""
         self._timers.clear(("ask", periodic.high))
-        self._confirm(periodic, asked, grant.lease_ms)
         if "renew" not in self._timers:
             self._timers.set("renew", now + _RENEWAL)
         periodic.active = True
@@ -188,60 +297,65 @@ class SlotRequests:
         self._actions.append(SlotsGranted(periodic.high, grant.period, grant.phase, interval))
 
     def on_renewed(self, now: int, answer: Renewed) -> None:
-        """The master prolongs leases, perhaps late. Slots that it no longer knows are requested again."""
-        for high, asked_at in list(self._asked.items()):
-            periodic, asked = self._periodics.get(high), asked_at.get(answer.serial)
-            if asked is None or periodic is None or not periodic.active:
+        """Prolong leases as the master says, perhaps late. Slots that it no longer knows are requested again."""
+        for periodic in self._periodics.values():
+            asked = periodic.asked.get(answer.serial)
+            if asked is None or not periodic.active:
                 continue
-            if high in answer.highs:
+            if periodic.high in answer.highs:
                 self._confirm(periodic, asked, answer.lease_ms)
-            elif asked > self._confirmed.get(high, LONG_AGO):  # else the answer is older than the grant
+            elif asked > periodic.confirmed:  # else the answer is older than the grant
                 self.suspend(now, periodic, "the master does not know of it")
                 self.schedule(now, periodic)
 
     def on_refuse(self, now: int, periodic: PeriodicMessage, refuse: Refuse) -> None:
-        """The master refuses slots."""
-        if periodic.active or refuse.serial not in self._asked.get(periodic.high, {}):
+        """Give up slots that the master refuses, and ask again later: they may come free."""
+        if periodic.active or refuse.serial not in periodic.asked:
             return
         try:
-            reason = Reason(refuse.reason)
+            reason = RefuseReason(refuse.reason)
         except ValueError:  # of a newer version
             return
         period, fragments, other, rival = refuse.period, refuse.fragments, refuse.other, refuse.rival
         text = Refusal(periodic.message, reason, period, fragments, other, rival).text
         self.revoke(now, periodic, text)
-        self._timers.set(("ask", periodic.high), now + (_RETRY if reason == Reason.TAKEN else _RENEWAL))
-        if self._refused.get(periodic.high) != text:
-            self._refused[periodic.high] = text
+        # Other slots than those that were taken may well be free, so this is asked soon.
+        self._timers.set(("ask", periodic.high), now + (_RETRY if reason is RefuseReason.TAKEN else _RENEWAL))
+        if periodic.refused != text:
+            periodic.refused = text
             self._actions.append(SlotsRefused(periodic.high, text))
 
     def revoke(self, now: int, periodic: PeriodicMessage, reason: str) -> None:
-        """Its slots are gone. Answers to earlier requests no longer count."""
+        """Give up the slots of a message. Answers to earlier requests no longer count."""
         periodic.reservation = None
-        self._asked.pop(periodic.high, None)
+        periodic.asked.clear()
         self.suspend(now, periodic, reason)
 
     def suspend(self, now: int, periodic: PeriodicMessage, reason: str) -> None:
-        """Its slots may not be used until a master has confirmed them."""
+        """Stop using the slots of a message until a master has confirmed them."""
         self._timers.clear(("lease", periodic.high))
         if periodic.active:
             periodic.active = False
             if periodic.payload is not None:
-                self._abandon(now, periodic)
+                self._abandon(now, periodic, "slots lost")
             periodic.restart()
             self._plan.invalidate()
             self._actions.append(SlotsLost(periodic.high, reason))
 
-    def _next_serial(self, now: int, *highs: int) -> int:
-        self._serial = (self._serial + 1) % _SERIALS
-        for high in highs:
+    def _next_serial(self, now: int, *periodics: PeriodicMessage) -> int:
+        self._serial = (self._serial + 1) % management.REQUEST_SERIALS
+        for each in periodics:
             # Late answers to all requests of the last 3 s count; older ones would grant a lease that is over.
-            asked = {serial: at for serial, at in self._asked.get(high, {}).items() if now < at + LEASE}
-            self._asked[high] = asked | {self._serial: now}
+            each.asked = {serial: at for serial, at in each.asked.items() if now < at + LEASE} | {self._serial: now}
         return self._serial
 
     def _confirm(self, periodic: PeriodicMessage, asked: int, lease_ms: int) -> None:
-        """The lease runs on; answers may come out of order."""
-        if asked >= self._confirmed.get(periodic.high, LONG_AGO):
-            self._confirmed[periodic.high] = asked
+        if asked >= periodic.confirmed:  # answers may come out of order
+            periodic.confirmed = asked
             self._timers.set(("lease", periodic.high), asked + lease_ms * MILLISECOND)
+
+
+def _set_bits(bits: int) -> Iterable[int]:
+    while bits:
+        yield (bits & -bits).bit_length() - 1
+        bits &= bits - 1

@@ -7,16 +7,13 @@ for slots while this node is the master. All others are for discovery, and leave
 
 from collections import Counter, deque
 from collections.abc import Callable, Hashable
-from typing import Any
 
 from r2p.codecs import management, rtcan
-from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import Fate, Profile
-from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
+from r2p.protocols.rtcan.events import EngineContext, Fate, Profile
+from r2p.protocols.rtcan.leases import PeriodicMessage, SlotGrants, SlotRequests
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.network import Detector, NetworkMembership
 from r2p.protocols.rtcan.node_id import NodeId
-from r2p.protocols.rtcan.plan import PeriodicMessage
 from r2p.protocols.rtcan.queue import QueuedMessage
 from r2p.protocols.rtcan.transmitter import SlotTransmitter
 from r2p.units import LONG_AGO, MILLISECOND, NEVER
@@ -45,9 +42,9 @@ class RateLimiter:
         self._delay: int | None = None  # drawn when it is needed: most networks are not of firmware
 
     def put(self, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Hashable:
-        """Send it when it is quiet, `urgent` ones first, in order.
+        """Queue a message to be sent when it is quiet, `urgent` ones first, in order.
 
-        The oldest that is not urgent is dropped when there are too many: its handle comes back.
+        When there are too many, the oldest that is not urgent is dropped; return its handle.
         """
         dropped: Hashable = None
         if len(self.waiting) >= _MAX:
@@ -64,7 +61,7 @@ class RateLimiter:
         return dropped
 
     def on_traffic(self, now: int) -> None:
-        """A management frame was sent, by any node."""
+        """Wait for silence again: a node has sent a management frame."""
         self._quiet_from = now
         self._delay = None
 
@@ -78,7 +75,7 @@ class RateLimiter:
         return self._quiet_from + QUIET + self._delay
 
     def pop(self, now: int) -> tuple[bytes, Hashable] | None:
-        """The message that may go now, and its handle."""
+        """Take the message that may go now, with its handle."""
         if self.due > now:
             return None
         self.on_traffic(now)
@@ -86,7 +83,7 @@ class RateLimiter:
         return self.waiting.popleft()
 
     def clear(self) -> list[Hashable]:
-        """Drop all; their handles come back."""
+        """Drop all; return their handles."""
         handles = [handle for _, handle in self.waiting]
         self.waiting.clear()
         self._urgent = 0
@@ -140,7 +137,7 @@ class ManagementSender:
 
 
 class ManagementHandlers:
-    """A handler for each management message of the RTCAN bus itself.
+    """Acts on the management messages of the RTCAN bus itself.
 
     `send(now, message)` sends management; `start_ticking(now, periodic)` lets a message go on without slots.
     """
@@ -158,81 +155,56 @@ class ManagementHandlers:
         self._requests = requests
         self._send = send
         self._start_ticking = start_ticking
-        self._handlers: dict[type, Callable[[int, Any, int], None]] = {
-            management.Network: self._on_network,
-            management.Claim: self._on_claim,
-            management.Reserve: self._on_reserve,
-            management.Grant: self._on_grant,
-            management.Refuse: self._on_refuse,
-            management.Release: self._on_release,
-            management.Renew: self._on_renew,
-            management.Renewed: self._on_renewed,
-        }
 
-    def handle(self, now: int, message: management.Management, source: int) -> bool:
-        """Act on a message of the node with the id8 `source`. Says whether there is a handler for it."""
-        handler = self._handlers.get(type(message))
-        if handler is not None:
-            handler(now, message, source)
-        return handler is not None
+    def handle(self, now: int, message: management.Management, source: int) -> None:
+        """Act on a message of the node with the id8 `source`.
+
+        Only the owner of a message id may speak of it, and only the master that this node follows may answer.
+        """
+        network = self._network
+        match message:
+            case management.Network(id8=id8) if id8 == source:
+                network.on_network(now, message)
+            case management.Claim():
+                network.node_id.on_claim(now, message)
+                network.on_claim(now, message)
+            case management.Reserve() | management.Renew() if self._is_master:
+                if (answer := self._answer(now, message, source)) is not None:
+                    self._send(now, answer)
+            case management.Release(of) if self._is_master and rtcan.id8_of(of) == source:
+                self._grants.remove(of)
+            case management.Renewed(id8=id8) if id8 == network.node_id.id8 and source == network.master:
+                self._requests.on_renewed(now, message)
+            case management.Grant() | management.Refuse() if source == network.master:
+                self._on_answer(now, message)
 
     def ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
         """Ask the master for slots, which may be this node."""
+        id8 = self._network.node_id.id8
         if not self._is_master:
             self._send(now, wanted)
-            return
-        id8 = self._network.node_id.id8
-        # Its own answer never goes over the bus: handle it as if it had.
-        answer = self._answer(now, wanted, id8)
-        if answer is not None:
-            self._handlers[type(answer)](now, answer, id8)
+        elif (answer := self._answer(now, wanted, id8)) is not None:
+            self.handle(now, answer, id8)  # its own answer never goes over the bus
 
     @property
     def _is_master(self) -> bool:
         return self._network.election.role is Role.MASTER
 
     def _answer(
-        self, now: int, wanted: management.Reserve | management.Renew, id8: int
+        self, now: int, wanted: management.Reserve | management.Renew, source: int
     ) -> management.Grant | management.Refuse | management.Renewed | None:
         if isinstance(wanted, management.Renew):
-            return self._grants.renew(now, wanted, id8)
+            return self._grants.renew(now, wanted, source)
+        if rtcan.id8_of(wanted.message) != source:
+            return None
         return self._grants.answer(now, wanted, self._network.epoch or 0)
 
-    # Only the owner of a message id may speak of it, and only the master that this node follows may answer.
-
-    def _on_network(self, now: int, message: management.Network, source: int) -> None:
-        if message.id8 == source:
-            self._network.on_network(now, message)
-
-    def _on_claim(self, now: int, message: management.Claim, source: int) -> None:
-        self._network.node_id.on_claim(now, message)
-        self._network.on_claim(now, message)
-
-    def _on_reserve(self, now: int, message: management.Reserve, source: int) -> None:
-        if self._is_master and rtcan.id8_of(message.message) == source:
-            answer = self._answer(now, message, source)
-            if answer is not None:
-                self._send(now, answer)
-
-    def _on_renew(self, now: int, message: management.Renew, source: int) -> None:
-        if self._is_master:
-            self._send(now, self._grants.renew(now, message, source))
-
-    def _on_renewed(self, now: int, message: management.Renewed, source: int) -> None:
-        if message.id8 == self._network.node_id.id8 and source == self._network.master:
-            self._requests.on_renewed(now, message)
-
-    def _on_grant(self, now: int, message: management.Grant, source: int) -> None:
-        periodic = self._requests.periodic_with(message.message)
-        if periodic is not None and source == self._network.master and message.epoch == self._network.epoch:
-            self._requests.on_grant(now, periodic, message)
-
-    def _on_refuse(self, now: int, message: management.Refuse, source: int) -> None:
-        periodic = self._requests.periodic_with(message.message)
-        if periodic is not None and source == self._network.master:
-            self._requests.on_refuse(now, periodic, message)
+    def _on_answer(self, now: int, answer: management.Grant | management.Refuse) -> None:
+        periodic = self._requests.periodic_with(answer.message)
+        if periodic is None:
+            return
+        if isinstance(answer, management.Refuse):
+            self._requests.on_refuse(now, periodic, answer)
             self._start_ticking(now, periodic)
-
-    def _on_release(self, now: int, message: management.Release, source: int) -> None:
-        if self._is_master and rtcan.id8_of(message.message) == source:
-            self._grants.remove(message.message)
+        elif answer.epoch == self._network.epoch:
+            self._requests.on_grant(now, periodic, answer)

@@ -11,10 +11,9 @@ that comes later does not depose a master that is there.
 import enum
 from collections.abc import Callable
 
-from r2p.codecs import rtcan
-from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.cycle import HOLDOVER
-from r2p.protocols.rtcan.events import Outcome
+from r2p.codecs.can_bits import start_of_frame
+from r2p.protocols.rtcan.cycle import HOLDOVER, SYNC_ONLY
+from r2p.protocols.rtcan.events import EngineContext, Outcome
 from r2p.protocols.rtcan.leases import SlotGrants
 from r2p.protocols.rtcan.transmitter import FirstSync, SlotTransmitter
 
@@ -25,6 +24,7 @@ _COLLECTING = 3  # cycles in which a new master only renews what the last one gr
 # Attempts after the first one to send the first sync, which may collide. A node alone gets no acknowledge: it leads all
 # the same.
 _RETRIES = 4
+_RETRY_PAUSE_MAX = 20_000_000  # ns, drawn at random: two nodes that collided would else collide again
 
 
 class Role(enum.Enum):
@@ -48,7 +48,7 @@ class Election:
         self._waited_for = 0  # better candidates that had their time to be elected
 
     def on_claim(self, now: int, id8: int, priority: int) -> None:
-        """A node sent its claim."""
+        """Note the claim of a node."""
         if priority:
             self._candidates[id8] = priority, now
         else:
@@ -64,7 +64,9 @@ class Election:
 
     def decide(self, now: int, id8: int) -> bool:
         """End the collection window; return whether this node is elected."""
-        better = self._better(now, id8)
+        mine = (self._priority, id8)
+        known = [(priority, other) for other, (priority, at) in self._candidates.items() if now < at + FRESH]
+        better = sum(candidate > mine for candidate in known)
         if better > self._waited_for:
             self._timers.set("election", now + (better - self._waited_for) * self._window)
             self._waited_for = better
@@ -73,12 +75,8 @@ class Election:
             self.role = Role.NONE
         return bool(self._priority)
 
-    def retry(self, at: int) -> None:
-        """The first sync did not get through: decide again then."""
-        self._timers.set("election", at)
-
     def end(self, role: Role) -> None:
-        """The election is over, with this role."""
+        """End the election with this role."""
         self.role = role
         self._timers.clear("election")
 
@@ -86,17 +84,12 @@ class Election:
         """Whether this node, with this id8, is the better master than `other`."""
         return (self._priority, id8) > (priority, other)
 
-    def _better(self, now: int, id8: int) -> int:
-        """How many candidates are better."""
-        mine = (self._priority, id8)
-        return sum((priority, other) > mine for other, (priority, at) in self._candidates.items() if now < at + FRESH)
-
 
 class MasterRole:
     """The master's part of one node: the first sync of all, then one at the start of every cycle.
 
-    `on_elected(now, inherits)`: this node is the master from now on; `retry(now)`: call `start_network` later. A master
-    that inherits a network renews leases for three cycles before it grants anything new.
+    `on_elected(now, inherits)`: this node is the master from now on. A master that inherits a network renews leases for
+    three cycles before it grants anything new.
     """
 
     def __init__(
@@ -105,14 +98,13 @@ class MasterRole:
         transmitter: SlotTransmitter,
         grants: SlotGrants,
         on_elected: Callable[[int, bool], None],
-        retry: Callable[[int], None],
     ) -> None:
+        self._context = context
         self._cycle = context.cycle
         self._transmitter = transmitter
         self._grants = grants
         self._on_elected = on_elected
-        self._retry = retry
-        self._first: tuple[rtcan.Frame, int, int, int] | None = None  # the first sync with the port: start, count, mask
+        self._first: FirstSync | None = None  # with the port
         self._retries = 0
         self._collecting = 0
         self._inherits = False
@@ -120,14 +112,10 @@ class MasterRole:
     def start_network(self, now: int, *, inherits: bool) -> None:
         """Send the first sync. If it `inherits`, the network of before goes on: the grid, the count, the leases."""
         self._grants.clear()
-        self._inherits = self._cycle.anchored = inherits
-        self._collecting = _COLLECTING if inherits else 0
-        self._grants.collecting = inherits
-        start, counter = self._cycle.upcoming(now)
-        mask = self._grants.calendar.mask(counter)
-        frame = rtcan.encode_sync(counter, mask)
-        if self._transmitter.send_first_sync(FirstSync(self._first_confirmed), frame, start):
-            self._first = frame, start, counter, mask
+        self._set_inherits(inherits)
+        first = FirstSync(*self._cycle.first_sync(now, inherits=inherits), self._first_confirmed)
+        if self._transmitter.send_first_sync(first):
+            self._first = first
         else:
             self._retry(now)
 
@@ -140,7 +128,9 @@ class MasterRole:
         self._first = None
 
     def begin_cycle(self, now: int) -> bool:
-        """Begin the next cycle with a sync. False: this node stood still too long to stay master."""
+        """Begin the next cycle with a sync; return False if this node stood still too long to stay master."""
+        # Slaves lose the cycle after HOLDOVER + 1 cycles without a sync, and then collect claims for _WINDOW cycles: a
+        # sync within one cycle of that still comes before another master's.
         if now > self._cycle.reference + (HOLDOVER + 2) * self._cycle.timing.cycle:
             return False
         if self._collecting:
@@ -156,18 +146,24 @@ class MasterRole:
         self._cycle.stop()
         self._grants.clear()
 
+    def _set_inherits(self, inherits: bool) -> None:
+        self._inherits = self._grants.collecting = inherits
+        self._collecting = _COLLECTING if inherits else 0
+
+    def _retry(self, now: int) -> None:
+        """Decide the election again a bit later: the first sync is tried again unless another node was first."""
+        self._context.timers.set("election", now + self._context.draw(_RETRY_PAUSE_MAX))
+
     def _first_confirmed(self, now: int, outcome: Outcome, at: int) -> None:
         """Lead, or try again, by what became of the first sync."""
-        if self._first is None:
+        first, self._first = self._first, None
+        if first is None:  # cancelled meanwhile
             return
-        frame, planned, counter, mask = self._first
-        self._first = None
         if outcome is Outcome.SENT:
-            start = at - rtcan.frame_bits(frame.id, frame.data) * self._cycle.timing.bit
-            if self._inherits and not self._cycle.delay(max(0, start - planned)):
-                self._inherits = self._grants.collecting = False
-                self._collecting = 0
-            self._lead(now, start, counter, mask)
+            start = start_of_frame(first.frame, at, self._cycle.timing.bit)
+            if self._inherits and not self._cycle.delay(max(0, start - first.start)):
+                self._set_inherits(False)
+            self._lead(now, start, first.counter, SYNC_ONLY)
         elif outcome is not Outcome.UNKNOWN and self._retries < _RETRIES:
             self._retries += 1
             self._retry(now)

@@ -10,7 +10,7 @@ from collections import Counter, deque
 
 import msgspec
 
-from r2p.codecs import management, rtcan
+from r2p.codecs import can_bits, management, rtcan
 from r2p.codecs.rtcan import Frame, Identifier, OtherFrame
 from r2p.errors import DecodeError
 from r2p.protocols.rtcan.cycle import Timing
@@ -131,7 +131,7 @@ class BusDirectory:
         self._greeted: set[int] = set()  # id8 with a name from a HELLO: a gateway also passes ALIVE on
 
     def learn(self, data: bytes, source: int) -> str:
-        """Learn from a management message of this id8 (0: firmware, which does not say). Its description comes back."""
+        """Learn from a management message of this id8 (0: firmware, which does not say); return its description."""
         try:
             message = management.decode(data)
         except DecodeError:
@@ -171,9 +171,7 @@ class Monitor:
         """Whole cycles watched since the last `reset`."""
         self.last_frame = 0
         """When the last frame was on the bus."""
-        self._period = 0
-        self._end = NEVER  # of the current period
-        self._loads: deque[BusLoad] = deque()  # of those that are over
+        self._loads: deque[BusLoad] = deque()  # of the periods that are over
         self._reassembly = Reassembly()
         self._sync: int | None = None  # start of the current cycle
         self._cycle = 0
@@ -181,17 +179,12 @@ class Monitor:
         self._filled: set[int] = set()
         self.reset(0)
 
-    def reset(self, now: int) -> None:
-        """Count from now on, until the next `reset`."""
-        self._end = NEVER
-        self._loads.clear()
-        self._begin_period(now)
-
-    def begin(self, now: int, period: int) -> None:
+    def reset(self, now: int, period: int = NEVER) -> None:
         """Count from now on, in periods of so many ns, each of which `next_load` gives once."""
-        self.reset(now)
         self._period = period
         self._end = now + period
+        self._loads.clear()
+        self._begin_period(now)
 
     def next_load(self) -> BusLoad:
         """The load of the next period that is over; call it when all frames of that are here."""
@@ -221,16 +214,16 @@ class Monitor:
         self._whole = False
 
     def fault(self, kind: str) -> None:
-        """An error frame, or another fault that the interface reports."""
+        """Count an error frame, or another fault that the interface reports."""
         self._faults[kind] += 1
 
     def frame(self, frame: Frame, stamp: int) -> SeenFrame:
-        """A frame was on the bus until `stamp`."""
+        """Count a frame that was on the bus until `stamp`."""
         self._on_bus(stamp)
         identifier = rtcan.decode_identifier(frame.id)
-        message = identifier.message
+        message = identifier.message_id
         kind = self._kind_of(frame, identifier)
-        bits = rtcan.frame_bits(frame.id, frame.data)
+        bits = can_bits.frame_bits(frame.id, frame.data)
         start = stamp - bits * self.directory.timing.bit
         if kind is FrameKind.SYNC:
             self._begin_cycle(start, frame)
@@ -248,7 +241,7 @@ class Monitor:
             "" if kind is FrameKind.SYNC else self.directory.module(message),
             identifier.laxity,
             identifier.left,
-            bits + rtcan.INTERMISSION,
+            bits + can_bits.INTERMISSION,
             rtcan.fragment_count(size) if size and size <= rtcan.PAYLOAD_MAX else None,
             self._cycle if self._sync is not None else None,
             slot,
@@ -256,9 +249,9 @@ class Monitor:
         )
 
     def other(self, frame: OtherFrame, stamp: int) -> SeenFrame:
-        """A frame that RTCAN does not use was on the bus until `stamp`."""
+        """Count a frame that RTCAN does not use, and that was on the bus until `stamp`."""
         self._on_bus(stamp)
-        bits = rtcan.other_frame_bits(frame)
+        bits = can_bits.other_frame_bits(frame)
         slot = self._slot_of(stamp - bits * self.directory.timing.bit, _OTHER, FrameKind.OTHER)
         self._count(_OTHER, FrameKind.OTHER, bits)
         text = f"{'29-bit' if frame.extended else '11-bit'} identifier {frame.id:X}"
@@ -266,7 +259,7 @@ class Monitor:
             text += f", asks for {frame.remote} bytes"
         cycle = self._cycle if self._sync is not None else None
         seen = Frame(frame.id, frame.data)
-        bits += rtcan.INTERMISSION
+        bits += can_bits.INTERMISSION
         return SeenFrame(stamp, seen, FrameKind.OTHER, "", "", 0, 0, bits, None, cycle, slot, text)
 
     def _on_bus(self, stamp: int) -> None:
@@ -277,7 +270,7 @@ class Monitor:
     def _count(self, message: int, kind: FrameKind, bits: int) -> None:
         tally = self._tallies.setdefault((message, kind), TrafficCount())
         tally.frames += 1
-        tally.bits += bits + rtcan.INTERMISSION
+        tally.bits += bits + can_bits.INTERMISSION
 
     @property
     def slots(self) -> list[BusSlot]:
@@ -303,7 +296,7 @@ class Monitor:
             total.bits += tally.bits
         timing = self.directory.timing
         reserved = min(1.0, self._reserved * timing.slot / elapsed) if elapsed else 0.0
-        longest = (rtcan.frame_bits_max(rtcan.FRAME_MAX) + rtcan.INTERMISSION) * timing.bit
+        longest = (can_bits.frame_bits_max(rtcan.FRAME_MAX) + can_bits.INTERMISSION) * timing.bit
         free = (1.0 - reserved) * elapsed / timing.slot * (timing.slot // longest) if self._reserved else 0.0
         return BusLoad(elapsed, timing.bit, tallies, dict(self._faults), reserved, free, gap)
 
@@ -318,7 +311,7 @@ class Monitor:
         self._reserved += self._mask.bit_count()
 
     def _end_cycle(self) -> None:
-        """The cycle that ends was watched from its beginning."""
+        """Count the slots of a cycle that was watched from its beginning."""
         self.cycles += 1
         self._grow(self._mask.bit_length() - 1)
         for index, slot in enumerate(self._slots):
@@ -369,16 +362,14 @@ class Monitor:
         return text
 
     def _kind_of(self, frame: Frame, identifier: Identifier) -> FrameKind:
-        message, laxity = identifier.message, identifier.laxity
-        if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX and not self._ends_management(message):
+        message, laxity = identifier.message_id, identifier.laxity
+        # Firmware that has no time left ends its management with the identifier of the sync of cycle 0.
+        ends_management = message == rtcan.FIRMWARE_MANAGEMENT and self._reassembly.ends_with_next(message)
+        if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX and not ends_management:
             return FrameKind.SYNC
         if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.directory.topics:
             return FrameKind.MANAGEMENT  # firmware of 2014 may have topics there
         return FrameKind.HRT if laxity == rtcan.HRT else FrameKind.NRT if laxity == rtcan.NRT else FrameKind.SRT
-
-    def _ends_management(self, message: int) -> bool:
-        """Firmware that has no time left ends its management with the identifier of the sync of cycle 0."""
-        return message == rtcan.FIRMWARE_MANAGEMENT and self._reassembly.ends_with_next(message)
 
 
 def describe(message: management.Management) -> str:

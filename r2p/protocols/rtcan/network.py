@@ -18,9 +18,8 @@ import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.rtcan import CYCLE_MASK, Frame
-from r2p.protocols.rtcan.context import EngineContext
 from r2p.protocols.rtcan.cycle import Alignment, Cycle, CycleState
-from r2p.protocols.rtcan.events import LostSync, NewMaster, ParameterMismatch, ParametersMatch, Profile
+from r2p.protocols.rtcan.events import EngineContext, LostSync, NewMaster, ParameterMismatch, ParametersMatch, Profile
 from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
 from r2p.protocols.rtcan.master import Election, MasterRole, Role
 from r2p.protocols.rtcan.node_id import NodeId, Stage
@@ -32,9 +31,7 @@ REPEAT = SECOND
 FORGOTTEN = 3_000_000_000
 """A master without NETWORK for this long is gone (ns): two may be lost."""
 _ANSWER_APART = 3  # cycles between two NETWORK that answer others
-_LONGEST = (1 << 63) - 1  # ns, 292 years: no network lasts longer, and no field of ours could say so
-_EPOCHS = (1 << 32) - 1  # u32 on the wire, and never 0
-_PAUSE = 20_000_000  # ns before the first sync is tried again, at most
+_TIME_MAX = (1 << 63) - 1  # ns, 292 years: no network lasts longer, and no field could say so
 _UNKNOWN_MASTER = 1_200_000_000  # ns; a master that sends no NETWORK for so long is firmware
 _NEAR = 4  # cycles that a NETWORK may be late, or extrapolating from the last one be wrong
 _YIELDED = 3  # cycles after which a lesser master's syncs are over
@@ -59,11 +56,11 @@ class Detector:
         self._firmware = False
 
     def firmware_seen(self) -> None:
-        """A frame with high byte 0 that is not a sync was received."""
+        """Note a frame with high byte 0 that is not a sync: only firmware sends such ones."""
         self._firmware = True
 
     def decide(self, *, synced: bool) -> None:
-        """The time to listen is over; `synced` says whether there are sync frames."""
+        """Decide, after listening, what kind of network it is; `synced`: there are sync frames."""
         if self.profile is Profile.AUTO:
             self.profile = Profile.FIRMWARE if self._firmware and not synced else Profile.RTCAN
 
@@ -80,7 +77,7 @@ class MasterTracker:
         self._since = 0
 
     def on_network(self, now: int, network: management.Network, master: int | None, epoch: int | None) -> bool:
-        """A master sent NETWORK; ours so far is `master`. Says whether it is of ours."""
+        """Note a NETWORK, and return whether it is of the node's master, which so far is `master`."""
         self._latest = now, network
         rank = network.priority, network.id8
         if self._is_another(now, network, master, epoch):
@@ -96,13 +93,13 @@ class MasterTracker:
         return (network.slots, network.slot) == (timing.slots, timing.slot)
 
     def on_started(self, now: int) -> management.Network | None:
-        """A cycle has started. The last NETWORK comes back, brought up to date, if its counter fits this cycle."""
+        """Note that a cycle has started; return the last NETWORK, brought up to date, if its counter fits."""
         self._since = now
         self._rival = None
         return self._recall(now, self._latest)
 
     def on_aligned(self, now: int) -> management.Network | None:
-        """One more sync on our grid. If it must be another master's than ours, the NETWORK of that comes back."""
+        """Note one more sync on the grid; return the NETWORK of another master than so far if it must be that one's."""
         rival = self._rival
         if rival is None or now < rival[0] + _YIELDED * self._cycle.timing.cycle:
             return None
@@ -110,11 +107,11 @@ class MasterTracker:
         return self._recall(now, rival)
 
     def on_foreign(self) -> None:
-        """A sync is off our grid: the rival sends that one, ours is still our master's."""
+        """Note a sync off the grid: it is the rival's, and those on the grid are still the master's."""
         self._rival = None
 
     def has_our_length(self, now: int) -> bool | None:
-        """Whether the cycle of a master that sends no NETWORK is as long as ours; None: not known yet."""
+        """Whether the cycle of a master that sends no NETWORK is as long as this node's; None if not known yet."""
         measured = self._cycle.measured()
         if now < self._since + _UNKNOWN_MASTER or measured is None:
             return None
@@ -123,18 +120,18 @@ class MasterTracker:
         return abs(length - ours) <= ours // 1000 + error  # clocks differ less, other numbers of slots more
 
     def forget(self, master: int | None) -> None:
-        """This master's syncs are over."""
+        """Forget a master whose syncs are over."""
         self._rival = None
         if self._latest is not None and self._latest[1].id8 == master:
             self._latest = None
 
     def _is_another(self, now: int, network: management.Network, master: int | None, epoch: int | None) -> bool:
-        """Whether it is of another master than the one of our syncs; one of the two will yield."""
+        """Whether it is of another master than the one whose syncs are followed; one of the two will yield."""
         if not self._cycle.running or master is None or now > self._heard_at + FORGOTTEN:
             return False
         if (network.id8, network.epoch) == (master, epoch):
             return False
-        # A better master that goes on with this epoch, grid and count has taken over: it is ours from now on.
+        # A better master that goes on with this epoch, grid and count has taken over: it is followed from now on.
         same_grid = network.epoch == epoch and -_NEAR <= network.cycle - self._cycle.counter <= _NEAR
         return not (same_grid and (network.priority, network.id8) > self._rank)
 
@@ -174,7 +171,7 @@ class NetworkMembership:
         self.utc_error = management.NO_UTC
         """How far off that may be (us)."""
         self.verified = False
-        """Whether the network's parameters are known to be ours."""
+        """Whether the network's parameters are known to be those of this node."""
         self.mismatch: str | None = None
         """Why the node sends nothing: the network has other parameters."""
         self._context = context
@@ -186,7 +183,7 @@ class NetworkMembership:
         self._requests = requests
         self._send = send
         self._tracker = MasterTracker(context.cycle)
-        self._master_role = MasterRole(context, transmitter, grants, self._on_elected, self._retry_first_sync)
+        self._master_role = MasterRole(context, transmitter, grants, self._on_elected)
         self._sent_at = LONG_AGO
 
     @property
@@ -198,7 +195,7 @@ class NetworkMembership:
     # Frames and messages of others
 
     def on_sync(self, now: int, frame: Frame, stamp: int) -> None:
-        """A sync frame of another node."""
+        """Follow the sync frame of another node; as the master, answer it."""
         if self.election.role is Role.MASTER:
             self._counts["foreign syncs"] += 1
             self._answer(now)
@@ -222,9 +219,9 @@ class NetworkMembership:
             self._verify_by_length(now)
 
     def on_network(self, now: int, network: management.Network) -> None:
-        """A master says who it is, and the parameters of its network."""
-        if network.cycle * self._cycle.timing.cycle > _LONGEST:
-            self._counts["undecodable"] += 1  # forged: our own NETWORK could not say this count as a time
+        """Follow the NETWORK of a master, yield to it, or answer it."""
+        if network.cycle * self._cycle.timing.cycle > _TIME_MAX:
+            self._counts["undecodable"] += 1  # forged: a NETWORK of this node could not say this count as a time
             return
         if self.election.role is Role.MASTER:
             if self.election.beats(self.node_id.id8, network.priority, network.id8):
@@ -243,7 +240,7 @@ class NetworkMembership:
             self._follow(now, network)
 
     def on_claim(self, now: int, claim: management.Claim) -> None:
-        """A node claims an id8, and may look for a master."""
+        """Note the claim of a node; if it looks for a master, answer."""
         self.election.on_claim(now, claim.id8, claim.priority)
         if claim.flags & management.CLAIM_ELECTING:
             if self.election.role is Role.MASTER:
@@ -254,18 +251,18 @@ class NetworkMembership:
     # Time
 
     def on_id_owned(self, now: int) -> None:
-        """The node may send management: look for a master."""
+        """Look for a master, now that the node may send management."""
         if not self._cycle.running:
             self._elect(now, forget=False)
 
     def decide_election(self, now: int) -> None:
-        """The time of the election is over."""
+        """Send the first sync if this node is elected, now that the claims are collected."""
         may_lead = self.node_id.stage is Stage.OWNING and not self._cycle.running and self.mismatch is None
         if may_lead and self.election.decide(now, self.node_id.id8):
             self._master_role.start_network(now, inherits=self.epoch is not None and self._cycle.anchored)
 
     def next_cycle(self, now: int) -> None:
-        """A cycle is over."""
+        """Begin the next cycle: lead it, bridge a missing sync, or give the cycle up."""
         if self._cycle.state is CycleState.LEADING:
             if not self._master_role.begin_cycle(now):
                 self._step_down(now, _TOO_LATE)
@@ -283,10 +280,8 @@ class NetworkMembership:
         if self.election.role is not Role.MASTER or self.epoch is None:
             return
         self._sent_at = now
-        self._transmitter.withdraw_management(
-            self.node_id.id8, management.ManagementType.NETWORK
-        )  # its counter is old by now
         self._timers.set("network", now + REPEAT)
+        self._transmitter.withdraw_network(self.node_id.id8)  # its counter is old by now
         timing, counter = self._cycle.timing, self._cycle.counter
         id8, priority = self.node_id.id8, self._context.settings.priority
         offset, error = self.utc_offset, self.utc_error
@@ -304,7 +299,7 @@ class NetworkMembership:
             self._elect(now, forget=True)
 
     def on_id_lost(self, now: int) -> None:
-        """The node may not send for a while: it can't be the master, nor have slots."""
+        """Give up the role of master and all slots, as the node may not send for a while."""
         if self.election.role is Role.MASTER:
             self._step_down(now, "this node was the master, and may not send")
         self._master_role.cancel()
@@ -312,7 +307,7 @@ class NetworkMembership:
         self._requests.pause(now, "the node may not send")
 
     def stop(self, now: int) -> None:
-        """The bus is gone."""
+        """Forget the network, as the bus is gone."""
         self._cycle.stop()
         self._master_role.cancel()
         self.election.end(Role.NONE)
@@ -323,7 +318,7 @@ class NetworkMembership:
     # Slave
 
     def _join(self, now: int, *, resumed: bool) -> None:
-        """A cycle has started, of another master."""
+        """Become a slave in a cycle that another master has started."""
         self.verified = resumed
         self._master_role.cancel()
         self.election.end(Role.SLAVE)
@@ -333,10 +328,10 @@ class NetworkMembership:
         self._follow(now, self._tracker.on_started(now))
 
     def _follow(self, now: int, network: management.Network | None) -> None:
-        """The master of our syncs has sent this NETWORK, and its parameters are ours. None: not known yet."""
+        """Follow the NETWORK of the master whose syncs these are, and whose parameters fit; None: not known yet."""
         if network is None:
             return
-        renumbered = self._cycle.anchor(network.cycle)  # phases count from cycle 0: other slots are ours then
+        renumbered = self._cycle.anchor(network.cycle)  # phases count from cycle 0: the node has other slots then
         if network.epoch != self.epoch or renumbered:
             self._requests.revoke_all(now, "another network")
         self.utc_offset, self.utc_error = network.utc_offset, network.utc_error
@@ -345,7 +340,7 @@ class NetworkMembership:
         changed = (network.id8, network.epoch) != (self.master, self.epoch)
         self.master, self.epoch = network.id8, network.epoch
         self.verified = True
-        # Another master may not know our leases: stop, and have it confirm them.
+        # Another master may not know this node's leases: stop, and have it confirm them.
         if changed or not self._requests.has_master:
             self._requests.pause(now, "another master")
             if changed:
@@ -353,7 +348,7 @@ class NetworkMembership:
             self._requests.resume(now)
 
     def _verify_by_length(self, now: int) -> None:
-        """Accept a master that sends no NETWORK when its cycle is as long as ours."""
+        """Accept a master that sends no NETWORK when its cycle is as long as this node's."""
         ours = self._tracker.has_our_length(now)
         if ours and self.mismatch is None:
             self.verified = True
@@ -392,13 +387,10 @@ class NetworkMembership:
 
     # Master
 
-    def _retry_first_sync(self, now: int) -> None:
-        self.election.retry(now + self._context.draw(_PAUSE))
-
     def _on_elected(self, now: int, inherits: bool) -> None:
-        """This node is the master. Of a network that it `inherits` it keeps the epoch."""
+        """Be the master. A network that this node `inherits` keeps its epoch."""
         if not inherits:
-            self.epoch = self._context.draw(_EPOCHS) + 1
+            self.epoch = self._context.draw(management.EPOCH_MAX) + 1  # never 0
         self.election.end(Role.MASTER)
         self.master = self.node_id.id8
         self.verified = True
@@ -407,14 +399,14 @@ class NetworkMembership:
         self._requests.resume(now)
 
     def _yield_to(self, now: int, network: management.Network) -> None:
-        """A better master is there: its next sync will be followed."""
+        """Make room for a better master, whose next sync will be followed."""
         self.election.on_claim(now, network.id8, network.priority)  # a candidate, should its syncs not come
         self._step_down(now, "a better master is there")
         self.election.begin(now, forget=False)
 
     def _step_down(self, now: int, reason: str) -> None:
         self._master_role.step_down()
-        self._transmitter.withdraw_management(self.node_id.id8, management.ManagementType.NETWORK)
+        self._transmitter.withdraw_network(self.node_id.id8)
         self._timers.clear("network")
         self._forget_master(now, reason)
         self._actions.append(LostSync(reason))

@@ -10,8 +10,7 @@ import enum
 from collections.abc import Callable
 
 from r2p.codecs.management import CLAIM_FIXED, Claim
-from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import IdConflict
+from r2p.protocols.rtcan.events import EngineContext, IdConflict
 from r2p.units import LONG_AGO, SECOND
 
 # All in ns.
@@ -19,10 +18,10 @@ OBJECTION = 250_000_000
 """How long others may object to a claim."""
 REPEAT = 3_000_000_000
 """Claims are repeated this often."""
-_YIELDS = SECOND  # a node that has claimed our id8 with a higher number has this long to yield
-_APART = 100_000_000  # between two claims of ours
+_YIELDS = SECOND  # a node that has claimed this id8 with a higher number has this long to yield
+_APART = 100_000_000  # between two claims of this node
 _INSISTING = 4_000_000_000  # a node that has a better claim repeats it within this: REPEAT, and room for a full bus
-_FIRMWARE = 500_000_000  # a node that uses our id8 for this long after our claim, without one of its own, is firmware
+_FIRMWARE = 500_000_000  # a node that uses this id8 for so long after the claim, without one of its own, is firmware
 _NOTICE = SECOND  # between two `IdConflict`
 _SPREAD = 50_000_000  # nodes that are switched on together don't claim together
 
@@ -38,28 +37,28 @@ class Stage(enum.Enum):
 class NodeId:
     """The id8 of a node, as its settings want it: fixed, or any that is free.
 
-    `send_claim(now)` sends our claim; `stage_changed(now)` is called when the stage changes.
+    `send_claim(now)` sends a claim of this node; `on_stage(now)` is called when the stage changes.
     """
 
     def __init__(
-        self, context: EngineContext, send_claim: Callable[[int], None], stage_changed: Callable[[int], None]
+        self, context: EngineContext, send_claim: Callable[[int], None], on_stage: Callable[[int], None]
     ) -> None:
         settings = context.settings
         self.stage = Stage.LISTENING
         self.fixed = settings.id8 is not None
         self.id8 = settings.id8 or 0
         self.number = settings.number >> 8 if self.fixed else settings.number | 1 << 63
-        """The number in our claims: lower for fixed ids, so that a node that can't take another id8 wins."""
+        """The number in the claims: lower for fixed ids, so that a node that can't take another id8 wins."""
         self._context = context
         self._timers = context.timers
         self._send_claim = send_claim
-        self._stage_changed = stage_changed
+        self._on_stage = on_stage
         self._taken: set[int] = set()
         self._claimed_at = LONG_AGO
         self._noticed_at = LONG_AGO
         self._rival_claimed_at = LONG_AGO
-        self._suspected_at: int | None = None  # the first frame with our id8 of a node that does not claim it
-        self._disputed_at = LONG_AGO  # the last claim of our id8 with a lower number
+        self._suspected_at: int | None = None  # the first frame with this id8 of a node that does not claim it
+        self._disputed_at = LONG_AGO  # the last claim of this id8 with a lower number
         self._waiting = False  # for a fixed id8 that is taken; its `IdConflict` is out
 
     @property
@@ -67,7 +66,7 @@ class NodeId:
         return CLAIM_FIXED if self.fixed else 0
 
     def start(self, now: int) -> None:
-        """Listen which ids are taken."""
+        """Listen which id8 are taken."""
         self._suspected_at = None
         self._taken.clear()
         self.stop(now)
@@ -78,14 +77,14 @@ class NodeId:
         self.stage = Stage.LISTENING
         self._timers.clear("listened")
         self._timers.clear("claim")
-        self._stage_changed(now)
+        self._on_stage(now)
 
     def mark_taken(self, id8: int) -> None:
-        """A frame of the node with this id8 was received."""
+        """Note that a node uses this id8."""
         self._taken.add(id8)
 
     def on_listened(self, now: int) -> None:
-        """Claim an id8, now that the time to listen is over; if ours is fixed and taken, listen on."""
+        """Claim an id8, now that the time to listen is over; if a fixed one is taken, listen on."""
         if self.fixed and self.id8 in self._taken:
             if not self._waiting:
                 self._waiting = True
@@ -98,7 +97,7 @@ class NodeId:
             if self.id8 not in free:  # else it is the one that this node had before
                 self.id8 = free[self._context.draw(len(free))]
         self.stage = Stage.CLAIMING
-        self._stage_changed(now)
+        self._on_stage(now)
         self.claim(now)
         self._timers.set("claim", now + OBJECTION)
 
@@ -106,7 +105,7 @@ class NodeId:
         """Own the id8, as no other node objected; or repeat the claim."""
         if self.stage is Stage.CLAIMING:
             self.stage = Stage.OWNING
-            self._stage_changed(now)
+            self._on_stage(now)
         self._timers.set("claim", now + REPEAT)
         self.claim(now)
 
@@ -117,7 +116,7 @@ class NodeId:
             self._send_claim(now)
 
     def on_claim(self, now: int, claim: Claim) -> None:
-        """Another node claims an id8."""
+        """Answer the claim of another node if it is for this node's id8: insist or yield."""
         self._taken.add(claim.id8)
         if claim.id8 != self.id8 or self.stage is Stage.LISTENING:
             return

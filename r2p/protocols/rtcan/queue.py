@@ -155,7 +155,7 @@ class LaxityQueue:
         return None
 
     def next_frame(self, message: QueuedMessage, now: int) -> Frame:
-        """Its next frame, with the laxity of this moment. Its topic does not compete until that is sent or put back."""
+        """The next frame of a message, with the laxity of now. The topic competes again when it is sent or put back."""
         fifo = self._fifos[message.message]
         fifo.busy = True
         laxity = NRT if fifo.deadline == NEVER else rtcan.srt_laxity(fifo.deadline - now)
@@ -165,7 +165,7 @@ class LaxityQueue:
         return Frame(identifier, message.payload[at : at + FRAME_MAX])
 
     def put_back(self, message: QueuedMessage, hold: int = LONG_AGO) -> None:
-        """Its frame was not sent: the topic competes again, from the instant `hold` on."""
+        """Let the topic of a frame that was not sent compete again, from the instant `hold` on."""
         fifo = self._fifos[message.message]
         fifo.busy = False
         fifo.held = hold
@@ -173,14 +173,14 @@ class LaxityQueue:
             self._expiry = fifo.expiry
 
     def frame_sent(self, message: QueuedMessage) -> bool:
-        """Its frame was sent. Says whether it was the last one: then the message is out of the queue."""
+        """Count a frame as sent; return whether it was the last one, which takes the message out of the queue."""
         fifo = self._fifos[message.message]
         fifo.busy = False
         message.sent += 1
         if message.sent == message.frames:
             self._drop(fifo, [message])
             return True
-        if message.sent == 1 and message.drop:  # from now on it is not given up any more
+        if message.sent == 1 and message.drop:  # from now on it is no longer given up
             fifo.expiry = min((each.expiry for each in fifo.waiting), default=NEVER)
         self._expiry = min(self._expiry, fifo.expiry)
         return False

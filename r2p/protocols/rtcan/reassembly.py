@@ -5,7 +5,7 @@ does not continue a message in the right way ends it; the rest is skipped up to 
 frame, which CAN can make, is not a gap.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 
 import msgspec
 
@@ -41,7 +41,7 @@ class Reassembly:
     """Joins frames, in any order of sources, to messages; holds at most one unfinished message of each source."""
 
     def __init__(self) -> None:
-        self.losses: dict[int, Counter[str]] = {}
+        self.losses: defaultdict[int, Counter[str]] = defaultdict(Counter)
         """What was lost, by id8 of the source and reason."""
         self._buffers: dict[int, SourceBuffer] = {}
         self.open: dict[int, SourceBuffer] = {}
@@ -76,7 +76,7 @@ class Reassembly:
         return list(self._buffers)
 
     def receive(self, frame: Frame, stamp: int) -> Received | None:
-        """A frame came in; `stamp` is the instant when it ended. The message that it completes comes back."""
+        """Receive a frame that ended at `stamp`; return the message that it completes."""
         identifier, data = frame.id, frame.data
         # The codec's functions are inlined: this runs for each frame on the bus.
         buffer = self._buffers.get(identifier >> MESSAGE_SHIFT & MESSAGE_MAX)
@@ -99,12 +99,10 @@ class Reassembly:
 
     def poll(self, now: int) -> None:
         """Give up messages whose next frame stays away."""
-        while self.open:
-            buffer = next(iter(self.open.values()))
-            if now < buffer.last + TIMEOUT:
-                return
-            self._reset(buffer, "time-out")
-            buffer.expected = _IDLE
+        while self.due <= now:
+            oldest = next(iter(self.open.values()))
+            self._reset(oldest, "time-out")
+            oldest.expected = _IDLE
 
     def reset(self) -> None:
         """Forget unfinished messages."""
@@ -167,8 +165,5 @@ class Reassembly:
         buffer.parts.clear()
 
     def _lose(self, message: int, reason: str) -> None:
-        source = rtcan.id8_of(message)
-        counts = self.losses.get(source)
-        if counts is None:
-            counts = self.losses[source] = Counter()
+        counts = self.losses[rtcan.id8_of(message)]
         counts[reason] += 1

@@ -33,7 +33,7 @@ class _AnnouncedId(msgspec.Struct, eq=False):
 
 
 class TopicIdAllocator:
-    """The high bytes in use on one bus: ours by topic, and those of others, at most one topic for each message id."""
+    """The high bytes in use on one bus: this module's by topic, others' with at most one topic for each message id."""
 
     def __init__(self) -> None:
         self.refused: set[str] = set()
@@ -70,7 +70,7 @@ class TopicIdAllocator:
         self._ours.pop(topic, None)
 
     def on_announced(self, now: int, topic: str, message: int, own_id8: int, *, firmware: bool = False) -> list[str]:
-        """A module publishes a topic with this message id. Our topics that need another high byte now come back.
+        """Note the message id of another module's topic; return the own topics that need another high byte now.
 
         Of two modules that picked the same one for different topics, or different ones for the same topic, the one with
         the lower id8 keeps it; `firmware` always does.
@@ -90,12 +90,12 @@ class TopicIdAllocator:
         return moved
 
     def on_module_gone(self, id8: int) -> None:
-        """The module with this id8 left."""
+        """Forget the module with this id8, which left."""
         for message in [each for each in self._announced if rtcan.id8_of(each) == id8]:
             self._forget(message)
 
     def retry(self, now: int) -> list[str]:
-        """Our topics for which there was no high byte, and may be one now."""
+        """Return the own topics for which there was no high byte, and may be one now."""
         self._forget_ended(now)
         freed, self._freed = self._freed, False
         return list(self.refused) if freed else []

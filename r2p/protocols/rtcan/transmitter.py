@@ -12,13 +12,13 @@ from collections.abc import Callable
 
 import msgspec
 
-from r2p.codecs import rtcan
-from r2p.codecs.management import type_of
-from r2p.codecs.rtcan import FRAME_MAX, INTERMISSION, LAXITY_SHIFT, Frame
-from r2p.protocols.rtcan.context import EngineContext
+from r2p.codecs import can_bits, rtcan
+from r2p.codecs.can_bits import INTERMISSION
+from r2p.codecs.management import ManagementType, type_of
+from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, Frame
 from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, CycleState
-from r2p.protocols.rtcan.events import Due, Fate, Mailbox, Outcome, Transmit, Withdraw
-from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
+from r2p.protocols.rtcan.events import Due, EngineContext, Fate, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.leases import PeriodicMessage, SlotPlan
 from r2p.protocols.rtcan.queue import LaxityQueue, QueuedMessage
 from r2p.units import LONG_AGO, NEVER
 
@@ -26,7 +26,7 @@ _ERRORS = 8  # bus errors after which a message is given up
 _PAUSE = 500_000  # ns after a bus error, before the same topic is tried again
 _PAUSE_SPREAD = 8_000_000  # ns; two nodes that collided would else collide again
 _MANAGEMENT_MAX = 128  # management messages that wait
-_CONFIRMED = 10  # cycles in a row with our slots in the mask, after which one without them is doubted
+_CONFIRMED = 10  # cycles in a row with the own slots in the mask, after which one without them is doubted
 _CLOSE = 5  # bits between the hand-over and the last moment: then stuff bits are counted
 # Python 3.11 takes its time to find a member of an enum.
 _HRT, _SRT, _NRT = Mailbox
@@ -46,23 +46,27 @@ class Mode(enum.Enum):
 _SILENT, _FREE, _SLOTTED = Mode
 
 
-class CyclicSync(msgspec.Struct, frozen=True):
-    """Stands for the sync frame in its mailbox."""
-
-
 class FirstSync(msgspec.Struct, frozen=True):
-    """Stands for the sync frame that makes a node the master; `done` gets what became of it, and when."""
+    """The sync frame that makes a node the master, planned for the instant `start` as that of cycle `counter`.
 
+    `done(now, outcome, at)` gets what became of it, and when.
+    """
+
+    frame: Frame
+    start: int
+    counter: int
     done: Callable[[int, Outcome, int], None]
 
 
-class DiscardedFrame(msgspec.Struct, frozen=True):
-    """Stands for a frame whose message was discarded."""
+class NoMessage(enum.Enum):
+    """What stands in a mailbox for a frame that belongs to no message."""
+
+    SYNC = "sync"
+    DISCARDED = "its message was discarded"
 
 
-SYNC = CyclicSync()
-DISCARDED = DiscardedFrame()
-Item = QueuedMessage | PeriodicMessage | CyclicSync | FirstSync | DiscardedFrame
+_SYNC, _DISCARDED = NoMessage
+Item = QueuedMessage | PeriodicMessage | FirstSync | NoMessage
 
 
 class Mailboxes:
@@ -95,14 +99,14 @@ class Mailboxes:
         self.put(message, frame, _NRT if frame.id >> LAXITY_SHIFT == rtcan.NRT else _SRT, first, last)
 
     def empty(self, mailbox: Mailbox) -> Item | None:
-        """The port has done with the frame in this mailbox: its owner comes back."""
+        """Empty a mailbox whose frame the port has done with; return the frame's owner."""
         boxes = self.boxes
         item, boxes[mailbox] = boxes[mailbox], None
         self.idle = boxes[_SRT] is None and boxes[_NRT] is None
         return item
 
     def reset(self) -> None:
-        """The port has lost all frames."""
+        """Forget all frames, as the port has lost them."""
         self.boxes = [None, None, None]
         self.idle = True
 
@@ -132,10 +136,10 @@ class Mailboxes:
                 item.recalled = True
 
     def discard(self) -> list[QueuedMessage]:
-        """Forget all messages of the queue; they come back."""
+        """Empty the queue; return its messages."""
         for mailbox in _SRT, _NRT:
             if self.boxes[mailbox] is not None:
-                self.boxes[mailbox] = DISCARDED
+                self.boxes[mailbox] = _DISCARDED
         return self._queue.clear()
 
     def expire(self, now: int) -> None:
@@ -144,7 +148,7 @@ class Mailboxes:
             self._report(message.handle, Fate.OVERDUE, missed=True, at=now)
 
     def confirm(self, now: int, message: QueuedMessage, outcome: Outcome, at: int, *, slotted: bool) -> None:
-        """The port says what became of a frame of the queue."""
+        """Settle a message by what became of a frame of it."""
         if outcome is _SENT or outcome is _UNKNOWN:  # not again if unknown: receivers would count a repeat, or a gap
             message.unknown = message.unknown or outcome is _UNKNOWN
             if self._queue.frame_sent(message):
@@ -195,29 +199,30 @@ class SlotTransmitter:
         self._coarse = settings.coarse
         self._done = 0  # the last slot whose part of the plan is done
         self._tried = 0  # the last slot in which nothing more can be tried
-        self._end = 0  # of the cycle; for a slave when no sync can come any more that would begin the next one
+        self._end = 0  # of the cycle; for a slave when a sync that begins the next one can no longer come
         self._sync = Frame(0, b"")
-        self._confirmed = 0  # cycles in a row whose mask had our slots
+        self._confirmed = 0  # cycles in a row whose mask had the own slots
         self._doubted = 0
         # A try now would come too late for the slots before `now + ahead`; a coarse port may still try in that one.
         self._ahead = self._latency - (self._slot if self._coarse else self._bit)
         self._close = _CLOSE * self._bit
-        self._longest = [(rtcan.frame_bits_max(n) + INTERMISSION) * self._bit for n in range(FRAME_MAX + 1)]  # ns
+        self._longest = [(can_bits.frame_bits_max(n) + INTERMISSION) * self._bit for n in range(FRAME_MAX + 1)]  # ns
 
     # Messages
 
-    def withdraw_management(self, id8: int, kind: int) -> None:
-        """Drop waiting management of this type: it is no longer true."""
-        self.queue.withdraw(rtcan.message_id(rtcan.MANAGEMENT, id8), lambda each: type_of(each.payload) == kind)
+    def withdraw_network(self, id8: int) -> None:
+        """Drop a NETWORK that waits: it is no longer true."""
+        message = rtcan.message_id(rtcan.MANAGEMENT, id8)
+        self.queue.withdraw(message, lambda each: type_of(each.payload) == ManagementType.NETWORK)
 
     def forget(self, periodic: PeriodicMessage) -> None:
         """Send nothing more of a periodic message that has ended."""
         self.plan.invalidate()
         if self.mailboxes.boxes[_HRT] is periodic:  # it may be on the bus: the port still has to confirm it
-            self.mailboxes.boxes[_HRT] = DISCARDED
+            self.mailboxes.boxes[_HRT] = _DISCARDED
 
     def fill(self, now: int, periodic: PeriodicMessage, payload: bytes | None) -> None:
-        """The data of a periodic message that owns slots; None: nothing this time."""
+        """Send the data of a periodic message that owns slots; None: nothing this time."""
         slot = periodic.waiting
         periodic.restart(payload)
         if slot is not None and payload is not None:
@@ -238,13 +243,13 @@ class SlotTransmitter:
             self._counts["syncs not sent"] += 1
             return
         self._sync = frame
-        self.mailboxes.put(SYNC, frame, _HRT, start, last)
+        self.mailboxes.put(_SYNC, frame, _HRT, start, last)
 
-    def send_first_sync(self, first: FirstSync, frame: Frame, start: int) -> bool:
-        """Send a new master's first sync. There are no slots yet: it may be late. False: the mailbox is not empty."""
+    def send_first_sync(self, first: FirstSync) -> bool:
+        """Send a new master's first sync, which may be late, as there are no slots yet. False: the mailbox is full."""
         if self.mailboxes.boxes[_HRT] is not None:
             return False
-        self.mailboxes.put(first, frame, _HRT, start, NEVER)
+        self.mailboxes.put(first, first.frame, _HRT, first.start, NEVER)
         return True
 
     # The mode, the cycle and time
@@ -259,7 +264,7 @@ class SlotTransmitter:
         self.reschedule(now)
 
     def begin_cycle(self, now: int) -> None:
-        """A cycle has begun, at `Cycle.reference`; nothing of it is done yet."""
+        """Begin the plan of a cycle, which has started at `Cycle.reference`."""
         self._done = self._tried = 0
         self.plan.begin_cycle(self._cycle.counter)
         if self.plan.own:
@@ -267,13 +272,13 @@ class SlotTransmitter:
         self.realign(now)
 
     def realign(self, now: int) -> None:
-        """`Cycle.reference` is another instant than before; the cycle is the same."""
+        """Reckon with another `Cycle.reference` than before; the cycle is the same."""
         cycle = self._cycle
         self._end = cycle.end if cycle.state is _LEADING else cycle.reference + (self._slots + 1) * self._slot
         self._schedule(now)
 
     def reschedule(self, now: int) -> None:
-        """There may be something new to send."""
+        """Find out anew what is due, as there may be something new to send."""
         if self.mode is _FREE:
             self.mailboxes.fill(now)
             self.due = self.mailboxes.due
@@ -283,7 +288,7 @@ class SlotTransmitter:
             self.due = NEVER
 
     def reset(self) -> None:
-        """The bus is gone, and all frames with it."""
+        """Forget all frames, as the bus is gone."""
         self.mailboxes.reset()
         self.due = NEVER
 
@@ -304,7 +309,7 @@ class SlotTransmitter:
                 self._schedule(now)
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        """The port says what became of the frame in this mailbox, and when it was over."""
+        """Take note of what became of the frame in this mailbox, and when it was over."""
         item = self.mailboxes.empty(mailbox)
         if isinstance(item, QueuedMessage):
             self.mailboxes.confirm(now, item, outcome, at, slotted=self.mode is _SLOTTED)
@@ -314,7 +319,7 @@ class SlotTransmitter:
                 self._schedule(now)
         elif isinstance(item, PeriodicMessage):
             self._confirm_periodic(now, item, outcome, at)
-        elif item is SYNC:
+        elif item is _SYNC:
             if outcome is not _SENT:
                 self._counts["syncs not sent"] += 1
             elif self._cycle.state is _LEADING:
@@ -322,7 +327,7 @@ class SlotTransmitter:
                 self._schedule(now)
         elif isinstance(item, FirstSync):
             item.done(now, outcome, at)
-        elif item is DISCARDED:
+        elif item is _DISCARDED:
             self.reschedule(now)
         else:
             self._counts["confirmed without need"] += 1
@@ -330,9 +335,9 @@ class SlotTransmitter:
     # Slots
 
     def _check_mask(self, own: int) -> None:
-        """A mask without slots that we own, which the last ones had, is more likely forged than true.
+        """Doubt a mask without the own slots, which the last ones had: it is more likely forged than true.
 
-        Then this cycle is like one without a sync, of which there may be three.
+        A cycle with such a mask is like one without a sync, of which there may be three.
         """
         mask = self._cycle.mask
         if mask is None:
@@ -414,7 +419,7 @@ class SlotTransmitter:
 
     def _exact_latest_start(self, frame: Frame, end: int) -> int:
         """As above, to the stuff bit. That is not cheap, unless the same frame is seen again."""
-        bits = rtcan.frame_bits(frame.id, frame.data) + INTERMISSION
+        bits = can_bits.frame_bits(frame.id, frame.data) + INTERMISSION
         return end - bits * self._bit
 
     # Periodic messages

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
-from r2p.codecs.rtcan import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
+from r2p.codecs.can_bits import INTERMISSION, TAIL, bits_until_lost, frame_bits, wire_bits
 from r2p.sim.can.controller import RECESSIVE_BITS, BusWire, CanController
 from r2p.sim.can.records import CanNode, ControllerState, ErrorKind, FrameRecord, Statistics
 from r2p.sim.can.timeline import Timeline

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from r2p.codecs import management, rtcan
+from r2p.codecs import can_bits, management, rtcan
 from r2p.codecs.management import NO_PARAMS
 from r2p.messages import ClockOffset
 from r2p.names import MANAGEMENT
@@ -219,7 +219,7 @@ class RtcanLink(BufferedLink):
         """The start of the first frame; roughly on a coarse port, whose stamps are not worth the counting of bits."""
         bit = self.engine.timing.bit
         if self.driver.port.coarse:
-            return received.stamp - rtcan.frame_bits_max(min(len(received.payload), rtcan.FRAME_MAX)) * bit
+            return received.stamp - can_bits.frame_bits_max(min(len(received.payload), rtcan.FRAME_MAX)) * bit
         return received.started(bit)
 
     def sender(self, arrival: ReceivedMessage) -> Hashable:

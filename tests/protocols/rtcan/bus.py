@@ -5,10 +5,10 @@ node, and when, is what its controller would.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from r2p.codecs import rtcan
-from r2p.codecs.rtcan import INTERMISSION, Frame
+from r2p.codecs import can_bits
+from r2p.codecs.can_bits import INTERMISSION
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import (
     Action,
@@ -22,6 +22,9 @@ from r2p.protocols.rtcan.events import (
     Withdraw,
 )
 from r2p.units import NEVER
+
+if TYPE_CHECKING:
+    from r2p.codecs.rtcan import Frame
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -188,7 +191,7 @@ class Bus:
         winners = [(node, mailbox, frame) for identifier, node, mailbox, frame in contending if identifier == lowest]
         frame = winners[0][2]
         good = len({each[2].data for each in winners}) == 1 and len(self._live) > 1
-        bits = rtcan.frame_bits(frame.id, frame.data) if good else 60 + _ERROR_FRAME
+        bits = can_bits.frame_bits(frame.id, frame.data) if good else 60 + _ERROR_FRAME
         self._sending = self.now + bits * self._bit, winners, good
         if good:
             self.sent.append((self.now, frame, winners[0][0]))

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r2p.protocols.rtcan.calendar import LONGEST_PERIOD, Calendar, Reason, Refusal, Reservation, occupied
+from r2p.codecs.management import RefuseReason
+from r2p.protocols.rtcan.calendar import PERIOD_MAX, Calendar, Refusal, Reservation, occupied
 
 
 def collide(a: Reservation, b: Reservation) -> bool:
@@ -41,8 +42,8 @@ def test_the_least_phase_from_1_on() -> None:
     calendar = Calendar(10)
     assert [admitted(calendar, message, 10).phase for message in range(9)] == [*range(1, 10)]
     refusal = refused(calendar, 9, 10)
-    assert refusal.reason == Reason.FULL
-    assert refusal.text == "no 1 slots in a row are free every 10 slots"
+    assert refusal.reason == RefuseReason.FULL
+    assert refusal.text == "no slot is free every 10 slots"
     assert calendar.remove(3)
     assert not calendar.remove(3)
     assert admitted(calendar, 9, 10).phase == 4
@@ -53,25 +54,25 @@ def test_fragments_take_slots_in_a_row() -> None:
     assert admitted(calendar, 1, 12, 3).phase == 1
     assert admitted(calendar, 2, 6, 2).phase == 4  # 4, 5 and 10, 11: not 1..3, nor 6 = 0
     assert admitted(calendar, 3, 12, 3).phase == 6
-    assert refused(calendar, 4, 12, 2).reason == Reason.FULL
+    assert refused(calendar, 4, 12, 2).reason == RefuseReason.FULL
     assert admitted(calendar, 4, 12).phase == 9
 
 
 @pytest.mark.parametrize(
     ("period", "fragments", "reason", "text"),
     [
-        (7, 1, Reason.PERIOD, "a period of 7 slots neither divides the 60 of a cycle nor is a multiple"),
-        (90, 1, Reason.PERIOD, "a period of 90 slots neither divides the 60"),
-        (20, 1, Reason.OTHER, "a period of 20 slots neither divides the 12 of message 0x0102 nor is a multiple"),
-        (0, 1, Reason.LENGTH, "this message needs one of 2 to 65536"),
-        (1, 1, Reason.LENGTH, "a period of 1 slots"),
-        (6, 6, Reason.LENGTH, "a period of 6 slots"),
-        (6, 0, Reason.LENGTH, ""),
-        (LONGEST_PERIOD + 60, 1, Reason.LENGTH, ""),
-        (12, 11, Reason.FULL, "no 11 slots in a row are free every 12 slots"),
+        (7, 1, RefuseReason.PERIOD, "a period of 7 slots neither divides the 60 of a cycle nor is a multiple"),
+        (90, 1, RefuseReason.PERIOD, "a period of 90 slots neither divides the 60"),
+        (20, 1, RefuseReason.OTHER, "a period of 20 slots neither divides the 12 of message 0x0102 nor is a multiple"),
+        (0, 1, RefuseReason.LENGTH, "this message needs one of 2 to 65536"),
+        (1, 1, RefuseReason.LENGTH, "a period of 1 slots"),
+        (6, 6, RefuseReason.LENGTH, "a period of 6 slots"),
+        (6, 0, RefuseReason.LENGTH, ""),
+        (PERIOD_MAX + 60, 1, RefuseReason.LENGTH, ""),
+        (12, 11, RefuseReason.FULL, "no 11 slots in a row are free every 12 slots"),
     ],
 )
-def test_refusals_say_why(period: int, fragments: int, reason: Reason, text: str) -> None:
+def test_refusals_say_why(period: int, fragments: int, reason: RefuseReason, text: str) -> None:
     calendar = Calendar(60)
     admitted(calendar, 0x0102, 12)
     refusal = refused(calendar, 0x0103, period, fragments)
@@ -101,7 +102,7 @@ def test_asking_again_changes_nothing_and_asking_for_something_else_gives_the_ol
     assert calendar.admit(1, 13, round_down=True) == first
     assert admitted(calendar, 1, 5, 2) == Reservation(1, 5, 3, 2)
     assert calendar.get(1) == Reservation(1, 5, 3, 2)
-    assert refused(calendar, 1, 3).reason == Reason.PERIOD
+    assert refused(calendar, 1, 3).reason == RefuseReason.PERIOD
     assert calendar.get(1) is None
 
 
@@ -120,7 +121,7 @@ def test_what_another_master_granted() -> None:
     ):
         taken = calendar.readmit(other)
         assert isinstance(taken, Refusal)
-        assert taken.reason == Reason.TAKEN
+        assert taken.reason == RefuseReason.TAKEN
         assert taken.text == "its slots were given to another message"
     assert len(calendar) == 1
     assert calendar.readmit(Reservation(1, 20, 14, 2)) == Reservation(1, 20, 14, 2)
@@ -130,7 +131,7 @@ def test_what_another_master_granted() -> None:
 def test_periods_of_several_cycles() -> None:
     calendar = Calendar(4)
     assert [admitted(calendar, message, 12).phase for message in range(9)] == [1, 2, 3, 5, 6, 7, 9, 10, 11]
-    assert refused(calendar, 9, 4).reason == Reason.FULL
+    assert refused(calendar, 9, 4).reason == RefuseReason.FULL
     for message in (0, 3, 6):
         calendar.remove(message)
     assert admitted(calendar, 9, 4).phase == 1
@@ -200,7 +201,7 @@ def test_nothing_is_refused_that_would_fit_at_some_phase(slots: int, data: st.Da
     for message in range(data.draw(st.integers(0, 12))):
         period = data.draw(st.sampled_from(divisors))
         outcome = calendar.admit(message, period, data.draw(st.integers(1, 3)))
-        if isinstance(outcome, Refusal) and outcome.reason == Reason.FULL:
+        if isinstance(outcome, Refusal) and outcome.reason == RefuseReason.FULL:
             others = [*calendar, Reservation(-1, slots, 0)]
             for phase in range(period):
                 candidate = Reservation(99, period, phase, outcome.fragments)

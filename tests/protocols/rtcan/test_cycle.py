@@ -2,7 +2,7 @@
 
 import pytest
 
-from r2p.codecs import rtcan
+from r2p.codecs import can_bits, rtcan
 from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, Alignment, Cycle, CycleState, following, timing
 from tests.can_vectors import CanCase, can_cases
 
@@ -14,7 +14,7 @@ LATENCY = 7_000
 def receive_sync(cycle: Cycle, start: int, counter: int, mask: int = 0) -> Alignment:
     """A sync frame whose start of frame was at `start`."""
     frame = rtcan.encode_sync(counter, mask)
-    return cycle.on_sync(frame, start + rtcan.frame_bits(frame.id, frame.data) * TIMING.bit + LATENCY)
+    return cycle.on_sync(frame, start + can_bits.frame_bits(frame.id, frame.data) * TIMING.bit + LATENCY)
 
 
 def slave() -> Cycle:

@@ -1,8 +1,7 @@
 """Who takes over, and when."""
 
-from r2p.protocols.rtcan.context import EngineContext
 from r2p.protocols.rtcan.cycle import timing
-from r2p.protocols.rtcan.events import EngineSettings
+from r2p.protocols.rtcan.events import EngineContext, EngineSettings
 from r2p.protocols.rtcan.master import FRESH, Election, Role
 
 MS = 1_000_000

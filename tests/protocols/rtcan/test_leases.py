@@ -1,15 +1,276 @@
-"""Answers of the master that come late, or out of order."""
+"""Hard real-time messages: slots of their own, on lease, and what becomes of them."""
 
-from r2p.codecs import management
-from r2p.codecs.management import Grant, Renew, Renewed, Reserve
-from r2p.protocols.rtcan.calendar import Reason
-from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import EngineSettings, SlotsGranted, SlotsLost, SlotsRefused
-from r2p.protocols.rtcan.leases import LEASE, SlotRequests
-from r2p.protocols.rtcan.plan import PeriodicMessage, SlotPlan
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-SECOND = 1_000_000_000
-HIGH, MESSAGE = 5, 0x050A
+from r2p.codecs import management, rtcan
+from r2p.codecs.management import Grant, RefuseReason, Renew, Renewed, Reserve
+from r2p.protocols.rtcan.calendar import Reservation
+from r2p.protocols.rtcan.cycle import timing
+from r2p.protocols.rtcan.events import (
+    Done,
+    Due,
+    EngineContext,
+    EngineSettings,
+    Fate,
+    SlotsGranted,
+    SlotsLost,
+    SlotsRefused,
+)
+from r2p.protocols.rtcan.leases import LEASE, PeriodicMessage, SlotPlan, SlotRequests
+from tests.protocols.rtcan.bus import MS, SECOND, Bus
+from tests.protocols.rtcan.networks import CYCLE, SLOT, TOPIC, counted, is_sync, network, starts, syncs
+
+MESSAGE = 0x050A
+
+
+@pytest.mark.parametrize("lead", [0, 1, 500_000, 3 * MS, SECOND])
+@pytest.mark.parametrize("size", [3, 8, 16, 20])
+def test_a_periodic_message_owns_its_slots(size: int, lead: int) -> None:
+    bus = Bus()
+    _master, owner, listener = network(bus, 1, 0, 0)
+    filled = counted(owner, size)
+    listener.engine.subscribe(rtcan.message_id(TOPIC, 11), size)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, size, 5 * MS, lead=lead, handle="hrt"))
+    bus.run(20 * MS)
+    granted = owner.of(SlotsGranted)
+    assert granted == [SlotsGranted(TOPIC, 30, 1, 30 * SLOT)]
+    begin = bus.now
+    bus.run(SECOND)
+    fragments = rtcan.fragment_count(size)
+    at = [start for start in starts(bus, TOPIC, 0) if start > begin]
+    reference = syncs(bus, begin)[0][0]
+    assert {(start - reference) % (30 * SLOT) for start in at} == {SLOT * (1 + n) for n in range(fragments)}
+    assert abs(len(at) - fragments * SECOND // (30 * SLOT)) <= fragments
+    got = listener.received(TOPIC)
+    assert got == sorted(got, key=filled.index)  # never an old one after a newer one
+    assert len(filled) - len(got) <= 2
+    assert owner.engine.counts["missed"] <= 1  # what still waited without slots when it got them
+    asked = {due.at for due in owner.of(Due) if due.slotted}
+    assert set(at[::fragments]) <= asked
+
+
+def test_the_master_has_slots_too_and_none_is_given_twice() -> None:
+    bus = Bus()
+    nodes = network(bus, 1, 0, 0)
+    for high, period in ((2, MS), (3, 5 * MS), (4, 10 * MS)):
+        for node in nodes:
+            counted(node)
+            node.act(node.engine.reserve(node.now, high, 8, period))
+        bus.run(100 * MS)
+    phases = sorted((g.period, g.phase) for node in nodes for g in node.of(SlotsGranted))
+    assert phases == [(6, 1), (6, 2), (6, 3), (30, 4), (30, 5), (30, 6), (60, 10), (60, 11), (60, 12)]
+    begin = bus.now
+    bus.run(20 * CYCLE)
+    hrt = [at for at, frame, _ in bus.sent if frame.id >> 23 == 0 and at > begin and not is_sync(frame)]
+    assert len(hrt) == pytest.approx(20 * 39, abs=39)
+    assert all(node.engine.counts["missed"] == 0 for node in nodes)
+    mask = nodes[2].engine.cycle.mask
+    assert mask is not None
+    assert (mask >> 1).bit_count() == 39
+
+
+def test_a_refusal_says_why_and_the_message_goes_as_a_soft_one() -> None:
+    bus = Bus()
+    master, owner = network(bus, 1, 0)
+    counted(owner, 400)
+    owner.engine.reserve(owner.now, TOPIC, 400, 5 * MS)
+    bus.run(100 * MS)
+    (refused,) = owner.of(SlotsRefused)
+    assert "a period of 30 slots" in refused.reason
+    assert {frame.id >> 23 for _, frame, _ in bus.sent if frame.id >> 15 & 0xFF == TOPIC} <= set(range(1, 6))
+    assert master.engine.cycle.mask == 1
+
+
+def test_without_a_master_periodic_messages_go_as_soft_ones_with_their_period_as_deadline() -> None:
+    bus = Bus()
+    a, b = network(bus, 0, 0)
+    filled = counted(a)
+    b.engine.subscribe(rtcan.message_id(TOPIC, 10), 8)
+    a.act(a.engine.reserve(a.now, TOPIC, 8, 10 * MS, handle="periodic"))
+    bus.run(SECOND)
+    assert b.received(TOPIC) == filled[:-1]
+    assert len(filled) == 101
+    assert {frame.id >> 23 for _, frame, _ in bus.sent if frame.id >> 15 & 0xFF == TOPIC} == {10}
+    assert [due.at for due in a.of(Due)] == [a.of(Due)[0].at + n * 10 * MS for n in range(101)]
+    assert {(done.handle, done.fate) for done in a.of(Done)} == {("periodic", Fate.SENT)}
+
+
+def test_a_period_without_data_is_skipped() -> None:
+    bus = Bus()
+    _, owner = network(bus, 1, 0)
+    owner.fill = lambda due: None
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, MS, lead=MS))
+    bus.run(100 * MS)
+    assert starts(bus, TOPIC) == []
+    assert owner.engine.counts["slots without data"] > 50
+    with pytest.raises(ValueError, match="7 bytes for a periodic message of 8"):
+        owner.engine.fill(owner.now, TOPIC, bytes(7))
+
+
+def test_a_missed_slot_abandons_the_message_and_the_next_one_has_fresh_data() -> None:
+    bus = Bus()
+    _, owner, listener = network(bus, 1, 0, 0)
+    filled = counted(owner, 24)
+    listener.engine.subscribe(rtcan.message_id(TOPIC, 11), 24)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 24, 10 * MS, handle="hrt"))
+    bus.run(100 * MS)
+    bus.run_until(lambda: bus.sent[-1][1].id >> 15 & 0xFF == TOPIC and bus.sent[-1][1].id & 0x7F == 2)
+    bus.run(150_000)
+    before = len(listener.received(TOPIC))
+    at = owner.engine.next_deadline()
+    assert at is not None
+    bus.now = owner.true(at) + 100_000  # the next fragment's interrupt comes 100 us late
+    owner.act(owner.engine.poll(owner.now))
+    assert owner.of(Done)[-1].fate is Fate.ABANDONED
+    assert owner.engine.counts["late_to_slot"] == 1
+    abandoned = len(filled)
+    bus.run(3 * CYCLE)
+    assert listener.received(TOPIC)[before:] == filled[abandoned:][:2]
+    assert len(filled) >= abandoned + 2
+    assert listener.engine.reassembly.losses[11]["gap"] == 1
+
+
+def test_slots_are_given_back() -> None:
+    bus = Bus()
+    master, owner = network(bus, 1, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
+    bus.run(100 * MS)
+    assert master.engine.cycle.mask == 0b11
+    owner.act(owner.engine.release(owner.now, TOPIC))
+    bus.run(30 * MS)
+    assert master.engine.cycle.mask == 0b1
+    assert starts(bus, TOPIC)[-1] < bus.now - 25 * MS
+
+
+def test_the_slots_of_a_dead_node_come_free_after_3_s() -> None:
+    bus = Bus()
+    master, owner = network(bus, 1, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
+    bus.run(10 * SECOND)
+    assert master.engine.cycle.mask == 0b11  # renewed and renewed
+    assert owner.of(SlotsLost) == []
+    bus.kill(owner)
+    other = bus.add(id8=12)  # another node must acknowledge
+    bus.start(other)
+    bus.run(SECOND)
+    assert master.engine.cycle.mask == 0b11
+    bus.run(2100 * MS)
+    assert master.engine.cycle.mask == 0b1
+
+
+def test_the_owner_stops_when_the_master_does_not_answer() -> None:
+    bus = Bus()
+    master, owner = network(bus, 1, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 10 * MS))
+    bus.run(100 * MS)
+    master.deaf = lambda frame: frame.id >> 15 & 0xFF == rtcan.MANAGEMENT
+    bus.run(4 * SECOND)
+    assert owner.of(SlotsLost) == [SlotsLost(TOPIC, "the master does not answer")]
+    assert master.engine.cycle.mask == 0b1
+    assert {frame.id >> 23 for at, frame, _ in bus.sent[-50:] if frame.id >> 15 & 0xFF == TOPIC} != {0}
+    master.deaf = lambda frame: False
+    bus.run(SECOND)
+    assert len(owner.of(SlotsGranted)) == 2  # it has asked all the time
+    assert starts(bus, TOPIC, 0)[-1] > bus.now - 2 * CYCLE
+
+
+SLOTS = CYCLE // SLOT
+periodics = st.lists(
+    st.builds(
+        lambda cycles, phase, fragments, lead, begins: PeriodicMessage(
+            TOPIC,
+            0x2105,
+            8 * fragments,
+            fragments,
+            cycles * CYCLE,
+            lead * SLOT,
+            None,
+            reservation=Reservation(0x2105, cycles * SLOTS, 1 + phase, fragments),
+            active=True,
+            from_cycle=begins,
+        ),
+        st.sampled_from([1, 2, 4, 12]),
+        st.integers(0, 50),
+        st.integers(1, 3),
+        st.integers(0, 100),
+        st.integers(0, 5),
+    ),
+    max_size=4,
+)
+
+
+@given(periodics, st.integers(0, 3))
+def test_a_plan_that_knows_its_cycles_says_what_a_new_one_says(messages: list[PeriodicMessage], gone: int) -> None:
+    plan = SlotPlan(timing())
+    plan.periodics = dict(enumerate(messages))
+    for cycle in range(40):
+        if cycle == 30:  # a message loses its slots
+            plan.periodics.pop(gone, None)
+            plan.invalidate()
+        fresh = SlotPlan(timing())
+        fresh.periodics = plan.periodics
+        plan.begin_cycle(cycle)
+        fresh.begin_cycle(cycle)
+        assert (plan.sends, plan.fills, plan.next) == (fresh.sends, fresh.fills, fresh.next)
+
+
+def test_what_waits_for_its_slot_when_the_slots_are_given_back_is_counted() -> None:
+    bus = Bus()
+    _master, owner, _ = network(bus, 1, 0, 0)
+    filled = counted(owner, 20)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 20, 5 * MS, lead=2 * MS, handle="hrt"))
+    bus.run(SECOND)
+    asked = len(filled)
+    bus.run_until(lambda: len(filled) > asked)
+    owner.act(owner.engine.release(owner.now, TOPIC))
+    bus.run(20 * MS)
+    fates = [done.fate for done in owner.of(Done) if done.fate is not Fate.REPLACED]
+    assert fates[-1] is Fate.ABANDONED
+    assert fates.count(Fate.SENT) == len(filled) - 1
+    assert owner.engine.counts["hrt slots given back"] == 1
+
+
+@pytest.mark.parametrize("mask", [0, 1])
+def test_a_forged_sync_without_our_slots_does_not_end_them(mask: int) -> None:
+    """A broken node is a bit earlier than the master. What the last ten syncs said is believed for three cycles."""
+    bus = Bus()
+    _master, owner, listener = network(bus, 1, 0, 0)
+    filled = counted(owner)
+    listener.engine.subscribe(rtcan.message_id(TOPIC, 11), 8)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 5 * MS, handle="hrt"))
+    bus.run(SECOND)
+    missed, got = owner.engine.counts["missed"], len(filled)
+    for _ in range(10):
+        reference, counter = owner.engine.cycle.reference, owner.engine.cycle.counter
+        assert owner.engine.cycle.running
+        forged = rtcan.encode_sync(counter + 1, mask)
+        bus.run(reference + CYCLE + 120_000 - bus.now)  # the master's has not ended yet
+        owner.act(owner.engine.receive(owner.now, forged, owner.now))
+        bus.run(200 * MS)
+    assert owner.engine.counts["masks doubted"] == 10
+    assert owner.engine.counts["missed"] == missed
+    assert len(listener.received(TOPIC)) >= len(filled) - 1
+    assert len(filled) > got
+
+
+def test_a_mask_that_stays_without_our_slots_is_believed() -> None:
+    bus = Bus()
+    master, owner, _ = network(bus, 1, 0, 0)
+    counted(owner)
+    owner.act(owner.engine.reserve(owner.now, TOPIC, 8, 5 * MS, handle="hrt"))
+    bus.run(SECOND)
+    master.engine.grants.calendar.mask = lambda cycle: 1  # type: ignore[method-assign]
+    bus.run(20 * CYCLE)
+    assert owner.engine.counts["masks doubted"] == 3
+    assert owner.engine.counts["hrt not in the mask"] > 0
+
+
+# Answers of the master that come late, or out of order
 
 
 class Owner:
@@ -18,16 +279,16 @@ class Owner:
     def __init__(self) -> None:
         self.asked: list[Reserve | Renew] = []
         self.abandoned: list[int] = []
-        self.periodic = PeriodicMessage(HIGH, MESSAGE, 8, 1, 10_000_000, 0, None)
+        self.periodic = PeriodicMessage(TOPIC, MESSAGE, 8, 1, 10_000_000, 0, None)
         context = EngineContext(EngineSettings(number=1))
         plan = SlotPlan(context.timing)
-        plan.periodics[HIGH] = self.periodic
+        plan.periodics[TOPIC] = self.periodic
         self.out, self.timers = context.actions, context.timers
         self.requests = SlotRequests(
             context,
             plan,
             lambda now, wanted: self.asked.append(wanted),
-            lambda now, periodic: self.abandoned.append(now),
+            lambda now, periodic, reason: self.abandoned.append(now),
         )
         self.requests.has_master = True
 
@@ -50,7 +311,7 @@ class Owner:
     def lease(self) -> int | None:
         """When it ends."""
         while (at := self.timers.next()) is not None:
-            if ("lease", HIGH) in list(self.timers.pop(at)):
+            if ("lease", TOPIC) in list(self.timers.pop(at)):
                 return at
         return None
 
@@ -61,7 +322,7 @@ def test_a_grant_counts_though_it_was_asked_again_meanwhile() -> None:
     first = owner.ask(0)
     owner.ask(SECOND // 4)
     owner.grant(SECOND // 3, first)
-    assert owner.out == [SlotsGranted(HIGH, 60, 1, 9_960_000)]
+    assert owner.out == [SlotsGranted(TOPIC, 60, 1, 9_960_000)]
     assert owner.lease() == LEASE  # from the request on that was answered
 
 
@@ -70,7 +331,7 @@ def test_a_renewal_counts_though_it_was_asked_again_meanwhile() -> None:
     owner.grant(0, owner.ask(0))
     late = owner.renew(SECOND)
     owner.renew(2 * SECOND)
-    owner.renewed(5 * SECOND // 2, late, HIGH)
+    owner.renewed(5 * SECOND // 2, late, TOPIC)
     assert owner.lease() == SECOND + LEASE
 
 
@@ -79,7 +340,7 @@ def test_an_older_answer_does_not_shorten_a_lease() -> None:
     owner.grant(0, owner.ask(0))
     serials = [owner.renew(n * SECOND) for n in (1, 2)]
     for serial in reversed(serials):
-        owner.renewed(2 * SECOND, serial, HIGH)
+        owner.renewed(2 * SECOND, serial, TOPIC)
     assert owner.lease() == 2 * SECOND + LEASE
 
 
@@ -94,15 +355,15 @@ def test_an_older_answer_does_not_end_a_lease() -> None:
     assert owner.periodic.active
     owner.renewed(3 * SECOND, owner.renew(3 * SECOND))
     assert not owner.periodic.active
-    assert owner.out[-1] == SlotsLost(HIGH, "the master does not know of it")
+    assert owner.out[-1] == SlotsLost(TOPIC, "the master does not know of it")
 
 
 def test_answers_without_a_request_change_nothing() -> None:
     owner = Owner()
     serial = owner.ask(0)
     owner.grant(0, serial + 1)
-    owner.renewed(0, serial, HIGH)
-    refusal = management.Refuse(MESSAGE, serial, int(Reason.FULL), 1, 60)
+    owner.renewed(0, serial, TOPIC)
+    refusal = management.Refuse(MESSAGE, serial, int(RefuseReason.FULL), 1, 60)
     owner.requests.on_refuse(0, owner.periodic, refusal)
     owner.requests.on_refuse(0, owner.periodic, refusal)
     owner.grant(0, serial)  # to what was refused

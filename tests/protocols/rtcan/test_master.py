@@ -2,7 +2,7 @@
 
 import pytest
 
-from r2p.codecs import management, rtcan
+from r2p.codecs import can_bits, management, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import (
@@ -105,8 +105,8 @@ def test_a_sync_gets_through_where_the_bus_is_full() -> None:
     assert [node.engine.election.role for node in masters].count(Role.MASTER) == 1
     assert [len(node.of(NewMaster)) for node in masters] == [1] * 4
     (first, *others), (master, *_) = zip(*syncs(bus), strict=True)
-    before = [(at, at + rtcan.frame_bits(frame.id, frame.data) * 1_000) for at, frame, _ in bus.sent if at < first]
-    assert first - before[-1][1] == rtcan.INTERMISSION * 1_000  # the bus was full
+    before = [(at, at + can_bits.frame_bits(frame.id, frame.data) * 1_000) for at, frame, _ in bus.sent if at < first]
+    assert first - before[-1][1] == can_bits.INTERMISSION * 1_000  # the bus was full
     assert {(at - first) % CYCLE for at in others} == {0}  # the grid begins where the frame did
     assert master.engine.counts["syncs not sent"] == 0
 

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from r2p.codecs import management, rtcan
+from r2p.codecs import can_bits, management, rtcan
 from r2p.protocols.rtcan.cycle import Alignment, Cycle, Timing, timing
 from r2p.protocols.rtcan.network import MasterTracker
 
@@ -14,7 +14,7 @@ FINE, COARSE = timing(), timing(10, 100 * MS)
 
 def receive_sync(cycle: Cycle, start: int, counter: int) -> Alignment:
     frame = rtcan.encode_sync(counter, 1)
-    return cycle.on_sync(frame, start + rtcan.frame_bits(frame.id, frame.data) * 1_000)
+    return cycle.on_sync(frame, start + can_bits.frame_bits(frame.id, frame.data) * 1_000)
 
 
 def believed(ours: Timing, theirs: int, jitter: int, ppm: int = 0) -> bool | None:

@@ -4,8 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r2p.codecs import management, rtcan
-from r2p.codecs.rtcan import INTERMISSION, Frame, OtherFrame
+from r2p.codecs import can_bits, management, rtcan
+from r2p.codecs.can_bits import INTERMISSION
+from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.cycle import timing
 from r2p.protocols.rtcan.events import SlotsGranted
 from r2p.protocols.rtcan.monitor import FrameKind, Monitor, SeenFrame, TrafficCount
@@ -28,7 +29,7 @@ class Watched:
     def run(self, duration: int) -> None:
         self.bus.run(duration)
         for start, frame, _ in self.bus.sent[self._heard :]:
-            end = start + rtcan.frame_bits(frame.id, frame.data) * BIT
+            end = start + can_bits.frame_bits(frame.id, frame.data) * BIT
             self.seen.append(self.monitor.frame(frame, end))
         self._heard = len(self.bus.sent)
 
@@ -119,7 +120,7 @@ def test_the_load_counts_every_bit() -> None:
         publish(watched.talker, 8, number.to_bytes(8, "little"))
         watched.run(3 * MS)
     load = watched.monitor.load(watched.bus.now)
-    bits = [rtcan.frame_bits(frame.id, frame.data) + INTERMISSION for _, frame, _ in watched.bus.sent[begin:]]
+    bits = [can_bits.frame_bits(frame.id, frame.data) + INTERMISSION for _, frame, _ in watched.bus.sent[begin:]]
     assert load.total == pytest.approx(sum(bits) * BIT / (900 * MS))
     assert sum(tally.frames for tally in load.tallies.values()) == len(bits)
     assert load.tallies["0x070C", "id 12", FrameKind.SRT].frames == 300
@@ -173,7 +174,7 @@ def test_the_network_tells_its_own_timing() -> None:
     network(bus, 1, 0, slots=10, cycle=10 * MS)
     monitor = Monitor(timing())
     for start, frame, _ in bus.sent:
-        monitor.frame(frame, start + rtcan.frame_bits(frame.id, frame.data) * BIT)
+        monitor.frame(frame, start + can_bits.frame_bits(frame.id, frame.data) * BIT)
     assert monitor.directory.timing_known
     assert (monitor.directory.timing.slots, monitor.directory.timing.slot) == (10, MS)
     assert len(monitor.slots) == 10  # not those of before
@@ -253,6 +254,6 @@ def test_frames_that_rtcan_does_not_use_are_counted_as_other_ones() -> None:
         "29-bit identifier 10000000, asks for 2 bytes",
     ]
     load = monitor.load(SECOND)
-    bits = sum(rtcan.other_frame_bits(frame) + INTERMISSION for frame in frames)
+    bits = sum(can_bits.other_frame_bits(frame) + INTERMISSION for frame in frames)
     assert load.tallies == {("", "", FrameKind.OTHER): TrafficCount(3, bits)}
     assert load.total == bits * BIT / SECOND

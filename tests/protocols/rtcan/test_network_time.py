@@ -2,7 +2,7 @@
 
 import pytest
 
-from r2p.codecs import rtcan
+from r2p.codecs import can_bits, rtcan
 from r2p.codecs.management import ManagementType
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.cycle import Cycle, timing
@@ -159,4 +159,4 @@ def test_a_count_that_was_heard_long_ago_is_the_nearest_one(ahead: int) -> None:
 
 def hear(cycle: Cycle, count: int, start: int) -> None:
     frame = rtcan.encode_sync(count, 1)
-    cycle.on_sync(frame, start + rtcan.frame_bits(frame.id, frame.data) * US)
+    cycle.on_sync(frame, start + can_bits.frame_bits(frame.id, frame.data) * US)

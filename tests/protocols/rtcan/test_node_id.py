@@ -3,8 +3,7 @@
 import pytest
 
 from r2p.codecs.management import CLAIM_FIXED, Claim
-from r2p.protocols.rtcan.context import EngineContext
-from r2p.protocols.rtcan.events import EngineSettings, IdConflict
+from r2p.protocols.rtcan.events import EngineContext, EngineSettings, IdConflict
 from r2p.protocols.rtcan.node_id import OBJECTION, NodeId, Stage
 
 MS = 1_000_000

@@ -38,7 +38,7 @@ def drain(queue: LaxityQueue, now: int = NOW, step: int = 0) -> list[tuple[int, 
         if message is None:
             return order
         identifier = rtcan.decode_identifier(queue.next_frame(message, now).id)
-        order.append((identifier.message, identifier.laxity, identifier.left))
+        order.append((identifier.message_id, identifier.laxity, identifier.left))
         queue.frame_sent(message)
         now += step
 
@@ -233,12 +233,12 @@ def test_whatever_waits(messages: list[tuple[int, int | None, int, bool]], step:
         frame = queue.next_frame(best, now)
         identifier = rtcan.decode_identifier(frame.id)
         number, left = frame.data[0], identifier.left
-        if identifier.message in open_topics:
-            assert open_topics.pop(identifier.message) == (number, left + 1)
+        if identifier.message_id in open_topics:
+            assert open_topics.pop(identifier.message_id) == (number, left + 1)
         else:
             assert left == best.frames - 1
         if left:
-            open_topics[identifier.message] = (number, left)
+            open_topics[identifier.message_id] = (number, left)
         heads = {each.message: each for each in reversed(list(queue.messages()))}
         assert identifier.laxity == min(
             min(_laxity(each, now) for each in queue.messages() if each.message == topic) for topic in heads
@@ -333,7 +333,7 @@ def test_recorded_queue(case: CanCase) -> None:
     if case.name in FIRST_COME:
         names = {message: name for name, (message, _) in replay.messages.items()}
         parts = [rtcan.decode_identifier(frame.id) for _, frame in frames]
-        assert " ".join(f"{names[each.message]}{each.left}" for each in parts) == FIRST_COME[case.name]
+        assert " ".join(f"{names[each.message_id]}{each.left}" for each in parts) == FIRST_COME[case.name]
         assert sorted(frame.data for _, frame in frames) == sorted(sent.frame.data for sent in case.sent)
         return
     if case.name in ERROR_ENDS_IT:

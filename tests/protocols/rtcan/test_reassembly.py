@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r2p.codecs import rtcan
+from r2p.codecs import can_bits, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import MessageError
 from r2p.protocols.rtcan.events import Mailbox, Received
@@ -63,7 +63,7 @@ def test_what_a_message_tells() -> None:
     assert results[:2] == [None, None]
     assert received == Received(first.id, payload(20), STAMP)
     assert (received.source, received.high, received.message, received.laxity) == (10, 2, A, 33)
-    assert received.started(1_000) == STAMP - rtcan.frame_bits(first.id, first.data) * 1_000
+    assert received.started(1_000) == STAMP - can_bits.frame_bits(first.id, first.data) * 1_000
     assert [Received(laxity << 23, b"", 0).mailbox for laxity in (0, 1, 62, 63)] == [
         Mailbox.HRT,
         Mailbox.SRT,

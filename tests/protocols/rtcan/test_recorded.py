@@ -4,13 +4,13 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from r2p.codecs import rtcan
+from r2p.codecs import can_bits, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.protocols.rtcan.calendar import Reservation
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Outcome, Profile, Transmit
+from r2p.protocols.rtcan.leases import PeriodicMessage
 from r2p.protocols.rtcan.master import Role
-from r2p.protocols.rtcan.plan import PeriodicMessage
 from tests.can_vectors import CanCase, arriving, can_cases, payload
 from tests.protocols.rtcan.networks import current_cycle
 
@@ -181,7 +181,7 @@ def test_recorded_syncs_at_a_slave(case: CanCase) -> None:
         if step.verb == "frame":
             now += slots * SLOT
             frame = arriving(step)
-            engine.receive(now, frame, now + rtcan.frame_bits(frame.id, frame.data) * 1_000)
+            engine.receive(now, frame, now + can_bits.frame_bits(frame.id, frame.data) * 1_000)
             assert current_cycle(engine) == rtcan.decode_sync(frame).cycle
     assert current_cycle(engine) == case.of("driver")[-1].fields["cycle"]
 

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from r2p.codecs import rtcan
+from r2p.codecs import can_bits, rtcan
 from r2p.errors import MessageError
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Done, EngineSettings, Fate, Mailbox, Outcome, Received, Transmit
@@ -115,7 +115,7 @@ def test_nothing_starts_that_does_not_end_in_its_slot() -> None:
     slave.engine.confirm(in_time, Mailbox.SRT, Outcome.LATE, in_time)
     (transmit,) = slave.engine.poll(following + SLOT + 15_000)  # ... which 15 us later is too long
     assert isinstance(transmit, Transmit)
-    length = (rtcan.frame_bits(transmit.frame.id, transmit.frame.data) + 3) * 1_000
+    length = (can_bits.frame_bits(transmit.frame.id, transmit.frame.data) + 3) * 1_000
     assert transmit.not_after == following + 2 * SLOT - length
     assert master.engine.counts["late_to_slot"] == 0
 

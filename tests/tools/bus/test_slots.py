@@ -79,7 +79,7 @@ def test_a_refusal_has_its_reason_and_another_order_is_told() -> None:
     plan = ["imu:18@200Hz", "a1:8@996us", "a2:8@996us", "a3:8@996us", "a4:8@996us"]
     code, rows, err = admit(*plan)
     assert code == 1
-    assert "no 1 slots in a row are free every 6 slots" in str(rows[-1]["refused"])
+    assert "no slot is free every 6 slots" in str(rows[-1]["refused"])
     assert "2 of 5 messages do not fit" in err
     _, _, err = admit("b:8@5ms", "c:8@5ms", "d:8@5ms", "e:8@5ms", "f:8@5ms", "a:8@996us")
     assert "all of them fit in this order: a b c d e f" in err

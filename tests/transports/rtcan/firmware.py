@@ -33,7 +33,7 @@ def recorded(kind: str, topic: str = "") -> list[Frame]:
 def recorded_data() -> list[Frame]:
     """The recorded messages of `leds`, one frame each."""
     frames = [_frame(entry) for entry in _entries() if entry.can_id is not None]
-    return [frame for frame in frames if rtcan.decode_identifier(frame.id).message == MESSAGE]
+    return [frame for frame in frames if rtcan.decode_identifier(frame.id).message_id == MESSAGE]
 
 
 def _entries() -> list[Entry]:
@@ -106,12 +106,12 @@ class Firmware:
 
     def _receive(self, frame: Frame, _stamp: int) -> None:
         found = rtcan.decode_identifier(frame.id)
-        if found.message == rtcan.FIRMWARE_MANAGEMENT:
+        if found.message_id == rtcan.FIRMWARE_MANAGEMENT:
             self._receive_management(frame.data if found.left == 3 else self._management + frame.data, found.left)
-        elif rtcan.high_byte(found.message) == self._high:
-            self._parts[found.message] = self._parts.get(found.message, b"") + frame.data
+        elif rtcan.high_byte(found.message_id) == self._high:
+            self._parts[found.message_id] = self._parts.get(found.message_id, b"") + frame.data
             if not found.left:
-                self.commands.append((found.message, self._parts.pop(found.message)))
+                self.commands.append((found.message_id, self._parts.pop(found.message_id)))
 
     def _receive_management(self, data: bytes, left: int) -> None:
         self._management = data

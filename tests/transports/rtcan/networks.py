@@ -71,7 +71,7 @@ class Lab:
 
     def hrt(self, module: str) -> list[FrameRecord]:
         """Its frames in slots of its own, without syncs."""
-        return self.sent(lambda found: found.laxity == rtcan.HRT and rtcan.high_byte(found.message) > 0, module)
+        return self.sent(lambda found: found.laxity == rtcan.HRT and rtcan.high_byte(found.message_id) > 0, module)
 
     def clear(self) -> None:
         self.frames.clear()

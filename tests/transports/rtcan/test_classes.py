@@ -23,7 +23,7 @@ class Bulk(r2p.Message):
 
 def slots_of(made: Lab, starts: list[int]) -> list[int]:
     """The slots (of a cycle) that begin exactly at these instants."""
-    syncs = [each.start for each in made.sent(lambda found: found.laxity == rtcan.HRT and found.message < 256)]
+    syncs = [each.start for each in made.sent(lambda found: found.laxity == rtcan.HRT and found.message_id < 256)]
     slots, rest = zip(*(divmod(start - syncs[0], SLOT) for start in starts), strict=True)
     assert set(rest) == {0}
     return [slot % 60 for slot in slots]
@@ -267,7 +267,7 @@ async def test_two_publishers_of_one_topic_have_two_message_ids() -> None:
         samples = subscriber.samples()
         seen = {(sample.source.module, sample.data) for sample in [await anext(samples), await anext(samples)]}
         assert {module for module, _ in seen} == {"A", "B"}
-        messages = {each.message for each in made.identifiers(lambda found: found.laxity == rtcan.NRT)}
+        messages = {each.message_id for each in made.identifiers(lambda found: found.laxity == rtcan.NRT)}
         assert len(messages) == 2
         assert len({rtcan.high_byte(message) for message in messages}) == 1
 
@@ -280,7 +280,7 @@ async def test_no_module_gets_what_it_does_not_subscribe() -> None:
         await publisher.wait_subscriber()
         await publisher.publish(Led())
         await subscriber.fetch(timeout=1.0)
-        message = made.identifiers(lambda found: found.laxity == rtcan.NRT)[0].message
+        message = made.identifiers(lambda found: found.laxity == rtcan.NRT)[0].message_id
         wanted = {each: made.link(each).engine.filters() for each in ("B", "C")}
         needed = rtcan.message_filter(message)
         assert needed in wanted["B"]

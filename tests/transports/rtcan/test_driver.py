@@ -120,7 +120,7 @@ async def test_a_port_that_confirms_at_once_and_an_owner_that_publishes_at_once(
     owner.on_ready = lambda: driver.carry_out(driver.engine.publish(port.now(), 0x42, payload, handle="bulk"))
     driver.up()
     await asyncio.sleep(3.0)
-    data = [frame for frame in port.sent if rtcan.high_byte(rtcan.decode_identifier(frame.id).message) == 0x42]
+    data = [frame for frame in port.sent if rtcan.high_byte(rtcan.decode_identifier(frame.id).message_id) == 0x42]
     assert b"".join(frame.data for frame in data) == payload
     assert [rtcan.decode_identifier(frame.id).left for frame in data] == list(range(12, -1, -1))
     assert owner.fates() == [Fate.SENT]

@@ -54,12 +54,12 @@ async def test_management_waits_for_silence() -> None:
         for number in range(10):
             node.advertise(f"topic{number}", Led)
         await asyncio.sleep(5.0)
-        frames = made.sent(lambda found: found.message == rtcan.FIRMWARE_MANAGEMENT)
+        frames = made.sent(lambda found: found.message_id == rtcan.FIRMWARE_MANAGEMENT)
         firsts = [at for at, each in enumerate(frames) if rtcan.decode_identifier(each.frame.id).left == 3]
         ours = [at for at in firsts if frames[at].senders == ("PC1",)]
         assert len(ours) > 20
         assert all(frames[at].start - frames[at - 1].end >= 33_000_000 for at in ours)
-        assert not made.sent(lambda found: rtcan.high_byte(found.message) == rtcan.MANAGEMENT)
+        assert not made.sent(lambda found: rtcan.high_byte(found.message_id) == rtcan.MANAGEMENT)
 
 
 async def test_subscriptions_of_firmware_never_expire_and_those_of_r2p_do() -> None:

@@ -78,7 +78,7 @@ async def test_what_comes_after_the_good_bye_is_counted_for_a_while() -> None:
             await bob.advertise("leds", Led).wait_subscriber()
             await asyncio.sleep(0.1)
             needed = link.engine.filters()[-1]
-            message = rtcan.decode_identifier(needed[0]).message
+            message = rtcan.decode_identifier(needed[0]).message_id
         frame = rtcan.Frame(rtcan.encode_identifier(rtcan.NRT, message), Led().encode())
         for seconds, lost in (0.0, 1), (0.5, 2), (5.0, 2), (5.0, 2):
             await asyncio.sleep(seconds)

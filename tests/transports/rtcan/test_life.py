@@ -51,7 +51,7 @@ async def test_nothing_is_announced_before_the_node_has_an_id() -> None:
         while not link.engine.ready:
             assert not link.up
             assert "not on the bus" in link.guarantee("leds", r2p.PublisherClass.NON_REAL_TIME)
-            claims = made.sent(lambda found: rtcan.high_byte(found.message) == rtcan.MANAGEMENT)
+            claims = made.sent(lambda found: rtcan.high_byte(found.message_id) == rtcan.MANAGEMENT)
             assert len(claims) <= 4  # the CLAIM, which no node acknowledges
             await asyncio.sleep(0.01)
         assert link.up
@@ -233,7 +233,7 @@ async def test_two_topics_never_share_a_high_byte() -> None:
         assert await ones.fetch(timeout=1.0) == Led(led=1)
         assert await others.fetch(timeout=1.0) == PWM2(pwm1=1)
         data = made.identifiers(lambda found: found.laxity == rtcan.NRT)
-        assert len({rtcan.high_byte(each.message) for each in data}) == 2
+        assert len({rtcan.high_byte(each.message_id) for each in data}) == 2
 
 
 def _colliding() -> tuple[str, str]:
@@ -281,8 +281,8 @@ async def test_publishers_of_a_topic_share_a_high_byte() -> None:
             await publisher.publish(Led(led=led))
             assert await subscriber.fetch(timeout=1.0) == Led(led=led)
         data = made.identifiers(lambda found: found.laxity == rtcan.NRT)
-        assert len({each.message for each in data}) == 2
-        assert len({rtcan.high_byte(each.message) for each in data}) == 1
+        assert len({each.message_id for each in data}) == 2
+        assert len({rtcan.high_byte(each.message_id) for each in data}) == 1
 
 
 async def test_stop_is_urgent() -> None:
