@@ -30,16 +30,16 @@ class Record(Generic[T]):
         self.version = version
         self._may_be_empty = may_be_empty
         self._format = struct.Struct("<" + kinds)
-        self._fields = list(zip(cls.__struct_fields__, (k for k in kinds.split() if k != "x"), strict=True))
-        self._names = [field.type is str for field in msgspec.structs.fields(cls)]
+        formats = [kind for kind in kinds.split() if kind != "x"]
+        fields = zip(msgspec.structs.fields(cls), formats, strict=True)
+        self._fields = [(field.name, kind, field.type is str) for field, kind in fields]
 
     def pack(self, message: T) -> bytes:
-        return self._format.pack(*(self._packable(message, name, kind) for name, kind in self._fields))
+        return self._format.pack(*(self._packable(message, name, kind) for name, kind, _ in self._fields))
 
     def unpack(self, body: bytes) -> T:
-        values = self._format.unpack_from(body)
-        named = zip(self._fields, self._names, values, strict=True)
-        return self.cls(*(self._name(field[0], value) if is_name else value for field, is_name, value in named))
+        values = zip(self._fields, self._format.unpack_from(body), strict=True)
+        return self.cls(*(self._name(name, value) if is_name else value for (name, _, is_name), value in values))
 
     def _packable(self, message: T, name: str, kind: str) -> int | bytes:
         """The value of an attribute, checked: `struct` itself would cut and pad bytes without an error."""

@@ -10,7 +10,7 @@ moves back from cycle to cycle, so that network time catches up.
 """
 
 import enum
-from collections.abc import Container
+from collections.abc import Callable, Container
 from functools import lru_cache
 
 import msgspec
@@ -24,8 +24,6 @@ HOLDOVER = 3
 """Cycles without a sync that a slave bridges."""
 NO_SLOT = 1 << 16
 """After every slot of a cycle."""
-SYNC_ONLY = 1
-"""The mask of a cycle in which no slot is reserved but the sync's."""
 _CATCH_UP = 64  # part of a slot by which a cycle is shortened while network time catches up
 _IN_TIME = 8_000  # ns between plan and stamp of a sync: two calibrated latencies that vary by +-3 us, and a bit more
 _AMBIGUOUS = 128  # cycles: half of what the 8 bits of a sync tell apart
@@ -189,11 +187,14 @@ class Cycle:
 
     # Master
 
-    def first_sync(self, now: int, *, inherits: bool) -> tuple[Frame, int, int]:
-        """The first sync of a new master, its start and its count; if it `inherits` a network, grid and count go on."""
+    def first_sync(self, now: int, mask: Callable[[int], int], *, inherits: bool) -> tuple[Frame, int, int]:
+        """The first sync of a new master, its start and its count; `mask(count)` gives the slots that it reserves.
+
+        If the master `inherits` a network, the grid and the count of before go on.
+        """
         self.anchored = inherits
         start, counter = self.upcoming(now)
-        return rtcan.encode_sync(counter, SYNC_ONLY), start, counter
+        return rtcan.encode_sync(counter, mask(counter)), start, counter
 
     def upcoming(self, now: int) -> tuple[int, int]:
         """Start and count of the next cycle: by the grid and the counter of before, if there were any."""

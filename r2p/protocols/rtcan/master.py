@@ -12,7 +12,8 @@ import enum
 from collections.abc import Callable
 
 from r2p.codecs.can_bits import start_of_frame
-from r2p.protocols.rtcan.cycle import HOLDOVER, SYNC_ONLY
+from r2p.codecs.rtcan import decode_sync
+from r2p.protocols.rtcan.cycle import HOLDOVER
 from r2p.protocols.rtcan.events import EngineContext, Outcome
 from r2p.protocols.rtcan.leases import SlotGrants
 from r2p.protocols.rtcan.transmitter import FirstSync, SlotTransmitter
@@ -113,7 +114,8 @@ class MasterRole:
         """Send the first sync. If it `inherits`, the network of before goes on: the grid, the count, the leases."""
         self._grants.clear()
         self._set_inherits(inherits)
-        first = FirstSync(*self._cycle.first_sync(now, inherits=inherits), self._first_confirmed)
+        frame, start, counter = self._cycle.first_sync(now, self._grants.calendar.mask, inherits=inherits)
+        first = FirstSync(frame, start, counter, self._first_confirmed)
         if self._transmitter.send_first_sync(first):
             self._first = first
         else:
@@ -163,7 +165,7 @@ class MasterRole:
             start = start_of_frame(first.frame, at, self._cycle.timing.bit)
             if self._inherits and not self._cycle.delay(max(0, start - first.start)):
                 self._set_inherits(False)
-            self._lead(now, start, first.counter, SYNC_ONLY)
+            self._lead(now, start, first.counter, decode_sync(first.frame).mask)
         elif outcome is not Outcome.UNKNOWN and self._retries < _RETRIES:
             self._retries += 1
             self._retry(now)

@@ -233,7 +233,7 @@ def test_management_of_firmware_that_has_no_time_left_is_not_shown_as_a_sync() -
 def test_a_frame_counts_for_the_period_in_which_it_was_on_the_bus() -> None:
     """However late it is read: periods that are over wait until they are asked for."""
     monitor = Monitor(timing())
-    monitor.begin(SECOND, SECOND)
+    monitor.reset(SECOND, SECOND)
     for number in range(50):
         monitor.frame(Frame(rtcan.encode_identifier(20, 0x0501), b"%8d" % number), SECOND + number * 100 * MS)
     frames = [sum(tally.frames for tally in monitor.next_load().tallies.values()) for _ in range(7)]
