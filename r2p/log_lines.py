@@ -55,12 +55,16 @@ class LineLimit:
         self._lines: dict[str, list[int]] = {}
         """Of each kind: the start of its period (ns), and how many lines there would have been since."""
 
-    def suffix(self, kind: str, now: int) -> str | None:
-        """The text to append to one more line at `now` (monotonic ns); None if the line is left out."""
+    def suffix(self, kind: str, now: int, rate: int = 0) -> str | None:
+        """The text to append to one more line at `now` (monotonic ns); None if the line is left out.
+
+        `rate` is that of this kind, where it is not the same for all.
+        """
+        rate = rate or self._rate
         lines = self._lines.get(kind)
         if lines is not None and now - lines[0] < self._period:  # first, as this is so for most lines of a flood
             lines[1] += 1
-            return "" if lines[1] <= self._rate else None
-        left_out = lines[1] - self._rate if lines is not None else 0
+            return "" if lines[1] <= rate else None
+        left_out = lines[1] - rate if lines is not None else 0
         self._lines[kind] = [now, 1]
         return f" ({left_out} more since the last such line)" if left_out > 0 else ""

@@ -94,7 +94,6 @@ class LinkManager:
         """Names that two modules may have."""
         self._commands: dict[tuple[Command, str], tuple[int, str]] = {}
         """Commands that were sent, by the module's alias: when (monotonic ns), and its name."""
-        self._mismatches: dict[Link, LineLimit] = {}
         self._limits: dict[Link, LineLimit] = {}
         self._clients = LineLimit()
         self._refusals = LineLimit(1, _REFUSED_APART)
@@ -137,9 +136,8 @@ class LinkManager:
         """Add a link, up or not yet."""
         self.links.append(link)
         self._limits[link] = LineLimit()
-        self._mismatches[link] = LineLimit(_MISMATCH_LINES)
         self.space.links.append(link)
-        self._bridging.attach(link)
+        self._bridging.attach(link)  # before any topic is announced: it decides which ones may be
         for topic in list(self.space.topics.values()):
             link.stats.lost.guard(link.topic_changed, topic)
         link.set_flags(self.flags)
@@ -150,7 +148,6 @@ class LinkManager:
         self.space.links.remove(link)
         self._bridging.detach(link)
         del self._limits[link]
-        del self._mismatches[link]
         self._link_accepted(link)
         self.closed_links.add(link.stats, link.losses)
 
@@ -198,7 +195,9 @@ class LinkManager:
             case CommandReceived():
                 self._on_command(event.command)
             case Mismatched():
-                self._log_mismatch(link, event)
+                # Within a limit of its own: another type in each message would fill the log.
+                text = f"topic {event.topic} is refused: {describe_mismatch(event)}"
+                self._log_limited(link, logging.ERROR, f"type of {event.topic}", text, _MISMATCH_LINES)
                 self._events.emit(event)
             case CommandDenied():
                 self._report_command_denied(link, event)
@@ -213,7 +212,7 @@ class LinkManager:
                     "link %s gives back what this module sends: switch off local echo at the other end", link.title
                 )
             case ModuleChanged():
-                self._link_accepted(link)
+                self._link_accepted(link)  # a module that refuses the connection announces nothing
                 self._suspect_conflict(link, event.info)
                 self._events.emit(event)
             case ModuleGone():
@@ -264,19 +263,11 @@ class LinkManager:
         if suffix is not None:
             logger.log(level, "link %s %s%s", link.title, text, suffix)
 
-    def _log_limited(self, link: Link, level: int, kind: str, text: str) -> None:
+    def _log_limited(self, link: Link, level: int, kind: str, text: str, rate: int = 0) -> None:
         """Log what the other end can make happen any number of times a second."""
-        suffix = self._limits[link].suffix(kind, self.space.clock.monotonic()) if link in self._limits else ""
+        suffix = self._limits[link].suffix(kind, self.space.clock.monotonic(), rate) if link in self._limits else ""
         if suffix is not None:
             logger.log(level, "link %s: %s%s", link.title, text, suffix)
-
-    def _log_mismatch(self, link: Link, event: Mismatched) -> None:
-        """Log a mismatch at most once a second: another type in each message would fill the log."""
-        limit = self._mismatches.get(link)
-        suffix = None if limit is None else limit.suffix(event.topic, self.space.clock.monotonic())
-        if suffix is not None:
-            text = describe_mismatch(event)
-            logger.error("link %s: topic %s is refused: %s%s", link.title, event.topic, text, suffix)
 
     # Connections that the other end refuses
 

@@ -452,6 +452,6 @@ class CommandHandler:
 
     def _log(self, level: int, text: str, detail: str = "") -> None:
         """Log what other modules can make happen any number of times a second."""
-        suffix = self._limit.suffix(text, int(asyncio.get_running_loop().time() * SECOND))
+        suffix = self._limit.suffix(text, self._module.space.clock.monotonic())
         if suffix is not None:
             logger.log(level, "%s%s%s", text, detail, suffix)

@@ -29,11 +29,12 @@ _CLEANUP_POLL = 0.01  # seconds until it is checked again whether clean-up is ov
 _HANDLER_GRACE = 1.0  # seconds for which an `except` counts as clean-up after a crash; then the node goes on in it
 
 
-def check_function(function: NodeFunction) -> None:
-    """Raise Error for what can't run as a node, as it is not a coroutine function."""
+def check_function(function: NodeFunction) -> Any:
+    """Return the function, or the one in its `functools.partial`. Raises Error unless it is a coroutine function."""
     bare = function.func if isinstance(function, functools.partial) else function
     if not (inspect.iscoroutinefunction(bare) or inspect.iscoroutinefunction(getattr(bare, "__call__", None))):  # noqa: B004 - looked into, not called
         raise Error(f"{function!r} is not a coroutine function: write `async def name(node: r2p.Node) -> None`")
+    return bare
 
 
 def name_of(function: NodeFunction) -> str:
@@ -41,8 +42,7 @@ def name_of(function: NodeFunction) -> str:
 
     Raises NameTooLong or InvalidName if that is not a valid node name, and Error for what is not a coroutine function.
     """
-    check_function(function)
-    bare = function.func if isinstance(function, functools.partial) else function
+    bare = check_function(function)
     name = getattr(bare, "__name__", type(bare).__name__)
     if len(name) > NODE_MAX:
         raise NameTooLong(

@@ -95,7 +95,7 @@ class Sink(abc.ABC):
         self.blocks_publishers = True
 
 
-class PendingDelivery(abc.ABC):
+class PendingDelivery:
     """A sample that waits for room in some sinks."""
 
     __slots__ = ("remaining", "sample")
@@ -107,7 +107,6 @@ class PendingDelivery(abc.ABC):
         for sink in sinks:
             sink.get_wait_queue().add(sink, self)
 
-    @abc.abstractmethod
     def on_completed(self, sink: Sink, reason: str) -> None:
         """Called when the sink has the sample, or has lost it, and counted that, for this reason."""
 
@@ -126,12 +125,9 @@ class PendingDelivery(abc.ABC):
 
 
 class _LatchedDelivery(PendingDelivery):
-    """A latched value on its way to a new subscriber."""
+    """A latched value on its way to a new subscriber; its publisher does not wait for that."""
 
     __slots__ = ()
-
-    def on_completed(self, sink: Sink, reason: str) -> None:
-        """The publisher does not wait for it."""
 
 
 _Line = deque[tuple[Sink, PendingDelivery]]
