@@ -79,11 +79,7 @@ class Publisher(BasePublisher[M, NonRealTime]):
             await delivery.over
         finally:
             timer.cancel()
-            without = delivery.withdraw()  # none, unless this task was cancelled
-            for sink in without:
-                sink.count_lost(CANCELLED)
-            if without:
-                self._miss(sample.sequence, CANCELLED, without)
+            self._withdraw(delivery, CANCELLED, CANCELLED)  # nothing waits any longer, unless this task was cancelled
             if delivery.failed:
                 self._miss(sample.sequence, delivery.reason, delivery.failed)
 

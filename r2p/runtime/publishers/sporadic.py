@@ -4,7 +4,7 @@ from typing import Generic
 
 from r2p.clock import Alarm
 from r2p.messages import Layout
-from r2p.runtime.backpressure import GIVEN_UP, PendingDelivery, Sink
+from r2p.runtime.backpressure import PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Sporadic
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, checkpoint
@@ -97,11 +97,8 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
     def _give_up(self, event: "_EventDelivery[M]", reason: str) -> None:
         if event in self._pending:  # a callback for an event before it may have closed the publisher
             self._pending.remove(event)
-            without = event.withdraw()
-            for sink in without:
-                sink.count_lost(GIVEN_UP)
             late = max(0, self._clock.monotonic() - event.due) / SECOND
-            self._miss(event.sample.sequence, reason, without, late)
+            self._withdraw(event, reason, late=late)
 
 
 class _EventDelivery(PendingDelivery, Generic[M]):
