@@ -506,4 +506,4 @@ async def test_nothing_is_kept_of_types_that_clients_had(caplog: pytest.LogCaptu
             caplog.clear()
             writer.close()
             await until(lambda: not module.links)
-            assert not module._opened._mismatches
+            assert not module._opened._limits
