@@ -54,6 +54,13 @@ class TopicInfo(msgspec.Struct):
     types: dict[int, TopicType] = {}
     typed_at: dict[int, int] = {}
 
+    def set_heard(self, role: int, at: int | None) -> None:
+        """Set when a peer in this role was heard last."""
+        if role == ROLE_PUBLISHES:
+            self.advertised_at = at
+        else:
+            self.requested_at = at
+
     def set_type(self, role: int, known: TopicType | None) -> None:
         """Set what the peers in this role say; None removes it."""
         if known is None:

@@ -243,8 +243,8 @@ class Outbox:
                 self._sent.append(data)
                 self._events.append(Send(data, urgent))
 
-    def emit(self, event: Event) -> None:
-        self._events.append(event)
+    def emit(self, *events: Event) -> None:
+        self._events += events
 
     def drain(self) -> list[Event]:
         events, self._events = self._events, []

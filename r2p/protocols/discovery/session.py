@@ -14,7 +14,7 @@ come.
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Hashable
-from typing import Any
+from typing import Any, TypeVar
 
 from r2p.codecs import UnknownType, management
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
@@ -41,6 +41,9 @@ from r2p.protocols.discovery.schedule import ItemKind, Schedule
 from r2p.protocols.timers import KeyedTimers
 from r2p.units import SECOND
 
+D = TypeVar("D", bytes, str)
+M = TypeVar("M")
+
 _SUSPENDED = SECOND
 """Ns by which `poll` is late only when this program did not run: its computer slept, or a debugger held it."""
 _HEARD_AGAIN = 2 * SECOND
@@ -51,7 +54,8 @@ class DiscoveryProtocol(ABC):
     """The modules, topics and subscriptions of one link.
 
     Every method that takes `now` (monotonic ns) returns the events to act on, in order. Call `poll` at
-    `next_deadline()`, which may have changed after each call.
+    `next_deadline()`, which may have changed after each call. `counts` is the counter to use, where its owner
+    wants to see it grow.
     """
 
     flags: int
@@ -64,6 +68,13 @@ class DiscoveryProtocol(ABC):
     """The topics of the other modules, by name."""
     endpoints: dict[EndpointKey, EndpointInfo]
     """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
+
+    def __init__(self, module: str, instance: int, counts: Counter[str] | None) -> None:
+        self.flags = 0
+        self.counts = Counter() if counts is None else counts
+        self._module = module
+        self._instance = instance
+        self._outbox = Outbox()
 
     @property
     def sole_peer(self) -> int | None:
@@ -117,9 +128,10 @@ class DiscoveryProtocol(ABC):
 
     # What users and gateways ask for
 
-    @abstractmethod
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         """Command a module to stop, to reboot or to enter its loader."""
+        self._outbox.send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
+        return self._outbox.drain()
 
     @abstractmethod
     def query(self, now: int) -> list[Event]:
@@ -159,13 +171,31 @@ class DiscoveryProtocol(ABC):
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
         """Handle a management message from `source`. Bad bytes are counted, and raise nothing."""
 
+    def _decode(self, decode: Callable[[D], M], data: D) -> M | None:
+        """Decode a message or a token; None for one that is counted."""
+        try:
+            return decode(data)
+        except UnknownType:
+            self.counts["unknown type"] += 1
+        except DecodeError:
+            self.counts["undecodable"] += 1
+        return None
+
+    def _commanded(self, now: int, message: management.Order, source: PeerAddress) -> None:
+        if message.module == self._module:
+            self._outbox.emit(CommandReceived(COMMAND_OF_TYPE[management.order_type(message)]))
+
+    def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
+        if message.order in COMMAND_OF_TYPE:
+            command = COMMAND_OF_TYPE[message.order]
+            self._outbox.emit(CommandDenied(message.gateway, command, message.module, message.reason))
+
 
 class Discovery(DiscoveryProtocol):
     """The management protocol of one link.
 
     `rate` is the most management messages a second that were not asked for, `burst` how many of them may go at once,
     `quiet` the time (s) without management traffic before something is repeated. An `observer` sends no ALIVE.
-    `counts` is the counter to use, where its owner wants to see it grow.
     """
 
     def __init__(
@@ -179,9 +209,7 @@ class Discovery(DiscoveryProtocol):
         observer: bool = False,
         counts: Counter[str] | None = None,
     ) -> None:
-        self.flags = 0
-        self.counts = Counter() if counts is None else counts
-        self._outbox = Outbox()
+        super().__init__(module, instance, counts)
         self._schedule = Schedule(rate, burst, round(quiet * SECOND))
         self._timers = KeyedTimers()
         self._directory = Directory(self._timers, self.counts)
@@ -275,10 +303,6 @@ class Discovery(DiscoveryProtocol):
 
     # What users and gateways ask for
 
-    def command(self, now: int, command: Command, module: str) -> list[Event]:
-        self._outbox.send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
-        return self._outbox.drain()
-
     def query(self, now: int) -> list[Event]:
         self._announcer.announce_once(ItemKind.QUERY)
         return self._flush(now)
@@ -344,18 +368,12 @@ class Discovery(DiscoveryProtocol):
             self.counts["link down"] += 1
             return []
         self._schedule.traffic(now)  # whatever it is, it took time on a line that is to be quiet
-        try:
-            message = management.decode(data)
-        except UnknownType:
-            self.counts["unknown type"] += 1
-        except DecodeError:
-            self.counts["undecodable"] += 1
-        else:
-            handler = self._handlers.get(type(message))
-            if handler is not None and not self._liveness.is_echo(now, data):
-                handler(now, message, source)  # before demand, which looks up the leases that a HELLO has set
-                if self._demand is not None:
-                    self._demand.receive(now, message, source)
+        message = self._decode(management.decode, data)
+        handler = self._handlers.get(type(message))
+        if message is not None and handler is not None and not self._liveness.is_echo(now, data):
+            handler(now, message, source)  # before demand, which looks up the leases that a HELLO has set
+            if self._demand is not None:
+                self._demand.receive(now, message, source)
         return self._outbox.drain()
 
     def _flush(self, now: int) -> list[Event]:
@@ -379,15 +397,8 @@ class Discovery(DiscoveryProtocol):
             case ("endpoint", (int(instance), str(node), str(topic), int(role))):
                 self._directory.forget_endpoint((instance, node, topic, role))
 
-    # Commands
-
     def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
         if message.reason in (management.DENIED_CLIENTS, management.DENIED_GATEWAYS):
             self._outbox.emit(ConnectionDenied(message.gateway, message.reason == management.DENIED_GATEWAYS))
-        elif message.order in COMMAND_OF_TYPE:
-            command = COMMAND_OF_TYPE[message.order]
-            self._outbox.emit(CommandDenied(message.gateway, command, message.module, message.reason))
-
-    def _commanded(self, now: int, message: management.Order, source: PeerAddress) -> None:
-        if message.module == self._announcer.module:
-            self._outbox.emit(CommandReceived(COMMAND_OF_TYPE[management.order_type(message)]))
+        else:
+            super()._denied(now, message, source)

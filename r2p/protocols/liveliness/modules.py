@@ -6,7 +6,7 @@ import msgspec
 
 from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.protocols.discovery.directory import FOR_EVER, TABLE_MAX, EndpointInfo, EndpointKey, decrement
-from r2p.protocols.discovery.events import Event, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
+from r2p.protocols.discovery.events import ModuleChanged, ModuleGone, ModuleInfo, NameConflict, Outbox
 from r2p.units import SECOND
 
 _CONFLICT_AFTER = 3 * SECOND // 2
@@ -14,18 +14,18 @@ _CONFLICT_AFTER = 3 * SECOND // 2
 
 
 class ModuleRegistry:
-    """The other modules on the network of module `module`, run `instance`. What has changed is added to `events`.
+    """The other modules on the network of module `module`, run `instance`. What has changed goes to `outbox`.
 
     It keeps TABLE_MAX modules; of others only the name, so that they are shown as soon as another module is gone.
     """
 
-    def __init__(self, module: str, instance: int, events: list[Event], counts: Counter[str]) -> None:
+    def __init__(self, module: str, instance: int, outbox: Outbox, counts: Counter[str]) -> None:
         self.modules: dict[str, ModuleInfo] = {}
         self.endpoints: dict[EndpointKey, EndpointInfo] = {}
         self.generation = 0
         self._module = module
         self._instance = instance
-        self._events = events
+        self._outbox = outbox
         self._counts = counts
         self._tokens: dict[str, dict[str, ModuleToken]] = {}  # by name and key
         self._endpoint_tokens: Counter[EndpointKey] = Counter()
@@ -103,7 +103,7 @@ class ModuleRegistry:
             if name == self._module:
                 instances.insert(0, self._instance)
             one, other, *_ = dict.fromkeys(instances)
-            self._events.append(NameConflict(name, one, other))
+            self._outbox.emit(NameConflict(name, one, other))
 
     def _update(self, now: int, name: str) -> None:
         """The tokens of a name have changed: the nearest and latest of them becomes the module."""
@@ -135,7 +135,7 @@ class ModuleRegistry:
             self._names[info.instance] = info.name
         if before is None or before.differs(info):
             self.generation += 1
-            self._events.append(ModuleChanged(info))
+            self._outbox.emit(ModuleChanged(info))
         for key in () if info.instance is None else self._endpoints_of.get(info.instance, ()):
             endpoint = self.endpoints[key]
             if endpoint.module != info.name:
@@ -152,7 +152,7 @@ class ModuleRegistry:
         if info.instance is not None:
             self._names.pop(info.instance, None)
         self.generation += 1
-        self._events.append(ModuleGone(info))
+        self._outbox.emit(ModuleGone(info))
 
 
 def _info(token: ModuleToken, now: int) -> ModuleInfo:

@@ -10,25 +10,18 @@ from collections import Counter
 
 import msgspec
 
-from r2p.codecs import UnknownType, liveliness, management
+from r2p.codecs import liveliness, management
 from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.errors import DecodeError
 from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.directory import TABLE_MAX, Aliases, Demand
 from r2p.protocols.discovery.events import (
-    COMMAND_OF_TYPE,
-    MESSAGE_OF_COMMAND,
-    Command,
-    CommandDenied,
-    CommandReceived,
     Event,
     ModuleInfo,
     NameConflict,
     PeerAddress,
     QueryTokens,
-    Send,
     TopicType,
 )
 from r2p.protocols.discovery.session import DiscoveryProtocol
@@ -50,23 +43,15 @@ _PAUSE_MAX = 300 * SECOND
 
 
 class LivelinessDiscovery(DiscoveryProtocol):
-    """The discovery of one module on a network with liveliness tokens.
-
-    `counts` is the counter to use, if its owner wants to see it grow.
-    """
+    """The discovery of one module on a network with liveliness tokens."""
 
     def __init__(
         self, module: str, instance: int, *, observer: bool = False, counts: Counter[str] | None = None
     ) -> None:
-        self.flags = 0
-        self.counts = Counter() if counts is None else counts
-        self._module = module
-        self._instance = instance
-        self._up = False
-        self._events: list[Event] = []
+        super().__init__(module, instance, counts)
         self._own = TokenSet(module, instance, observer=observer)
-        self._matching = Matching(self._own, self._events)
-        self._modules = ModuleRegistry(module, instance, self._events, self.counts)
+        self._matching = Matching(self._own, self._outbox)
+        self._modules = ModuleRegistry(module, instance, self._outbox, self.counts)
         self.modules = self._modules.modules
         self.topics = self._matching.topics
         self.endpoints = self._modules.endpoints
@@ -85,7 +70,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         if flags != self.flags:
             self.flags = flags
             self._own.set_flags(flags)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def advertise(
         self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
@@ -106,11 +91,11 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
         self._own.add_node(topic, role, node, publisher_class)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
         self._own.remove_node(topic, role, node)
-        return self._pop_events()
+        return self._outbox.drain()
 
     # For gateways
 
@@ -136,14 +121,13 @@ class LivelinessDiscovery(DiscoveryProtocol):
                     token = msgspec.structs.replace(known, flags=flags & liveliness.FLAGS_MASK)
                     self._relay(("module", name), token, gone=False)
                 else:
-                    for each in management.alias_messages(name):
-                        self._send(each)
-                    self._send(management.Alive(module_alias(name), flags))
+                    alive = management.Alive(module_alias(name), flags)
+                    self._outbox.send(*management.alias_messages(name), alive)
             case management.Endpoint(role, instance, node, topic, publisher_class):
                 key = (instance, node, topic, role & ~management.ROLE_GONE)
                 endpoint = TopicToken(self._instance, key[3], topic, instance, node, publisher_class, hops=1)
                 self._relay(key, endpoint, gone=bool(role & management.ROLE_GONE))
-        return self._pop_events()
+        return self._outbox.drain()
 
     def _relay(self, key: tuple[str | int, ...], token: liveliness.Token, *, gone: bool) -> None:
         if gone:
@@ -155,77 +139,68 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     # What users ask for
 
-    def command(self, now: int, command: Command, module: str) -> list[Event]:
-        self._send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
-        return self._pop_events()
-
     def query(self, now: int) -> list[Event]:
         """Do nothing: what r2p modules have is known."""
-        return self._pop_events()
+        return self._outbox.drain()
 
     def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
-        self._send(management.Conflict(module_alias(module), instance_a, instance_b))
-        return self._pop_events()
+        self._outbox.send(management.Conflict(module_alias(module), instance_a, instance_b))
+        return self._outbox.drain()
 
     # The link
 
     def link_up(self, now: int) -> list[Event]:
-        self._up = True
-        self._events += self._own.pop_changes()
+        self._outbox.up = True
+        self._outbox.emit(*self._own.pop_changes())
         self._review_refused(now)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def link_down(self, now: int) -> list[Event]:
         """Forget all tokens, which will appear again. This module's own are declared anew then."""
-        self._up = False
-        self._events += self._own.withdraw_all()
+        self._outbox.up = False
+        self._outbox.emit(*self._own.withdraw_all())
         for key in list(self._tokens):
             self._remove_token(now, key)
         self._refused.clear()
         self._modules.clear()  # what is left is firmware, which gateways announce by messages
-        return self._pop_events()
+        return self._outbox.drain()
 
     def leave(self, now: int) -> list[Event]:
         """Stop; the tokens go with the session."""
-        self._up = False
+        self._outbox.up = False
         self._refused.clear()
-        return self._pop_events()
+        return self._outbox.drain()
 
     def next_deadline(self) -> int | None:
-        if self._up and self._own.has_changes:
+        if self._outbox.up and self._own.has_changes:
             return 0
         due = (self._modules.next_deadline(), self._refused.next_deadline(), self._mark_at)
         return min((each for each in due if each is not None), default=None)
 
     def poll(self, now: int) -> list[Event]:
         """Declare what has changed here; mark as heard what has a token; query tokens that were refused."""
-        if self._up:
-            self._events += self._own.pop_changes()
+        if self._outbox.up:
+            self._outbox.emit(*self._own.pop_changes())
         if self._mark_at is not None and self._mark_at <= now:
             self._mark_heard(now)
         if self._refused.is_due(now, self._free):
-            self._events.append(QueryTokens())
+            self._outbox.emit(QueryTokens())
         self._modules.poll(now)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
-        try:
-            message = management.decode(data)
-        except UnknownType:
-            self.counts["unknown type"] += 1
-        except DecodeError:
-            self.counts["undecodable"] += 1
-        else:
+        message = self._decode(management.decode, data)
+        if message is not None:
             self._handle(now, message, source)
-        return self._pop_events()
+        return self._outbox.drain()
 
     # Tokens of other modules
 
     def appeared(self, now: int, key: str) -> list[Event]:
         """Handle a token that is there; one that is known already is ignored."""
-        token = None if key in self._tokens else self._decoded(key)
+        token = None if key in self._tokens else self._decode(liveliness.decode, key)
         if token is None or token.session == self._instance:
-            return self._pop_events()
+            return self._outbox.drain()
         if len(self._tokens) >= TOKENS_MAX:
             return self.refused(now)
         self._tokens[key] = token
@@ -237,7 +212,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
             self._modules.endpoint_appeared(token)
             if not token.hops:  # behind a gateway: its own tokens say what it passes on
                 self._matching.appeared(now, key, token)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def disappeared(self, now: int, key: str) -> list[Event]:
         """Handle a token that is gone."""
@@ -246,7 +221,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         else:
             self._refused.remove_one()
         self._review_refused(now)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def refused(self, now: int) -> list[Event]:
         """Count a token for which there was no room."""
@@ -257,13 +232,13 @@ class LivelinessDiscovery(DiscoveryProtocol):
         """Note that so many tokens may be there that were not reported, which are queried when there is room."""
         self._refused.add(count)
         self._review_refused(now)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def query_ended(self, now: int, *, complete: bool) -> list[Event]:
         """Note that all answers to `QueryTokens` have come, or, if not `complete`, some of them."""
         self._refused.query_ended(complete=complete)
         self._review_refused(now)
-        return self._pop_events()
+        return self._outbox.drain()
 
     # Topics
 
@@ -271,19 +246,19 @@ class LivelinessDiscovery(DiscoveryProtocol):
         if self._own.get(topic, role) != own:
             self._own.set_topic(topic, role, own)
             self._matching.changed(topic, role)
-        return self._pop_events()
+        return self._outbox.drain()
 
     def _remove_topic(self, topic: str, role: int) -> list[Event]:
         self._own.remove_topic(topic, role)
         self._matching.changed(topic, role)
-        return self._pop_events()
+        return self._outbox.drain()
 
     @property
     def _free(self) -> int:
         return TOKENS_MAX - len(self._tokens)
 
     def _review_refused(self, now: int) -> None:
-        if self._up:
+        if self._outbox.up:
             self._refused.review(now, self._free)
 
     def _remove_token(self, now: int, key: str) -> None:
@@ -306,35 +281,17 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     def _handle(self, now: int, message: management.Management, source: PeerAddress) -> None:
         match message:
-            case management.Stop(self._module) | management.Reboot(self._module) | management.Bootload(self._module):
-                self._events.append(CommandReceived(COMMAND_OF_TYPE[management.order_type(message)]))
+            case management.Stop() | management.Reboot() | management.Bootload():
+                self._commanded(now, message, source)
             case management.Conflict(self._module, a, b) if self._instance in (a, b):
-                self._events.append(NameConflict(self._module, a, b))
-            case management.Denied(gateway, module, order, reason) if order in COMMAND_OF_TYPE:
-                self._events.append(CommandDenied(gateway, COMMAND_OF_TYPE[order], module, reason))
+                self._outbox.emit(NameConflict(self._module, a, b))
+            case management.Denied():
+                self._denied(now, message, source)
             case management.Name():
                 self._aliases.receive(message)
             case management.Alive(name, flags):
                 name = self._aliases.name_of(name)
                 self._modules.add_firmware(ModuleInfo(name, flags, now, hops=1, source=source))
-
-    def _send(self, message: management.Management, *, urgent: bool = False) -> None:
-        if self._up:
-            self._events.append(Send(management.encode(message), urgent))
-
-    def _decoded(self, key: str) -> liveliness.Token | None:
-        try:
-            return liveliness.decode(key)
-        except UnknownType:
-            self.counts["unknown type"] += 1
-        except DecodeError:
-            self.counts["undecodable"] += 1
-        return None
-
-    def _pop_events(self) -> list[Event]:
-        events = self._events[:]
-        self._events.clear()
-        return events
 
 
 class RefusedTokens:

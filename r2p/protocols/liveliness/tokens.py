@@ -18,8 +18,8 @@ from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBS
 from r2p.protocols.discovery.directory import Demand, TopicInfo, decrement
 from r2p.protocols.discovery.events import (
     Declare,
-    Event,
     Mismatched,
+    Outbox,
     PublisherFound,
     PublisherGone,
     SubscriberJoined,
@@ -157,12 +157,12 @@ class _PeerSession(msgspec.Struct):
 class Matching:
     """The topics of one network."""
 
-    def __init__(self, own: TokenSet, events: list[Event]) -> None:
+    def __init__(self, own: TokenSet, outbox: Outbox) -> None:
         self.topics: dict[str, TopicInfo] = {}
         self.demand = Demand()
         """What other modules publish and subscribe to, whether this one has anything to do with it or not."""
         self._own = own
-        self._events = events
+        self._outbox = outbox
         self._sessions: dict[int, _PeerSession] = {}
         self._subscribers: Counter[str] = Counter()  # sessions that this module sends to, by topic
         self._sessions_of: dict[TopicRole, dict[int, _PeerSession]] = {}  # by number
@@ -176,7 +176,7 @@ class Matching:
         self._sessions_of.setdefault(topic_role, {})[token.session] = session
         self.demand.add(*topic_role, token.session)
         info = self.topics.setdefault(token.topic, TopicInfo(token.topic))
-        self._set_heard(now, info, token.role)
+        info.set_heard(token.role, now)
         self._update_type(info, token.role)
         self._match(token.session, session, topic_role)
 
@@ -210,7 +210,7 @@ class Matching:
     def mark_heard(self, now: int) -> None:
         """Mark what has a token as heard now."""
         for topic, role in self._sessions_of:
-            self._set_heard(now, self.topics[topic], role)
+            self.topics[topic].set_heard(role, now)
 
     def _match(self, number: int, session: _PeerSession, key: TopicRole) -> None:
         topic, role = key
@@ -229,7 +229,7 @@ class Matching:
                 if session.mismatched.get(key) != theirs:
                     self._mismatches[topic] += key not in session.mismatched
                     session.mismatched[key] = theirs
-                    self._events.append(Mismatched(topic, number, role, own.type, theirs))
+                    self._outbox.emit(Mismatched(topic, number, role, own.type, theirs))
         if topic in self.topics:
             self.topics[topic].mismatch = topic in self._mismatches
 
@@ -244,9 +244,9 @@ class Matching:
         topic, role = key
         if role == ROLE_SUBSCRIBES:
             self._subscribers[topic] += key not in session.matched
-            self._events.append(SubscriberJoined(topic, NO_PARAMS, detail, number))
+            self._outbox.emit(SubscriberJoined(topic, NO_PARAMS, detail, number))
         else:
-            self._events.append(PublisherFound(topic, number, NO_PARAMS, detail))
+            self._outbox.emit(PublisherFound(topic, number, NO_PARAMS, detail))
         session.matched[key] = detail
 
     def _end(self, number: int, session: _PeerSession, key: TopicRole) -> None:
@@ -254,11 +254,11 @@ class Matching:
             return
         topic, role = key
         if role == ROLE_PUBLISHES:
-            self._events.append(PublisherGone(topic, number))
+            self._outbox.emit(PublisherGone(topic, number))
             return
-        self._events.append(SubscriberLeft(topic, number, gone=key not in session.tokens))
+        self._outbox.emit(SubscriberLeft(topic, number, gone=key not in session.tokens))
         if decrement(self._subscribers, topic):
-            self._events.append(SubscribersGone(topic))
+            self._outbox.emit(SubscribersGone(topic))
 
     def _update_type(self, info: TopicInfo, role: int) -> None:
         """A topic has the type of the first session that declares one."""
@@ -266,20 +266,12 @@ class Matching:
         types = (_type_of(session.tokens[info.name, role]) for session in sessions)
         info.set_type(role, next((each for each in types if each != TopicType()), None))
 
-    def _set_heard(self, now: int, info: TopicInfo, role: int) -> None:
-        if role == ROLE_PUBLISHES:
-            info.advertised_at = now
-        else:
-            info.requested_at = now
-
     def _remove_role(self, topic: str, role: int) -> None:
         """Forget the role of a topic that has lost its last token, and the topic without the other role."""
         if (topic, _counterpart(role)) not in self._sessions_of:
             del self.topics[topic]
-        elif role == ROLE_PUBLISHES:
-            self.topics[topic].advertised_at = None
         else:
-            self.topics[topic].requested_at = None
+            self.topics[topic].set_heard(role, None)
 
 
 def _type_of(tokens: dict[str, TopicToken]) -> TopicType:
