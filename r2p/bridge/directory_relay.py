@@ -24,7 +24,7 @@ from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
-from r2p.units import MILLISECOND, SECOND
+from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
 ROUNDS = 5
 """Looks at what has changed in a second, at most."""
@@ -36,7 +36,7 @@ _SLICE = 250  # facts that are repeated at once
 _SLICE_APART = 20 * MILLISECOND  # ns between two of them
 _REST = 10  # times as long as a look took before the next one: on a slow computer it must not take all the time
 _SOON = 2 * MILLISECOND  # ns; so that what comes together is looked at together
-_APART = 200 * MILLISECOND  # ns between two answers on one link
+_APART = 200 * MILLISECOND  # ns between two answers on one link at least
 _LATELY = 2 * SECOND  # ns; an answer contains the firmware that was heard since
 _Key = tuple[object, ...]
 
@@ -75,7 +75,7 @@ class _Announced(msgspec.Struct, frozen=True):
 
 
 class _LinkDirectory(msgspec.Struct, eq=False):
-    """What is known on one link, and what has been announced there; instants in monotonic ns, None: not yet.
+    """What is known on one link, and what has been announced there; instants in monotonic ns, None before the first.
 
     `dirty`: the facts may have changed. `joined`: it is in the tree, and knows all. `behind`: it has to wait until the
     gateways agree, and lacks what has changed meanwhile. `met` are the instances there that have got everything, or
@@ -90,14 +90,10 @@ class _LinkDirectory(msgspec.Struct, eq=False):
     behind: bool = False
     met: set[int] | None = None
     asked: bool = False
-    answered_at: int | None = None
+    answered_at: int = LONG_AGO
     repeat_at: int | None = None
     to_repeat: deque[_Key] | None = None
     answering: bool = False
-
-    def answer_due(self) -> int:
-        """The instant before which no other answer goes out."""
-        return 0 if self.answered_at is None else self.answered_at + _APART
 
 
 class DirectoryRelay:
@@ -182,7 +178,7 @@ class DirectoryRelay:
             if link.to_repeat is not None:
                 due = min(due, now + _SLICE_APART)
             if link.asked:
-                due = min(due, max(now + _SOON, link.answer_due()))
+                due = min(due, max(now + _SOON, link.answered_at + _APART))
         self._alarm.set(due)
 
     def _poll(self) -> None:
@@ -218,7 +214,7 @@ class DirectoryRelay:
         """Repeat on a link what a peer asks for, or what was not announced for a while."""
         self._meet(port)
         link = self._link(port)
-        if link.asked and now >= link.answer_due():
+        if link.asked and now >= link.answered_at + _APART:
             link.asked, link.answering, link.answered_at = False, True, now
             link.to_repeat = deque(link.announced)
         if link.repeat_at is None or now >= link.repeat_at:
@@ -233,8 +229,8 @@ class DirectoryRelay:
         link = self._link(port)
         if link.repeat_at is not None or link.asked:
             link.repeat_at = max(link.repeat_at or 0, now + _APART)
-        if link.answered_at is not None or link.asked:
-            link.answered_at = max(link.answered_at or 0, now)
+        if link.answered_at > LONG_AGO or link.asked:
+            link.answered_at = now
 
     def _period(self) -> int:
         """The time (ns) in which everything is repeated."""

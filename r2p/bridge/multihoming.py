@@ -137,8 +137,8 @@ class MultihomedModule:
 
     # Topics
 
-    def uses(self, topic: Topic, port: "_MultihomedPort") -> bool:
-        """Whether the topic takes this link; one that is down keeps what it had, until it is up again."""
+    def review_use(self, topic: Topic, port: "_MultihomedPort") -> bool:
+        """Decide whether the topic takes this link; one that is down keeps what it had, until it is up again."""
         if port.number not in self.selection.by_number:
             return True
         without = self._unable_for(topic)
@@ -172,7 +172,7 @@ class MultihomedModule:
             if self._now() >= self.selection.consent_until:
                 self._poll()
             port = self._ports.get(link)
-            return port is not None and not self.uses(topic, port)
+            return port is not None and not self.review_use(topic, port)
 
         return drops
 
@@ -262,7 +262,7 @@ class _MultihomedPort(GatewayHooks):
         return self._owner.handle_management(self, data)
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
-        return own if self._owner.uses(topic, self) else NOTHING
+        return own if self._owner.review_use(topic, self) else NOTHING
 
     @property
     def may_announce(self) -> bool:

@@ -50,7 +50,7 @@ PROBE = 2 * SECOND
 PROBE_MEMORY = 7 * SECOND
 """A loop is believed in for this long after a probe showed it: two of three probes may be lost."""
 PROBE_PROVEN = 300 * MILLISECOND
-"""A gateway of which only a probe was heard for this long is not on this network itself."""
+"""A gateway of which only a probe was heard for this long, and no BRIDGE, is not on this network itself."""
 STRANGE_PROBES_MAX = 256
 """Probes of gateways outside the mesh that are kept for each port: they may be forged."""
 
@@ -219,13 +219,12 @@ class TreePort(msgspec.Struct, eq=False):
 
     # What comes in
 
-    def admits_newcomers(self, now: int) -> bool:
-        """Whether a gateway that is new here becomes a neighbour, after those that came and went."""
+    def forgive_flaps(self, now: int) -> None:
+        """Forget neighbours that went long ago: with FLAPS_MAX of them a gateway that is new here has to wait."""
         if self.flaps:
             forgiven = min(self.flaps, (now - self.flapped_at) // FLAP_FORGIVEN)
             self.flaps -= forgiven
             self.flapped_at += forgiven * FLAP_FORGIVEN
-        return self.flaps < FLAPS_MAX
 
     def receive_bridge(self, now: int, message: Bridge, acked_at: int) -> bool:
         """Enter a BRIDGE of a neighbour, old or new; False: it is late. `acked_at`: see `Neighbour`."""

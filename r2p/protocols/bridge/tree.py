@@ -17,6 +17,7 @@ from r2p.codecs.management import BRIDGE_ACKS, Bridge, Leaf, Mesh, encode_acks
 from r2p.codecs.probes import PORT_MODULUS
 from r2p.protocols.bridge.mesh import HEARD_MAX, MeshMap
 from r2p.protocols.bridge.ports import (
+    FLAPS_MAX,
     LEASE,
     LISTEN,
     PROBE,
@@ -111,12 +112,12 @@ class SpanningTree:
             port.echoes = True
             return
         # The sender may be another port of this gateway, on the same network.
-        if sender not in port.neighbours and not self._admits_neighbour(now, port):
+        if sender not in port.neighbours and not self._admit_neighbour(now, port):
             return
         if port.receive_bridge(now, message, self._sent.acked_at(message.acks)):
             self._update(now, port)
 
-    def _admits_neighbour(self, now: int, port: TreePort) -> bool:
+    def _admit_neighbour(self, now: int, port: TreePort) -> bool:
         """Decide whether to enter one more gateway as a neighbour; if not, count it as lost.
 
         A gateway that is not entered forwards nothing: it hears this one, which does not acknowledge it. Were each one
@@ -125,7 +126,8 @@ class SpanningTree:
         if sum(len(each.neighbours) for each in self.ports.values()) >= HEARD_MAX:
             port.lost["too many gateways"] += 1
             return False
-        if not port.admits_newcomers(now):
+        port.forgive_flaps(now)
+        if port.flaps >= FLAPS_MAX:
             port.lost["gateways come and go"] += 1
             return False
         return True

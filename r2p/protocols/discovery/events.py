@@ -250,8 +250,8 @@ class Outbox:
         events, self._events = self._events, []
         return events
 
-    def is_echo(self, data: bytes) -> bool:
-        """Whether these bytes were sent lately; each message is recognised once."""
+    def pop_echo(self, data: bytes) -> bool:
+        """Return whether these bytes were sent lately; each message is recognised once."""
         if data not in self._sent:
             return False
         self._sent.remove(data)

@@ -67,7 +67,7 @@ class PeerLiveness:
         message = self._with_name(message)
         if message.module.startswith("_"):
             return  # a gateway's probe for loops: only tools have such names, and they send no ALIVE
-        if message.module == self._module and not self._is_namesake(now):
+        if message.module == self._module and not self._report_namesake(now):
             return
         before, info = self._directory.read_alive(now, message, source)
         # Firmware has no instance: a restart shows in its flags only, if at all.
@@ -103,9 +103,12 @@ class PeerLiveness:
 
     # Time and the link
 
-    def is_echo(self, now: int, data: bytes) -> bool:
-        """Whether the line gave back a message of this module; that it does so is known from this module's HELLO."""
-        if now >= self._echoing_until or not self._outbox.is_echo(data):
+    def drop_echo(self, now: int, data: bytes) -> bool:
+        """Count a message of this module that the line gave back; False for any other.
+
+        That the line does so is known from the HELLO of this module.
+        """
+        if now >= self._echoing_until or not self._outbox.pop_echo(data):
             return False
         self._echoing_until = now + _ECHO_INTERVAL
         self._counts["echo"] += 1
@@ -143,8 +146,8 @@ class PeerLiveness:
         info = self._directory.modules.get(message.module)
         return info is not None and info.r2p and info.hops < message.hops
 
-    def _is_namesake(self, now: int) -> bool:
-        """Whether an ALIVE with this module's own name is that of another module, which is to be remembered."""
+    def _report_namesake(self, now: int) -> bool:
+        """Report an ALIVE with this module's own name, unless it is an echo; return whether to remember its sender."""
         if now < self._echoing_until:
             self._counts["echo"] += 1
             return False
@@ -208,14 +211,15 @@ class PeerLiveness:
     def _echoed(self, now: int) -> None:
         self._counts["echo"] += 1
         self._echoing_until = now + _ECHO_INTERVAL
-        if self._may_report(now, ""):
+        if self._admit_report(now, ""):
             self._outbox.emit(EchoDetected())
 
     def _report_conflict(self, now: int, module: str, instance_a: int | None, instance_b: int | None) -> None:
-        if self._may_report(now, module):
+        if self._admit_report(now, module):
             self._outbox.emit(NameConflict(module, instance_a, instance_b))
 
-    def _may_report(self, now: int, subject: str) -> bool:
+    def _admit_report(self, now: int, subject: str) -> bool:
+        """Decide whether to report a conflict now, and note that; '': an echo."""
         if now < self._next_report.get(subject, now):
             return False
         if len(self._next_report) >= _REPORTED_MAX:

@@ -370,7 +370,7 @@ class Discovery(DiscoveryProtocol):
         self._schedule.traffic(now)  # whatever it is, it took time on a line that is to be quiet
         message = self._decode(management.decode, data)
         handler = self._handlers.get(type(message))
-        if message is not None and handler is not None and not self._liveness.is_echo(now, data):
+        if message is not None and handler is not None and not self._liveness.drop_echo(now, data):
             handler(now, message, source)  # before demand, which looks up the leases that a HELLO has set
             if self._demand is not None:
                 self._demand.receive(now, message, source)

@@ -183,7 +183,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
             self._outbox.emit(*self._own.pop_changes())
         if self._mark_at is not None and self._mark_at <= now:
             self._mark_heard(now)
-        if self._refused.is_due(now, self._free):
+        if self._refused.begin_query(now, self._free):
             self._outbox.emit(QueryTokens())
         self._modules.poll(now)
         return self._outbox.drain()
@@ -331,7 +331,7 @@ class RefusedTokens:
         self._query_at = None
 
     def next_deadline(self) -> int | None:
-        """When to call `is_due` (monotonic ns)."""
+        """When to call `begin_query` (monotonic ns)."""
         return self._query_at
 
     def review(self, now: int, free: int) -> None:
@@ -342,8 +342,8 @@ class RefusedTokens:
             self._pause = _PAUSE_MIN
         self._query_at = now + self._pause + self._pause * self._spread // 256
 
-    def is_due(self, now: int, free: int) -> bool:
-        """Whether to query the tokens now; `query_ended` has to follow."""
+    def begin_query(self, now: int, free: int) -> bool:
+        """Decide whether to query the tokens now; then `query_ended` has to follow."""
         if self._query_at is None or now < self._query_at:
             return False
         self._query_at = None

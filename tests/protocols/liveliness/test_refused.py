@@ -174,7 +174,7 @@ def test_a_token_that_is_refused_twice_in_a_look_does_not_need_room_for_two() ->
     count = session.RefusedTokens(1000, 0)
     count.add()
     count.review(0, 1)
-    assert count.is_due(5 * SECOND, 1)
+    assert count.begin_query(5 * SECOND, 1)
     count.add()  # it came
     count.add()  # and is among the answers
     count.query_ended(complete=True)
