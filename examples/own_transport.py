@@ -26,7 +26,7 @@ class Udp(Transport, asyncio.DatagramProtocol, Carrier):
         hub.attach(self._link)
         try:
             self._socket, _ = await loop.create_datagram_endpoint(lambda: self, local_addr=here, remote_addr=there)
-            self._link.connected(self)  # announces everything
+            self._link.connect(self)  # announces everything
             opened()  # the module's `async with` waits for this
             await loop.create_future()
         finally:
@@ -34,7 +34,7 @@ class Udp(Transport, asyncio.DatagramProtocol, Carrier):
             hub.detach(self._link)
 
     def datagram_received(self, data: bytes, addr: object) -> None:
-        self._link.fed(data)
+        self._link.feed(data)
 
     def send(self, data: bytes) -> None:
         self._socket.sendto(data)

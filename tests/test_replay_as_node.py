@@ -92,9 +92,9 @@ async def replay(case: Case, chunk: int | None, script: Script) -> None:
                 answers = [each.management for each in script.said[before:] if each.topic == "R2P"]
                 assert about(answers, entry) == recorded_answers(case, at), f"at {entry.t_ms} ms"
         elif "disconnects" in entry.comment:
-            script.link.disconnected("recorded")
+            script.link.disconnect("recorded")
         elif "connects again" in entry.comment:
-            script.link.connected(script)
+            script.link.connect(script)
     await asyncio.sleep(_SETTLED)
 
 

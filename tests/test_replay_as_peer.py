@@ -66,9 +66,9 @@ class Peer:
             elif entry.dir == TO_NODE:
                 await self.act(entry)
             elif "disconnects" in entry.comment:
-                self.script.link.disconnected("recorded")
+                self.script.link.disconnect("recorded")
             elif "connects again" in entry.comment:
-                self.script.link.connected(self.script)
+                self.script.link.connect(self.script)
         await asyncio.sleep(0.001)
         for task in self.reading:
             task.cancel()

@@ -33,8 +33,7 @@ from r2p.protocols.bridge.tree import FIRST_CLIENT, SpanningTree
 from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.announcement import Announcement
-from r2p.transports.link import GatewayHooks, Link
+from r2p.transports.link import Announcement, GatewayHooks, Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _FORWARDS = (PortState.ALONE, PortState.FORWARDING)

@@ -14,8 +14,7 @@ from r2p.errors import DecodeError
 from r2p.protocols.bridge.link_selection import LinkSelection
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.announcement import NOTHING, Announcement
-from r2p.transports.link import GatewayHooks, Link
+from r2p.transports.link import NOTHING, Announcement, GatewayHooks, Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _TYPES = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}

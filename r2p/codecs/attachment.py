@@ -3,7 +3,8 @@
 It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by the origin, which stays the same from
 message to message of one publisher; so a reader looks it up in a table, and decodes it once. What a publisher sends
 without a pause may travel together: the payload is then several messages of one size, one after the other, whose
-serials and sequences count on from those in the header. Credit and the sender of management messages are here, too.
+serials and sequences count on from those in the header. The codecs of credit, and of the sender of management messages,
+are here, too.
 
 | bytes | what |
 | --- | --- |
@@ -52,7 +53,7 @@ _CREDIT = struct.Struct("<BBII")
 _LEAVING = 0x80
 _SENDER = struct.Struct("<BI")
 _unpack = _FIXED.unpack_from
-_pack_start = struct.Struct("<IIQqq").pack  # as _FIXED, with the first four bytes as one number
+_pack_start = struct.Struct("<IIQqq").pack  # as _FIXED, with the first four bytes as the number of `start_of`
 
 PACKET_MAX = 256
 """Messages in one payload."""
@@ -60,7 +61,7 @@ PACKET_MAX = 256
 _TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
 _NAMES = re.compile(rf"((?:{MODULE_PATH})?)/([A-Za-z0-9_]{{0,8}})".encode())
 _MODULE = re.compile(MODULE_PATH)
-_REMEMBERED_MAX = 4096  # origins that a reader keeps; an even number
+_REMEMBERED_MAX = 4096  # origins that a reader keeps, in two halves; forged ones can't fill more memory
 _SHOWN_MAX = 40  # bytes of a wrong name that an error shows
 
 
@@ -95,7 +96,10 @@ class Header(msgspec.Struct, frozen=True, gc=False):
 
 
 class Packer:
-    """Packs headers without a clock part, of one origin: the fast way. `start` is the result of `start_of`."""
+    """Packs headers without a clock part, of one origin: the fast way.
+
+    `start` is the result of `start_of`: as one number the first four bytes take one argument of `pack` instead of four.
+    """
 
     __slots__ = ("_pack", "_tail", "origin")
 
@@ -140,7 +144,7 @@ class HeaderReader(Generic[T]):
 
     @property
     def known(self) -> dict[bytes, T]:
-        """What is remembered, by the bytes of the origin: a copy."""
+        """A copy of what is remembered, by the bytes of the origin."""
         return self._older | self._recent
 
     def forget(self, key: bytes) -> None:
@@ -154,6 +158,7 @@ class HeaderReader(Generic[T]):
 
         Raises `UnknownType` for a version to ignore, else `DecodeError`.
         """
+        # A tuple, not a `Header`: this is done for each packet, and its reader unpacks the parts at once.
         try:
             version, flags, hops, more, serial, sequence, stamp, deadline = _unpack(data)
         except struct.error:  # too short; a header of another version may be
@@ -161,7 +166,7 @@ class HeaderReader(Generic[T]):
         if version != VERSION:
             raise UnknownType(f"version {version} of the header")
         if len(data) < _FIXED.size:
-            raise DecodeError(f"header too short: {len(data)} bytes, at least {_FIXED.size} needed")
+            raise _too_short("header", data, _FIXED.size)
         at = _FIXED.size
         clock = None
         if flags & FLAG_CLOCK:
@@ -170,11 +175,11 @@ class HeaderReader(Generic[T]):
         stamps: tuple[int, ...] = (stamp,)
         if more:
             if len(data) < at + 8 * more:
-                raise DecodeError("the header ends in its stamps")
+                raise _too_short("header with stamps", data, at + 8 * more)
             stamps += _stamps(more).unpack_from(data, at)
             at += 8 * more
         if sequence + more > _SEQUENCE_MAX:
-            raise DecodeError("the sequence ends in this packet")
+            raise DecodeError(f"sequence {sequence} leaves none for {more} more messages")
         tail = data[at:]  # the key of what is known: the origin of a known publisher is not decoded again
         known = self._recent.get(tail)
         if known is None:
@@ -195,12 +200,12 @@ class HeaderReader(Generic[T]):
 
 def decode(data: bytes) -> Header:
     """Decode a header. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
-    origin, serial, sequence, stamps, deadline, hops, stamped, clock = HeaderReader(_itself).read(data)
+    origin, serial, sequence, stamps, deadline, hops, stamped, clock = HeaderReader(lambda origin: origin).read(data)
     return Header(origin, serial, sequence, stamps[0], deadline, hops, stamped, clock, stamps[1:])
 
 
 class Credit(msgspec.Struct, frozen=True, gc=False):
-    """How far a subscriber's session has come: up to this serial of the publisher's session, in this topic and class.
+    """The progress of a subscriber's session: up to this serial of the publisher's session, in this topic and class.
 
     `leaving`: it no longer subscribes, so this is its final credit.
     """
@@ -223,7 +228,7 @@ def decode_credit(data: bytes) -> Credit:
     """Decode a credit. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
     _check_version(data, "credit")
     if len(data) < _CREDIT.size:
-        raise DecodeError(f"credit too short: {len(data)} bytes, at least {_CREDIT.size + 1} needed")
+        raise _too_short("credit", data, _CREDIT.size + 1)
     if _TOPIC.fullmatch(data, _CREDIT.size) is None:
         raise DecodeError(f"credit for {data[_CREDIT.size :][:_SHOWN_MAX]!r}, which is not a valid topic")
     _, publisher_class, session, serial = _CREDIT.unpack_from(data)
@@ -258,8 +263,8 @@ def _check_version(data: bytes, what: str) -> None:
         raise UnknownType(f"version {data[0]} of the {what}")
 
 
-def _itself(origin: Origin) -> Origin:
-    return origin
+def _too_short(what: str, data: bytes, needed: int) -> DecodeError:
+    return DecodeError(f"{what} too short: {len(data)} bytes, at least {needed} needed")
 
 
 @functools.cache
@@ -269,7 +274,7 @@ def _stamps(count: int) -> struct.Struct:
 
 def _decode_clock(data: bytes) -> ClockOffset:
     if len(data) < _FIXED.size + _CLOCK.size:
-        raise DecodeError("the header ends in its clock part")
+        raise _too_short("header with a clock", data, _FIXED.size + _CLOCK.size)
     return ClockOffset(*_CLOCK.unpack_from(data, _FIXED.size))
 
 

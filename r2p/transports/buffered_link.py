@@ -14,11 +14,12 @@ from typing import Any, ClassVar, Protocol
 
 import msgspec
 
+from r2p.codecs.management import ROLE_PUBLISHES
 from r2p.names import MANAGEMENT
-from r2p.protocols.discovery.events import SubscriberJoined
+from r2p.protocols.discovery.events import PeerAddress, SubscriberJoined
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
-from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.sample import Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, LinkSubscriber
 from r2p.transports.receive_backpressure import LinkBackpressure
@@ -26,7 +27,7 @@ from r2p.units import SECOND
 
 _MANAGEMENT = MANAGEMENT.encode()
 _EARLY = SECOND  # ns by which a message may come before the answer to its subscription
-_MOST_EARLY = 256  # of those
+_EARLY_MAX = 256  # messages that come early and are kept: any sender can send them, so there is a limit
 _NOT_SUBSCRIBED = "not subscribed"
 
 
@@ -142,7 +143,7 @@ class BufferedLink(Link):
             return
         subscriber = self._subscribers.get(name)
         if subscriber is None or subscriber.topic is not topic:
-            subscriber = self._subscribers[name] = BufferedSubscriber(self, topic)
+            subscriber = self._subscribers[name] = BufferedSubscriber(self, topic, self.wait_queue)
             topic.join(subscriber)
         else:
             topic.resend_latched(subscriber)
@@ -256,7 +257,7 @@ class BufferedLink(Link):
             return
         key = arrival.topic, self.sender(arrival)
         self._early.pop(key, None)
-        if len(self._early) >= _MOST_EARLY:
+        if len(self._early) >= _EARLY_MAX:
             del self._early[next(iter(self._early))]
         self._early[key] = arrival, self._clock.monotonic()
 
@@ -278,31 +279,71 @@ class BufferedLink(Link):
 class BufferedSubscriber(LinkSubscriber):
     """One topic on its way into the send buffer of a link, which it shares with the link's other topics."""
 
-    __slots__ = ("_buffer",)
+    __slots__ = ()
 
-    def __init__(self, link: BufferedLink, topic: Topic) -> None:
-        super().__init__(link, topic, link.wait_queue)
-        self._buffer = link
+    link: BufferedLink
 
     def offer(self, sample: Sample) -> bool:
-        link = self._buffer
+        link = self.link
         if not link.up:
-            if sample.publisher_class != PublisherClass.NON_REAL_TIME:
-                return False  # its publisher signals each sample; that of others has signalled the outage
-            self.force(sample)
-            return True
+            return self.offer_down(sample)
         if not link.has_room_for(sample):
             return False
         link.write(self.topic.name, sample)
         return True
 
     def force(self, sample: Sample) -> None:
-        link = self._buffer
+        link = self.link
         if link.up and not link.full:
             link.write(self.topic.name, sample)
         else:
-            self.lost += 1
-            link.stats.lost["send buffer full" if link.up else LINK_DOWN] += 1
+            self.count_lost("send buffer full" if link.up else LINK_DOWN)
 
     def refill(self) -> None:
-        self._buffer.made_room()
+        self.link.made_room()
+
+
+class SenderLookup:
+    """The source of messages by topic and address, looked up anew when discovery has learnt something.
+
+    Lines and CAN frames do not say who sent them, so that follows from what discovery knows: r2p modules announce which
+    of their nodes publish a topic. A topic that none has announced comes from the only module that can have sent it, if
+    there is only one. `shared` are the addresses that several modules may have.
+    """
+
+    def __init__(self, discovery: DiscoveryProtocol, link: str, shared: tuple[PeerAddress, ...] = ()) -> None:
+        self._discovery = discovery
+        self._link = link
+        self._shared = shared
+        self._sources: dict[tuple[str, PeerAddress], Source] = {}
+        self._generation = -1
+
+    def source(self, topic: str, address: PeerAddress = None) -> Source:
+        """The source of a message from this address. Without an address it may be any module at the other end.
+
+        A name is empty if it is unknown or ambiguous.
+        """
+        if self._generation != self._discovery.generation:
+            self._generation = self._discovery.generation
+            self._sources.clear()
+        source = self._sources.get((topic, address))
+        if source is None:
+            source = self._sources[topic, address] = self._find(topic, address)
+        return source
+
+    def _find(self, topic: str, address: PeerAddress) -> Source:
+        modules = list(self._discovery.modules.values())
+        if address is not None:
+            direct = [info for info in modules if info.source == address]
+            modules = direct or [info for info in modules if info.source in self._shared]
+        names = {info.instance: info.name for info in modules if info.r2p}
+        # Without an address, a publisher of a module that is not known yet may be the sender; its module has no name.
+        publishers = {
+            (names.get(each.instance, ""), each.node)
+            for each in self._discovery.endpoints.values()
+            if each.topic == topic and each.role == ROLE_PUBLISHES and (address is None or each.instance in names)
+        }
+        if len(publishers) == 1:
+            return Source(*publishers.pop(), self._link)
+        candidates = {module for module, _ in publishers} or {info.name for info in modules if not info.observer}
+        return Source(candidates.pop() if len(candidates) == 1 else "", "", self._link)

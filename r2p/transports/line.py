@@ -26,10 +26,8 @@ from r2p.protocols.discovery.negotiation import GRACE
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import PublisherHandle, Topic
-from r2p.transports.announcement import NOTHING
-from r2p.transports.buffered_link import BufferedLink
-from r2p.transports.link import Hub, is_booting
-from r2p.transports.senders import SenderLookup
+from r2p.transports.buffered_link import BufferedLink, SenderLookup
+from r2p.transports.link import NOTHING, Hub, is_booting
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -39,8 +37,8 @@ BUFFER = 64 * 1024
 """Bytes that wait for a connection that takes no more, before its publishers have to wait or lose."""
 
 _MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
-_MOST_URGENT = 96  # urgent messages that wait, whatever else does: another 8 KiB
-_CLOSING = 0.5  # seconds for the other end to read what is still buffered
+_URGENT_MAX = 96  # urgent messages that wait, whatever else does: another 8 KiB
+_CLOSING_S = 0.5  # seconds for the other end to read what is still buffered: a program that ends must not hang
 _MANAGEMENT = MANAGEMENT.encode()
 _NRT = PublisherClass.NON_REAL_TIME
 
@@ -54,6 +52,9 @@ class Carrier(abc.ABC):
 
     flow_controlled: ClassVar[bool] = False
     """Whether the other end waits while nothing is read, and nothing is lost by that."""
+
+    unconfirmed = 0
+    """Bytes that it was given and that the other end has not confirmed, as far as that is known when it breaks."""
 
     @abc.abstractmethod
     def send(self, data: bytes) -> None:
@@ -71,18 +72,13 @@ class Carrier(abc.ABC):
     def close(self) -> None:
         """Send what is held, as far as the other end reads it, and close."""
 
-    @property
-    def unconfirmed(self) -> int:
-        """Bytes that it was given and that the other end has not confirmed, as far as that is known."""
-        return 0
-
 
 class Connection(Carrier):
     """A carrier that can break. Its transport waits until it has ended, and closes it."""
 
     def __init__(self) -> None:
         self.ended = asyncio.Event()
-        """Set when it is gone for good, or was never there."""
+        """Set when the connection is gone for good, or was never there."""
 
     @abc.abstractmethod
     def abort(self) -> None:
@@ -93,7 +89,7 @@ class Connection(Carrier):
         self.close()
         try:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_CLOSING):
+                async with asyncio.timeout(_CLOSING_S):
                     await self.ended.wait()
         finally:
             self.abort()
@@ -128,33 +124,26 @@ class LineLink(BufferedLink):
         self._reader = debug.Reader(self.stats.lost)
         self._encoders: dict[str, Callable[[bytes, int], bytes]] = {}
         self._senders = SenderLookup(self.discovery, self.name)
-        self._received_at = 0
-        """When the bytes of the line that is delivered next came in (UTC, ns)."""
+        self._received_at = 0  # when the bytes of the line that is delivered next came in (UTC, ns)
         self._carrier: Carrier | None = None
         self._urgent: deque[bytes] = deque()
         self._management: deque[bytes] = deque()
         self._samples: deque[bytes] = deque()
-        self._waiting = 0
-        """Bytes in these three queues."""
-        self._corked = False
-        """Whether a line was sent in this turn of the loop, so that others wait for its end."""
-        self._blocked = False
-        """Whether the carrier is full."""
-        self._limit = self._buffer = buffer
-        """Bytes that may wait; -1 while samples have to wait for the grace period."""
+        self._buffered_bytes = 0  # bytes in these three queues
+        self._corked = False  # whether a line was sent in this turn of the loop, so that others wait for its end
+        self._blocked = False  # whether the carrier is full
+        self._limit = self._buffer = buffer  # bytes that may wait; -1 while samples have to wait for the grace period
         self._grace: asyncio.TimerHandle | None = None
         self._piecemeal = piecemeal
         self._unconfirmed = UnconfirmedBytes()
-        self._messages_given = 0
-        """Samples that have been given to carriers, as `stats.sent` counts them."""
+        self._messages_given = 0  # samples that have been given to carriers, as `stats.sent` counts them
         self._unsent: tuple[str, Sample] | None = None
         """The sample of a real-time publisher that the carrier has not sent entirely, and its topic."""
-        self._loader_topics: set[str] = set()
-        """Those that flow without a handshake now."""
+        self._loader_topics: set[str] = set()  # those that flow without a handshake now
 
     # For the carrier
 
-    def connected(self, carrier: Carrier) -> None:
+    def connect(self, carrier: Carrier) -> None:
         """Use this carrier from now on: its connection is up."""
         if self._closed:
             carrier.close()
@@ -169,15 +158,15 @@ class LineLink(BufferedLink):
             self._begin_grace()
             self.on_up()
 
-    def disconnected(self, reason: str) -> None:
+    def disconnect(self, reason: str) -> None:
         """Give up the carrier: its connection has ended."""
         self._count_unknown()
         self._carrier = None
         self._end_grace()
         self.on_down(reason)
-        self._lose_unsent()
+        self._lose_unsent()  # after `on_down`, so that it counts as lost in this outage
 
-    def fed(self, data: bytes | memoryview) -> None:
+    def feed(self, data: bytes | memoryview) -> None:
         """Deliver the messages in bytes that came in."""
         self.stats.bytes_received += len(data)
         received_at = self._clock.now()
@@ -211,7 +200,7 @@ class LineLink(BufferedLink):
     def carrier_ready(self) -> None:
         """Go on with what waits: the carrier has sent all that it held."""
         self._blocked = False
-        self.stats.lost.guard(self._unsent_is_sent)
+        self.stats.lost.guard(self._report_late)
         self.made_room()  # before the bytes that wait fill the carrier again
         if not self._corked:
             self._uncork()
@@ -220,11 +209,11 @@ class LineLink(BufferedLink):
 
     @property
     def full(self) -> bool:
-        return self._waiting >= self._limit
+        return self._buffered_bytes >= self._limit
 
     def has_room_for(self, sample: Sample) -> bool:
         if sample.publisher_class == _NRT:
-            return self._waiting < self._limit
+            return self._buffered_bytes < self._limit
         return not self._blocked and self._limit >= 0
 
     def write(self, topic: str, sample: Sample) -> None:
@@ -243,18 +232,22 @@ class LineLink(BufferedLink):
         real_time = sample.publisher_class != _NRT
         if self._blocked or (self._corked and not real_time):
             self._samples.append(line)
-            self._waiting += len(line)
-            if self._waiting >= self._limit:
+            self._buffered_bytes += len(line)
+            if self._buffered_bytes >= self._limit:
                 self._flush()
             return
-        if real_time:
-            self._unsent = topic, sample  # before it is sent: it is lost if the carrier breaks by it
+        if not real_time:
+            self._send_at_once(line)
+            return
+        self._unsent = topic, sample  # before it is sent: it is lost if the carrier breaks by it
         self._send_at_once(line)
-        if real_time:
-            self._realtime_given()
+        if not self.up:
+            self._lose_unsent()
+        elif not self._blocked:  # else it is on its way only when the carrier is ready again
+            self._unsent = None
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        if len(self._urgent) >= _MOST_URGENT if urgent else self._waiting >= self._limit + _MANAGEMENT_BUFFER:
+        if len(self._urgent) >= _URGENT_MAX if urgent else self._buffered_bytes >= self._limit + _MANAGEMENT_BUFFER:
             self.stats.lost["management, send buffer full"] += 1
             return
         deadline = self._clock.now() // 1000 + debug.NO_DEADLINE
@@ -262,7 +255,7 @@ class LineLink(BufferedLink):
         if not (self._corked or self._blocked):
             self._send_at_once(line)
             return
-        self._waiting += len(line)
+        self._buffered_bytes += len(line)
         (self._urgent if urgent else self._management).append(line)
 
     def sample(self, topic: str, arrival: debug.Line) -> Sample:
@@ -302,7 +295,7 @@ class LineLink(BufferedLink):
 
     def close(self) -> None:
         self._end_grace()
-        self._flush(closing=True)  # the carrier gets all that waits, and after it the announcement of our end
+        self._flush(closing=True)  # the carrier gets all that waits, and after it the announcement of the end
         super().close()
         self._flush(closing=True)
         carrier, self._carrier = self._carrier, None
@@ -347,13 +340,13 @@ class LineLink(BufferedLink):
             self.made_room()
 
     def _flush(self, *, closing: bool = False) -> None:
-        while self._waiting and (closing or not self._blocked):
+        while self._buffered_bytes and (closing or not self._blocked):
             self._send(self._next_piece())
 
     def _next_piece(self) -> bytes:
         if self._piecemeal:
             piece = (self._urgent or self._management or self._samples).popleft()
-            self._waiting -= len(piece)
+            self._buffered_bytes -= len(piece)
             return piece
         piece = b"".join([*self._urgent, *self._management, *self._samples])
         self._clear_buffer()
@@ -363,7 +356,7 @@ class LineLink(BufferedLink):
         self._urgent.clear()
         self._management.clear()
         self._samples.clear()
-        self._waiting = 0
+        self._buffered_bytes = 0
 
     def _send(self, data: bytes) -> None:
         if self._carrier is not None:
@@ -382,13 +375,7 @@ class LineLink(BufferedLink):
 
     # A real-time sample that the carrier could not send at once: it is on its way only when all its bytes are sent.
 
-    def _realtime_given(self) -> None:
-        if not self.up:
-            self._lose_unsent()
-        elif not self._blocked:
-            self._unsent = None
-
-    def _unsent_is_sent(self) -> None:
+    def _report_late(self) -> None:
         unsent, self._unsent = self._unsent, None
         if unsent is not None:
             topic, sample = unsent
@@ -410,7 +397,7 @@ class LineLink(BufferedLink):
         return None if topic is None else topic.publisher_of(sample)
 
     # The loader's topic flows without a handshake while its module is in boot mode (PROTOCOL.md 5): that of a module at
-    # the other end, or our own.
+    # the other end, or this module itself.
 
     def module_changed(self, module: str) -> None:
         topic = self._space.topics.get(LOADER_PREFIX + module)
@@ -428,7 +415,10 @@ class LineLink(BufferedLink):
 
     def _match_loader(self, topic: Topic) -> None:
         name = topic.name
-        if self._in_boot_mode(name.removeprefix(LOADER_PREFIX)):
+        module = name.removeprefix(LOADER_PREFIX)
+        is_own = module == self._space.module
+        in_boot_mode = bool(self.discovery.flags & FLAG_BOOT) if is_own else is_booting(self, module)
+        if in_boot_mode:
             self._loader_topics.add(name)
             if not self._announced.get(name, NOTHING).publishes:
                 self._remove_subscriber(name)
@@ -440,26 +430,15 @@ class LineLink(BufferedLink):
             self._remove_subscriber(name)
             self.remove_publishers(name)
 
-    def _in_boot_mode(self, module: str) -> bool:
-        if module == self._space.module:
-            return bool(self.discovery.flags & FLAG_BOOT)
-        return is_booting(self, module)
 
-
-_RECENT = 64
-"""The pieces sent last; the position of each is known."""
-
-_STEP = 4096
-"""Bytes between two marks before those, for the last 512 kB at least."""
-
-_LONG_STEP = 16 * _STEP
-"""Bytes between two marks before those: 8 MB at least, more than a socket's buffers hold."""
-
-_MARKS = 128
+_RECENT_MAX = 64  # pieces sent last; the position of each is known
+_MARKS = 128  # marks that are known before those, at each step: as many at least, and up to twice as many
+_STEP = 4096  # bytes between two marks: the last 512 kB
+_LONG_STEP = 16 * _STEP  # bytes between two marks before those: 8 MB, more than a socket's buffers hold
 
 
 class UnconfirmedBytes:
-    """How many messages the last bytes of a connection were: what may be lost when it breaks.
+    """The number of messages that the last bytes of a connection were: what may be lost when it breaks.
 
     The longer ago bytes were sent, the fewer of their positions are known, so memory stays small; where the position
     that is asked for is not known the answer is the count as of the known one before it.
@@ -467,59 +446,48 @@ class UnconfirmedBytes:
 
     def __init__(self) -> None:
         self._bytes = 0
-        self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
-        self._marks = _Marks()
-        self._next = 0
-        self._old = _Marks()
-        self._next_old = 0
+        self._recent: deque[tuple[int, int]] = deque(maxlen=_RECENT_MAX)
+        self._marks = _Marks(_STEP)
+        self._old_marks = _Marks(_LONG_STEP)
 
     def add(self, size: int, messages: int) -> None:
         """Note that `size` bytes are sent now, after `messages` messages."""
         position = self._bytes
         self._recent.append((position, messages))
-        if position >= self._next:
-            self._mark(position, messages)
+        if position >= self._marks.next:  # seldom, and this is done for each piece
+            self._marks.add(position, messages)
+            if position >= self._old_marks.next:
+                self._old_marks.add(position, messages)
         self._bytes = position + size
 
-    def _mark(self, position: int, messages: int) -> None:
-        self._next = position + _STEP
-        self._marks.add(position, messages)
-        if position >= self._next_old:
-            self._next_old = position + _LONG_STEP
-            self._old.add(position, messages)
-
     def messages_in(self, last: int, messages: int) -> int:
-        """How many messages the `last` bytes were, at most; `messages` have been sent by now."""
+        """Return how many messages the `last` bytes were, at most; `messages` have been sent by now."""
         if not last or not self._recent:
             return 0
         begin = self._bytes - last
         for position, before in reversed(self._recent):
             if position <= begin:
                 return messages - before
-        for marks in (self._marks, self._old):
-            if (found := marks.before(begin)) is not None:
-                return messages - found
-        return messages - self._old.oldest
+        for marks in (self._marks, self._old_marks):
+            index = bisect_right(marks.positions, begin)
+            if index:
+                return messages - marks.messages[index - 1]
+        return messages - self._old_marks.messages[0]
 
 
 class _Marks:
-    """How many messages had been sent before a byte, at every so many bytes: the last 128 to 256 of them."""
+    """The number of messages that had been sent before a byte, at every `step` bytes."""
 
-    def __init__(self) -> None:
+    def __init__(self, step: int) -> None:
+        self._step = step
+        self.next = 0
+        """The position from which on the next mark is due."""
         self.positions = array("Q")
-        self._before = array("Q")
+        self.messages = array("Q")
 
     def add(self, position: int, messages: int) -> None:
         if len(self.positions) == 2 * _MARKS:
-            del self.positions[:_MARKS], self._before[:_MARKS]
+            del self.positions[:_MARKS], self.messages[:_MARKS]
+        self.next = position + self._step
         self.positions.append(position)
-        self._before.append(messages)
-
-    def before(self, position: int) -> int | None:
-        """As of the mark there or just before it; None: that is forgotten."""
-        index = bisect_right(self.positions, position)
-        return self._before[index - 1] if index else None
-
-    @property
-    def oldest(self) -> int:
-        return self._before[0]
+        self.messages.append(messages)

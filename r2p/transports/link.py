@@ -16,7 +16,15 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
-from r2p.codecs.management import FLAG_BOOT, NO_PARAMS, QUEUE
+from r2p.codecs.management import (
+    ANY_TYPE,
+    CLASS_LATCHES,
+    FLAG_BOOT,
+    NO_PARAMS,
+    QUEUE,
+    ROLE_PUBLISHES,
+    ROLE_SUBSCRIBES,
+)
 from r2p.messages import ClockOffset, Message
 from r2p.names import TOPIC_MAX
 from r2p.protocols.discovery.announcer import Relayed
@@ -30,17 +38,61 @@ from r2p.protocols.discovery.events import (
     Send,
     SubscriberJoined,
     SubscribersGone,
+    TopicType,
 )
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
-from r2p.runtime.sample import PublisherClass, Source
+from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
-from r2p.transports.announcement import NOTHING, Announcement, announce, announcement_of
 from r2p.transports.stats import RETRY_AFTER_ERROR, LinkStats, LoggedCounter
 from r2p.units import SECOND
 
 MESSAGES_PER_TURN = 64
 """Messages that a link delivers before it lets the event loop run once."""
+
+
+class Announcement(msgspec.Struct, frozen=True):
+    """The other ends' view of a topic of this module; `asked` is the type in which it subscribes to the topic.
+
+    `queue`: how many messages a publisher keeps, or has on the way, for this module; that has nothing to do with the
+    queues of its own subscribers.
+    """
+
+    publishes: bool = False
+    subscribes: bool = False
+    size: int = 0
+    fingerprint: bytes = ANY_TYPE
+    asked: TopicType = TopicType()
+    queue: int = QUEUE
+    params: bytes = NO_PARAMS
+    endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
+
+
+NOTHING = Announcement()
+
+
+def type_of(topic: Topic) -> TopicType:
+    """The size and fingerprint of a topic's messages, as far as this module knows them."""
+    return TopicType() if topic.layout is None else TopicType(topic.layout.size, topic.layout.fingerprint)
+
+
+def _announcement_of(topic: Topic) -> Announcement:
+    """Return what the other ends should know of a topic that only this module uses."""
+    publishers: dict[tuple[str, int], int] = {}
+    for each in topic.publishers:
+        key = each.node.name, ROLE_PUBLISHES
+        publisher_class = int(each.publisher_class) | (CLASS_LATCHES if each.latch else 0)
+        publishers[key] = max(publisher_class, publishers.get(key, 0))  # a node may have several, of several classes
+    subscribers = {(each.owner, ROLE_SUBSCRIBES): 0 for each in topic.queues}
+    topic_type = type_of(topic)
+    return Announcement(
+        publishes=bool(publishers),
+        subscribes=bool(subscribers),
+        size=topic_type.size,
+        fingerprint=topic_type.fingerprint,
+        asked=topic_type,
+        endpoints=publishers | subscribers,
+    )
 
 
 class Hub(Protocol):
@@ -90,10 +142,10 @@ class GatewayHooks(Protocol):
     """What a gateway decides for one of its links, and a module with several links to networks that gateways join."""
 
     def handle_management(self, data: bytes) -> bool:
-        """Handle a management message before discovery does; returns True if it concerns gateways only."""
+        """Handle a management message before discovery does; return True if it concerns gateways only."""
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
-        """What the other ends are to know of a topic, with what is wanted for other links."""
+        """Return what the other ends should know of a topic: `own`, and what is wanted for other links."""
 
     @property
     def may_announce(self) -> bool:
@@ -107,7 +159,7 @@ class GatewayHooks(Protocol):
         """The name of the module that published a message, as it is on the link's network."""
 
     def discovery_changed(self) -> None:
-        """Look at what discovery knows: it may have changed."""
+        """Adapt to what discovery knows: it may have changed."""
 
 
 class Transport(abc.ABC):
@@ -123,7 +175,7 @@ class Transport(abc.ABC):
 
 
 class Link(abc.ABC):
-    """What all links share: discovery, announcements, state and counters."""
+    """The part that all links share: discovery, announcements, state and counters."""
 
     max_payload: ClassVar[int] = 255
     """Bytes of the longest message."""
@@ -145,7 +197,7 @@ class Link(abc.ABC):
         """The name as it stands in texts."""
         self.up = False
         self.admits_gateways = True
-        """Whether a gateway at its other end takes part in the mesh of ours; else it is for clients."""
+        """Whether a gateway at its other end takes part in the mesh of this module's; else the link is for clients."""
         self.gateway_hooks: GatewayHooks | None = None
         """Set by the module where gateways join networks: what it decides for the link."""
         self.denied = False
@@ -163,8 +215,7 @@ class Link(abc.ABC):
         self._subscribers: dict[str, LinkSubscriber] = {}
         """By topic: those at the other end, as publishers here see them."""
         self._announced: dict[str, Announcement] = {}
-        self._lapsed: set[str] = set()
-        """Topics that lost their subscribers while the link was down."""
+        self._lapsed: set[str] = set()  # topics that lost their subscribers while the link was down
         self._events: deque[Event] = deque()
         self._acting = False
         self._down_at = self._clock.monotonic()
@@ -232,11 +283,11 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def discard(self) -> int:
-        """Empty the send buffer; returns how many samples are lost by that."""
+        """Empty the send buffer; return how many samples are lost by that."""
 
     @abc.abstractmethod
     def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
-        """Receive what a remote publisher sends: messages of `size` bytes, 0: of any size. Again: with another size."""
+        """Receive messages of `size` bytes (0: any) from a remote publisher; called again when the size changes."""
 
     @abc.abstractmethod
     def remove_publisher(self, name: str, source: Hashable) -> None:
@@ -274,7 +325,7 @@ class Link(abc.ABC):
         return any(each.latches(topic) for each in self.discovery.endpoints.values())
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
-        """What the class means here for this topic, in words."""
+        """Describe what the class means here for this topic."""
         return "best effort, in order" + (", waits for room" if publisher_class == PublisherClass.NON_REAL_TIME else "")
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
@@ -282,13 +333,12 @@ class Link(abc.ABC):
         return publisher_class != PublisherClass.NON_REAL_TIME
 
     def refusal(self, size: int) -> str | None:
-        """Why messages of `size` bytes can't be sent on this link."""
-        return (
-            f"{size} bytes, and it carries at most {self.max_payload} in a message" if size > self.max_payload else None
-        )
+        """Return why messages of `size` bytes can't be sent on this link; None if they can."""
+        too_long = size > self.max_payload
+        return f"{size} bytes, and it carries at most {self.max_payload} in a message" if too_long else None
 
     def inadmissible(self, size: int, period: float) -> str | None:
-        """Why there can never be slots for messages of `size` bytes each `period` seconds."""
+        """Return why there can never be slots for messages of `size` bytes each `period` seconds; None if there can."""
         return None
 
     def network_time(self) -> int | None:
@@ -296,15 +346,15 @@ class Link(abc.ABC):
         return None
 
     def translation(self) -> ClockOffset | None:
-        """How network time translates to UTC here, and how accurately; None if that is not known."""
+        """Return how network time translates to UTC here, and how accurately; None if that is not known."""
         return None
 
     def params(self, topic: str) -> bytes | None:
-        """What the peers need to know to receive a topic from this module; None if it can't be published here."""
+        """Return what peers need to know to receive a topic from this module; None if it can't be published here."""
         return NO_PARAMS
 
     def window(self, topic: Topic) -> int:
-        """How many messages a publisher of the topic is to keep for this link."""
+        """Return how many messages a publisher of the topic is to keep for this link."""
         return QUEUE
 
     async def admission(self, topic: str) -> None:
@@ -336,9 +386,8 @@ class Link(abc.ABC):
 
     def topic_changed(self, topic: Topic) -> None:
         """Announce what this module publishes and subscribes of a topic: it may have changed."""
-        now = self._clock.monotonic()
         known = self._announced.pop(topic.name, NOTHING)
-        desired = announcement_of(topic)
+        desired = _announcement_of(topic)
         if self.gateway_hooks is not None:
             desired = self.gateway_hooks.desired_state(topic, desired)
         if len(topic.name) > self.max_name:
@@ -349,7 +398,7 @@ class Link(abc.ABC):
             desired, publishes=params is not None, params=params or NO_PARAMS, queue=queue
         )
         if desired != known:
-            self._apply(announce(self.discovery, now, topic.name, known, desired))
+            self._apply(self._announce_changes(topic.name, known, desired))
         # Discovery reports nothing of what this module has withdrawn itself.
         if not desired.publishes:
             self._remove_subscriber(topic.name)
@@ -357,6 +406,27 @@ class Link(abc.ABC):
             self.remove_publishers(topic.name)
         if desired.publishes or desired.subscribes or desired.endpoints:
             self._announced[topic.name] = desired
+
+    def _announce_changes(self, topic: str, known: Announcement, desired: Announcement) -> list[Event]:
+        """Bring the other ends from what they know of a topic to what they should know; return what follows from it."""
+        discovery, now = self.discovery, self._clock.monotonic()
+        events: list[Event] = []
+        retyped = (desired.size, desired.fingerprint) != (known.size, known.fingerprint)
+        if desired.publishes and (retyped or not known.publishes or desired.params != known.params):
+            events += discovery.advertise(now, topic, desired.size, desired.fingerprint, desired.params)
+        elif known.publishes and not desired.publishes:
+            events += discovery.withdraw(now, topic)
+        asks_anew = (desired.asked, desired.queue) != (known.asked, known.queue)
+        if desired.subscribes and (asks_anew or not known.subscribes):
+            events += discovery.subscribe(now, topic, desired.asked.size, desired.queue, desired.asked.fingerprint)
+        elif known.subscribes and not desired.subscribes:
+            events += discovery.unsubscribe(now, topic)
+        for (node, role), publisher_class in desired.endpoints.items():
+            if known.endpoints.get((node, role)) != publisher_class:
+                events += discovery.add_endpoint(now, node, topic, role, publisher_class)
+        for node, role in known.endpoints.keys() - desired.endpoints.keys():
+            events += discovery.remove_endpoint(now, node, topic, role)
+        return events
 
     # Discovery
 
@@ -373,7 +443,7 @@ class Link(abc.ABC):
     def _apply(self, events: Iterable[Event]) -> None:
         self._events.extend(events)
         if self._acting:
-            return  # what an event brings about comes after the events before it
+            return  # what an event causes comes after the events before it
         self._acting = True
         try:
             while self._events:
@@ -422,20 +492,31 @@ class LinkSubscriber(RemoteSubscriber):
     Publishers do not wait for a link that is down: what it is given then is lost and counted.
     """
 
-    __slots__ = ("_link", "topic")
+    __slots__ = ("topic",)
+
+    link: Link  # which the base only compares
 
     def __init__(self, link: Link, topic: Topic, wait_queue: WaitQueue) -> None:
         super().__init__(link.name, link, wait_queue)
-        self._link = link
         self.topic = topic
 
     @property
     def reachable(self) -> bool:
-        return self._link.up
+        return self.link.up
 
     def count_lost(self, reason: str) -> None:
         super().count_lost(reason)
-        self._link.stats.lost[reason] += 1
+        self.link.stats.lost[reason] += 1
+
+    def offer_down(self, sample: Sample) -> bool:
+        """Accept a sample as lost while the link is down, if its publisher has signalled the outage.
+
+        A real-time publisher signals each sample that is missed, so its samples are not accepted.
+        """
+        if sample.publisher_class != PublisherClass.NON_REAL_TIME:
+            return False
+        self.count_lost(LINK_DOWN)
+        return True
 
 
 def is_booting(link: Link, module: str) -> bool:
@@ -452,7 +533,7 @@ def unique_name(name: str, hub: Hub) -> str:
 
 
 def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
-    """That of a line or a bus; `rate` is in messages/s."""
+    """Make the discovery of a line or a bus; `rate` is in messages/s."""
     counts = LoggedCounter(link, hub.space.clock)
     burst = max(4, int(rate / 4))  # what a quarter of a second carries
     return Discovery(hub.space.module, hub.instance, rate=rate, burst=burst, observer=hub.observer, counts=counts)

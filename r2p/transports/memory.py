@@ -64,7 +64,7 @@ class MemoryPort:
         """Hand on what was held."""
         self.paused = False
         while self.held and not self.paused:
-            self.network.arrived()
+            self.network.release()
             self.receive(self.held.popleft())
 
 
@@ -118,7 +118,7 @@ class MemoryNetwork:
     def unplug(self, address: int) -> None:
         port = self._ports.pop(address, None)
         if port is not None:
-            self.arrived(len(port.held))
+            self.release(len(port.held))
             port.held.clear()
 
     def send(self, datagram: Datagram) -> None:
@@ -127,7 +127,7 @@ class MemoryNetwork:
             if address != datagram.port:
                 self._send_to(address, datagram)
 
-    def arrived(self, count: int = 1) -> None:
+    def release(self, count: int = 1) -> None:
         """Note that messages are no longer on their way."""
         was_full = self.full
         self._in_flight -= count
@@ -169,13 +169,13 @@ class MemoryNetwork:
     def _arrive(self, address: int, datagram: Datagram) -> None:
         port = self._ports.get(address)
         if port is None:
-            self.arrived()
+            self.release()
             return
         self.counts["delivered"] += 1
         if port.paused:
             port.held.append(datagram)
             return
-        self.arrived()
+        self.release()
         port.receive(datagram)
 
 

@@ -1,37 +1,47 @@
 """How a message that came by a link waits for room in a full queue.
 
-A `BlockedMessage` waits for some turns of the event loop. Then its owner decides: `LinkBackpressure` on links with one
-way in, and on zenoh the `Backlog` of the topic (`r2p.transports.zenoh.backlog`).
+A `BlockedMessage` waits FULL_QUEUE_TURNS turns of the event loop: most readers make room within them. Then its owner
+decides. There are two, as a slow reader must not stop what others receive, and a fast one should lose nothing:
 
-A slow reader must not stop a line that others share, and a fast one should lose nothing. So a full queue gets
-FULL_QUEUE_TURNS turns of the event loop to make room. If it makes none, this link treats it as lossy (puts messages in
-by force, which drops older ones) until it has plenty of room again. Where a gateway passes messages on to a link
-without room, and the sender waits while nothing is read, the line stands still instead, for LONGEST_STALL seconds at
-most: so backpressure reaches from end to end.
+`LinkBackpressure`, on a link whose topics share one way in. A queue that made no room is treated as lossy (it gets
+messages by force, which drops older ones) until it has plenty of room again. Where a gateway passes messages on to a
+link without room, and the sender waits while nothing is read, the link stops reading instead, for STALL_MAX_S seconds
+at most: so backpressure reaches from end to end.
+
+`Backlog`, for one topic on zenoh, whose packets wait apart from those of other topics. A message that does not expire
+waits for as long as it takes: its publisher learns that from the credit that does not come. An event or a periodic
+message replaces an older one.
 """
 
 import abc
 import asyncio
 import functools
+from collections import deque
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 from r2p.runtime.backpressure import INTERNAL_ERROR, PendingDelivery, Sink
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import RemoteSubscriber
 from r2p.transports.stats import LoggedCounter
 
+P = TypeVar("P")  # what is known of a message's publisher; it is only passed on
+
 FULL_QUEUE_TURNS = 4
 """Turns of the event loop that a link waits for a full queue before it goes on without it."""
 
-LONGEST_STALL = 1.0
-"""Seconds that a line stands still, at most, while another link has no room."""
+STALL_MAX_S = 1.0
+"""Seconds that a link reads nothing, at most, while another link has no room."""
 
-SHORTEST_STALL = 0.05
-"""Seconds that it stands still, at most, right after a stall that has not helped.
+STALL_MIN_S = 0.05
+"""Seconds that it reads nothing, at most, right after a stall that has not helped.
 
-Where many topics have no room, the line would otherwise stand still for LONGEST_STALL once for each of them. The limit
-grows with the time since that stall, up to LONGEST_STALL. 0.05 is a choice: 20 blocked topics cost a second.
+Where many topics have no room, the link would otherwise stall for STALL_MAX_S once for each of them. The limit grows
+with the time since that stall, up to STALL_MAX_S. 0.05 is a choice: 20 blocked topics cost a second.
 """
+
+BACKLOG_MAX = 16_384
+"""Messages that wait behind one that is blocked: what eight publishers may send meanwhile."""
 
 
 class ReceiveBackpressure(abc.ABC):
@@ -42,11 +52,11 @@ class ReceiveBackpressure(abc.ABC):
         self.lost = lost
 
     @abc.abstractmethod
-    def delivered(self) -> None:
+    def on_delivered(self) -> None:
         """Go on with the next message: every sink has this one or has given it up. Called in a turn of its own."""
 
     @abc.abstractmethod
-    def expired(self, message: "BlockedMessage") -> None:
+    def on_expired(self, message: "BlockedMessage") -> None:
         """Decide about the sinks that have made no room within FULL_QUEUE_TURNS turns."""
 
 
@@ -57,7 +67,7 @@ class BlockedMessage(PendingDelivery):
 
     def __init__(self, sample: Sample, sinks: list[Sink], owner: ReceiveBackpressure) -> None:
         super().__init__(sample, [])
-        self.remaining = sinks  # in line only after a turn: most readers make room within it, and lines cost time
+        self.remaining = sinks  # in their wait queues after a turn only: most make room within it, and queues cost time
         self._owner = owner
         self._holds = False
         self._turns = FULL_QUEUE_TURNS
@@ -74,13 +84,13 @@ class BlockedMessage(PendingDelivery):
 
     def on_completed(self, sink: Sink, reason: str) -> None:
         if self._holds and not self.remaining:
-            self._owner.loop.call_soon(self._owner.delivered)  # after the work of the reader that made room
+            self._owner.loop.call_soon(self._owner.on_delivered)  # after the work of the reader that made room
 
     def _retry(self) -> None:
         self.remaining = [sink for sink in self.remaining if not self._offer(sink)]
         for sink in self.remaining:
             sink.get_wait_queue().add(sink, self)
-        self._look()
+        self._check_remaining()
 
     def _offer(self, sink: Sink) -> bool:
         """Offer the message to a sink. Returns True if its wait is over: it has the message, or has raised."""
@@ -90,14 +100,14 @@ class BlockedMessage(PendingDelivery):
             self._owner.lost.internal_error(error)
             return True
 
-    def _look(self) -> None:
+    def _check_remaining(self) -> None:
         self._turns -= 1
         if not self.remaining:
-            self._owner.delivered()
+            self._owner.on_delivered()
         elif self._turns > 0:
-            self._owner.loop.call_soon(self._look)
+            self._owner.loop.call_soon(self._check_remaining)
         else:
-            self._owner.expired(self)
+            self._owner.on_expired(self)
 
 
 class LinkBackpressure(ReceiveBackpressure):
@@ -117,22 +127,20 @@ class LinkBackpressure(ReceiveBackpressure):
         super().__init__(loop, lost)
         self._resume = resume
         self._flow_controlled = flow_controlled
-        self._lossy: set[Sink] = set()
-        """Sinks that were waited for in vain, and have not had plenty of room since."""
-        self._stalled: BlockedMessage | None = None
-        """The message for which the line stands still."""
-        self._stall: asyncio.TimerHandle | None = None
-        self._in_vain_at = -LONGEST_STALL
+        self._lossy: set[Sink] = set()  # those that were waited for in vain, and have not had plenty of room since
+        self._stalled: BlockedMessage | None = None  # the message for which the link reads nothing
+        self._stall_timer: asyncio.TimerHandle | None = None
+        self._in_vain_at = -STALL_MAX_S  # when the last stall ended that has not helped (s)
         self._closed = False
 
     def wait(self, sample: Sample, blocked: list[Sink]) -> bool:
         """Wait for room in these sinks: `resume` is called later. Returns False if none of them is worth a wait."""
         for sink in self._lossy.intersection(blocked):
             self.lost.guard(sink.force, sample)
-        waiting = [sink for sink in blocked if sink not in self._lossy]
-        if waiting:
-            BlockedMessage(sample, waiting, self)
-        return bool(waiting)
+        worth_a_wait = [sink for sink in blocked if sink not in self._lossy]
+        if worth_a_wait:
+            BlockedMessage(sample, worth_a_wait, self)
+        return bool(worth_a_wait)
 
     def close(self) -> None:
         """End a stall, and begin no other."""
@@ -141,12 +149,12 @@ class LinkBackpressure(ReceiveBackpressure):
             self._stalled.withdraw()
             self._end_stall()
 
-    def delivered(self) -> None:
+    def on_delivered(self) -> None:
         self._end_stall()
         self._resume()
 
-    def expired(self, message: BlockedMessage) -> None:
-        # Only other links stall the line: a slow reader in this module loses messages, so that other topics go on.
+    def on_expired(self, message: BlockedMessage) -> None:
+        # Only other links stall this one: a slow reader in this module loses messages, so that other topics go on.
         may_stall = self._flow_controlled() and not self._closed
         slow = [sink for sink in message.remaining if not (may_stall and isinstance(sink, RemoteSubscriber))]
         # Events and periodic messages stall nothing: they would be stale. The other link is no less waited for later.
@@ -164,26 +172,93 @@ class LinkBackpressure(ReceiveBackpressure):
         else:
             self._resume()
 
-    # Stall: the line stands still until there is room on the links that the message goes out by, or the time is over
+    # Stall: nothing is read until there is room on the links that the message goes out by, or the time is over
 
     def _begin_stall(self, message: BlockedMessage) -> None:
         message.hold()
         self._stalled = message
-        longest = min(LONGEST_STALL, max(SHORTEST_STALL, self.loop.time() - self._in_vain_at))
-        self._stall = self.loop.call_later(longest, self._give_up, message, f"no room for {longest:.2g} s")
+        longest = min(STALL_MAX_S, max(STALL_MIN_S, self.loop.time() - self._in_vain_at))
+        self._stall_timer = self.loop.call_later(longest, self._give_up, message, f"no room for {longest:.2g} s")
 
     def _end_stall(self) -> None:
         self._stalled = None
-        if self._stall is not None:
-            self._stall.cancel()
-            self._stall = None
+        if self._stall_timer is not None:
+            self._stall_timer.cancel()
+            self._stall_timer = None
 
     def _give_up(self, message: BlockedMessage, reason: str) -> None:
         guard = self.lost.guard
         for sink in list(message.remaining):
             guard(sink.refill)  # a last attempt
+        if message.remaining:
+            self._in_vain_at = self.loop.time()
         for sink in list(message.remaining):
             if not guard(sink.become_lossy, reason):
                 sink.get_wait_queue().remove(sink, message)
-                message.complete(sink, INTERNAL_ERROR)  # else the line would stand still for ever
-            self._in_vain_at = self.loop.time()
+                message.complete(sink, INTERNAL_ERROR)  # else the link would stand still for ever
+
+
+class Backlog(ReceiveBackpressure, Generic[P]):
+    """What waits for room on one topic: the message that is blocked, and those behind it.
+
+    `deliver` gets each message when it has its turn, and None for the blocked one when every sink has it; `resume` is
+    called when reading may go on.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        lost: LoggedCounter,
+        deliver: Callable[[P, int, Sample | None], None],
+        resume: Callable[[], None],
+    ) -> None:
+        super().__init__(loop, lost)
+        self.blocked: BlockedMessage | None = None
+        self.holds = False
+        """Whether the blocked message waits without a limit; reading goes on, and events overtake it."""
+        self._deliver = deliver
+        self._resume = resume
+        self._blocked_serial: tuple[P, int]  # whose message is blocked, and its serial
+        self._queue: deque[tuple[P, int, Sample | None]] = deque()
+
+    def block(self, publisher: P, serial: int, sample: Sample, sinks: list[Sink]) -> None:
+        """Wait for room in these sinks."""
+        self._blocked_serial = publisher, serial
+        self.blocked = BlockedMessage(sample, sinks, self)
+
+    def append(self, publisher: P, serial: int, sample: Sample | None) -> bool:
+        """Put a message behind the others, or None in place of one that is only acknowledged. False if it is full."""
+        if len(self._queue) >= BACKLOG_MAX:
+            return False
+        self._queue.append((publisher, serial, sample))
+        return True
+
+    def clear(self) -> int:
+        """Drop everything; return how many messages waited behind the blocked one."""
+        count = sum(sample is not None for _, _, sample in self._queue)
+        self._queue.clear()
+        blocked, self.blocked = self.blocked, None
+        if blocked is not None:
+            blocked.withdraw()
+        return count
+
+    def on_expired(self, message: BlockedMessage) -> None:
+        if message.sample.publisher_class == PublisherClass.NON_REAL_TIME:
+            message.hold()
+            self.holds = True
+            self._resume()
+        else:
+            for sink in message.withdraw():
+                self.lost.guard(sink.force, message.sample)
+            self.on_delivered()
+
+    def on_delivered(self) -> None:
+        if self.blocked is None:
+            return  # all was dropped meanwhile
+        self.blocked = None
+        self._deliver(*self._blocked_serial, None)
+        while self._queue and self.blocked is None:
+            self._deliver(*self._queue.popleft())
+        if self.blocked is None:
+            self.holds = False
+            self._resume()

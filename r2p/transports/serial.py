@@ -35,11 +35,11 @@ IN_KERNEL = 0.02
 
 _CHUNK = 4096  # bytes read at once
 _BITS_A_BYTE = 10  # 8N1
-_LONGEST_LINE = 576  # bytes
-_SMALLEST_WINDOW = 32  # bytes in the kernel: fewer, and a late timer leaves the line idle
+_LINE_MAX = 576  # bytes: the longest line that can be sent, so that one always fits into the buffer
+_WINDOW_MIN = 32  # bytes in the kernel: fewer, and a late timer leaves the line idle
 _MANAGEMENT_SHARE = 0.2  # of the line that management gets
-_MANAGEMENT_LINE = 96  # bytes
-_LONGEST_WAIT = 0.5  # seconds between attempts to open a device that is not there
+_MANAGEMENT_LINE = 96  # bytes of a management line, about
+_BACKOFF_MAX_S = 0.5  # seconds between attempts to open a device that is not there
 
 
 class SerialTransport(Transport):
@@ -59,10 +59,10 @@ class SerialTransport(Transport):
             f"serial:{self._device}",
             hub,
             management_rate=max(1.0, bytes_a_second * _MANAGEMENT_SHARE / _MANAGEMENT_LINE),
-            buffer=max(_LONGEST_LINE, int(bytes_a_second * BUFFERED)),
+            buffer=max(_LINE_MAX, int(bytes_a_second * BUFFERED)),
             piecemeal=True,
         )
-        backoff = Backoff(hub.random, longest=_LONGEST_WAIT)
+        backoff = Backoff(hub.random, longest=_BACKOFF_MAX_S)
         hub.attach(link)
         opened()
         try:
@@ -113,18 +113,17 @@ class _SerialConnection(Connection):
         self._fd: int = device.fileno()
         self._link = link
         self._bytes_a_second = bytes_a_second
-        self._window = max(_SMALLEST_WINDOW, int(bytes_a_second * IN_KERNEL))
+        self._window = max(_WINDOW_MIN, int(bytes_a_second * IN_KERNEL))
         self._unsent = bytearray()
         self._timer: asyncio.TimerHandle | None = None
         self._reading = False
         self._full = False
         self._closing = False
-        self._unconfirmed = 0
 
     def start(self) -> None:
         """Begin to read, and connect the link."""
         self.resume()
-        self._link.connected(self)
+        self._link.connect(self)
 
     # Carrier
 
@@ -157,10 +156,6 @@ class _SerialConnection(Connection):
     def abort(self) -> None:
         self._end("closed")
 
-    @property
-    def unconfirmed(self) -> int:
-        return self._unconfirmed
-
     def _read(self) -> None:
         try:
             data = os.read(self._fd, _CHUNK)
@@ -170,7 +165,7 @@ class _SerialConnection(Connection):
             self._end(_reason(error))
             return
         if data:
-            self._link.fed(data)
+            self._link.feed(data)
         else:
             self._end("the device is gone")
 
@@ -211,9 +206,9 @@ class _SerialConnection(Connection):
         self.ended.set()
         self.pause()
         self._stop_waiting()
-        self._unconfirmed = len(self._unsent) + _queued(self._fd)
+        self.unconfirmed = len(self._unsent) + _queued(self._fd)
         self._device.close()
-        self._link.disconnected(reason)
+        self._link.disconnect(reason)
 
 
 def _pyserial() -> Any:
@@ -250,7 +245,7 @@ def _reason(error: OSError) -> str:
 
 
 def _explain(device: str, error: Exception) -> str:
-    """Why the device can't be opened, and what to do."""
+    """Return why the device can't be opened, and what to do."""
     if isinstance(error, OSError) and error.errno == errno.EACCES:
         return f"{device}: permission denied; add yourself to its group: sudo usermod -aG dialout $USER"
     if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):

@@ -20,8 +20,7 @@ logger = get_logger("r2p.link")
 RETRY_AFTER_ERROR = 100_000_000
 """Ns until a timer whose work raised goes off again: a deadline that is over would otherwise be tried without end."""
 
-_LINES = 1
-"""Lines of the log in a second about one reason."""
+_LINES = 1  # lines of the log in a second about one reason
 
 _TRACEBACK = "traceback"
 
@@ -100,5 +99,5 @@ class LinkStats(msgspec.Struct):
         for name in ("sent", "received", "bytes_sent", "bytes_received", "ups"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for reason, count in losses.items():
-            dict.__setitem__(self.lost, reason, self.lost[reason] + count)  # past our own, as that link has logged it
+            dict.__setitem__(self.lost, reason, self.lost[reason] + count)  # without logging: that link has done it
         self.faults.update(other.faults)

@@ -29,17 +29,17 @@ from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url, yes_or_no
 
 PORT = 2323
-"""Where `tcp-listen:` listens, and `tcp:HOST` connects, unless the URL says otherwise."""
+"""The port where `tcp-listen:` listens, and `tcp:HOST` connects, unless the URL says otherwise."""
 
 MAX_CLIENTS = 200
 """Connections that `tcp-listen:` serves at once, unless `max_clients=` says otherwise."""
 
-_MOST_REFUSED = 8  # refused clients that are sent the reason at a time; others are cut off
-_REFUSED_FOR = 0.5  # seconds for a refused client to read the reason and close
+_REFUSED_MAX = 8  # refused clients that are sent the reason at a time; others are cut off
+_REFUSED_S = 0.5  # seconds for a refused client to read the reason and close
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
-_CONNECT_TIMEOUT = 5.0  # seconds
-_STABLE = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
-_DEAD_AFTER = 5  # seconds of silence
+_CONNECT_TIMEOUT_S = 5.0  # seconds
+_STABLE_S = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
+_DEAD_AFTER_S = 5  # seconds of silence
 
 
 class _TcpConnection(asyncio.BufferedProtocol, Connection):
@@ -53,11 +53,10 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
         self._buffer = bytearray(_CHUNK)
         self._transport: asyncio.Transport | None = None
         self._paused = False
-        self._unconfirmed = 0
 
     @abc.abstractmethod
-    def open_link(self, peer: str) -> LineLink:
-        """The link that the connection carries, now that its other end is there."""
+    def open_link(self, transport: asyncio.Transport, peer: str) -> LineLink | None:
+        """Return the link that the connection carries, now that its other end is there; None: it is refused."""
 
     # Carrier
 
@@ -87,11 +86,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
         else:
             self.ended.set()
 
-    @property
-    def unconfirmed(self) -> int:
-        return self._unconfirmed
-
-    def forget(self) -> None:
+    def mark_ended(self) -> None:
         """Count it as ended: it was given up while it was made. The event loop closes it, and uvloop reports no end."""
         self._transport = None
         self.ended.set()
@@ -106,19 +101,16 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
             self._transport.abort()
             return
         _set_options(self._transport.get_extra_info("socket"))
-        self.opened(self._transport, f"tcp:{_address(peer[0], peer[1])}")
-
-    def opened(self, transport: asyncio.Transport, peer: str) -> None:
-        """Connect the link: the other end is there."""
-        self.link = self.open_link(peer)
-        self.link.connected(self)
+        self.link = self.open_link(self._transport, f"tcp:{_address(peer[0], peer[1])}")
+        if self.link is not None:
+            self.link.connect(self)
 
     def get_buffer(self, sizehint: int) -> bytearray:
         return self._buffer
 
     def buffer_updated(self, nbytes: int) -> None:
         if self.link is not None:
-            self.link.fed(memoryview(self._buffer)[:nbytes])
+            self.link.feed(memoryview(self._buffer)[:nbytes])
 
     def pause_writing(self) -> None:
         if self.link is not None:
@@ -130,10 +122,10 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._transport is not None:
-            self._unconfirmed = self._transport.get_write_buffer_size() + _unacknowledged(self._transport)
+            self.unconfirmed = self._transport.get_write_buffer_size() + _unacknowledged(self._transport)
         self._transport = None
         if self.link is not None:
-            self.link.disconnected(_explain(exc) if exc else "the other end closed the connection")
+            self.link.disconnect(_explain(exc) if exc else "the other end closed the connection")
         self.ended.set()
 
 
@@ -156,8 +148,8 @@ def _set_options(sock: socket.socket) -> None:
     if sys.platform == "linux":
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, _DEAD_AFTER - 2)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _DEAD_AFTER * 1000)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, _DEAD_AFTER_S - 2)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _DEAD_AFTER_S * 1000)
 
 
 class TcpTransport(Transport):
@@ -176,7 +168,7 @@ class TcpTransport(Transport):
         opened()
         try:
             while True:
-                if await self._connect(link) >= _STABLE:
+                if await self._connect(link) >= _STABLE_S:
                     backoff.reset()
                 if link.denied:
                     backoff.slow_down()
@@ -191,10 +183,10 @@ class TcpTransport(Transport):
         connection = _ClientConnection(link)
         try:
             try:
-                async with asyncio.timeout(_CONNECT_TIMEOUT):
+                async with asyncio.timeout(_CONNECT_TIMEOUT_S):
                     await loop.create_connection(lambda: connection, self._host, self._port)
             except BaseException:  # cancelled, too: the connection may be there by now
-                connection.forget()
+                connection.mark_ended()
                 raise
             began = loop.time()
             await connection.ended.wait()
@@ -216,7 +208,7 @@ class _ClientConnection(_TcpConnection):
         super().__init__()
         self._link = link
 
-    def open_link(self, peer: str) -> LineLink:
+    def open_link(self, transport: asyncio.Transport, peer: str) -> LineLink:
         return self._link
 
 
@@ -229,104 +221,94 @@ class TcpListenTransport(Transport):
 
     def __init__(self, url: Url) -> None:
         options = url.parsed({"max_clients": _client_count, "gateways": yes_or_no})
-        self._gateways = bool(options.get("gateways", False))
+        self.url = url
+        self.max_clients = options.get("max_clients", MAX_CLIENTS)
+        self.admits_gateways = bool(options.get("gateways", False))
+        self.served: set[_ServerConnection] = set()
+        self.refused: set[_ServerConnection] = set()
+        """Those that are sent the reason, and have not closed yet."""
+        self.closing = False
         host, self._port = _host_port(url)
         self._host = host or "127.0.0.1"
-        self._url = url
-        self._max_clients = options.get("max_clients", MAX_CLIENTS)
         self.port: int | None = None
         """The port that it listens on, once it does (port 0 in the URL: any free one)."""
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         loop = asyncio.get_running_loop()
-        clients = _Clients(hub, str(self._url), self._max_clients, gateways=self._gateways)
+        self.closing = False
         try:
-            server = await loop.create_server(lambda: _ServerConnection(clients), self._host, self._port)
+            server = await loop.create_server(lambda: _ServerConnection(self, hub), self._host, self._port)
         except OSError as error:
-            raise TransportError(f"{self._url}: can't listen: {_explain(error)}") from error
+            raise TransportError(f"{self.url}: can't listen: {_explain(error)}") from error
         try:
             self.port = server.sockets[0].getsockname()[1]
-            hub.listening(str(self._url), _address(self._host, self.port))
+            hub.listening(str(self.url), _address(self._host, self.port))
             opened()
             await loop.create_future()
         finally:
-            clients.closing.set()
+            self.closing = True
             server.close()
-            await asyncio.gather(*(client.leave() for client in [*clients.served, *clients.refused]))
+            await asyncio.gather(*(client.leave() for client in [*self.served, *self.refused]))
             await server.wait_closed()
-
-
-class _Clients:
-    """The connections of one server: those that are served, and those that are being refused."""
-
-    def __init__(self, hub: Hub, url: str, most: int, *, gateways: bool) -> None:
-        self.hub = hub
-        self.most = most
-        self.gateways = gateways
-        self.served: set[_ServerConnection] = set()
-        self.refused: set[_ServerConnection] = set()
-        self.closing = asyncio.Event()
-        self._url = url
-
-    def refuse(self, client: "_ServerConnection", transport: asyncio.Transport) -> None:
-        """Send an r2p client the reason (PROTOCOL.md 9): when it has read that, it closes."""
-        self.hub.connection_refused(self._url, f"all {self.most} connections are in use: see max_clients=")
-        if len(self.refused) >= _MOST_REFUSED:
-            transport.abort()
-            return
-        self.refused.add(client)
-        name = self.hub.space.module
-        denied = management.Denied(name, name, 0, management.DENIED_CLIENTS)
-        transport.write(debug.encode(MANAGEMENT.encode(), management.encode(denied), 0))
-        transport.write_eof()
-        asyncio.get_running_loop().call_later(_REFUSED_FOR, client.abort)
 
 
 class _ServerConnection(_TcpConnection):
     """A connection of the server, with a link of its own if it is served."""
 
-    def __init__(self, clients: _Clients) -> None:
+    def __init__(self, server: TcpListenTransport, hub: Hub) -> None:
         super().__init__()
-        self._clients = clients
-        self._hub = clients.hub
+        self._server = server
+        self._hub = hub
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if self._clients.closing.is_set():  # accepted just before the server was closed
+        if self._server.closing:  # accepted just before the server was closed
             self.ended.set()
         super().connection_made(transport)
 
-    def opened(self, transport: asyncio.Transport, peer: str) -> None:
-        if len(self._clients.served) < self._clients.most:
-            super().opened(transport, peer)
-        else:
-            self._clients.refuse(self, transport)
-
-    def open_link(self, peer: str) -> LineLink:
+    def open_link(self, transport: asyncio.Transport, peer: str) -> LineLink | None:
+        if len(self._server.served) >= self._server.max_clients:
+            self._refuse(transport)
+            return None
         link = LineLink(peer, self._hub)
         link.transient = True
-        link.admits_gateways = self._clients.gateways
-        self._clients.served.add(self)
+        link.admits_gateways = self._server.admits_gateways
+        self._server.served.add(self)
         self._hub.attach(link)
         return link
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
-        self._clients.refused.discard(self)
+        self._server.refused.discard(self)
         if self.link is not None:
-            self._clients.served.remove(self)
+            self._server.served.remove(self)
             self.link.close()
             self._hub.detach(self.link)
             self.link = None
 
+    def _refuse(self, transport: asyncio.Transport) -> None:
+        """Send an r2p client the reason (PROTOCOL.md 9): when it has read that, it closes."""
+        server, name = self._server, self._hub.space.module
+        self._hub.connection_refused(
+            str(server.url), f"all {server.max_clients} connections are in use: see max_clients="
+        )
+        if len(server.refused) >= _REFUSED_MAX:
+            transport.abort()
+            return
+        server.refused.add(self)
+        denied = management.Denied(name, name, 0, management.DENIED_CLIENTS)
+        transport.write(debug.encode(MANAGEMENT.encode(), management.encode(denied), 0))
+        transport.write_eof()
+        asyncio.get_running_loop().call_later(_REFUSED_S, self.abort)
+
     async def leave(self) -> None:
-        """Close it, as the server closes."""
+        """Close the link and the connection, as the server closes."""
         if self.link is not None:
             self.link.close()
         await self.aclose()
 
 
 def _explain(error: Exception) -> str:
-    """What went wrong, and what to do where that is known."""
+    """Return what went wrong, and what to do where that is known."""
     if isinstance(error, TimeoutError) and not error.errno:
         return "no answer"
     if isinstance(error, socket.gaierror):

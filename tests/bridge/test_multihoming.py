@@ -255,9 +255,9 @@ class Clients(Transport):
         try:
             for number, link in enumerate(links):
                 hub.attach(link)
-                link.connected(Nowhere())
+                link.connect(Nowhere())
                 await asyncio.sleep(0.01)
-                link.fed(manage(management.Hello(f"C{number}", 1000 + number, 0, 0, 60_000)))
+                link.feed(manage(management.Hello(f"C{number}", 1000 + number, 0, 0, 60_000)))
             await asyncio.get_running_loop().create_future()
         finally:
             for link in links:

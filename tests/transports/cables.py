@@ -161,21 +161,21 @@ class LineEnd(Transport, Carrier):
         self._wanted = True
         if self.link is not None and not self._plugged:
             self._plugged = True
-            self.link.connected(self)
+            self.link.connect(self)
 
     def pull(self, reason: str = "pulled") -> None:
         self._wanted = self.frozen = False
         self._stuck.clear()
         if self.link is not None and self._plugged:
             self._plugged = False
-            self.link.disconnected(reason)
+            self.link.disconnect(reason)
 
     def arrive(self, data: bytes) -> None:
         """The other end sent this."""
         if self._paused:
             self._inbox.append(data)
         elif self.link is not None and self._plugged:
-            self.link.fed(data)
+            self.link.feed(data)
 
     def thaw(self) -> None:
         self.frozen = False

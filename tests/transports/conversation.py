@@ -32,8 +32,6 @@ class Script(Transport, Carrier):
         self.said: list[Said] = []
         self.blocked = False
         """While it is set the line takes nothing after what it takes now."""
-        self.on_the_way = 0
-        """Bytes that the other end has not confirmed."""
         self._reader = debug.Reader()
         self._held: list[bytes] = []
         self._paused = False
@@ -43,7 +41,7 @@ class Script(Transport, Carrier):
         link.admits_gateways = self.admits_gateways
         hub.attach(link)
         try:
-            link.connected(self)
+            link.connect(self)
             opened()
             await asyncio.get_running_loop().create_future()
         finally:
@@ -57,7 +55,7 @@ class Script(Transport, Carrier):
             if self._paused:
                 self._held.append(data[at : at + size])
             else:
-                self.link.fed(data[at : at + size])
+                self.link.feed(data[at : at + size])
 
     def unblock(self) -> None:
         self.blocked = False
@@ -73,17 +71,13 @@ class Script(Transport, Carrier):
         if self.blocked:
             self.link.carrier_full()
 
-    @property
-    def unconfirmed(self) -> int:
-        return self.on_the_way
-
     def pause(self) -> None:
         self._paused = True
 
     def resume(self) -> None:
         self._paused = False
         while self._held and not self._paused:
-            self.link.fed(self._held.pop(0))
+            self.link.feed(self._held.pop(0))
 
     def close(self) -> None:
         self._paused = True

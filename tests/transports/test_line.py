@@ -93,7 +93,7 @@ async def test_orders_that_wait_for_a_blocked_line_are_bounded() -> None:
         for _ in range(2000):
             script.hear(manage(m.SubscribeRequest("leds", 5, 1)))
             module.command(r2p.Command.STOP, "A")
-        assert script.link._waiting < 20_000
+        assert script.link._buffered_bytes < 20_000
         assert script.link.losses["management, send buffer full"] > 1800
         script.said.clear()
         script.unblock()
@@ -102,7 +102,7 @@ async def test_orders_that_wait_for_a_blocked_line_are_bounded() -> None:
         script.blocked = True
         for _ in range(3):
             module.command(r2p.Command.STOP, "A")
-        script.link.disconnected("broken")
+        script.link.disconnect("broken")
         assert script.link.losses["orders not sent"] == 2  # the line had taken the first one
 
 
@@ -115,14 +115,14 @@ async def test_what_waits_for_a_blocked_line_is_bounded() -> None:
         script.blocked = True
         while not missed:
             await publisher.publish(Text())
-        waiting = script.link._waiting
+        waiting = script.link._buffered_bytes
         assert BUFFER <= waiting < BUFFER + 200
         for _ in range(10):
             await publisher.publish(Text())
-        assert script.link._waiting == waiting
+        assert script.link._buffered_bytes == waiting
         for _ in range(1000):
             script.hear(manage(m.SubscribeRequest("text", 64, 1)))
-        assert script.link._waiting < BUFFER + 10_000
+        assert script.link._buffered_bytes < BUFFER + 10_000
         losses = script.link.losses
         assert losses["send buffer full"] == 11
         assert losses["management, send buffer full"] > 800
@@ -176,11 +176,11 @@ async def test_what_waited_when_the_line_broke_is_never_sent() -> None:
         for number in range(5):
             await publisher.publish(Led(led=number))
         sent = len(script.topics("leds"))
-        script.link.disconnected("broken")
+        script.link.disconnect("broken")
         await publisher.publish(Led(led=5))
         script.blocked = False
         await asyncio.sleep(10)
-        script.link.connected(script)
+        script.link.connect(script)
         await publisher.publish(Led(led=6))
         await asyncio.sleep(0)
         assert script.topics("leds")[sent:] == [Led(led=6).encode()]
@@ -194,11 +194,11 @@ async def test_what_waits_for_a_new_connection_that_breaks_again_is_lost() -> No
         publisher = node.advertise("leds", Led)
         script.hear(manage(SUBSCRIBE))
         await asyncio.sleep(1)
-        script.link.disconnected("broken")
-        script.link.connected(script)
+        script.link.disconnect("broken")
+        script.link.connect(script)
         publishing = asyncio.create_task(publisher.publish(Led()))
         await asyncio.sleep(0.01)
-        script.link.disconnected("broken again")
+        script.link.disconnect("broken again")
         await publishing
         assert script.topics("leds") == []
         assert script.link.stats.sent == 0
@@ -213,12 +213,12 @@ async def test_what_was_on_the_way_when_the_line_broke_is_unknown() -> None:
         for number in range(10):
             await publisher.publish(Led(led=number))
             await asyncio.sleep(0.001)
-        script.on_the_way = 2 * len(line("leds", Led().encode())) + 1
-        script.link.disconnected("broken")
+        script.unconfirmed = 2 * len(line("leds", Led().encode())) + 1
+        script.link.disconnect("broken")
         assert script.link.losses == {"unknown at disconnect": 3}
-        script.link.connected(script)
-        script.on_the_way = 5
-        script.link.disconnected("broken again, before anything was sent")
+        script.link.connect(script)
+        script.unconfirmed = 5
+        script.link.disconnect("broken again, before anything was sent")
         assert script.link.losses == {"unknown at disconnect": 3}
 
 
@@ -235,7 +235,7 @@ async def test_publishers_stop_waiting_for_a_line_that_breaks() -> None:
         stalled = filler.sent
         assert not events.publish_nowait(Led())
         held = len(script.link._samples)
-        script.link.disconnected("broken")
+        script.link.disconnect("broken")
         assert script.link.losses["link down"] == held + 2
         await asyncio.sleep(0)
         flood.cancel()
@@ -315,7 +315,7 @@ async def test_an_event_that_a_line_had_begun_to_send_when_it_broke_is_missed() 
         script.blocked = True
         await asyncio.sleep(1)
         await event.publish(Led())
-        script.link.disconnected("broken")
+        script.link.disconnect("broken")
         assert missed == [r2p.Missed("leds", "link down", where="script")]
         assert (script.link.stats.sent, script.link.losses["link down"]) == (1, 1)
 
@@ -355,7 +355,7 @@ async def test_what_a_line_that_is_down_does_not_get() -> None:
         text = node.advertise("text", Led, r2p.NonRealTime(**signals))
         script.hear(b"".join(manage(m.SubscribeRequest(topic, 5, 1)) for topic in ("event", "state", "text")))
         await asyncio.sleep(0.5)
-        script.link.disconnected("broken")
+        script.link.disconnect("broken")
         assert {each.topic for each in degraded} == {"event", "state", "text"}
         for _ in range(3):
             assert not event.publish_nowait(Led())
@@ -373,11 +373,11 @@ async def test_the_outage_is_reported() -> None:
         publisher = node.advertise("leds", Led)
         script.hear(manage(SUBSCRIBE))
         await asyncio.sleep(1)
-        script.link.disconnected("broken")
+        script.link.disconnect("broken")
         for _ in range(3):
             await publisher.publish(Led())
         await asyncio.sleep(2.5)
-        script.link.connected(script)
+        script.link.connect(script)
         told = [await anext(events), await anext(events)]
         assert told == [r2p.LinkDown("script", "broken"), r2p.LinkUp("script", 2.5, 3)]
 
@@ -389,10 +389,10 @@ async def test_firmware_has_time_after_a_reconnect() -> None:
         script.hear(manage(SUBSCRIBE) + manage(m.SubscribeRequest("event", 5, 1)))
         await asyncio.sleep(1)
         for _ in range(2):
-            script.link.disconnected("broken")
+            script.link.disconnect("broken")
             await asyncio.sleep(10)
             script.said.clear()
-            script.link.connected(script)
+            script.link.connect(script)
             connected = asyncio.get_running_loop().time()
             assert leds.subscribers == 1
             await event.publish(Led(led=1))
@@ -411,8 +411,8 @@ async def test_an_r2p_peer_needs_no_time() -> None:
             script.hear(manage(m.Hello("PC2", 7)) + manage(SUBSCRIBE))
             assert leds.publish_nowait(Led())
             await asyncio.sleep(0)
-            script.link.disconnected("broken")
-            script.link.connected(script)
+            script.link.disconnect("broken")
+            script.link.connect(script)
         assert len(script.topics("leds")) == 2
 
 
@@ -444,10 +444,10 @@ async def test_nothing_happens_after_closing() -> None:
         script.hear(line("leds", Led().encode()) * 200)  # waits for room, more in the backlog
         publisher.publish_nowait(Led())  # a line is corked
     spoken = len(script.said)
-    link.fed(line("leds", Led().encode()))
+    link.feed(line("leds", Led().encode()))
     link.carrier_ready()
-    link.connected(script)
-    link.disconnected("late")
+    link.connect(script)
+    link.disconnect("late")
     await asyncio.sleep(10)
     assert len(script.said) == spoken
     assert not subscriber.queue
@@ -561,11 +561,11 @@ async def test_user_code_that_raises_does_not_harm_the_link() -> None:
         async with r2p.Module("PC1", via=script) as module, node_in(module) as node:
             node.advertise("leds", Led, r2p.Sporadic(0.1, on_degraded=fail))
             script.hear(manage(m.Hello("IMU1", 7)) + manage(SUBSCRIBE))
-            script.link.disconnected("broken")
+            script.link.disconnect("broken")
             assert not script.link.up
             assert not module.network.modules()[1:]
             await asyncio.sleep(1)
-            script.link.connected(script)
+            script.link.connect(script)
             assert script.link.up
             assert not module.nodes["test"].running
 
@@ -607,22 +607,22 @@ async def test_a_line_that_is_refused_again_and_again_is_told_once(
         for number in range(10):
             if number:
                 await asyncio.sleep(2)
-                script.link.connected(script)
+                script.link.connect(script)
             script.hear(manage(m.Denied("A", "A", 0, m.DENIED_CLIENTS)))
-            script.link.disconnected("closed")
+            script.link.disconnect("closed")
             assert script.link.denied
         told = [await anext(events) for _ in range(3)]
         assert [type(each) for each in told] == [r2p.LinkUp, r2p.LinkNotice, r2p.LinkDown]
         assert (caplog.text.count("is up"), caplog.text.count("is down")) == (1, 1)
         await asyncio.sleep(2)
-        script.link.connected(script)
+        script.link.connect(script)
         if heard:
             script.hear(manage(m.Hello("A", 7)))
         else:
             await asyncio.sleep(3)
         assert not script.link.denied
         assert await anext(events) == r2p.LinkUp("script", 20.0 if heard else 23.0, 0)
-        script.link.disconnected("closed")
+        script.link.disconnect("closed")
         assert caplog.text.count("is down") == 2
 
 
@@ -655,17 +655,17 @@ async def test_lines_that_wait_keep_the_stamp_of_their_reception(monkeypatch: py
     async with scripted() as (script, _, node):
         subscriber = node.subscribe("leds", Led)
         link, message = script.link, line("leds", Led().encode())
-        link.fed(manage(m.SubscribeResponse("leds", 5, 1)))
+        link.feed(manage(m.SubscribeResponse("leds", 5, 1)))
         await asyncio.sleep(0.1)
         received_at = link._clock.now()
-        link.fed(3 * message)
-        link.disconnected("pulled")
-        link.connected(script)
+        link.feed(3 * message)
+        link.disconnect("pulled")
+        link.connect(script)
         clock = SimpleNamespace(now=lambda: received_at + 1, monotonic=link._clock.monotonic)
         monkeypatch.setattr(link, "_clock", clock)
-        link.fed(2 * message)
+        link.feed(2 * message)
         await asyncio.sleep(0.1)
         assert [sample.stamp - received_at for sample in subscriber._sink.queue] == [0, 0, 0, 1, 1]
-        link.fed(message)
+        link.feed(message)
         assert subscriber._sink.queue[-1].stamp == received_at + 1
         assert link.losses == {}

@@ -14,7 +14,7 @@ from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
 from r2p.transports.buffered_link import Arrival, BufferedLink
-from r2p.transports.receive_backpressure import FULL_QUEUE_TURNS, LONGEST_STALL
+from r2p.transports.receive_backpressure import FULL_QUEUE_TURNS, STALL_MAX_S
 
 pytestmark = pytest.mark.virtual_time
 
@@ -102,19 +102,19 @@ ALL = [line.data for line in LINES]
 async def test_an_end_that_waits_is_made_to_wait_and_nothing_is_lost() -> None:
     end, other = gateway(flow_controlled=True)
     end.receive(LINES)
-    await asyncio.sleep(LONGEST_STALL / 2)
+    await asyncio.sleep(STALL_MAX_S / 2)
     assert (other.taken, end.reads) == ([], False)
     for _ in LINES:
         other.space = 1
         other.refill()
-        await asyncio.sleep(LONGEST_STALL / 2)
+        await asyncio.sleep(STALL_MAX_S / 2)
     assert (other.taken, other.lost, end.reads) == (ALL, 0, True)
 
 
 async def test_a_link_that_hangs_holds_it_up_once() -> None:
     end, other = gateway(flow_controlled=True)
     end.receive(LINES)
-    await asyncio.sleep(LONGEST_STALL * 1.5)
+    await asyncio.sleep(STALL_MAX_S * 1.5)
     assert (other.taken, other.lost, other.blocks_publishers, end.reads) == ([], len(LINES), False, True)
 
 
@@ -129,7 +129,7 @@ async def test_what_expires_does_not_hold_it_up(publisher_class: PublisherClass)
     assert (other.taken, other.lost, end.reads) == ([], len(LINES), True)
     end.publisher_class = PublisherClass.NON_REAL_TIME
     end.receive(LINES[:1])
-    await asyncio.sleep(LONGEST_STALL / 2)
+    await asyncio.sleep(STALL_MAX_S / 2)
     other.space = 1
     other.refill()
     await asyncio.sleep(0.1)
@@ -145,19 +145,19 @@ async def test_many_topics_without_room_hold_it_up_hardly_longer_than_one() -> N
         topic.join(other)
         end.add_publisher(topic, 1, None)
     end.receive(Line(f"topic{number}".encode(), b"1") for number in range(len(others)))
-    await asyncio.sleep(LONGEST_STALL * 1.5)
+    await asyncio.sleep(STALL_MAX_S * 1.5)
     assert [other.lost for other in others] == [1] * len(others)
     assert end.reads
-    await asyncio.sleep(LONGEST_STALL)
+    await asyncio.sleep(STALL_MAX_S)
     end.receive(LINES[:1])
-    await asyncio.sleep(LONGEST_STALL * 0.9)  # it is given its time again
+    await asyncio.sleep(STALL_MAX_S * 0.9)  # it is given its time again
     assert not end.reads
 
 
 async def test_a_line_that_is_connected_anew_is_held_up_as_the_old_one_was() -> None:
     end, other = gateway(flow_controlled=True)
     end.receive(LINES)
-    await asyncio.sleep(LONGEST_STALL / 2)
+    await asyncio.sleep(STALL_MAX_S / 2)
     end.reads = True
     end.receive(LINES)
     assert not end.reads
@@ -178,12 +178,12 @@ async def test_one_that_does_not_wait_loses_soon() -> None:
 async def test_closed_while_it_waits() -> None:
     end, other = gateway(flow_controlled=True)
     end.receive(LINES)
-    await asyncio.sleep(LONGEST_STALL / 2)
+    await asyncio.sleep(STALL_MAX_S / 2)
     end.close()
     assert not other.get_wait_queue()
     other.space = len(LINES)
     other.refill()
-    await asyncio.sleep(LONGEST_STALL * 2)
+    await asyncio.sleep(STALL_MAX_S * 2)
     assert (other.taken, other.lost) == ([], 0)
 
 
@@ -226,13 +226,13 @@ async def test_a_message_that_raises_does_not_stop_the_others(
     end, other = gateway(flow_controlled=flow_controlled, other=Faulty(*faults))
     other.space = space
     end.receive(LINES)
-    await asyncio.sleep(10 * LONGEST_STALL)
+    await asyncio.sleep(10 * STALL_MAX_S)
     assert (other.taken, end.reads) == ([LINES[number].data for number in taken], True)
     assert end.stats.lost["internal error"] == errors
     other.space = 1
     other.refill()
     end.receive(LINES[:1])
-    await asyncio.sleep(10 * LONGEST_STALL)
+    await asyncio.sleep(10 * STALL_MAX_S)
     assert other.taken[-1] == LINES[0].data
 
 
@@ -240,9 +240,9 @@ async def test_a_message_that_raises_does_not_stop_the_others(
 async def test_a_message_that_raises_while_it_waits_for_room_waits_no_more() -> None:
     end, other = gateway(flow_controlled=True, other=Faulty("offer"))
     end.receive(LINES[1:])
-    await asyncio.sleep(LONGEST_STALL / 2)
+    await asyncio.sleep(STALL_MAX_S / 2)
     other.space = 9
     with pytest.raises(RuntimeError):
         other.refill()  # a link guards this, and goes on
-    await asyncio.sleep(LONGEST_STALL)
+    await asyncio.sleep(STALL_MAX_S)
     assert (other.taken, end.reads, other.wait_queue.non_real_time) == (ALL[2:], True, deque())

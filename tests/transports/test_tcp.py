@@ -196,7 +196,7 @@ async def test_a_peer_that_accepts_and_closes_is_not_hammered(monkeypatch: pytes
         await until(lambda: accepted >= 10)
         assert Patient.resets == 0
         assert Patient.delays >= 9
-        monkeypatch.setattr(tcp, "_STABLE", 0.0)
+        monkeypatch.setattr(tcp, "_STABLE_S", 0.0)
         await until(lambda: Patient.resets)
     server.close()
     await server.wait_closed()

@@ -226,13 +226,13 @@ class Wire(Transport, Carrier):
             self._plugged = True
             self._paused = False
             self._power.attach(self._end)
-            self._link.connected(self)
+            self._link.connect(self)
 
     def pull(self) -> None:
         """Disconnect. The emulated module does not notice it, the other one does."""
         if self._plugged and self._link is not None:
             self.close()
-            self._link.disconnected("the wire is pulled")
+            self._link.disconnect("the wire is pulled")
 
     def receive(self, data: bytes) -> None:
         """Receive bytes of the emulated module."""
@@ -241,7 +241,7 @@ class Wire(Transport, Carrier):
         if self._paused:
             self._held.append(data)
         else:
-            self._link.fed(data)
+            self._link.feed(data)
 
     # Carrier: the end at the Module
 

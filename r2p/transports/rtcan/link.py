@@ -40,7 +40,7 @@ from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
-from r2p.transports.buffered_link import BufferedLink
+from r2p.transports.buffered_link import BufferedLink, SenderLookup
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, unique_name
 from r2p.transports.rtcan.driver import EngineDriver, UtcEstimator
@@ -53,7 +53,6 @@ from r2p.transports.rtcan.tx import (
     Transmitter,
     inadmissible,
 )
-from r2p.transports.senders import SenderLookup
 from r2p.transports.stats import LoggedCounter
 from r2p.units import LONG_AGO, MILLISECOND
 

@@ -22,8 +22,7 @@ if TYPE_CHECKING:  # imported when it is used: a URL can be checked without zeno
 
 MODES = ("peer", "client", "router")
 
-_NAMED_MAX = 8
-"""Networks that one text names."""
+_NAMED_MAX = 8  # networks that one text names
 
 _NETWORK = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _PORT_PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws")

@@ -10,14 +10,9 @@ from pathlib import Path
 
 import msgspec
 
-_STEP_TIMEOUT_S = 2.0
-"""Seconds for an endpoint to answer."""
-
-_ALERT_TIMEOUT_S = 0.5
-"""Seconds in which a server refuses our certificate, after the handshake has succeeded: TLS 1.3 lets it do so."""
-
-_HANDSHAKE_TIMEOUT_S = 1.0
-"""Seconds for a server that speaks TLS to answer in it."""
+_STEP_TIMEOUT_S = 2.0  # seconds for an endpoint to answer
+_ALERT_TIMEOUT_S = 0.5  # seconds for a server to refuse a client's certificate: with TLS 1.3 after the handshake
+_HANDSHAKE_TIMEOUT_S = 1.0  # seconds for a server that speaks TLS to answer in it
 
 NOT_ADMITTED = "accepts the connection, but not this module"
 """Part of a text that is also right for a moment when a router comes back, until zenoh tries again."""
@@ -167,7 +162,7 @@ async def _start_tls(reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
         raise ConnectionError(_NO_TLS) from error
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(_ALERT_TIMEOUT_S):
-            await reader.read(1)  # a server that refuses our certificate says so only now
+            await reader.read(1)  # a server that refuses the certificate of this side says so only now
 
 
 def _context(tls: Tls) -> ssl.SSLContext:

@@ -24,27 +24,17 @@ from r2p.protocols.discovery.events import Declare, Event, QueryTokens, Subscrib
 from r2p.protocols.liveliness.session import TOKENS_MAX, LivelinessDiscovery
 from r2p.runtime.sample import PublisherClass
 from r2p.runtime.topic import Topic
-from r2p.transports.announcement import NOTHING
-from r2p.transports.link import Hub, Link, unique_name
+from r2p.transports.link import NOTHING, Hub, Link, unique_name
 from r2p.transports.stats import LoggedCounter
-from r2p.transports.zenoh.credit import ZenohSender
+from r2p.transports.zenoh.sender import ZenohSender
 from r2p.transports.zenoh.session import LoopQueue, ZenohSession
 from r2p.transports.zenoh.subscribe import ZenohReceiver
 
-_EVENTS_MAX = 65_536
-"""Tokens, messages of the protocol and the like that wait for the loop."""
-
-_ANSWERS_MAX = 4 * _EVENTS_MAX
-"""Tokens that were queried and wait for the loop: more than are queried at once, so the end of the answers has room."""
-
-_TYPE_QUERIES_MAX = 1024
-"""Queries for types that wait for the loop."""
-
-_TOKENS_TIMEOUT_S = 30.0
-"""Seconds for the network to answer with all its tokens."""
-
-_TYPE_TIMEOUT_S = 1.0
-"""Seconds for the modules to answer a query for a type."""
+_EVENTS_MAX = 65_536  # tokens, messages of the protocol and the like that wait for the loop
+_ANSWERS_MAX = 4 * _EVENTS_MAX  # queried tokens that wait for the loop: more than are queried at once, so all fit
+_TYPE_QUERIES_MAX = 1024  # queries for types that wait for the loop
+_TOKENS_TIMEOUT_S = 30.0  # seconds for the network to answer with all its tokens
+_TYPE_TIMEOUT_S = 1.0  # seconds for the modules to answer a query for a type
 
 _GUARANTEES = {
     PublisherClass.NON_REAL_TIME: "in order, waits for room in every subscriber; zenoh priority data",
@@ -74,11 +64,10 @@ class ZenohLink(Link):
         self._session: ZenohSession | None = None
         self._prefix = ""
         self._queues: list[LoopQueue] = []
-        self._transports: set[str] = set()
-        """The zenoh sessions that it is connected to, by id."""
-        self._tokens = TokenDebouncer(hub.space.loop, self._token_settled, self._token_refused)
-        self._token_changes = self._queue(self._token_changed)
-        self._token_answers = self._queue(self._token_answered, most=_ANSWERS_MAX)
+        self._transports: set[str] = set()  # the zenoh sessions that it is connected to, by id
+        self._tokens = TokenDebouncer(hub.space.loop, self._on_token_settled, self._on_token_refused)
+        self._token_changes = self._queue(self._on_token)
+        self._token_answers = self._queue(self._on_token_answer, most=_ANSWERS_MAX)
         self._overflowed = 0
         self.sender = ZenohSender(self, hub, self._subscribers, batching=batching)
         self.receiver = ZenohReceiver(self, hub)
@@ -96,9 +85,9 @@ class ZenohLink(Link):
                 self.sender.publishers.declare(self._space.topics[name])
         if not self._connects:  # before tokens come: they are believed only on a link that is up
             self.on_up()
-        session.watch_transports(self._queue(self._transport_changed))
+        session.watch_transports(self._queue(self._on_transport))
         session.watch_tokens(f"{prefix}/{liveliness.KEY_PREFIX}", self._token_changes)
-        session.listen(f"{prefix}/control", self._queue(self._control_received))
+        session.listen(f"{prefix}/control", self._queue(self._on_control))
         queue = functools.partial(self._queue, most=_TYPE_QUERIES_MAX)
         session.answer_queries(f"{prefix}/schema/{self.instance:x}/*", self._schema, queue)
 
@@ -144,13 +133,13 @@ class ZenohLink(Link):
         return self.receiver.window(topic)
 
     def on_up(self) -> None:
-        self.receiver.resumed()
+        self.receiver.on_up()
         super().on_up()
         self._tokens.on_up()  # last: to a subscriber that appears something may be sent at once
 
     def on_down(self, reason: str) -> None:
         self._tokens.on_down()
-        self.receiver.interrupted()
+        self.receiver.on_down()
         super().on_down(reason)
 
     def close(self) -> None:
@@ -170,7 +159,7 @@ class ZenohLink(Link):
         self.receiver.unsubscribe(name)
 
     def _subscriber_joined(self, event: SubscriberJoined) -> None:
-        self.sender.joined(event.topic, cast("int", event.source), event.queue)
+        self.sender.add_subscriber(event.topic, cast("int", event.source), event.queue)
 
     def _remove_subscriber(self, name: str) -> None:
         self.sender.batcher.flush()  # before the publishers that it is sent with are undeclared
@@ -191,7 +180,7 @@ class ZenohLink(Link):
             case QueryTokens():
                 self._query_tokens()
             case SubscriberLeft(topic, int(session), gone):
-                self.sender.left(topic, session, gone=gone)
+                self.sender.remove_subscriber(topic, session, gone=gone)
             case _:
                 super()._act(event)
 
@@ -218,7 +207,7 @@ class ZenohLink(Link):
 
     # What comes in; in the loop
 
-    def _transport_changed(self, change: tuple[str, bool]) -> None:
+    def _on_transport(self, change: tuple[str, bool]) -> None:
         other, opened = change
         if self._closed or not self._connects:  # one that takes connections is up even alone
             return
@@ -231,37 +220,36 @@ class ZenohLink(Link):
             if not self._transports:
                 self.on_down("the connection is lost")
 
-    def _token_changed(self, change: tuple[str, bool]) -> None:
+    def _on_token(self, change: tuple[str, bool]) -> None:
         if self._closed:
             return
         if self._token_changes.overflowed != self._overflowed:  # tokens were lost, which zenoh does not report again
             overflowed = self._token_changes.overflowed
             missed, self._overflowed = overflowed - self._overflowed, overflowed
             self._apply(self._liveliness.missed(self._clock.monotonic(), missed))
-        self._tokens.changed(*change)
+        self._tokens.on_change(*change)
 
-    def _token_refused(self) -> None:
+    def _on_token_refused(self) -> None:
         self._apply(self._liveliness.refused(self._clock.monotonic()))
 
     def _query_tokens(self) -> None:
         """Query all tokens: zenoh reports each only once, and some were refused."""
         if self._session is not None:
-            self._tokens.query_started()
-            self._session.query_tokens(
-                f"{self._prefix}/{liveliness.KEY_PREFIX}", _TOKENS_TIMEOUT_S, self._token_answers
-            )
+            self._tokens.begin_query()
+            prefix = f"{self._prefix}/{liveliness.KEY_PREFIX}"
+            self._session.query_tokens(prefix, _TOKENS_TIMEOUT_S, self._token_answers)
 
-    def _token_answered(self, answer: str | bool) -> None:
-        """A token, or at last whether these were all."""
+    def _on_token_answer(self, answer: str | bool) -> None:
+        """Handle a token, or at last whether these were all."""
         if self._closed:
             return
         if isinstance(answer, str):
-            self._tokens.answered(answer)
+            self._tokens.on_answer(answer)
         else:
-            usable = self._tokens.query_ended()
+            usable = self._tokens.end_query()
             self._apply(self._liveliness.query_ended(self._clock.monotonic(), complete=answer and usable))
 
-    def _token_settled(self, key: str, there: bool) -> None:
+    def _on_token_settled(self, key: str, there: bool) -> None:
         now = self._clock.monotonic()
         try:
             events = self._liveliness.appeared(now, key) if there else self._liveliness.disappeared(now, key)
@@ -270,7 +258,7 @@ class ZenohLink(Link):
         else:
             self._apply(events)
 
-    def _control_received(self, message: tuple[bytes, bytes]) -> None:
+    def _on_control(self, message: tuple[bytes, bytes]) -> None:
         header, data = message
         try:
             sender = decode_sender(header)
@@ -306,10 +294,10 @@ class TokenDebouncer:
         self._early: dict[str, None] = {}
         self._going: dict[str, asyncio.TimerHandle] = {}
         self._went: set[str] | None = None
-        """What went since a query started: the answers about these may be older than their end. None: no query."""
+        """What went since a query began: the answers about these may be older than their end. None without a query."""
 
-    def changed(self, key: str, there: bool) -> None:
-        """A token came or went."""
+    def on_change(self, key: str, there: bool) -> None:
+        """Note that a token came or went."""
         if not self._up:
             self._changed_early(key, there)
         elif there:
@@ -322,29 +310,29 @@ class TokenDebouncer:
             self._going[key] = self._loop.call_later(_SETTLE_S, self._gone, key)
             self._note_end(key)
 
-    def query_started(self) -> None:
-        """All tokens are queried: what goes from now on is newer than the answers."""
+    def begin_query(self) -> None:
+        """Note that all tokens are queried: what goes from now on is newer than the answers."""
         self._went = set(self._going)
 
-    def answered(self, key: str) -> None:
-        """A token is among the answers."""
+    def on_answer(self, key: str) -> None:
+        """Believe a token that is among the answers, unless it went meanwhile."""
         if self._went is not None and key not in self._went:
             self._settled(key, True)
 
-    def query_ended(self) -> bool:
-        """All answers have come. Return whether they could be used."""
+    def end_query(self) -> bool:
+        """Return whether the answers could be used: all have come."""
         usable, self._went = self._went is not None, None
         return usable
 
     def on_up(self) -> None:
-        """The link is up: believe what came before."""
+        """Believe what came before the link was up."""
         self._up = True
         early, self._early = self._early, {}
         for key in early:
             self._settled(key, True)
 
     def on_down(self) -> None:
-        """The link is down, or closed: tokens that go now have not gone by themselves."""
+        """Believe nothing that goes now: with the link down, or closed, tokens do not go by themselves."""
         self._up = False
         self._went = None
         for timer in self._going.values():

@@ -21,7 +21,7 @@ from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.session import ZenohSession
-from r2p.transports.zenoh.threads import WAITING_MAX, WAITING_MAX_URGENT
+from r2p.transports.zenoh.threads import PENDING_MAX, PENDING_URGENT_MAX
 
 Put = Callable[..., None]
 """`Publisher.put(data, *, attachment)` of zenoh."""
@@ -29,8 +29,7 @@ Put = Callable[..., None]
 BATCH_MAX = PACKET_MAX
 """Messages that wait in a stream until the turn ends; more go out at once."""
 
-_BATCH_BYTES_MAX = 16 * 1024
-"""Bytes of a packet of several messages."""
+_BATCH_BYTES_MAX = 16 * 1024  # bytes of a packet of several messages
 
 FLOOD = 8
 """Messages in one turn that make a flood; what comes more slowly goes out when its turn is over."""
@@ -48,15 +47,15 @@ def put_nowhere(data: bytes, *, attachment: bytes) -> None:
 class TxStream:
     """The messages of one topic and class on their way out, of one publisher at a time."""
 
-    __slots__ = ("_packer", "_put", "source", "urgent", "waiting", "window")
+    __slots__ = ("_packer", "_put", "samples", "source", "urgent", "window")
 
     def __init__(self, window: SendWindow, *, urgent: bool) -> None:
         self.window = window
         self.urgent = urgent
         """Whether messages never wait, not even for the end of the turn."""
         self.source: Source | None = None
-        self.waiting: list[Sample] = []
-        """Each already has its serial in the window: the last one here has the window's last."""
+        self.samples: list[Sample] = []
+        """Those that wait. Each already has its serial in the window: the last one here has the window's last."""
         self._packer = _NO_PACKER
         self._put: Put = put_nowhere
 
@@ -71,9 +70,9 @@ class TxStream:
 
         What is not sent is counted here. Subscribers must not count it as well, so what follows gets its serials.
         """
-        waiting, self.waiting = self.waiting, []
-        serial = self.window.serial - len(waiting) + 1  # each was given one when it was offered
-        for samples in _packets(waiting) if batching and len(waiting) > 1 else [[each] for each in waiting]:
+        all_samples, self.samples = self.samples, []
+        serial = self.window.serial - len(all_samples) + 1  # each was given one when it was offered
+        for samples in _packets(all_samples) if batching and len(all_samples) > 1 else [[each] for each in all_samples]:
             try:
                 data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
                 self._put(data, attachment=self._header(samples, serial))
@@ -138,7 +137,7 @@ class Batcher:
         if not self._turn_begun:  # so a message that comes alone is not held up
             self._turn_begun = True
             self._loop.call_soon(self._end_turn)
-        elif not stream.urgent and len(stream.waiting) < BATCH_MAX:
+        elif not stream.urgent and len(stream.samples) < BATCH_MAX:
             self._streams[stream] = None
             return
         stream.send(self._stats, batching=self._batching)
@@ -158,15 +157,15 @@ class Batcher:
     def discard(self) -> int:
         """Drop what waits, and return how much that was. It is counted here, so what follows gets its serials."""
         streams, self._streams = self._streams, {}
-        count = sum(len(stream.waiting) for stream in streams)
+        count = sum(len(stream.samples) for stream in streams)
         for stream in streams:
-            stream.window.serial -= len(stream.waiting)
-            stream.waiting.clear()
+            stream.window.serial -= len(stream.samples)
+            stream.samples.clear()
         return count
 
     def _end_turn(self) -> None:
         """Send what waits, unless it is a flood: more and more, which makes fewer and fuller packets a turn later."""
-        count = sum([len(stream.waiting) for stream in self._streams])
+        count = sum([len(stream.samples) for stream in self._streams])
         self._turn_begun = count > 0
         if self._turn_begun:
             self._loop.call_soon(self._end_turn)
@@ -204,7 +203,7 @@ class PublisherCache:
     def declare(self, topic: Topic) -> None:
         """Declare the publishers of a topic that is published now."""
         classes = {publisher.publisher_class for publisher in topic.publishers}
-        for publisher_class in classes or {PublisherClass.NON_REAL_TIME}:  # none of our own: a gateway
+        for publisher_class in classes or {PublisherClass.NON_REAL_TIME}:  # none in this module: a gateway passes it on
             self._publisher(topic.name, publisher_class)
 
     def undeclare(self, topic: str) -> None:
@@ -238,7 +237,7 @@ class PublisherCache:
         publisher = self._publisher(topic, publisher_class)
         if publisher is None or self._session is None:
             return put_nowhere
-        most = WAITING_MAX if publisher_class == PublisherClass.NON_REAL_TIME else WAITING_MAX_URGENT
+        most = PENDING_MAX if publisher_class == PublisherClass.NON_REAL_TIME else PENDING_URGENT_MAX
         outbound, send = self._session.outbound, publisher.put
 
         def put(data: bytes, *, attachment: bytes) -> None:

@@ -6,6 +6,7 @@ waits for a network.
 """
 
 import asyncio
+import concurrent.futures
 import contextlib
 import functools
 import json
@@ -29,6 +30,7 @@ from r2p.transports.zenoh.threads import OutboundThread, as_exception
 T = TypeVar("T")
 
 _CONTROL_BYTES_MAX = 4096
+"""Bytes of a management message or its attachment; r2p sends far shorter ones, and longer ones are not copied."""
 
 _CHANNEL_MAX = 65_536
 """Items that wait in zenoh until their thread runs: more than there can be. zenoh may put in all of them during the
@@ -72,7 +74,7 @@ class LoopQueue:
             with contextlib.suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._drain)
 
-    def failed(self, error: Exception) -> None:
+    def count_error(self, error: Exception) -> None:
         """Count an error that kept an item from being put in; in any thread."""
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._lost.internal_error, error)
@@ -97,17 +99,15 @@ class SubscriptionReader:
         self,
         subscriber: "zenoh.Subscriber[Handler[zenoh.Sample]]",
         loop: asyncio.AbstractEventLoop,
-        arrived: Callable[[zenoh.Sample], None],
+        on_sample: Callable[[zenoh.Sample], None],
     ) -> None:
         self._subscriber = subscriber
         self._loop = loop
-        self._arrived = arrived
+        self._on_sample = on_sample
         self._try_receive = subscriber.handler.try_recv
-        self._passed: deque[zenoh.Sample] = deque()
-        """Samples that the thread has passed to the loop."""
-        self._received = 0
-        """... of which the loop has received so many; the thread compares that with what it passed."""
-        self._waits = True
+        self._passed: deque[zenoh.Sample] = deque()  # samples that the thread has passed to the loop
+        self._received = 0  # ... of which the loop has received so many; the thread compares that with what it passed
+        self._waits = True  # whether `on_sample` is to be called with the next sample
         self._thread_paused = False
         self._closed = False
         self._resume_thread = threading.Lock()
@@ -123,7 +123,7 @@ class SubscriptionReader:
         return self._try_receive() if self._thread_paused else None
 
     def wait(self) -> None:
-        """Call `arrived` with the next sample; soon with one that was passed meanwhile."""
+        """Call `on_sample` with the next sample; soon with one that was passed meanwhile."""
         self._waits = True
         if self._passed:
             self._loop.call_soon(self._hand_out)
@@ -157,18 +157,18 @@ class SubscriptionReader:
         if self._waits and not self._passed:
             self._waits = False
             self._received += 1
-            self._arrived(sample)
+            self._on_sample(sample)
         else:
             self._passed.append(sample)
 
     def _hand_out(self) -> None:
-        """What was passed before `wait` comes before all that is passed after it."""
+        """Call `on_sample` with what was passed before `wait`: it comes before all that is passed after it."""
         if not self._waits or self._closed:
             return
         if self._passed:
             self._waits = False
             self._received += 1
-            self._arrived(self._passed.popleft())
+            self._on_sample(self._passed.popleft())
         else:  # it has been received meanwhile
             self.wait()
 
@@ -179,7 +179,7 @@ async def open_session(config: zenoh.Config, on_error: Callable[[Exception], obj
     Raises Unreachable where that may work later, TransportError where it can't.
     """
     try:
-        return ZenohSession(await _in_thread(lambda: zenoh.open(config), _close), on_error)
+        return ZenohSession(await _in_thread(lambda: zenoh.open(config), zenoh.Session.close), on_error)
     except zenoh.ZError as error:
         text = plain_text(error)
         if text.startswith("Unable to connect"):
@@ -193,8 +193,7 @@ class ZenohSession:
     def __init__(self, session: zenoh.Session, on_error: Callable[[Exception], object]) -> None:
         self._session = session
         self.outbound = OutboundThread(asyncio.get_running_loop(), on_error)
-        self._declared: list[Any] = []
-        """Kept, as zenoh undeclares what Python collects."""
+        self._declared: list[Any] = []  # kept, as zenoh undeclares what Python collects
         self._publishers: set[zenoh.Publisher] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_count = 0
@@ -248,14 +247,14 @@ class ZenohSession:
             except zenoh.ZError:  # the session is closed
                 pass
             except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: counted and logged in the loop
-                queue.failed(as_exception(error))
+                queue.count_error(as_exception(error))
             finally:
                 queue.put(complete)
 
         threads.start_thread(run, "token query")
 
     def listen(self, key: str, queue: LoopQueue) -> None:
-        """Report each message of a key: (its attachment, payload), either of them empty if it is too long to be ours.
+        """Report each message of a key: (its attachment, payload), either of them empty if it is too long for r2p.
 
         The key has no wildcard: zenoh's router keeps 3 kB for ever of each closed session that subscribed with a
         wildcard, if another session has subscribed by the same key expression.
@@ -298,21 +297,19 @@ class ZenohSession:
                 try:
                     put(item)
                 except BaseException as error:  # noqa: BLE001 - a panic, too: counted in the loop; the next one follows
-                    queue.failed(as_exception(error))
+                    queue.count_error(as_exception(error))
 
         self._declared.append(declared)
         threads.start_thread(listen, "listener")
 
-    def subscribe(self, key: str, most: int, arrived: Callable[[zenoh.Sample], None]) -> "SubscriptionReader":
-        """Call `arrived` in the loop with the first sample that comes; those behind it are received from the reader.
+    def subscribe(self, key: str, most: int, on_sample: Callable[[zenoh.Sample], None]) -> SubscriptionReader:
+        """Call `on_sample` in the loop with the first sample that comes; those behind it are received from the reader.
 
         Of more than `most` that wait, the oldest are lost.
         """
-        loop = asyncio.get_running_loop()
         handler: RingChannel[zenoh.Sample] = RingChannel(most)
-        return SubscriptionReader(
-            self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE), loop, arrived
-        )
+        subscriber = self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE)
+        return SubscriptionReader(subscriber, asyncio.get_running_loop(), on_sample)
 
     def declare_publisher(self, key: str, publisher_class: PublisherClass) -> zenoh.Publisher:
         """Declare a publisher with the priority of the class. Never BLOCK: that would stop the loop."""
@@ -423,38 +420,27 @@ async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] |
 
     When this is cancelled the thread goes on, and what it returns then goes to `abandoned`.
     """
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[T] = loop.create_future()
-
-    def succeed(result: T) -> None:
-        if not future.cancelled():
-            future.set_result(result)
-        elif abandoned is not None:
-            threads.start_thread(functools.partial(abandoned, result), "clean-up")
-
-    def fail(error: Exception) -> None:
-        if not future.cancelled():
-            future.set_exception(error)
+    done: concurrent.futures.Future[T] = concurrent.futures.Future()
+    done.set_running_or_notify_cancel()  # so that cancelling this leaves it alone
 
     def work() -> None:
         try:
-            result = function()
+            done.set_result(function())
         except BaseException as error:  # noqa: BLE001 - a panic of zenoh, too: raised again where it is awaited
-            with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(fail, as_exception(error))
-            return
-        try:
-            loop.call_soon_threadsafe(succeed, result)
-        except RuntimeError:  # the loop is closed
-            if abandoned is not None:
-                abandoned(result)
+            done.set_exception(as_exception(error))
 
     threads.start_thread(work, "request")
-    return await future
+    try:
+        return await asyncio.wrap_future(done)
+    except asyncio.CancelledError:
+        if abandoned is not None:
+            threads.start_thread(functools.partial(_abandon, done, abandoned), "clean-up")
+        raise
 
 
-def _close(session: zenoh.Session) -> None:
-    session.close()
+def _abandon(done: "concurrent.futures.Future[T]", abandoned: Callable[[T], None]) -> None:
+    if done.exception() is None:  # which waits for it
+        abandoned(done.result())
 
 
 def _bytes_of(data: zenoh.ZBytes | None) -> bytes:

@@ -23,8 +23,8 @@ from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
-from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link
-from r2p.transports.zenoh.backlog import Backlog
+from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, type_of
+from r2p.transports.receive_backpressure import Backlog
 from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 
 RING = 4096
@@ -33,20 +33,11 @@ RING = 4096
 WINDOW = 2048
 """Messages of one publisher that may be on the way to one subscriber's module, at most."""
 
-_WINDOW_BYTES = 192 * 1024
-"""... and their bytes: five topics at full speed fit into zenoh's own queue of 1 MB."""
-
-_OVERHEAD = 32
-"""Bytes of a message besides its payload, in a packet of several: its stamp, and its share in header and framing."""
-
-_FINAL_CREDITS_MAX = 256
-"""Sessions that learn that a topic is no longer subscribed to; older ones may be long gone."""
-
-_SENDERS_MAX = 4096
-"""Senders that are remembered: by a stream with their serials, by a link with their losses."""
-
-_RESUME_S = 10.0
-"""Seconds after a link came up in which its topics are subscribed again, or are used on another link."""
+_WINDOW_BYTES = 192 * 1024  # bytes of those: five topics at full speed fit into zenoh's own queue of 1 MB
+_OVERHEAD = 32  # bytes of a message besides its payload, in a packet of several: its stamp and its share of the header
+_FINAL_CREDITS_MAX = 256  # sessions that learn that a topic is no longer subscribed to; older ones may be long gone
+_SENDERS_MAX = 4096  # senders that are remembered: by a stream with their serials, by a link with their losses
+_RESUME_S = 10.0  # seconds after a link came up in which its topics are subscribed again, or are used on another link
 
 _NRT = PublisherClass.NON_REAL_TIME
 
@@ -89,12 +80,12 @@ class RxStream:
         self._receiver = receiver
         self._loop = receiver.loop
         self._paused = False
-        self._type = _type_of(topic)
+        self._type = type_of(topic)
         self._headers = HeaderReader(self._new_publisher)
 
     def update(self) -> None:
         """Apply a change of the topic's type, or of how many messages its subscribers let be on the way."""
-        topic_type = _type_of(self.topic)
+        topic_type = type_of(self.topic)
         if topic_type != self._type:
             self._type = topic_type
             for publisher in self._headers.known.values():
@@ -139,7 +130,7 @@ class RxStream:
 
     # Packets
 
-    def arrived(self, packet: zenoh.Sample | None) -> None:
+    def on_packet(self, packet: zenoh.Sample | None) -> None:
         """Deliver this packet and those behind it, about MESSAGES_PER_TURN messages in a turn of the loop."""
         reader = self.reader
         if reader is None:
@@ -158,25 +149,25 @@ class RxStream:
             packet = reader.receive()
         if packet is None:
             # Behind the readers that these messages woke: their answers go out before the thread is switched to.
-            self._loop.call_soon(self._look_again)
+            self._loop.call_soon(self._check_again)
         else:
-            self._loop.call_soon(self.arrived, packet)
+            self._loop.call_soon(self.on_packet, packet)
 
     def _resume(self) -> None:
         """Go on reading if that was paused."""
         if self._paused:
             self._paused = False
             if self.reader is not None:
-                self.arrived(self.reader.receive())
+                self.on_packet(self.reader.receive())
 
-    def _look_again(self) -> None:
+    def _check_again(self) -> None:
         reader = self.reader
         if reader is not None:
             packet = reader.receive()
             if packet is None:
                 reader.wait()
             else:
-                self.arrived(packet)
+                self.on_packet(packet)
 
     def _unpack(self, data: bytes, header: bytes) -> int:
         """Deliver the messages of one packet; return how many they are."""
@@ -254,7 +245,7 @@ class RxStream:
     # Messages
 
     def _deliver(self, publisher: RemotePublisher, serial: int, sample: Sample | None) -> None:
-        """Deliver a message, or wait for room for it. None: it needs no room (any more), and is only acknowledged."""
+        """Deliver a message, or wait for room for it; None: it needs none, and is only acknowledged."""
         sinks = None if sample is None else self._deliver_to_topic(sample)
         if sample is None or sinks is None:
             self._acknowledge(publisher, serial)
@@ -262,7 +253,7 @@ class RxStream:
             self.backlog.block(publisher, serial, sample, sinks)
 
     def _deliver_to_topic(self, sample: Sample) -> list[Sink] | None:
-        """Hand it to the topic; return the sinks that have no room. If that raises it is lost, and counted."""
+        """Hand a message to the topic; return the sinks that have no room. One that raises is lost, and counted."""
         try:
             return self.topic.deliver(sample)
         except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
@@ -281,7 +272,7 @@ class RxStream:
     def _append(self, publisher: RemotePublisher, serial: int, sample: Sample | None) -> bool:
         fits = self.backlog.append(publisher, serial, sample)
         if not fits:
-            publisher.window.skip(1)
+            publisher.window.skip(1)  # it gets no acknowledgement of its own, so the next credit comes earlier
         return fits
 
     def _acknowledge(self, publisher: RemotePublisher, serial: int) -> None:
@@ -428,7 +419,7 @@ class ZenohReceiver:
     def _start_reading(self, stream: RxStream) -> None:
         if self._session is not None:
             key = f"{self._prefix}/topic/{stream.topic.name}"
-            stream.reader = self._session.subscribe(key, RING, stream.arrived)
+            stream.reader = self._session.subscribe(key, RING, stream.on_packet)
 
     def send_credit(
         self, topic: str, session: int, publisher_class: PublisherClass, serial: int, *, leaving: bool = False
@@ -441,15 +432,15 @@ class ZenohReceiver:
             data = encode_credit(Credit(self._instance, publisher_class, serial, topic, leaving))
             self._session.put(f"{self._prefix}/credit/{session:x}", data, final=leaving)
 
-    def interrupted(self) -> None:
-        """The link is down: keep how far each publisher had come, as what it sends until then is lost."""
+    def on_down(self) -> None:
+        """Keep how far each publisher had come when the link went down, as what it sends until then is lost."""
         self._up = False
         if len(self._kept) >= _SENDERS_MAX or self.loop.time() >= self._kept_until:
             self._kept.clear()  # what was kept at an earlier outage, and is not used
         self._kept |= {name: (stream.windows, _progress(stream.windows)) for name, stream in self._streams.items()}
 
-    def resumed(self) -> None:
-        """The link is up again."""
+    def on_up(self) -> None:
+        """Use what was kept of an outage for a while: the link is up again."""
         self._up = True
         self._kept_until = self.loop.time() + _RESUME_S
 
@@ -461,7 +452,7 @@ class ZenohReceiver:
         return windows
 
     def window(self, topic: Topic) -> int:
-        """How many messages may be on the way; 0: any number, the subscribers would rather lose some."""
+        """Return how many messages may be on the way; 0: any number, as the subscribers would rather lose some."""
         if topic.queues and all(queue.lossy for queue in topic.queues):
             return 0
         size = self.link.max_payload if topic.layout is None else topic.layout.size
@@ -489,7 +480,7 @@ class ZenohReceiver:
                 queue.publisher_joined()
 
     def remove_publisher(self, name: str, sender: Hashable) -> None:
-        """Remove it, though what it sent may still be on the way."""
+        """Remove a module that published the topic, though what it sent may still be on the way."""
         stream = self._streams.get(name)
         if stream is not None:
             stream.remove_sender(sender)
@@ -522,10 +513,6 @@ def _split(data: bytes, count: int) -> list[bytes]:
     if odd or not size:
         raise DecodeError(f"{len(data)} bytes for {count} messages")
     return [data[at : at + size] for at in range(0, len(data), size)]
-
-
-def _type_of(topic: Topic) -> TopicType:
-    return TopicType() if topic.layout is None else TopicType(topic.layout.size, topic.layout.fingerprint)
 
 
 def _progress(windows: ReceiveWindows) -> dict[tuple[int, PublisherClass], int]:

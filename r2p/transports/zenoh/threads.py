@@ -19,13 +19,17 @@ from weakref import WeakSet
 T = TypeVar("T")
 
 MANY_TOKENS = 1000
-"""Tokens from which on the thread makes the calls; until there are half as many."""
+"""Tokens from which on the thread makes the calls. It stops when there are fewer than half as many: so a number that
+goes up and down does not switch it on and off.
+"""
 
-WAITING_MAX = 512
-"""Packets that wait for the thread."""
+PENDING_MAX = 512
+"""Packets that wait for the thread: 8 MB of full ones."""
 
-WAITING_MAX_URGENT = 16
-"""Packets of events and periodic messages, which are of no use when they are late."""
+PENDING_URGENT_MAX = 16
+"""Packets of events and periodic messages that wait: as many as zenoh itself queues of them (`config`). More would only
+be late.
+"""
 
 _JOIN_TIMEOUT_S = 2.0
 """Seconds for which the end of the program waits for a thread: one that connects in vain may take longer."""
@@ -80,7 +84,7 @@ class OutboundThread:
         self._many_tokens = tokens >= (MANY_TOKENS // 2 if self._many_tokens else MANY_TOKENS)
 
     @property
-    def waiting(self) -> int:
+    def pending_calls(self) -> int:
         """Calls that the thread has yet to make."""
         return self._submitted - self._done
 
@@ -92,7 +96,7 @@ class OutboundThread:
     @property
     def full(self) -> bool:
         """Whether too many calls wait already to add what can be sent later, or not at all."""
-        return self.waiting >= WAITING_MAX
+        return self.pending_calls >= PENDING_MAX
 
     def call(self, function: Callable[[], object]) -> None:
         """Call it: now, or in the thread while that makes the calls."""
@@ -112,7 +116,7 @@ class OutboundThread:
 
         Raises BlockingIOError if `max_pending` calls wait already.
         """
-        if max_pending is not None and self.waiting >= max_pending:
+        if max_pending is not None and self.pending_calls >= max_pending:
             raise BlockingIOError
         if self._thread is None:
             self._thread = start_thread(self._work, "calls")

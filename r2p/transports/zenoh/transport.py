@@ -26,24 +26,14 @@ if TYPE_CHECKING:
     from r2p.transports.zenoh.link import ZenohLink
     from r2p.transports.zenoh.session import ZenohSession
 
-_SCOUTING_S = 0.5
-"""Seconds in which peers find each other."""
+_SCOUTING_S = 0.5  # seconds in which peers find each other
+_SCOUTING_TRIES = 5  # checks in that time
+_BACKOFF_MAX_S = 0.5  # seconds between two attempts to open a session
+_DIAGNOSE_EVERY_S = 1.0  # seconds between two checks whether a link that is down should be explained
 
-_SCOUTING_LOOKS = 5
-
-_BACKOFF_MAX_S = 0.5
-"""Seconds between two attempts to open a session."""
-
-_DIAGNOSE_EVERY_S = 1.0
-"""Seconds between two looks whether a link that is down should be explained."""
-
-_ALONE_S = 3.0
-"""Seconds without another module after which a module looks for other networks; twice as long each further time."""
-
-_ALONE_TOOL_S = 0.3
-"""... a tool's."""
-
-_ALONE_MAX_S = 60.0
+_ALONE_S = 3.0  # seconds without another module until it looks for other networks; twice as long each further time
+_ALONE_TOOL_S = 0.3  # the same for a tool, whose user waits
+_ALONE_MAX_S = 60.0  # and at most
 
 _RESTRICT = "zenoh:?listen=tcp/127.0.0.1:7447 restricts it to this one, docs/how-to/zenoh.md has TLS and passwords"
 """What to do about a port that is open to all."""
@@ -107,18 +97,18 @@ class ZenohTransport(Transport):
         if self._options.network is not None or not hub.observer:
             return self._options.network or default_network()
         found: set[str] = set()
-        for _ in range(_SCOUTING_LOOKS):
+        for _ in range(_SCOUTING_TRIES):
             found = await session.find_networks(tools=True)
             if found:
                 break
-            await asyncio.sleep(_SCOUTING_S / _SCOUTING_LOOKS)
+            await asyncio.sleep(_SCOUTING_S / _SCOUTING_TRIES)
         try:
             return choose_network(found)
         except ValueError as error:
             raise self._options.error(str(error)) from error
 
     async def _report_addresses(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, exposed: list[str]) -> None:
-        """Report where it accepts connections, and, but for a tool, that it does so without authentication."""
+        """Report where the session accepts connections, and, but for a tool, that it does so without authentication."""
         addresses = await session.listening_endpoints() if self._options.listen is not None or exposed else []
         if self._options.listen is not None:
             for address in addresses:
@@ -129,7 +119,7 @@ class ZenohTransport(Transport):
             hub.link_notice(link, "open to all", f"{text}{_RESTRICT}", trouble=True)
 
     async def _explain(self, config: "zenoh.Config", link: "ZenohLink") -> None:
-        """Say what is wrong whenever the link is down; never returns."""
+        """Report what is wrong whenever the link is down; never returns."""
         reason = ""
         while True:
             await asyncio.sleep(_DIAGNOSE_EVERY_S)
@@ -137,7 +127,7 @@ class ZenohTransport(Transport):
                 continue
             try:
                 before, reason = reason, await diagnose_connection(connection_settings(config))
-            except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
+            except Exception as error:  # noqa: BLE001 - counted and logged; the next check follows
                 link.stats.lost.internal_error(error)
                 continue
             if NOT_ADMITTED in reason and reason != before:
@@ -146,7 +136,7 @@ class ZenohTransport(Transport):
                 link.unreachable(reason)
 
     async def _look_for_others(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, network: str) -> None:
-        """Until another module is on the network: say once which other networks have modules."""
+        """Report once which other networks have modules, unless there is another module on this one."""
         pause = _ALONE_TOOL_S if hub.observer else _ALONE_S
         while True:
             await asyncio.sleep(pause)
@@ -164,7 +154,7 @@ class ZenohTransport(Transport):
     async def _other_networks(self, session: "ZenohSession", link: "ZenohLink", network: str) -> list[str]:
         try:
             return sorted(await session.find_networks(tools=False) - {network}) if link.up else []
-        except Exception as error:  # noqa: BLE001 - counted and logged; the next look follows
+        except Exception as error:  # noqa: BLE001 - counted and logged; the next check follows
             link.stats.lost.internal_error(error)
             return []
 

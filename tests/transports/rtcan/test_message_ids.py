@@ -15,8 +15,8 @@ from r2p.codecs.management import (
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.protocols.discovery.session import Discovery
 from r2p.runtime.sample import Source
+from r2p.transports.buffered_link import SenderLookup
 from r2p.transports.rtcan.message_ids import FIRMWARE, R2P, address_of
-from r2p.transports.senders import SenderLookup
 
 
 def test_what_r2p_says_among_firmware_is_marked() -> None:

@@ -13,8 +13,8 @@ from r2p.codecs import PublisherClass
 from r2p.codecs.attachment import Credit, encode_credit
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.config import ZenohOptions
-from r2p.transports.zenoh.credit import CreditReader, Reachability
 from r2p.transports.zenoh.link import ZenohLink
+from r2p.transports.zenoh.sender import CreditReader, Reachability
 from r2p.transports.zenoh.transport import ZenohTransport
 from tests.faults import once
 
@@ -56,7 +56,7 @@ async def test_credits() -> None:
         )
     )
     credits_of.connect(session, "credit")
-    credits_of._arrived(waiting.pop(0))  # type: ignore[arg-type]
+    credits_of._on_credit(waiting.pop(0))  # type: ignore[arg-type]
     assert [each.calls for each in subscribers] == [["refill"], ["acknowledge"], ["acknowledge", "refill"]]
     assert stats.lost == {"internal error": 2}
     credits_of.close()
@@ -70,7 +70,7 @@ async def test_subscribers(fault: str) -> None:
     sender: Any = SimpleNamespace(
         loop=asyncio.get_running_loop(),
         link=SimpleNamespace(stats=stats),
-        has_topic=lambda _: True,
+        topics={"a", "b"},
         publishers=SimpleNamespace(reaches=lambda _: True),
         admit=lambda topic, *_, **__: calls.append(topic),
         credits=SimpleNamespace(receive=lambda: None),
@@ -99,10 +99,10 @@ async def test_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
         for call in ("appeared", "disappeared"):
             monkeypatch.setattr(presence, call, once(getattr(presence, call)))
         for number in (1, 2, 3):
-            link._token_changed((f"1/{number}/module/PC{number}/{number}/0/0", True))
+            link._on_token((f"1/{number}/module/PC{number}/{number}/0/0", True))
         assert list(presence.modules) == ["PC2", "PC3"]
         for number in (2, 3):
-            link._token_changed((f"1/{number}/module/PC{number}/{number}/0/0", False))
+            link._on_token((f"1/{number}/module/PC{number}/{number}/0/0", False))
         await asyncio.sleep(0.1)
         assert list(presence.modules) == ["PC2"]
         assert link.losses == {"internal error": 2}

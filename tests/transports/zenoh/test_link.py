@@ -22,8 +22,8 @@ from r2p.msg import Led, Text
 from r2p.protocols.flow_control import NO_LIMIT
 from r2p.protocols.liveliness import session as liveliness_session
 from r2p.testing.network import node_in
-from r2p.transports.zenoh.credit import ZenohSubscriber
 from r2p.transports.zenoh.link import ZenohLink
+from r2p.transports.zenoh.sender import ZenohSubscriber
 from r2p.transports.zenoh.session import ZenohSession
 from r2p.transports.zenoh.subscribe import WINDOW
 from tests.transports.test_conformance import first, other, until

@@ -14,7 +14,7 @@ import r2p
 from r2p.msg import Float32
 from r2p.protocols.discovery.events import ModuleChanged, ModuleGone
 from r2p.testing.network import node_in
-from r2p.transports.zenoh.credit import ZenohSubscriber
+from r2p.transports.zenoh.sender import ZenohSubscriber
 from tests.transports.test_conformance import first, other, until
 from tests.transports.zenoh.cable import Net, guarded, module
 from tests.transports.zenoh.peer import MODULES, TOPICS, Page

@@ -47,8 +47,8 @@ class Wire:
         stream = self.streams[urgent]
         stream.window.serial += 1
         sample = Sample(data, HERE, 1000 + self.sequence, sequence=self.sequence)
-        stream.waiting.append(msgspec.structs.replace(sample, **fields))
-        if urgent or len(stream.waiting) in (1, BATCH_MAX):
+        stream.samples.append(msgspec.structs.replace(sample, **fields))
+        if urgent or len(stream.samples) in (1, BATCH_MAX):
             self.batcher.add(stream)
 
 
@@ -115,7 +115,7 @@ async def test_a_turn_that_does_not_end_is_no_reason_to_keep_all_of_it() -> None
     for _ in range(1 + BATCH_MAX):
         wire.add(b"1")
     assert wire.sent == [b"1", BATCH_MAX * b"1"]
-    assert not wire.streams[False].waiting
+    assert not wire.streams[False].samples
 
 
 async def test_a_link_that_goes_down_takes_along_what_waits() -> None:
@@ -164,7 +164,7 @@ async def test_what_shares_a_header(changes: list[dict[str, Any]], packets: list
     expected = []
     for serial, (data, fields) in enumerate(zip((b"a", b"b", b"c", b"d"), changes, strict=True), 2):
         wire.add(data, **fields)
-        each = wire.streams[False].waiting[-1]
+        each = wire.streams[False].samples[-1]
         hops = each.hops + bool(each.source.link)
         expected.append((serial, each.sequence, each.stamp, each.deadline, hops, each.stamped, each.clock))
     wire.batcher.flush()

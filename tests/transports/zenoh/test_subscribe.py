@@ -306,9 +306,9 @@ async def test_a_sink_that_raises_while_a_message_waits_for_it_does_not_stop_the
 
 def reconnect(ring: Ring) -> None:
     """The link goes down and comes up; its topics are subscribed anew then."""
-    ring.receiver.interrupted()
+    ring.receiver.on_down()
     ring.receiver.remove_publisher("leds", 7)
-    ring.receiver.resumed()
+    ring.receiver.on_up()
     ring.receiver.unsubscribe("leds")
     ring.receiver.subscribe(ring.topic)
 
@@ -341,9 +341,9 @@ async def test_what_came_by_another_link_in_the_meantime_is_not_lost() -> None:
     ring = Ring(queue=16)
     ring.put(1, 3)
     await turns()
-    ring.receiver.interrupted()
+    ring.receiver.on_down()
     ring.receiver.unsubscribe("leds")
-    ring.receiver.resumed()
+    ring.receiver.on_up()
     await asyncio.sleep(11)  # the topic is used elsewhere
     ring.receiver.subscribe(ring.topic)
     ring.idle()
@@ -356,8 +356,8 @@ async def test_a_topic_that_went_on_after_an_outage_begins_anew_when_it_was_clos
     ring = Ring(queue=16)
     ring.put(1, 3)
     await turns()
-    ring.receiver.interrupted()
-    ring.receiver.resumed()
+    ring.receiver.on_down()
+    ring.receiver.on_up()
     ring.put(6)
     await turns()
     assert ring.stats.lost == {"on the way": 2}
@@ -373,12 +373,12 @@ async def test_a_later_outage_does_not_count_what_was_sent_before_it_without_a_s
     ring = Ring(queue=16)
     ring.put(1, 3)
     await turns()
-    ring.receiver.interrupted()
+    ring.receiver.on_down()
     ring.receiver.unsubscribe("leds")
-    ring.receiver.resumed()
+    ring.receiver.on_up()
     await asyncio.sleep(60)
-    ring.receiver.interrupted()
-    ring.receiver.resumed()
+    ring.receiver.on_down()
+    ring.receiver.on_up()
     ring.receiver.subscribe(ring.topic)
     ring.idle()
     ring.put(500)

@@ -16,7 +16,7 @@ from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.publish import PublisherCache, TxStream
 from r2p.transports.zenoh.session import _in_thread
-from r2p.transports.zenoh.threads import MANY_TOKENS, WAITING_MAX_URGENT, OutboundThread
+from r2p.transports.zenoh.threads import MANY_TOKENS, PENDING_URGENT_MAX, OutboundThread
 from tests.transports.cables import GUARD
 from tests.transports.zenoh.test_publish import ORIGIN
 
@@ -55,7 +55,7 @@ def putting(out: OutboundThread, busy: Busy) -> Callable[..., None]:
 
 
 async def idle(out: OutboundThread) -> None:
-    while out.waiting:  # noqa: ASYNC110 - the thread is about to be done
+    while out.pending_calls:  # noqa: ASYNC110 - the thread is about to be done
         await asyncio.sleep(0)
 
 
@@ -93,7 +93,7 @@ async def test_with_many_a_thread_makes_them_in_order_and_the_loop_goes_on() -> 
     out.submit(lambda: busy.call("asked"), then=answer.set_result)
     out.set_token_count(0)
     out.call(partial(busy.call, "behind them"))
-    assert (busy.calls, out.waiting) == ([], 6)
+    assert (busy.calls, out.pending_calls) == ([], 6)
     busy.free.set()
     assert await answer == "asked"
     await idle(out)
@@ -109,15 +109,15 @@ async def test_what_does_not_fit_is_counted() -> None:
     out.set_token_count(MANY_TOKENS)
     stream = TxStream(SendWindow(), urgent=True)
     stream.prepare(Source("PC1", "talk"), ORIGIN, putting(out, busy))
-    for sequence in range(1, WAITING_MAX_URGENT + 4):
+    for sequence in range(1, PENDING_URGENT_MAX + 4):
         stream.window.serial += 1
-        stream.waiting.append(Sample(b"x", Source("PC1", "talk"), 1, sequence=sequence))
+        stream.samples.append(Sample(b"x", Source("PC1", "talk"), 1, sequence=sequence))
         stream.send(stats, batching=True)
-    assert (stats.sent, dict(stats.lost)) == (WAITING_MAX_URGENT, {"send buffer full": 3})
-    assert stream.window.serial == WAITING_MAX_URGENT  # so the next one that is sent leaves no gap to count once more
+    assert (stats.sent, dict(stats.lost)) == (PENDING_URGENT_MAX, {"send buffer full": 3})
+    assert stream.window.serial == PENDING_URGENT_MAX  # so the next one that is sent leaves no gap to count once more
     busy.free.set()
     await asyncio.to_thread(out.finish)
-    assert len(busy.calls) == WAITING_MAX_URGENT
+    assert len(busy.calls) == PENDING_URGENT_MAX
 
 
 async def test_what_fails_in_the_thread_is_told_and_the_next_call_is_made() -> None:
@@ -152,7 +152,7 @@ async def test_a_panic_of_zenoh_does_not_end_the_thread() -> None:
     async with asyncio.timeout(GUARD):
         assert str(await failed) == "Panic: poisoned"
         await asyncio.to_thread(out.finish)
-    assert (busy.calls, out.waiting) == (["next"], 0)
+    assert (busy.calls, out.pending_calls) == (["next"], 0)
 
 
 async def test_a_panic_of_zenoh_is_raised_where_its_result_is_awaited() -> None:
@@ -183,7 +183,7 @@ async def test_whether_messages_reach_a_subscriber_is_asked_in_the_thread() -> N
     out.set_token_count(MANY_TOKENS)
     assert not publishers.reaches("leds")
     assert not publishers.reaches("leds")
-    assert out.waiting == 1
+    assert out.pending_calls == 1
     busy.free.set()
     await idle(out)
     await asyncio.sleep(0)

@@ -30,38 +30,38 @@ class Believer:
 async def test_an_answer_that_is_older_than_the_end_of_its_token_is_not_believed() -> None:
     believer = Believer()
     for key in ("before", "during", "again"):
-        believer.tokens.changed(key, True)
-    believer.tokens.changed("before", False)
-    believer.tokens.query_started()
+        believer.tokens.on_change(key, True)
+    believer.tokens.on_change("before", False)
+    believer.tokens.begin_query()
     for key in ("during", "again"):
-        believer.tokens.changed(key, False)
+        believer.tokens.on_change(key, False)
     await asyncio.sleep(1.0)
-    believer.tokens.changed("again", True)
+    believer.tokens.on_change("again", True)
     for key in ("before", "during", "again", "refused"):
-        believer.tokens.answered(key)
-    assert believer.tokens.query_ended()
+        believer.tokens.on_answer(key)
+    assert believer.tokens.end_query()
     await asyncio.sleep(1.0)
     assert believer.there == {"again", "refused"}
 
 
 async def test_answers_are_of_no_use_once_the_link_was_down() -> None:
     believer = Believer()
-    believer.tokens.query_started()
+    believer.tokens.begin_query()
     believer.tokens.on_down()
     believer.tokens.on_up()
-    believer.tokens.answered("old")
-    assert not believer.tokens.query_ended()
+    believer.tokens.on_answer("old")
+    assert not believer.tokens.end_query()
     assert not believer.there
 
 
 async def test_answers_are_of_no_use_where_too_many_tokens_go_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tokens, "TOKENS_MAX", 4)
     believer = Believer()
-    believer.tokens.query_started()
+    believer.tokens.begin_query()
     for number in range(5):
-        believer.tokens.changed(f"{number}", False)
-    believer.tokens.answered("0")
-    assert not believer.tokens.query_ended()
+        believer.tokens.on_change(f"{number}", False)
+    believer.tokens.on_answer("0")
+    assert not believer.tokens.end_query()
     assert not believer.there
 
 
@@ -69,6 +69,6 @@ async def test_what_has_no_room_before_the_link_is_up_is_counted(monkeypatch: py
     monkeypatch.setattr(tokens, "TOKENS_MAX", 2)
     believer = Believer(up=False)
     for key in ("a", "b", "b", "c", "d"):
-        believer.tokens.changed(key, True)
+        believer.tokens.on_change(key, True)
     believer.tokens.on_up()
     assert (believer.there, believer.refused) == ({"a", "b"}, 2)

@@ -1,4 +1,4 @@
-"""The subscribers in other modules: when they are sent to, what credit they grant, and what they got in the end.
+"""What goes out by a link: to which subscribers in other modules, as far as their credit goes, and what they got.
 
     SubscriberJoined -> Reachability (do messages arrive there?) -> ZenohSubscriber -> TxStream
     credit           -> CreditReader -> ZenohSubscriber, whose waiting publishers go on
@@ -19,13 +19,26 @@ from r2p.codecs.attachment import Credit, Origin, decode_credit, name_for
 from r2p.codecs.management import ANY_TYPE
 from r2p.errors import DecodeError
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
-from r2p.runtime.sample import PublisherClass, Sample, Source
+from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
 from r2p.transports.link import Hub, Link, LinkSubscriber
 from r2p.transports.zenoh.publish import BATCH_MAX, Batcher, PublisherCache, TxStream
 from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 
 _NRT = PublisherClass.NON_REAL_TIME
+
+_CREDIT_PAUSE_S = 0.02  # seconds after which credit is read that no publisher waits for
+_CREDIT_RING = 1024  # credits that come in that time at most
+_CREDIT_BYTES_MAX = 256  # longer messages are not copied, as they can't be credits
+
+_RETRY_S = 0.002  # seconds until messages to a new subscriber are checked again; each time that much longer
+_RETRY_FACTOR_MAX = 100  # so at most every 0.2 s
+_RETRIES = 50  # checks, together 2.5 s, after which the user has to know
+_CHECK_S = 0.25  # seconds between two checks whether what was sent is acknowledged
+_RESENDS = 6  # checks at which latched values are sent once more, before the user has to know
+
+FINAL_CREDIT_S = 1.0
+"""Seconds after the end of a token in which a final credit may come: far more than threads and networks take."""
 
 
 class ZenohSubscriber(LinkSubscriber):
@@ -55,23 +68,17 @@ class ZenohSubscriber(LinkSubscriber):
         stream = self._streams[sample.publisher_class]
         window = stream.window
         # One condition for the hot path: there is credit, from the same publisher as before, and the link is up.
-        if window.serial >= window.limit or sample.source is not stream.source or not self._link.up:
-            if not self._link.up:
-                return self._offer_down(sample)
+        if window.serial >= window.limit or sample.source is not stream.source or not self.link.up:
+            if not self.link.up:
+                return self.offer_down(sample)
             if not self._has_credit(stream) and not self.resending:
                 return False
             if sample.source is not stream.source:
                 self._prepare(stream, sample)
         window.serial += 1
-        stream.waiting.append(sample)
-        if stream.urgent or len(stream.waiting) in (1, BATCH_MAX):
+        stream.samples.append(sample)
+        if stream.urgent or len(stream.samples) in (1, BATCH_MAX):
             self._batcher.add(stream)
-        return True
-
-    def _offer_down(self, sample: Sample) -> bool:
-        if sample.publisher_class != _NRT:
-            return False  # so its publisher reports it as missed
-        self.count_lost(LINK_DOWN)
         return True
 
     def _has_credit(self, stream: TxStream) -> bool:
@@ -86,14 +93,14 @@ class ZenohSubscriber(LinkSubscriber):
         return False
 
     def force(self, sample: Sample) -> None:
-        if not self._link.up:
+        if not self.link.up:
             self.count_lost(LINK_DOWN)
         elif not self.offer(sample):
             self.count_lost("no credit")
 
     def refill(self) -> None:
-        while not self._link.stats.lost.guard(self.wait_queue.serve):
-            pass  # the one that raised waits no more
+        while not self.link.stats.lost.guard(self.wait_queue.serve):
+            pass  # the one that raised no longer waits
         self.wait_queue.recover()
 
     def become_lossy(self, reason: str) -> None:
@@ -173,6 +180,8 @@ class ZenohSender:
         self.credits = CreditReader(self)
         self.reachability = Reachability(self)
         self.final_credits = FinalCredits(self)
+        self.topics = hub.space.topics
+        """Those that this module has anything to do with."""
         self._hub = hub
         self._subscribers = subscribers
         self._prefix = ""
@@ -190,23 +199,19 @@ class ZenohSender:
         self.publishers.close()
 
     def subscribers(self) -> Iterator[ZenohSubscriber]:
-        """Return what the link sends to: one for each topic that other modules subscribe."""
+        """Return what the link sends to: one for each topic that other modules subscribe to."""
         return (each for each in self._subscribers.values() if isinstance(each, ZenohSubscriber))
 
     def subscriber(self, topic: str) -> ZenohSubscriber | None:
         subscriber = self._subscribers.get(topic)
         return subscriber if isinstance(subscriber, ZenohSubscriber) else None
 
-    def has_topic(self, topic: str) -> bool:
-        """Whether this module has anything to do with a topic."""
-        return topic in self._hub.space.topics
-
     # Subscribers that come and go
 
-    def joined(self, topic: str, session: int, window: int) -> None:
-        """A subscriber's token appeared, or has another window."""
+    def add_subscriber(self, topic: str, session: int, window: int) -> None:
+        """Add a subscriber whose token appeared, or give it another window."""
         subscriber = self.subscriber(topic)
-        current = subscriber is not None and subscriber.topic is self._hub.space.topics.get(topic)
+        current = subscriber is not None and subscriber.topic is self.topics.get(topic)
         if subscriber is not None and current and subscriber.has_session(session):  # messages reach it already
             subscriber.add_session(session, window)
         else:
@@ -214,7 +219,7 @@ class ZenohSender:
 
     def admit(self, topic: str, session: int, window: int, *, leaving: bool = False) -> None:
         """Send to a subscriber that messages reach: what is latched, and all that is published from now on."""
-        here = self._hub.space.topics[topic]
+        here = self.topics[topic]
         subscriber = self.subscriber(topic)
         if subscriber is not None and subscriber.topic is here:
             subscriber.add_session(session, window)
@@ -227,8 +232,8 @@ class ZenohSender:
         if leaving:
             subscriber.set_leaving(session, leaving=True)
 
-    def left(self, topic: str, session: int, *, gone: bool) -> None:
-        """Send no more to a subscriber. `gone`: its token is, too; else it goes on to accept what is on the way."""
+    def remove_subscriber(self, topic: str, session: int, *, gone: bool) -> None:
+        """Stop sending to a subscriber. `gone`: its token is, too; else it goes on to accept what is on the way."""
         self.reachability.remove(topic, session)
         subscriber = self.subscriber(topic)
         unacknowledged = 0 if subscriber is None else subscriber.remove_session(session)
@@ -237,61 +242,38 @@ class ZenohSender:
         elif unacknowledged and gone:  # no credit comes on a link that is down
             self.count_unknown(unacknowledged)
 
-    def final_credit_received(self, topic: str, session: int) -> None:
-        """A subscriber says that it leaves."""
-        self.final_credits.received(topic, session)
-        self.reachability.set_leaving(topic, session)
-
     def count_unknown(self, count: int) -> None:
         """Count messages of which it stays unknown whether a subscriber got them."""
         self.link.stats.lost["unknown at disconnect"] += count
 
     def report_unreachable(self, topic: str, session: int) -> None:
-        """Tell the user that messages do not reach a subscriber."""
+        """Report to the user that messages do not reach a subscriber."""
         modules = self.link.discovery.modules.values()
         module = next((each.name for each in modules if each.instance == session), "?")
         key = f"{self._prefix}/topic/{topic}"
-        text = (
-            f"topic {topic} does not reach module {module}: does the access control of a router deny {key} to either?"
-        )
+        text = f"topic {topic} does not reach module {module}: "
+        text += f"does the access control of a router deny {key} to either?"
         self._hub.link_notice(self.link, "unreachable subscriber", text, trouble=True)
 
     # Publishers
 
     def origin(self, topic: Topic, sample: Sample) -> Origin:
         """Return what the headers say of the publisher of a message."""
-        own, source = self._hub.instance, sample.source
+        own, source, hooks = self._hub.instance, sample.source, self.link.gateway_hooks
         return Origin(
             sample.publisher_class,
             own,
             self._instance_of(source.module) if source.link else own,
             ANY_TYPE if topic.layout is None else topic.layout.fingerprint,
-            self._source_name(source),
+            name_for(source.module if hooks is None else hooks.source_name(source)),
             source.node,
         )
-
-    def _source_name(self, source: Source) -> str:
-        """Return the name that the module of a message has on this network."""
-        hooks = self.link.gateway_hooks
-        return name_for(source.module if hooks is None else hooks.source_name(source))
 
     def _instance_of(self, module: str) -> int:
         """Return the number of a module on any link; 0: firmware, or not known."""
         links = (each for each in self._hub.space.links if isinstance(each, Link))
         found = (each.discovery.modules.get(module) for each in links)
         return next((info.instance for info in found if info is not None and info.instance is not None), 0)
-
-
-# Credit
-
-_CREDIT_PAUSE_S = 0.02
-"""Seconds after which credit is read that no publisher waits for."""
-
-_CREDIT_RING = 1024
-"""Credits that come in that time at most."""
-
-_CREDIT_BYTES_MAX = 256
-"""Longer messages are not copied, as they can't be credits."""
 
 
 class CreditReader:
@@ -312,7 +294,7 @@ class CreditReader:
 
     def connect(self, session: ZenohSession, key: str) -> None:
         """Subscribe to this module's credit."""
-        self._reader = session.subscribe(key, _CREDIT_RING, self._arrived)
+        self._reader = session.subscribe(key, _CREDIT_RING, self._on_credit)
         self._waits = True
 
     def receive(self) -> None:
@@ -336,7 +318,7 @@ class CreditReader:
         if self._pause is not None:
             self._pause.cancel()
 
-    def _arrived(self, first: zenoh.Sample | None) -> None:
+    def _on_credit(self, first: zenoh.Sample | None) -> None:
         self._waits = False
         self._read(first)
         self._serve()
@@ -358,7 +340,8 @@ class CreditReader:
             if subscriber is not None:
                 subscriber.acknowledge(credit)
             if credit.leaving:
-                self._sender.final_credit_received(credit.topic, credit.session)
+                self._sender.final_credits.receive(credit.topic, credit.session)
+                self._sender.reachability.set_leaving(credit.topic, credit.session)
 
     def _serve(self) -> None:
         """Let publishers that wait go on."""
@@ -377,23 +360,6 @@ class CreditReader:
     def _pause_over(self) -> None:
         self._pause = None
         self.wait()
-
-
-# New subscribers
-
-_RETRY_S = 0.002
-"""Seconds until the second check whether messages reach a new subscriber; each further one takes that much longer."""
-
-_RETRY_FACTOR_MAX = 100
-
-_RETRIES = 50
-"""Checks, together 2.5 s, after which the user has to know."""
-
-_CHECK_S = 0.25
-"""Seconds between two checks whether what was sent is acknowledged."""
-
-_RESENDS = 6
-"""Checks at which latched values are sent once more, before the user has to know."""
 
 
 class _PendingSubscriber(msgspec.Struct, eq=False):
@@ -439,8 +405,8 @@ class Reachability:
             self._check_timer.cancel()
 
     def _try(self, topic: str, session: int, pending: _PendingSubscriber) -> None:
-        if self._pending.get((topic, session)) is not pending or not self._sender.has_topic(topic):
-            return  # it has left, or joined anew, or the topic is not used here any more
+        if self._pending.get((topic, session)) is not pending or topic not in self._sender.topics:
+            return  # it has left, or joined anew, or the topic is no longer used here
         if not self._reaches(topic):
             pending.retries += 1
             if pending.retries == _RETRIES:
@@ -478,12 +444,6 @@ class Reachability:
                 self._sender.report_unreachable(subscriber.topic.name, session)
 
 
-# Subscribers that left
-
-FINAL_CREDIT_S = 1.0
-"""Seconds after the end of a token in which a final credit may come: far more than threads and networks take."""
-
-
 class _DepartedSubscriber(msgspec.Struct, eq=False):
     """A subscriber whose token is gone; what it did not acknowledge is counted when the timer ends."""
 
@@ -511,8 +471,8 @@ class FinalCredits:
         timer = self._sender.loop.call_later(FINAL_CREDIT_S, self._expired, key)
         self._departed[key] = _DepartedSubscriber(unacknowledged, timer)
 
-    def received(self, topic: str, session: int) -> None:
-        """A final credit has come: the subscriber did not want what it did not acknowledge."""
+    def receive(self, topic: str, session: int) -> None:
+        """Count nothing of a subscriber whose final credit came: it did not want what it did not acknowledge."""
         departed = self._departed.pop((topic, session), None)
         if departed is not None:
             departed.timer.cancel()

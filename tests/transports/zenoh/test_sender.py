@@ -15,7 +15,7 @@ from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.stats import LinkStats
-from r2p.transports.zenoh.credit import FINAL_CREDIT_S, FinalCredits, ZenohSubscriber
+from r2p.transports.zenoh.sender import FINAL_CREDIT_S, FinalCredits, ZenohSubscriber
 from tests.faults import once
 
 pytestmark = pytest.mark.virtual_time
@@ -36,7 +36,7 @@ class Bench:
 
     def _look(self) -> None:
         if self.found is not None:
-            self.final_credits.received(*self.found)
+            self.final_credits.receive(*self.found)
 
 
 async def test_a_last_credit_that_comes_late_leaves_nothing_unknown() -> None:
@@ -44,9 +44,9 @@ async def test_a_last_credit_that_comes_late_leaves_nothing_unknown() -> None:
     bench.final_credits.expect("leds", 1, 5)
     bench.final_credits.expect("leds", 2, 7)
     await asyncio.sleep(FINAL_CREDIT_S / 2)
-    bench.final_credits.received("leds", 1)
-    bench.final_credits.received("leds", 3)  # nothing is expected of it
-    bench.final_credits.received("speed", 2)
+    bench.final_credits.receive("leds", 1)
+    bench.final_credits.receive("leds", 3)  # nothing is expected of it
+    bench.final_credits.receive("speed", 2)
     await asyncio.sleep(FINAL_CREDIT_S)
     assert bench.counted == [7]
 

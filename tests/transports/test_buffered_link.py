@@ -1,4 +1,7 @@
-"""What a link keeps: messages that come before what announces them, for a moment, and nothing of closed topics."""
+"""What a link keeps: messages that come before what announces them, for a moment, and nothing of closed topics.
+
+And who is named as the source of what comes in.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from r2p.codecs import management as m
 from r2p.msg import Led
 from r2p.names import MANAGEMENT
+from r2p.protocols.discovery.session import Discovery
+from r2p.runtime.sample import Source
 from r2p.testing.network import Network, node_in
+from r2p.transports.buffered_link import SenderLookup
 from r2p.transports.memory import Datagram
 from tests.bench import led, settle
+from tests.protocols.discovery.wire import PC2, PEER, S, hear, run
 
 if TYPE_CHECKING:
     import r2p
@@ -62,7 +70,7 @@ async def test_what_came_long_before_is_stale() -> None:
 async def test_what_comes_unasked_is_kept_for_few_senders_and_for_no_other_topic(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("r2p.transports.buffered_link._MOST_EARLY", 2)
+    monkeypatch.setattr("r2p.transports.buffered_link._EARLY_MAX", 2)
     net = Network()
     async with net.module("B") as b, node_in(b) as other:
         other.subscribe("leds", Led)
@@ -110,3 +118,47 @@ def grown(module: r2p.Module, size: int) -> set[str]:
                 seen.add(id(value))
                 waiting.append((f"{path}.{name}", value))
     return found
+
+
+def publisher(node: str, *, gone: bool = False) -> m.Endpoint:
+    return m.Endpoint(m.ROLE_PUBLISHES | (m.ROLE_GONE if gone else 0), PEER, node, "leds", m.CLASS_NRT)
+
+
+def test_a_publisher_that_is_replaced_by_another() -> None:
+    discovery = Discovery("PC1", 1)
+    discovery.link_up(0)
+    sources = SenderLookup(discovery, "lab")
+    assert sources.source("leds") == Source("", "", "lab")
+    hear(discovery, S, PC2, publisher("blink"))
+    assert sources.source("leds") == Source("PC2", "blink", "lab")
+    hear(discovery, S, publisher("blink", gone=True), publisher("wink"))
+    assert sources.source("leds") == Source("PC2", "wink", "lab")
+    hear(discovery, S, publisher("blink"))
+    assert sources.source("leds") == Source("PC2", "", "lab"), "one of two"
+    for now in range(4 * S, 24 * S, 4 * S):
+        assert sources.source("leds") == Source("PC2", "", "lab")
+        hear(discovery, now, PC2, publisher("blink"))
+        run(discovery, now, now + 4 * S)
+    assert sources.source("leds") == Source("PC2", "blink", "lab"), "the other one was not repeated"
+
+
+def test_what_is_only_repeated_is_not_worked_out_again() -> None:
+    discovery = Discovery("PC1", 1)
+    discovery.link_up(0)
+    sources = SenderLookup(discovery, "lab")
+    hear(discovery, S, PC2, publisher("blink"))
+    found = sources.source("leds")
+    hear(discovery, 2 * S, PC2, m.Alive("PC2"), publisher("blink"))
+    assert sources.source("leds") is found
+
+
+def test_firmware_is_known_where_it_is_alone() -> None:
+    discovery = Discovery("PC1", 1)
+    discovery.link_up(0)
+    sources = SenderLookup(discovery, "lab")
+    hear(discovery, S, m.Alive("IMU1"))
+    assert sources.source("leds") == Source("IMU1", "", "lab")
+    hear(discovery, S, m.Alive("IMU2"))
+    assert sources.source("leds") == Source("", "", "lab")
+    discovery.link_down(2 * S)
+    assert sources.source("leds") == Source("", "", "lab")
