@@ -127,9 +127,5 @@ def _load(name: str) -> Any:
     return typer.main.get_command(single)
 
 
-def _unloaded() -> None:
-    """Stand for a command that has not been imported."""
-
-
 for _name, (_path, _summary) in (GROUPS | COMMANDS).items():
-    app.command(_name, help=_summary)(_unloaded)
+    app.command(_name, help=_summary)(lambda: None)  # `resolve_command` puts the command itself in its place

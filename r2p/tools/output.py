@@ -238,13 +238,10 @@ def _narrowed(widths: list[int], lists: list[int], room: int) -> list[int]:
 
 def _folded(line: list[str], lists: list[int], widths: list[int]) -> Iterator[list[str]]:
     """Yield the lines of a folded row; an item that is wider than its column stays whole."""
-    cells = [_wrapped(cell, widths[i]) if i in lists else [cell] for i, cell in enumerate(line)]
+    wrap = functools.partial(textwrap.wrap, break_long_words=False, break_on_hyphens=False)
+    cells = [(wrap(cell, widths[i]) or [""]) if i in lists else [cell] for i, cell in enumerate(line)]
     for each in itertools.zip_longest(*cells, fillvalue=""):
         yield list(each)
-
-
-def _wrapped(text: str, width: int) -> list[str]:
-    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False) or [""]
 
 
 def _cell(value: Any) -> str:

@@ -100,19 +100,13 @@ def load(targets: Iterable[str]) -> list[Program]:
 
 
 def _program(target: str) -> Program:
-    path, attribute, name = _split(target)
+    where, _, name = target.partition("=")
+    path, _, attribute = where.rpartition(":") if ":" in where else (where, "", "")
     function = _function(path, attribute, load_module(path))
     try:
         return Program(function, node_name(name) if name else r2p.name_of(function))
     except r2p.NameTooLong as error:
         raise UsageError(f"{target}: a node name has at most {NODE_MAX} characters; {_rename_hint(target)}") from error
-
-
-def _split(target: str) -> tuple[str, str, str]:
-    """Return path, function (may be empty) and name (may be empty)."""
-    where, _, name = target.partition("=")
-    path, colon, function = where.rpartition(":")
-    return (path, function, name) if colon else (where, "", name)
 
 
 def _rename_hint(target: str) -> str:
@@ -227,12 +221,8 @@ def _add_to_path(directory: Path) -> None:
 
 
 def _broken(where: str, error: Exception) -> r2p.Error:
-    frame = error.__traceback__
-    while frame is not None and _is_ours(frame.tb_frame.f_code.co_filename):
+    frame, loaders = error.__traceback__, (__file__, str(importlib.__file__), "<frozen importlib")
+    while frame is not None and frame.tb_frame.f_code.co_filename.startswith(loaders):
         frame = frame.tb_next
     text = "".join(traceback.format_exception(type(error), error, frame))
     return r2p.Error(f"can't load {where}:\n{text.rstrip()}")
-
-
-def _is_ours(filename: str) -> bool:
-    return filename in {__file__, importlib.__file__} or filename.startswith("<frozen importlib")

@@ -47,6 +47,7 @@ REPORT_WAITING_AFTER = 1.0
 """Seconds that a command waits before it reports what it waits for."""
 
 _DESCRIPTORS = 12  # free file descriptors that are needed: an event loop, its wake-ups, and a link
+_TOO_MANY_FILES = (errno.EMFILE, errno.ENFILE)  # of this process, or of the computer
 _SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer has announced everything
 _SETTLED_ON_BUS = 0.6  # ... on a bus, where modules announce in turn
 _FIRMWARE = 1.5  # seconds in which firmware, which announces one item each half second, is heard at least once
@@ -396,12 +397,8 @@ def group(help: str) -> typer.Typer:
     app = typer.Typer(
         help=help, no_args_is_help=True, add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False
     )
-    app.callback()(_no_options)  # makes it a group even of one command
+    app.callback()(lambda: None)  # makes it a group even of one command
     return app
-
-
-def _no_options() -> None:
-    """A group has no options of its own."""
 
 
 def execute(
@@ -432,16 +429,13 @@ def _explain(error: BaseException) -> None:
         if isinstance(leaf, TimedOut):
             notify(str(leaf))
             raise typer.Exit(3) from leaf
-    if not all(isinstance(leaf, r2p.Error | Unwritable) or _is_exhausted(leaf) for leaf in leaves):
+    if not all(
+        isinstance(leaf, r2p.Error | Unwritable) or getattr(leaf, "errno", 0) in _TOO_MANY_FILES for leaf in leaves
+    ):
         raise error
     for leaf in leaves:
         notify(leaf.message if isinstance(leaf, r2p.NodeCrashed) else str(leaf))
     raise typer.Exit(1) from error
-
-
-def _is_exhausted(error: BaseException) -> bool:
-    """Return whether too many files were open, in this process or on this computer."""
-    return isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE)
 
 
 def _leaves(error: BaseException) -> Iterator[BaseException]:

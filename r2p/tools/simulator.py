@@ -269,7 +269,8 @@ class SimulatorScreen:
         parts: list[RenderableType] = [_title(figures, self._duration, min(width, _FULL)), upper]
         if rows > 0:
             parts.append(_table(figures.topics[:rows], names_only=width < _WIDE))
-        return Group(*parts, *map(_hint, self._hints))
+        commands = (Text(hint, style="cyan" if hint.startswith(" ") else "bold") for hint in self._hints)
+        return Group(*parts, *commands)
 
 
 def _title(figures: Figures, duration: float | None, width: int) -> Text:
@@ -334,12 +335,7 @@ def _table(topics: Iterable[TopicFigures], *, names_only: bool) -> Table:
 
 
 def _labelled(lines: list[str]) -> Text:
-    text = Text("\n".join(lines))
-    start = 0
-    for each in lines:
-        text.stylize("bold", start, start + _LABEL)
-        start += len(each) + 1
-    return text
+    return Text("\n").join(Text.assemble((each[:_LABEL], "bold"), each[_LABEL:]) for each in lines)
 
 
 def _coloured(drawing: str) -> Text:
@@ -347,11 +343,6 @@ def _coloured(drawing: str) -> Text:
     text.highlight_regex("#+", "dim default")
     text.highlight_regex(r"[<>^v]", "bold yellow")
     return text
-
-
-def _hint(hint: str) -> Text:
-    """Return a hint in its style; commands are indented."""
-    return Text(hint, style="cyan" if hint.startswith(" ") else "bold")
 
 
 class Map:

@@ -8,17 +8,23 @@ from typing import NamedTuple
 import msgspec
 
 import r2p
+from r2p.codecs import rtcan
 from r2p.msg import Odometry
 from r2p.runtime.publishers import AnyPublisher
 from r2p.sim import SimCan
 from r2p.sim.physics.world import Triple
 from r2p.sim.robots.emulated import MOTORS, Triskar2
 from r2p.transports.rtcan.link import RtcanLink
+from r2p.units import SECOND
 
 _WINDOW = 1.0  # seconds to average rates over
-_LEFT_OUT = ("log", "current", "power")
+_LEFT_OUT = ("log", "current", "power")  # topics that are no part of the control chain
 _HARD, _PERIODIC, _SOFT, _NOT = "hard: in slots", "by the clock", "soft: by deadline", "no"
-_CLASSES = {1: _NOT, 2: _SOFT, 3: _PERIODIC}
+_CLASSES = {
+    r2p.PublisherClass.NON_REAL_TIME: _NOT,
+    r2p.PublisherClass.SPORADIC: _SOFT,
+    r2p.PublisherClass.PERIODIC: _PERIODIC,
+}
 _URGENCY = [_HARD, _PERIODIC, _SOFT, _NOT]
 
 
@@ -79,7 +85,7 @@ class Figures(msgspec.Struct, frozen=True):
 
 
 class _Reading(NamedTuple):
-    """The counters at a time (s): messages by publisher; frames, bit times and errors of the bus."""
+    """The counters at a time (s): messages by publisher; frames, bit times and errors of the bus since it was made."""
 
     time: float
     sent: dict[tuple[str, str], int]
@@ -147,7 +153,10 @@ class FiguresReader:
 
     def _count(self, time: float) -> _Reading:
         sent = {_key(*each): each[1].sent for each in self._publishers()}
-        return _Reading(time, sent, (0, 0, 0) if self._bus is None else _counts(self._bus))
+        if self._bus is None:
+            return _Reading(time, sent, (0, 0, 0))
+        total = self._bus.bus.statistics.total
+        return _Reading(time, sent, (total.frames, total.occupied, total.errors))
 
     def _topic(self, module: r2p.Module, publisher: AnyPublisher, now: _Reading) -> TopicFigures:
         key = _key(module, publisher)
@@ -166,7 +175,7 @@ class FiguresReader:
 
     def _bus_figures(self, bus: SimCan, now: _Reading) -> BusFigures:
         before = self._readings[0]
-        span, bit = _span(before, now), bus.bus.bit / 1e9
+        span, bit = _span(before, now), bus.bus.bit / SECOND
         frames, occupied, _ = (count - old for count, old in zip(now.bus, before.bus, strict=True))
         all_frames, all_occupied, errors = (count - old for count, old in zip(now.bus, self._began.bus, strict=True))
         mean = all_occupied * bit / _span(self._began, now)
@@ -180,7 +189,7 @@ class FiguresReader:
             of = link.engine.timing.slots
             for each in link.slots.values():
                 if each.period:
-                    used += of / each.period * max(1, math.ceil(each.publisher.size / 8))
+                    used += of / each.period * rtcan.fragment_count(each.publisher.size)
         return used, of
 
 
@@ -191,12 +200,6 @@ def _key(module: r2p.Module, publisher: AnyPublisher) -> tuple[str, str]:
 def _span(before: _Reading, now: _Reading) -> float:
     """Return the seconds between two readings; more than 0 also for the first one."""
     return max(now.time - before.time, 1e-9)
-
-
-def _counts(bus: SimCan) -> tuple[int, int, int]:
-    """Return frames, bit times and errors since the bus was made."""
-    total = bus.bus.statistics.total
-    return total.frames, total.occupied, total.errors
 
 
 def _real_time(module: r2p.Module, publisher: AnyPublisher) -> str:

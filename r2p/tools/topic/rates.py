@@ -9,7 +9,7 @@ import asyncio
 import statistics
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -26,8 +26,8 @@ from r2p.units import SECOND
 QUEUE = 4096
 """Messages that wait for this tool; beyond that the oldest are lost, and counted."""
 
-_GAP = 2.0  # times the usual period: the publisher has paused
-_SMOOTHING = 1 / 16  # weight of a new period in the usual one
+_GAP = 2.0  # times the usual period: beyond that the publisher has paused
+_SMOOTHING = 1 / 16  # weight of a new period in the usual one, so that one gap hardly moves it
 _MISSING_MAX = 65536  # missing sequence numbers that are remembered: they may still arrive
 _ORIGINS = 4  # publishers that a report names
 _DIGITS = 9  # decimals of seconds: ns
@@ -78,23 +78,20 @@ def _command(name: str, kind: type[_Meter]) -> Callable[..., Coroutine[Any, Any,
     ) -> None:
         cls = Types(session.settings).stated(topic_name(topic), type)
         subscriber: r2p.Subscriber[Any] = session.node.subscribe(topic, cls, queue=QUEUE, lossy=True)
-        samples = received_samples(session, subscriber, typed=cls is not None)
         meter, output = kind(window), Output(format)
+
+        async def read() -> None:
+            async for sample in received_samples(session, subscriber, typed=cls is not None):
+                received()
+                meter.add(sample, session.node.now())
+
         async with output.while_read(), patience(topic, timeout) as received, asyncio.TaskGroup() as tasks:
-            reading = tasks.create_task(_read(session.node, samples, meter, received))
+            reading = tasks.create_task(read())
             await _print(session.node, subscriber, meter, output, 1 if once else count)
             reading.cancel()
 
     command.__name__, command.__doc__ = name, kind.__doc__
     return command
-
-
-async def _read(
-    node: r2p.Node, samples: AsyncIterator[r2p.Sample], meter: _Meter, received: Callable[[], None]
-) -> None:
-    async for sample in samples:
-        received()
-        meter.add(sample, node.now())
 
 
 async def _print(
