@@ -35,7 +35,6 @@ RUNS = 3
 PERIOD = 1_000_000  # ns
 DEADLINE = 0.008  # s: before management, which has 10 ms
 
-_REQUEST = 0x22
 _STAMP = struct.Struct("<Q")
 
 
@@ -75,7 +74,8 @@ def _robot(go: Connection, port: int) -> None:
         send(management.Alive("ROBOT"))
         send(management.Advertise("eight", 32))
         reader = debug.Reader()
-        while not any(each.data[-1] == _REQUEST for each in reader.feed(connection.recv(65536))):
+        request = management.ManagementType.SUBSCRIBE_REQUEST
+        while not any(each.data[-1] == request for each in reader.feed(connection.recv(65536))):
             pass
         send(management.SubscribeResponse("eight", 32))
         go.recv()

@@ -236,37 +236,28 @@ class RateCounter:
         return rows
 
 
-class _LogCounter(logging.Handler):
-    """Counts log lines, which are written below the table, so that it can no longer be drawn over."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.count += 1
-
-
-class LiveTable:
-    """A table that is drawn over itself, until something else is written below it."""
+class LiveTable(logging.Handler):
+    """A table that is drawn over itself, until something is logged: that is written below it."""
 
     def __init__(self, output: Output) -> None:
+        super().__init__()
         self._output = output
-        self._logged = _LogCounter()
-        self._seen = 0
+        self._height = 0  # 0: there is nothing to draw over
+        logging.getLogger("r2p").addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Note that something is logged."""
         self._height = 0
-        logging.getLogger("r2p").addHandler(self._logged)
 
     def close(self) -> None:
-        """Stop counting log lines."""
-        logging.getLogger("r2p").removeHandler(self._logged)
+        """Ignore what is logged from now on."""
+        logging.getLogger("r2p").removeHandler(self)
+        super().close()
 
     async def draw(self, rows: list[Row]) -> None:
         """Draw the table over the last one."""
         text = crop(table(rows), *shutil.get_terminal_size())
-        over = self._height if self._logged.count == self._seen else 0
-        self._seen = self._logged.count
-        self._height = text.count("\n") + 1
+        over, self._height = self._height, text.count("\n") + 1
         await self._output.remark(text, over=over)
 
 

@@ -11,8 +11,11 @@ A command is a coroutine function whose first parameter is a `Session`:
 `command` adds --via, -v and -q, joins as an observer, and maps the end to an exit code: 0 for success (also Ctrl-C,
 SIGTERM and a closed pipe), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`. The function itself is
 unchanged, so tests call it under virtual time, inside `async with join(Settings(via=["memory:lab"])) as session`.
-Commands that make a module of their own, such as `run`, use `settings()` and `execute()` with the options `Via`,
-`Verbose` and `Quiet`.
+Commands of the bus get a `BusMonitor` instead of a Session (`opening`). Commands that make a module of their own, such
+as `run`, use `settings()` and `execute()` with the options `Via`, `Verbose` and `Quiet`.
+
+Commands wait here: `Session.settle` for announcements, `Session.waiting` with a report, `patience` for messages,
+`wait_until` for a condition, and `moments` for the time.
 """
 
 import asyncio
