@@ -83,10 +83,11 @@ class BusMonitor:
         if self._running is not None:
             raise Error(f"the monitor of {self.via} was opened before: make a new one")
         # Not at the top: `Calendar` is used without a bus, and the transport takes its time to load.
-        from r2p.transports.rtcan.transport import RtcanOptions, open_port
+        from r2p.transports.rtcan.transport import RtcanOptions, from_url
 
         if self._port is None:
-            port, options = open_port(parse(self.via))
+            transport = from_url(parse(self.via))
+            port, options = transport.make_port(), transport.options
         else:
             port, options = self._port, RtcanOptions()
         self._errors = LoggedCounter(self.via, clock_of())

@@ -219,7 +219,7 @@ class CanController:
     def sent(self, request: Request, end: int) -> None:
         """Complete this request: its frame was acknowledged."""
         if self.confinement.transmit:
-            self.confinement.transmitted()
+            self.confinement.count(transmit=-1)
         if self.mailboxes.remove(request):
             self._interrupts.deliver(end, self.on_sent, request.frame)
 
@@ -237,13 +237,13 @@ class CanController:
         # The standard's exception: a node that is alone on the bus stays error passive, and never goes to bus-off.
         alone = kind is ErrorKind.ACK and self.confinement.passive
         if not alone:
-            self.confinement.failed(transmit=8)
+            self.confinement.count(transmit=8)
         if self.node.one_shot and self.mailboxes.remove(request):
             self._interrupts.deliver(at, self.on_error, request.frame, kind)
 
     def disturbed(self, count: int) -> None:
         """Note that a frame that this node was receiving was destroyed."""
-        self.confinement.failed(receive=count)
+        self.confinement.count(receive=count)
         self._bus.filters_changed()
 
     def restarted(self) -> None:
@@ -330,17 +330,9 @@ class Confinement:
         self.receive = 0
         self._on_change = on_change
 
-    def transmitted(self) -> None:
-        """Count a frame that was sent without an error."""
-        self._count(self.transmit - 1, self.receive)
-
     def received(self) -> None:
         """Count a frame that was received without an error."""
-        self._count(self.transmit, self.receive - 1 if self.receive <= _PASSIVE_ABOVE else _AFTER_GOOD_FRAME)
-
-    def failed(self, *, transmit: int = 0, receive: int = 0) -> None:
-        """Count a frame that was destroyed while it was sent or received."""
-        self._count(self.transmit + transmit, self.receive + receive)
+        self.count(receive=-1 if self.receive <= _PASSIVE_ABOVE else _AFTER_GOOD_FRAME - self.receive)
 
     def restart(self) -> None:
         self.transmit = self.receive = 0
@@ -353,9 +345,10 @@ class Confinement:
             self.passive = state is ControllerState.PASSIVE
             self._on_change(state)
 
-    def _count(self, transmit: int, receive: int) -> None:
-        self.transmit = max(0, transmit)
-        self.receive = max(0, receive)
+    def count(self, *, transmit: int = 0, receive: int = 0) -> None:
+        """Add to the counters: -1 for a frame without an error, more for one that was destroyed."""
+        self.transmit = max(0, self.transmit + transmit)
+        self.receive = max(0, self.receive + receive)
         if self.transmit > _BUS_OFF_ABOVE:
             self.enter(ControllerState.BUS_OFF)
         else:

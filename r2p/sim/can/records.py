@@ -94,21 +94,18 @@ class FrameRecord(msgspec.Struct, frozen=True, gc=False):
     error: ErrorKind | None
 
 
-class Count:
+class Count(msgspec.Struct, eq=False):
     """Frames that were sent, with their bits (stuff bits included, intermission not), and what was not sent."""
 
-    __slots__ = ("bits", "error_bits", "errors", "frames", "lost")
-
-    def __init__(self) -> None:
-        self.frames = 0
-        self.bits = 0
-        self.errors = 0  # attempts that ended with an error frame
-        self.error_bits = 0  # ... and the bits they took, error frame included
-        self.lost = 0  # arbitrations lost
+    frames: int = 0
+    bits: int = 0
+    errors: int = 0  # attempts that ended with an error frame
+    error_bits: int = 0  # ... and the bits they took, error frame included
+    lost: int = 0  # arbitrations lost
 
     def add(self, other: Count) -> None:
         """Add the numbers of another counter."""
-        for name in self.__slots__:
+        for name in self.__struct_fields__:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     @property

@@ -98,12 +98,12 @@ class RtcanTransport(Transport):
     """An RTCAN link called `name` on the port that `make_port` makes."""
 
     def __init__(self, name: str, make_port: Callable[[], CanPort], options: RtcanOptions) -> None:
+        self.make_port = make_port
+        self.options = options
         self._name = name
-        self._make_port = make_port
-        self._options = options
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
-        await run_link(self._name, hub, opened, self._make_port(), self._options)
+        await run_link(self._name, hub, opened, self.make_port(), self.options)
 
 
 async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanPort, options: RtcanOptions) -> None:
@@ -132,18 +132,7 @@ async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanP
 
 
 def from_url(url: Url) -> RtcanTransport:
-    """`rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`, with the options of `RtcanOptions`."""
-    make_port, options = _port_of(url)
-    return RtcanTransport(f"rtcan:{url.address}", make_port, options)
-
-
-def open_port(url: Url) -> tuple[CanPort, RtcanOptions]:
-    """The port of such a URL, not running yet, and the options: for a program that only listens to the bus."""
-    make_port, options = _port_of(url)
-    return make_port(), options
-
-
-def _port_of(url: Url) -> tuple[Callable[[], CanPort], RtcanOptions]:
+    """The transport of `rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`, with the options of `RtcanOptions`."""
     options = apply_options(str(url), url.parsed(OPTIONS), RtcanOptions())
     if options.priority and not options.holds_slots_on_coarse_port:
         raise TransportError(
@@ -159,7 +148,7 @@ def _port_of(url: Url) -> tuple[Callable[[], CanPort], RtcanOptions]:
         interface, channel = "socketcan", url.address
     if not channel:
         raise TransportError(f"{url} lacks the CAN interface: rtcan:can0, or rtcan:slcan:/dev/ttyACM0")
-    return _port_maker(interface, channel, options), options
+    return RtcanTransport(f"rtcan:{url.address}", _port_maker(interface, channel, options), options)
 
 
 def _port_maker(interface: str, channel: str, options: RtcanOptions) -> Callable[[], CanPort]:
