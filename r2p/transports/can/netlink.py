@@ -38,7 +38,7 @@ _HEADER = struct.Struct("=IHHII")  # length, type, flags, sequence, sender
 _LINK = struct.Struct("=BxHiII")  # family, type, index, flags, change
 _ATTRIBUTE = struct.Struct("=HH")  # length, type
 _NESTED = 0x3FFF  # the upper two bits of an attribute's type are flags
-_READ_MAX = 1 << 16  # bytes
+_READ_MAX = 1 << 16  # bytes: more than the kernel puts into one datagram
 
 
 class Interface(msgspec.Struct, frozen=True):

@@ -24,7 +24,7 @@ from r2p.transports.stats import RETRY_AFTER_ERROR
 from r2p.units import NEVER
 
 RETRY_INTERVAL = 500_000
-"""Ns until the next try when the driver's queue is full: no interface reports that it has room again."""
+"""Ns until the next try when the driver's queue is full, some four frames: no interface reports that it has room."""
 
 
 class CanPortListener(Protocol):

@@ -23,9 +23,9 @@ from r2p.protocols.rtcan.events import Action, Mailbox, Outcome, Transmit, Withd
 from r2p.transports.can.port import CanPort
 from r2p.transports.stats import RETRY_AFTER_ERROR
 
-_MEASURE_INTERVAL = 100_000_000  # ns between two measurements of UTC
+_MEASURE_INTERVAL = 100_000_000  # ns between two measurements of UTC: clocks 100 ppm apart drift by 10 us meanwhile
 _MEASUREMENTS = 32  # that count: those of the last 3 s
-_UTC_ERROR_MIN = 1_000  # ns
+_UTC_ERROR_MIN = 1_000  # ns: two clocks are never read at the same instant
 
 
 class DriverOwner(Protocol):

@@ -65,7 +65,7 @@ _BURST, _BURST_MIN = 8, 4  # messages at once, on a bus of 1 Mbit/s and on the s
 _BIT = 1000  # ns at 1 Mbit/s
 _FIRMWARE_RATE, _FIRMWARE_QUIET = 12.0, 0.033  # a second, and s: all modules have one id, so none may send at once
 
-_OFFSET_VALID = 10 * MILLISECOND  # for which the offset of UTC from the monotonic clock is not read again
+_OFFSET_VALID = 10 * MILLISECOND  # for which UTC's offset is not read again: slewed by 500 ppm it moves 5 us meanwhile
 _CLASSES = {
     Mailbox.HRT: PublisherClass.PERIODIC,
     Mailbox.SRT: PublisherClass.SPORADIC,
@@ -91,7 +91,7 @@ class RtcanLink(BufferedLink):
     def __init__(
         self, name: str, hub: Hub, port: CanPort, settings: EngineSettings, utc_error: int | None = None
     ) -> None:
-        name = unique_name(name, hub)
+        name = unique_name(name, hub)  # before all parts, which log and count under it
         counts = LoggedCounter(name, hub.space.clock)
         discovery = Discovery(
             hub.space.module, hub.instance, rate=_RATE, burst=_BURST, observer=hub.observer, counts=counts
@@ -153,9 +153,9 @@ class RtcanLink(BufferedLink):
         match event:
             case Ready():
                 self._limit_discovery(event.profile)
-                self.driver.update_filters()
+                self.driver.update_filters()  # before it announces: answers come to the new id8
                 self._announce()
-            case ParametersMatch() if self.engine.ready:
+            case ParametersMatch() if self.engine.ready:  # else `Ready` follows, and announces
                 self._notice(event)
                 self._announce()
             case SlotsGranted() | SlotsRefused() | SlotsLost():
@@ -394,7 +394,7 @@ class RtcanLink(BufferedLink):
     def close(self) -> None:
         """Release the slots and announce the end. The bus takes its time for that: see `driver.drain`."""
         if not self._closed:
-            self._slotted.close()
+            self._slotted.close()  # while the engine can still send that
             super().close()
             self._slotted.wake_waiters()
 

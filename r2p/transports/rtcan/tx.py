@@ -31,7 +31,7 @@ SRT_MESSAGES_MAX = 128
 that bulk data never keeps an event out.
 """
 
-_DEFAULT_DEADLINE = 50_000_000  # ns; of real-time messages without one: those from other links, and latched ones
+_DEFAULT_DEADLINE = 50_000_000  # ns, as of firmware; for real-time messages without one, from other links or latched
 _NRT = PublisherClass.NON_REAL_TIME
 _SENT = (Fate.SENT, Fate.UNKNOWN)
 
