@@ -9,8 +9,9 @@ from benchmarks.table import Row, rate, typical
 from benchmarks.thesis.network import Scenario, simulated
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
+from r2p.protocols.can_orders import Outcome, Transmit
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import EngineSettings, Outcome, Profile, Transmit
+from r2p.protocols.rtcan.events import EngineSettings, Profile
 from r2p.sim import run
 from r2p.sim.can import CanBus, CanController, CanNode
 

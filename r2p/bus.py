@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Self
 from r2p.clock import SHORTEST, check_seconds, clock_of
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.errors import Closed, Error
+from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, timing
-from r2p.protocols.rtcan.events import Mailbox, Outcome
 from r2p.protocols.rtcan.monitor import BusLoad, BusSlot, FrameKind, Monitor, SeenFrame
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.url import parse

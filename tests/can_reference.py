@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from r2p.codecs.rtcan import Frame
+    from r2p.codecs.can_bits import Frame
 
 INTERMISSION = 3
 

@@ -6,8 +6,8 @@ import asyncio
 from typing import Any
 
 from r2p.clock import clock_of
-from r2p.codecs.can_bits import frame_bits
-from r2p.codecs.rtcan import Frame, encode_identifier
+from r2p.codecs.can_bits import Frame, frame_bits
+from r2p.codecs.rtcan import encode_identifier
 from r2p.sim.can import CanBus, CanController, CanNode, FrameRecord
 
 BIT = 1000  # ns at 1 Mbit/s

@@ -12,7 +12,7 @@ import r2p
 from r2p.bus import BusLoad, BusMonitor, FrameKind
 from r2p.codecs.rtcan import Frame
 from r2p.msg import Led
-from r2p.protocols.rtcan.events import Transmit, Withdraw
+from r2p.protocols.can_orders import Transmit, Withdraw
 from r2p.protocols.rtcan.monitor import TrafficCount
 from r2p.sim.can import CanNode
 from r2p.sim.transport import SimCan, SimPort

@@ -1,4 +1,4 @@
-"""How many bits a CAN frame takes on the wire, and so when it began: controllers stamp its end.
+"""CAN frames, and how many bits they take on the wire: controllers stamp the end of a frame, so its start follows.
 
 A frame's length in bits depends on its content: after five equal bits the controller stuffs in a sixth, opposite one,
 also in the CRC. Bits are counted a byte at a time: a table has for each state of the stuffing (which bit came last, how
@@ -8,11 +8,30 @@ often) and each byte the next state and how many bits were stuffed in.
 from functools import lru_cache
 from typing import TypeAlias
 
-from r2p.codecs.rtcan import FRAME_MAX, IDENTIFIER_BITS, Frame, OtherFrame
+import msgspec
+
 from r2p.errors import MessageError
 
+FRAME_MAX = 8  # bytes in a frame
+IDENTIFIER_BITS = 29
 INTERMISSION = 3  # bits between two frames
 TAIL = 10  # bits after the CRC, never stuffed: CRC delimiter, ACK slot, ACK delimiter, end of frame
+
+
+class Frame(msgspec.Struct, frozen=True, gc=False):
+    """A data frame of CAN 2.0B: its 29-bit identifier and 0 to 8 bytes."""
+
+    id: int
+    data: bytes
+
+
+class OtherFrame(msgspec.Struct, frozen=True):
+    """A frame of another kind: with an 11-bit identifier, or a remote frame, which asks for `remote` bytes."""
+
+    id: int
+    data: bytes = b""
+    extended: bool = False
+    remote: int | None = None
 
 
 def frame_bits_min(size: int) -> int:

@@ -8,10 +8,13 @@ This module alone knows the layout of an identifier: hot paths elsewhere shift a
 
 import msgspec
 
+from r2p.codecs.can_bits import FRAME_MAX as FRAME_MAX  # `as`: programs find frames here, too
+from r2p.codecs.can_bits import IDENTIFIER_BITS as IDENTIFIER_BITS
+from r2p.codecs.can_bits import Frame as Frame
+from r2p.codecs.can_bits import OtherFrame as OtherFrame
 from r2p.errors import DecodeError, MessageError
 from r2p.units import MILLISECOND
 
-FRAME_MAX = 8  # bytes in a frame
 PAYLOAD_MAX = 1024  # bytes in a message: 128 fragments
 SLOTS_MAX = 64  # in a cycle: bits in the reservation mask
 
@@ -25,7 +28,6 @@ MANAGEMENT = 0x01
 FIRST_TOPIC = 0x02
 FIRMWARE_MANAGEMENT = 0x0000  # the message id of management of every module of 2014
 
-IDENTIFIER_BITS = 29
 LAXITY_SHIFT = 23
 HIGH_SHIFT = 15
 MESSAGE_SHIFT = 7  # also of the id8, the low byte of the message id
@@ -41,28 +43,12 @@ CYCLE_MASK = 0xFF  # a sync frame carries these bits of the cycle counter
 _ALL_SLOTS = (1 << SLOTS_MAX) - 1
 
 
-class Frame(msgspec.Struct, frozen=True, gc=False):
-    """A data frame of CAN 2.0B: its 29-bit identifier and 0 to 8 bytes."""
-
-    id: int
-    data: bytes
-
-
 class Identifier(msgspec.Struct, frozen=True, gc=False):
     """The parts of an identifier: laxity 0..63, message id 0..0xFFFF, fragments that come after this one 0..127."""
 
     laxity: int
     message_id: int
     left: int
-
-
-class OtherFrame(msgspec.Struct, frozen=True):
-    """A frame that RTCAN does not use: with an 11-bit identifier, or a remote frame, which asks for `remote` bytes."""
-
-    id: int
-    data: bytes = b""
-    extended: bool = False
-    remote: int | None = None
 
 
 class Sync(msgspec.Struct, frozen=True, gc=False):

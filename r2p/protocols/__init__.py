@@ -4,4 +4,5 @@
 - `rtcan`: the CAN protocol, with its cycle, its master and its slots.
 - `bridge`: how gateways agree on a tree, and which link a module with several of them uses.
 - `flow_control`, `time_left`, `timers`: parts that several links or protocols use.
+- `can_orders`: what RTCAN and the ports to CAN controllers exchange.
 """

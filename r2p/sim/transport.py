@@ -20,7 +20,7 @@ from r2p.clock import random_of
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, Latency
 from r2p.sim.can.controller import ignore
 from r2p.transports.can.port import CanPort, CanPortListener, PortAlarm

@@ -15,8 +15,8 @@ from r2p.transports.can.socketcan import SocketCanPort
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from r2p.codecs.rtcan import Frame, OtherFrame
-    from r2p.protocols.rtcan.events import Mailbox, Outcome
+    from r2p.codecs.can_bits import Frame, OtherFrame
+    from r2p.protocols.can_orders import Mailbox, Outcome
     from r2p.transports.can.port import CanPort
 
 GUARD = 30.0

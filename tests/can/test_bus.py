@@ -13,7 +13,7 @@ import pytest
 
 from r2p.bus import BusMonitor
 from r2p.codecs import management, rtcan
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.can_bits import Frame
 from r2p.tools.main import app
 from tests.can.rig import GUARD, cansend, ip, until
 

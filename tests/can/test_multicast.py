@@ -6,8 +6,8 @@ import subprocess
 
 import pytest
 
-from r2p.codecs.rtcan import Frame
-from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
+from r2p.codecs.can_bits import Frame
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit
 from r2p.transports.can.pythoncan import PythonCanPort
 from tests.can.rig import using
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 from can.interfaces import slcan
 
-from r2p.codecs.rtcan import Frame
-from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
+from r2p.codecs.can_bits import Frame
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit
 from r2p.transports.can import netlink
 from r2p.transports.can.pythoncan import PythonCanPort
 from tests.can.rig import ip, port_on, until, using

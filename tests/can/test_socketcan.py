@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can import netlink, socketcan
 from r2p.transports.can.socketcan import SocketCanPort
 from r2p.units import NEVER

@@ -12,7 +12,8 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 
-from r2p.protocols.rtcan.events import Fate, Outcome
+from r2p.protocols.can_orders import Outcome
+from r2p.protocols.rtcan.events import Fate
 from r2p.transports.can import rawsocket
 from tests.docs.blocks import ROOT
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.clock import clock_of
-from r2p.codecs.can_bits import bits_until_lost
-from r2p.codecs.rtcan import Frame, encode_identifier
+from r2p.codecs.can_bits import Frame, bits_until_lost
+from r2p.codecs.rtcan import encode_identifier
 from r2p.errors import Deadlock, MessageError
 from r2p.sim import run
 from r2p.sim.can import CanBus, CanController, CanNode, Latency

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from r2p.codecs.can_bits import wire_bits
-from r2p.codecs.rtcan import Frame, encode_identifier
+from r2p.codecs.can_bits import Frame, wire_bits
+from r2p.codecs.rtcan import encode_identifier
 from r2p.sim.can import CanBus, CanController, CanNode, ControllerState, ErrorKind, FrameRecord
 from r2p.sim.can.bus import bits_until_noticed, error_frame_bits, first_difference, flip
 from tests import can_watch

@@ -32,19 +32,8 @@ from collections.abc import Hashable, Sequence
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import HIGH_MAX, HIGH_SHIFT, ID8_MAX, MANAGEMENT, MESSAGE_SHIFT, NOT_SYNC, Frame
 from r2p.errors import DecodeError, MessageError
-from r2p.protocols.rtcan.events import (
-    Action,
-    Done,
-    Due,
-    EngineContext,
-    EngineSettings,
-    Fate,
-    Mailbox,
-    Outcome,
-    Profile,
-    Ready,
-    Received,
-)
+from r2p.protocols.can_orders import Mailbox, Outcome
+from r2p.protocols.rtcan.events import Action, Done, Due, EngineContext, EngineSettings, Fate, Profile, Ready, Received
 from r2p.protocols.rtcan.leases import PeriodicMessage, SlotGrants, SlotRequests
 from r2p.protocols.rtcan.management import ManagementHandlers, ManagementSender
 from r2p.protocols.rtcan.master import Role

@@ -14,9 +14,9 @@ import msgspec
 from r2p.codecs import rtcan
 from r2p.codecs.can_bits import start_of_frame
 from r2p.codecs.rtcan import MESSAGE_MAX, MESSAGE_SHIFT, Frame
+from r2p.protocols.can_orders import Mailbox, Transmit, Withdraw
 from r2p.protocols.rtcan.cycle import Cycle, timing
 from r2p.protocols.timers import KeyedTimers
-from r2p.units import NEVER
 
 
 class Profile(enum.Enum):
@@ -51,44 +51,6 @@ class EngineSettings(msgspec.Struct, frozen=True, kw_only=True):
     coarse: bool = False
     reserves: bool = True
     capacity: int = 256
-
-
-# Frames to and from the port
-
-
-class Mailbox(enum.IntEnum):
-    """Where a frame waits in the controller. Each holds one frame; HRT goes before SRT before NRT."""
-
-    HRT = 0  # sync and hard real-time
-    SRT = 1  # soft real-time and management
-    NRT = 2
-
-
-class Outcome(enum.Enum):
-    """What became of a frame that the port had to transmit."""
-
-    SENT = "sent"
-    LOST = "arbitration lost"  # one-shot controllers only
-    ERROR = "bus error"  # destroyed, not acknowledged, or given up in bus-off
-    LATE = "not started"  # withdrawn, or not started by `not_after`: it was never on the bus
-    UNKNOWN = "unknown"  # the port can't say; never sent again, as a second copy would look like a new message
-
-
-class Transmit(msgspec.Struct, frozen=True, gc=False):
-    """Put this frame into the mailbox, which is empty. Its start of frame must lie between the two instants; answer
-    every one with `Engine.confirm`.
-    """
-
-    frame: Frame
-    mailbox: Mailbox
-    not_before: int
-    not_after: int = NEVER
-
-
-class Withdraw(msgspec.Struct, frozen=True, gc=False):
-    """Take the frame back if it has not started; it is confirmed as every frame."""
-
-    mailbox: Mailbox
 
 
 # Messages

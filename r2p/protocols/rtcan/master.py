@@ -13,8 +13,9 @@ from collections.abc import Callable
 
 from r2p.codecs.can_bits import start_of_frame
 from r2p.codecs.rtcan import decode_sync
+from r2p.protocols.can_orders import Outcome
 from r2p.protocols.rtcan.cycle import HOLDOVER
-from r2p.protocols.rtcan.events import EngineContext, Outcome
+from r2p.protocols.rtcan.events import EngineContext
 from r2p.protocols.rtcan.leases import SlotGrants
 from r2p.protocols.rtcan.transmitter import FirstSync, SlotTransmitter
 

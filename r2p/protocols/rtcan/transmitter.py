@@ -16,8 +16,9 @@ from r2p.codecs import can_bits, rtcan
 from r2p.codecs.can_bits import INTERMISSION
 from r2p.codecs.management import ManagementType, type_of
 from r2p.codecs.rtcan import FRAME_MAX, LAXITY_SHIFT, Frame
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.cycle import HOLDOVER, NO_SLOT, CycleState
-from r2p.protocols.rtcan.events import Due, EngineContext, Fate, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.events import Due, EngineContext, Fate
 from r2p.protocols.rtcan.leases import PeriodicMessage, SlotPlan
 from r2p.protocols.rtcan.queue import LaxityQueue, QueuedMessage
 from r2p.units import LONG_AGO, NEVER

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Sequence
 
-    from r2p.codecs.rtcan import Frame
+    from r2p.codecs.can_bits import Frame
     from r2p.sim.can.controller import ControllerMailboxes, Request
 
 _FLAG: Final = 6  # bits of an error flag

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
-from r2p.codecs.rtcan import FRAME_MAX, IDENTIFIER_BITS
+from r2p.codecs.can_bits import FRAME_MAX, IDENTIFIER_BITS
 from r2p.errors import MessageError
 from r2p.sim.can.records import ControllerState, ErrorKind
 from r2p.sim.can.timeline import LocalAlarm, LocalClock
@@ -20,7 +20,7 @@ from r2p.units import NEVER
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from r2p.codecs.rtcan import Frame
+    from r2p.codecs.can_bits import Frame
     from r2p.sim.can.records import CanNode
     from r2p.sim.can.timeline import Timeline, TimelineTimer
 

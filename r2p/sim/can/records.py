@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from r2p.codecs.can_bits import INTERMISSION
-from r2p.codecs.rtcan import Frame, message_of
+from r2p.codecs.can_bits import INTERMISSION, Frame
+from r2p.codecs.rtcan import message_of
 
 if TYPE_CHECKING:
     import random

@@ -18,8 +18,8 @@ from typing import Generic, Protocol, TypeVar
 import msgspec
 
 from r2p.clock import ExactAlarm, clock_of
-from r2p.codecs.rtcan import Frame, OtherFrame
-from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
+from r2p.codecs.can_bits import Frame, OtherFrame
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.stats import RETRY_AFTER_ERROR
 from r2p.units import NEVER
 

@@ -17,9 +17,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from r2p.clock import Backoff, random_of
-from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import Mailbox, Outcome
+from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface
 from r2p.units import SECOND
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from r2p.codecs.rtcan import Frame
+from r2p.codecs.can_bits import Frame
 from r2p.units import SECOND
 
 BATCH = 64

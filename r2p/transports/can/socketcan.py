@@ -14,9 +14,9 @@ import socket
 from collections.abc import Callable
 
 from r2p.clock import Backoff, clock_of, random_of
-from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import Mailbox, Outcome
+from r2p.protocols.can_orders import Mailbox, Outcome
 from r2p.transports.can import netlink, rawsocket
 from r2p.transports.can.port import CanPortListener, InterfacePort, OpenInterface, PortAlarm
 from r2p.transports.can.rawsocket import RawSocket

@@ -18,8 +18,9 @@ from typing import Any, Protocol
 from r2p.clock import clock_of
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.messages import ClockOffset
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Action, Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.rtcan.events import Action
 from r2p.transports.can.port import CanPort
 from r2p.transports.stats import RETRY_AFTER_ERROR
 

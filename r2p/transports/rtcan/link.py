@@ -15,6 +15,7 @@ from r2p.codecs import can_bits, management, rtcan
 from r2p.codecs.management import NO_PARAMS
 from r2p.messages import ClockOffset
 from r2p.names import MANAGEMENT
+from r2p.protocols.can_orders import Mailbox
 from r2p.protocols.discovery.events import Event, ModuleGone, PublisherFound, PublisherGone
 from r2p.protocols.discovery.session import Discovery
 from r2p.protocols.rtcan.engine import Engine
@@ -25,7 +26,6 @@ from r2p.protocols.rtcan.events import (
     EngineSettings,
     IdConflict,
     LostSync,
-    Mailbox,
     NewMaster,
     ParameterMismatch,
     ParametersMatch,

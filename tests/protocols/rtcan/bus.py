@@ -9,18 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from r2p.codecs import can_bits
 from r2p.codecs.can_bits import INTERMISSION
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import (
-    Action,
-    Due,
-    EngineSettings,
-    Mailbox,
-    Outcome,
-    Ready,
-    Received,
-    Transmit,
-    Withdraw,
-)
+from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Ready, Received
 from r2p.units import NEVER
 
 if TYPE_CHECKING:

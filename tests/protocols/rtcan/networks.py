@@ -4,8 +4,9 @@ from typing import Any
 
 from r2p.codecs import rtcan
 from r2p.codecs.rtcan import Frame
+from r2p.protocols.can_orders import Outcome, Transmit
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Due, EngineSettings, Outcome, Profile, Transmit
+from r2p.protocols.rtcan.events import Due, EngineSettings, Profile
 from tests.protocols.rtcan.bus import SECOND, Bus, Node
 
 CYCLE = 9_960_000

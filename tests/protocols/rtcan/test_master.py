@@ -4,20 +4,9 @@ import pytest
 
 from r2p.codecs import can_bits, management, rtcan
 from r2p.codecs.rtcan import Frame
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import (
-    EngineSettings,
-    LostSync,
-    Mailbox,
-    NewMaster,
-    Outcome,
-    Profile,
-    Ready,
-    SlotsGranted,
-    SlotsLost,
-    Transmit,
-    Withdraw,
-)
+from r2p.protocols.rtcan.events import EngineSettings, LostSync, NewMaster, Profile, Ready, SlotsGranted, SlotsLost
 from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node
 from tests.protocols.rtcan.networks import (

@@ -6,21 +6,19 @@ import pytest
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import Frame
+from r2p.protocols.can_orders import Mailbox, Outcome, Withdraw
 from r2p.protocols.rtcan.events import (
     Action,
     Done,
     Fate,
     IdConflict,
     LostSync,
-    Mailbox,
     NewMaster,
-    Outcome,
     ParameterMismatch,
     ParametersMatch,
     Ready,
     SlotsGranted,
     SlotsLost,
-    Withdraw,
 )
 from r2p.protocols.rtcan.master import Role
 from tests.protocols.rtcan.bus import MS, SECOND, Bus, Node

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from r2p.codecs import can_bits, rtcan
 from r2p.codecs.rtcan import Frame
 from r2p.errors import MessageError
-from r2p.protocols.rtcan.events import Mailbox, Received
+from r2p.protocols.can_orders import Mailbox
+from r2p.protocols.rtcan.events import Received
 from r2p.protocols.rtcan.reassembly import TIMEOUT, Reassembly
 from r2p.units import NEVER
 from tests.can_vectors import CanCase, arriving, can_cases

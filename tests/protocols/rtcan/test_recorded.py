@@ -6,9 +6,10 @@ import pytest
 
 from r2p.codecs import can_bits, rtcan
 from r2p.codecs.rtcan import Frame
+from r2p.protocols.can_orders import Outcome, Transmit
 from r2p.protocols.rtcan.calendar import Reservation
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Outcome, Profile, Transmit
+from r2p.protocols.rtcan.events import Action, Due, EngineSettings, Profile
 from r2p.protocols.rtcan.leases import PeriodicMessage
 from r2p.protocols.rtcan.master import Role
 from tests.can_vectors import CanCase, arriving, can_cases, payload

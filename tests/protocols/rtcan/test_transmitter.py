@@ -6,8 +6,9 @@ import pytest
 
 from r2p.codecs import can_bits, rtcan
 from r2p.errors import MessageError
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import Done, EngineSettings, Fate, Mailbox, Outcome, Received, Transmit
+from r2p.protocols.rtcan.events import Done, EngineSettings, Fate, Received
 from tests.protocols.rtcan.bus import MS, Bus
 from tests.protocols.rtcan.networks import (
     SLOT,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from r2p.codecs.rtcan import Frame
-from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit
+from r2p.codecs.can_bits import Frame
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit
 from r2p.transports.can.port import RETRY_INTERVAL, TxMailboxes
 from r2p.units import NEVER
 

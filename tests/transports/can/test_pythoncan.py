@@ -10,9 +10,9 @@ from unittest.mock import Mock
 import can
 import pytest
 
-from r2p.codecs.rtcan import Frame, OtherFrame
+from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.errors import TransportError
-from r2p.protocols.rtcan.events import Mailbox, Outcome, Transmit, Withdraw
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.transports.can import pythoncan
 from r2p.transports.can.pythoncan import PythonCanPort
 from r2p.transports.rtcan.transport import INTERFACES

@@ -10,19 +10,9 @@ from r2p.clock import Alarm
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import Alive
 from r2p.codecs.rtcan import Frame
+from r2p.protocols.can_orders import Mailbox, Outcome, Transmit, Withdraw
 from r2p.protocols.rtcan.engine import Engine
-from r2p.protocols.rtcan.events import (
-    Action,
-    Done,
-    EngineSettings,
-    Fate,
-    Mailbox,
-    Outcome,
-    Profile,
-    Ready,
-    Transmit,
-    Withdraw,
-)
+from r2p.protocols.rtcan.events import Action, Done, EngineSettings, Fate, Profile, Ready
 from r2p.runtime.sample import PublisherClass
 from r2p.transports.can.port import CanPort, PortAlarm
 from r2p.transports.rtcan.driver import EngineDriver
