@@ -17,9 +17,11 @@ from r2p.units import MILLISECOND
 Relayed = management.Hello | management.Alive | management.Endpoint
 """What a gateway passes on of other modules."""
 
+_KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}
+
 
 class LocalTopic(msgspec.Struct, frozen=True):
-    """A topic that this module publishes (`params` are the transport's) or subscribes to (with a `queue`)."""
+    """A topic that this module publishes (`params` are the transport's), or subscribes to with a `queue`."""
 
     type: TopicType
     params: bytes = NO_PARAMS
@@ -49,8 +51,8 @@ class Announcer:
         self.instance = instance
         self.flags = 0
         self.r2p = False
-        self.publishers: dict[str, LocalTopic] = {}
-        self.subscribers: dict[str, LocalTopic] = {}
+        self.topics: dict[int, dict[str, LocalTopic]] = {ROLE_PUBLISHES: {}, ROLE_SUBSCRIBES: {}}
+        """What the module publishes and subscribes to, by ROLE_... and name."""
         self.publisher_counts: Counter[str] = Counter()
         """How many peers publish each of the subscribed topics to this module; those that none does are missing."""
         self.subscriber_counts: Counter[str] = Counter()
@@ -64,22 +66,22 @@ class Announcer:
 
     # What the module has
 
-    def publish(self, topic: str, own: LocalTopic) -> bool:
-        """Announce a publisher of the topic. Returns whether it is new, or has changed."""
-        return self._enter(self.publishers, ItemKind.PUBLISHER, topic, own)
+    def set_topic(self, topic: str, role: int, own: LocalTopic) -> bool:
+        """Announce that the module publishes or subscribes to a topic; return whether that is new, or has changed."""
+        if self.topics[role].get(topic) == own:
+            return False
+        self.topics[role][topic] = own
+        self._add(_KIND_OF_ROLE[role], topic)
+        return True
 
-    def withdraw(self, topic: str) -> bool:
-        return self._remove(self.publishers, ItemKind.PUBLISHER, topic)
-
-    def subscribe(self, topic: str, own: LocalTopic) -> bool:
-        """Announce a subscriber of the topic. Returns whether it is new, or has changed."""
-        return self._enter(self.subscribers, ItemKind.SUBSCRIBER, topic, own)
-
-    def unsubscribe(self, topic: str) -> bool:
-        was_there = self._remove(self.subscribers, ItemKind.SUBSCRIBER, topic)
-        if was_there and self.r2p:  # firmware has no such message: it goes on sending
+    def remove_topic(self, topic: str, role: int) -> bool:
+        """Stop announcing that; return whether it was announced."""
+        if self.topics[role].pop(topic, None) is None:
+            return False
+        self._drop(_KIND_OF_ROLE[role], topic)
+        if role == ROLE_SUBSCRIBES and self.r2p:  # firmware has no such message: it goes on sending
             self.announce_once(ItemKind.UNSUBSCRIBE, topic)
-        return was_there
+        return True
 
     def add_endpoint(self, node: str, topic: str, role: int, publisher_class: int) -> None:
         key = (node, topic, role)
@@ -103,7 +105,7 @@ class Announcer:
 
     def advertise_again(self, topic: str) -> None:
         """Repeat the advertisement of a topic as soon as the rate allows."""
-        if topic in self.publishers:
+        if topic in self.topics[ROLE_PUBLISHES]:
             self._add(ItemKind.PUBLISHER, topic)
 
     def repeat_all(self, now: int, *, tool: bool) -> None:
@@ -174,10 +176,10 @@ class Announcer:
     def _messages(self, item: Item) -> list[management.Management]:
         match item.kind, item.key:
             case ItemKind.PUBLISHER, (str(topic),):
-                own = self.publishers[topic]
+                own = self.topics[ROLE_PUBLISHES][topic]
                 return self._with_type(own, topic, ROLE_PUBLISHES, [self._advertisement(topic, own)])
             case ItemKind.SUBSCRIBER, (str(topic),):
-                own = self.subscribers[topic]
+                own = self.topics[ROLE_SUBSCRIBES][topic]
                 return self._with_type(own, topic, ROLE_SUBSCRIBES, self.requests(topic, own))
             case ItemKind.UNSUBSCRIBE, (str(topic),):
                 return [management.Unsubscribe(topic, self.instance)]
@@ -203,19 +205,6 @@ class Announcer:
         return [hello] if self._observer else [hello, management.Alive(self.module, self.flags)]
 
     # The schedule
-
-    def _enter(self, table: dict[str, LocalTopic], kind: ItemKind, topic: str, own: LocalTopic) -> bool:
-        if table.get(topic) == own:
-            return False
-        table[topic] = own
-        self._add(kind, topic)
-        return True
-
-    def _remove(self, table: dict[str, LocalTopic], kind: ItemKind, topic: str) -> bool:
-        if table.pop(topic, None) is None:
-            return False
-        self._drop(kind, topic)
-        return True
 
     def _add(self, kind: ItemKind, *key: str | int) -> None:
         self._schedule.add(Item(kind, key))

@@ -347,6 +347,11 @@ def _bound(table: dict[str, Any], most: int) -> None:
         del table[next(iter(table))]
 
 
+def counterpart(role: int) -> int:
+    """Return the role at the other end of a topic."""
+    return ROLE_SUBSCRIBES if role == ROLE_PUBLISHES else ROLE_PUBLISHES
+
+
 def decrement(counter: Counter[K], key: K) -> bool:
     """Count one less of a key, which goes with the last one; return whether this was the last one."""
     counter[key] -= 1

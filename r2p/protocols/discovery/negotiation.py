@@ -17,7 +17,7 @@ import msgspec
 from r2p.codecs import management
 from r2p.codecs.management import ANSWERED, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic
-from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, decrement
+from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, counterpart, decrement
 from r2p.protocols.discovery.events import (
     Mismatched,
     ModuleInfo,
@@ -114,7 +114,7 @@ class SubscriptionNegotiation:
         """ADVERTISE, of a publisher: request its messages if this module subscribes to the topic."""
         topic = message.topic
         self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
-        own = self._own.subscribers.get(topic)
+        own = self._own.topics[ROLE_SUBSCRIBES].get(topic)
         peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
             return
@@ -127,7 +127,7 @@ class SubscriptionNegotiation:
         """SUBSCRIBE_REQUEST, of a subscriber: respond, and attach it if it is new. The size in it decides nothing."""
         topic = message.topic
         self._directory.add_type(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
-        own = self._own.publishers.get(topic)
+        own = self._own.topics[ROLE_PUBLISHES].get(topic)
         peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
             return
@@ -138,7 +138,7 @@ class SubscriptionNegotiation:
     def responded(self, now: int, message: management.SubscribeResponse, source: PeerAddress) -> None:
         """SUBSCRIBE_RESPONSE, of a publisher that will send: accept its messages."""
         topic = message.topic
-        peer = self._get_or_create(source) if topic in self._own.subscribers else None
+        peer = self._get_or_create(source) if topic in self._own.topics[ROLE_SUBSCRIBES] else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, message)):
             return
         self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size))
@@ -231,19 +231,13 @@ class SubscriptionNegotiation:
             if theirs is not None:
                 self._fits(peer, topic, role, theirs)
 
-    def withdrawn(self, topic: str) -> None:
-        """End all remote subscriptions of a topic that this module no longer publishes."""
-        self._requests.forget(topic)
+    def topic_removed(self, topic: str, role: int) -> None:
+        """End what flowed of a topic that this module no longer publishes or subscribes to."""
+        theirs = counterpart(role)
+        (self._requests if theirs == ROLE_SUBSCRIBES else self._offers).forget(topic)
         for peer in list(self._peers.values()):
-            self._remove_subscriber(peer, topic)
-            peer.forget_type(topic, ROLE_SUBSCRIBES)
-
-    def subscription_ended(self, topic: str) -> None:
-        """Stop accepting messages of a topic that this module no longer subscribes to."""
-        self._offers.forget(topic)
-        for peer in list(self._peers.values()):
-            self._remove_publisher(peer, topic)
-            peer.forget_type(topic, ROLE_PUBLISHES)
+            self._end(peer, topic, theirs)
+            peer.forget_type(topic, theirs)
 
     # Changes of the peers
 
@@ -345,7 +339,7 @@ class SubscriptionNegotiation:
 
     def _counterpart(self, role: int) -> dict[str, LocalTopic]:
         """This module's topics in the opposite role of a peer."""
-        return {ROLE_PUBLISHES: self._own.subscribers, ROLE_SUBSCRIBES: self._own.publishers}.get(role, {})
+        return self._own.topics[counterpart(role)] if role in self._own.topics else {}
 
     def _fits(self, peer: Peer, topic: str, role: int, theirs: TopicType) -> bool:
         """Whether a peer's type fits this module's. If not, nothing flows, and it is reported once."""
@@ -358,10 +352,7 @@ class SubscriptionNegotiation:
         if peer.mismatched.get((topic, role)) != theirs:
             peer.mismatched[topic, role] = theirs
             self._outbox.emit(Mismatched(topic, peer.source, role, ours, theirs))
-        if role == ROLE_SUBSCRIBES:
-            self._remove_subscriber(peer, topic)
-        else:
-            self._remove_publisher(peer, topic)
+        self._end(peer, topic, role)
         return False
 
     def _add_subscriber(self, now: int, peer: Peer, topic: str, *, unanswered: bool) -> bool:
@@ -401,6 +392,13 @@ class SubscriptionNegotiation:
         peer.permanent.discard(topic)
         if peer.lease is not None:  # else the end of its module ends it
             self._timers.set(key, now + peer.lease)
+
+    def _end(self, peer: Peer, topic: str, role: int) -> None:
+        """End what flows to or from a peer in this role."""
+        if role == ROLE_SUBSCRIBES:
+            self._remove_subscriber(peer, topic)
+        else:
+            self._remove_publisher(peer, topic)
 
     def _remove_subscriber(self, peer: Peer, topic: str) -> None:
         self._requests.remove(peer.source, topic)  # an answer that is due would attach it again

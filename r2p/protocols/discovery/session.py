@@ -21,7 +21,15 @@ from r2p.codecs.management import ANY_TYPE, NO_PARAMS, QUEUE, ROLE_PUBLISHES, RO
 from r2p.errors import DecodeError
 from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic, Relayed
-from r2p.protocols.discovery.directory import Demand, Directory, EndpointInfo, EndpointKey, LeasedDemand, TopicInfo
+from r2p.protocols.discovery.directory import (
+    Demand,
+    Directory,
+    EndpointInfo,
+    EndpointKey,
+    LeasedDemand,
+    TopicInfo,
+    counterpart,
+)
 from r2p.protocols.discovery.events import (
     COMMAND_OF_TYPE,
     MESSAGE_OF_COMMAND,
@@ -96,27 +104,29 @@ class DiscoveryProtocol(ABC):
     def set_flags(self, now: int, flags: int) -> list[Event]:
         """Announce a new state of this module at once: FLAG_... of ALIVE."""
 
-    @abstractmethod
     def advertise(
         self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
     ) -> list[Event]:
         """Publish a topic: messages of `size` bytes (0: not known yet). `params` are the transport's."""
+        return self._set_topic(now, topic, ROLE_PUBLISHES, LocalTopic(TopicType(size, fingerprint), params))
 
-    @abstractmethod
     def withdraw(self, now: int, topic: str) -> list[Event]:
         """End the publication of a topic: its remote subscribers are gone."""
+        return self._remove_topic(now, topic, ROLE_PUBLISHES)
 
-    @abstractmethod
     def subscribe(
         self, now: int, topic: str, size: int = 0, queue: int = QUEUE, fingerprint: bytes = ANY_TYPE
     ) -> list[Event]:
-        """Subscribe to a topic; size 0 and no fingerprint take every type. `queue`: how many messages a publisher may
-        have on the way to this module.
-        """
+        """Subscribe to a topic; size 0 and no fingerprint take every type.
 
-    @abstractmethod
+        `queue`: how many messages a publisher may have on the way to this module. Management messages bound it by what
+        firmware has memory for (`queue_length`); for tokens 0 is any number, as the module would rather lose some.
+        """
+        return self._set_topic(now, topic, ROLE_SUBSCRIBES, LocalTopic(TopicType(size, fingerprint), queue=queue))
+
     def unsubscribe(self, now: int, topic: str) -> list[Event]:
         """End the subscription of a topic: its remote publishers are gone."""
+        return self._remove_topic(now, topic, ROLE_SUBSCRIBES)
 
     @abstractmethod
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
@@ -170,6 +180,14 @@ class DiscoveryProtocol(ABC):
     @abstractmethod
     def receive(self, now: int, data: bytes, source: PeerAddress = None) -> list[Event]:
         """Handle a management message from `source`. Bad bytes are counted, and raise nothing."""
+
+    @abstractmethod
+    def _set_topic(self, now: int, topic: str, role: int, own: LocalTopic) -> list[Event]:
+        """Announce that this module publishes or subscribes to a topic."""
+
+    @abstractmethod
+    def _remove_topic(self, now: int, topic: str, role: int) -> list[Event]:
+        """Stop announcing that."""
 
     def _decode(self, decode: Callable[[D], M], data: D) -> M | None:
         """Decode a message or a token; None for one that is counted."""
@@ -261,36 +279,18 @@ class Discovery(DiscoveryProtocol):
             self._announcer.announce_once(ItemKind.PRESENCE)
         return self._flush(now)
 
-    def advertise(
-        self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
-    ) -> list[Event]:
-        if self._announcer.publish(topic, LocalTopic(TopicType(size, fingerprint), params)):
-            self._negotiation.type_changed(topic, ROLE_SUBSCRIBES)
-            # Those who asked before there was a publisher need not ask again.
-            for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES) if self._demand is not None else ():
-                self._negotiation.requested(now, management.SubscribeRequest(topic, size, 1), source)
+    def _set_topic(self, now: int, topic: str, role: int, own: LocalTopic) -> list[Event]:
+        if self._announcer.set_topic(topic, role, own):
+            self._negotiation.type_changed(topic, counterpart(role))
+            if role == ROLE_PUBLISHES and self._demand is not None:
+                # Those who asked before there was a publisher need not ask again.
+                for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES):
+                    self._negotiation.requested(now, management.SubscribeRequest(topic, own.type.size, 1), source)
         return self._flush(now)
 
-    def withdraw(self, now: int, topic: str) -> list[Event]:
-        if self._announcer.withdraw(topic):
-            self._negotiation.withdrawn(topic)
-        return self._flush(now)
-
-    def subscribe(
-        self, now: int, topic: str, size: int = 0, queue: int = QUEUE, fingerprint: bytes = ANY_TYPE
-    ) -> list[Event]:
-        """Subscribe to a topic. Size 0 and no fingerprint take every type; nothing is requested before a size is known.
-
-        `queue`: messages that a publisher may have to keep, bounded by what firmware has memory for (`queue_length`).
-        """
-        own = LocalTopic(TopicType(size, fingerprint), queue=queue)
-        if self._announcer.subscribe(topic, own):
-            self._negotiation.type_changed(topic, ROLE_PUBLISHES)
-        return self._flush(now)
-
-    def unsubscribe(self, now: int, topic: str) -> list[Event]:
-        if self._announcer.unsubscribe(topic):
-            self._negotiation.subscription_ended(topic)
+    def _remove_topic(self, now: int, topic: str, role: int) -> list[Event]:
+        if self._announcer.remove_topic(topic, role):
+            self._negotiation.topic_removed(topic, role)
         return self._flush(now)
 
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:

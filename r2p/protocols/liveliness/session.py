@@ -12,9 +12,8 @@ import msgspec
 
 from r2p.codecs import liveliness, management
 from r2p.codecs.liveliness import ModuleToken, TopicToken
-from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.names import module_alias
-from r2p.protocols.discovery.announcer import Relayed
+from r2p.protocols.discovery.announcer import LocalTopic, Relayed
 from r2p.protocols.discovery.directory import TABLE_MAX, Aliases, Demand
 from r2p.protocols.discovery.events import (
     Event,
@@ -22,11 +21,10 @@ from r2p.protocols.discovery.events import (
     NameConflict,
     PeerAddress,
     QueryTokens,
-    TopicType,
 )
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.protocols.liveliness.modules import ModuleRegistry
-from r2p.protocols.liveliness.tokens import DeclaredTopic, Matching, TokenSet
+from r2p.protocols.liveliness.tokens import Matching, TokenSet
 from r2p.units import SECOND
 
 TOKENS_MAX = 4 * TABLE_MAX
@@ -71,23 +69,6 @@ class LivelinessDiscovery(DiscoveryProtocol):
             self.flags = flags
             self._own.set_flags(flags)
         return self._outbox.drain()
-
-    def advertise(
-        self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
-    ) -> list[Event]:
-        return self._set_topic(topic, ROLE_PUBLISHES, DeclaredTopic(TopicType(size, fingerprint)))
-
-    def withdraw(self, now: int, topic: str) -> list[Event]:
-        return self._remove_topic(topic, ROLE_PUBLISHES)
-
-    def subscribe(
-        self, now: int, topic: str, size: int = 0, queue: int = 16, fingerprint: bytes = ANY_TYPE
-    ) -> list[Event]:
-        """`queue` 0: any number of messages may be on the way, as the module would rather lose some."""
-        return self._set_topic(topic, ROLE_SUBSCRIBES, DeclaredTopic(TopicType(size, fingerprint), queue))
-
-    def unsubscribe(self, now: int, topic: str) -> list[Event]:
-        return self._remove_topic(topic, ROLE_SUBSCRIBES)
 
     def add_endpoint(self, now: int, node: str, topic: str, role: int, publisher_class: int = 0) -> list[Event]:
         self._own.add_node(topic, role, node, publisher_class)
@@ -242,13 +223,13 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
     # Topics
 
-    def _set_topic(self, topic: str, role: int, own: DeclaredTopic) -> list[Event]:
+    def _set_topic(self, now: int, topic: str, role: int, own: LocalTopic) -> list[Event]:
         if self._own.get(topic, role) != own:
             self._own.set_topic(topic, role, own)
             self._matching.changed(topic, role)
         return self._outbox.drain()
 
-    def _remove_topic(self, topic: str, role: int) -> list[Event]:
+    def _remove_topic(self, now: int, topic: str, role: int) -> list[Event]:
         self._own.remove_topic(topic, role)
         self._matching.changed(topic, role)
         return self._outbox.drain()

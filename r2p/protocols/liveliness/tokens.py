@@ -15,7 +15,8 @@ import msgspec
 from r2p.codecs import liveliness
 from r2p.codecs.liveliness import ModuleToken, TopicToken
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.protocols.discovery.directory import Demand, TopicInfo, decrement
+from r2p.protocols.discovery.announcer import LocalTopic
+from r2p.protocols.discovery.directory import Demand, TopicInfo, counterpart, decrement
 from r2p.protocols.discovery.events import (
     Declare,
     Mismatched,
@@ -36,13 +37,6 @@ _MODULE: TopicRole = ("", 0)  # stands for the token of the module itself, where
 _RELAYED: TopicRole = ("", -1)  # ... and for all that is relayed
 
 
-class DeclaredTopic(msgspec.Struct, frozen=True):
-    """A topic that this module publishes, or subscribes to (`window` messages may be on the way; 0: any number)."""
-
-    type: TopicType
-    window: int = 0
-
-
 class TokenSet:
     """The tokens of one module."""
 
@@ -51,7 +45,7 @@ class TokenSet:
         self._module = module
         self._instance = instance
         self._observer = observer
-        self._topics: dict[TopicRole, DeclaredTopic] = {}
+        self._topics: dict[TopicRole, LocalTopic] = {}
         self._nodes: dict[TopicRole, dict[str, int]] = {}
         self._relayed: dict[tuple[str | int, ...], liveliness.Token] = {}
         self._declared: dict[TopicRole, set[str]] = {}
@@ -63,14 +57,14 @@ class TokenSet:
         """Whether something has changed since `pop_changes` was called."""
         return bool(self._dirty)
 
-    def get(self, topic: str, role: int) -> DeclaredTopic | None:
+    def get(self, topic: str, role: int) -> LocalTopic | None:
         return self._topics.get((topic, role))
 
     def set_flags(self, flags: int) -> None:
         self._flags = flags
         self._dirty.add(_MODULE)
 
-    def set_topic(self, topic: str, role: int, own: DeclaredTopic) -> None:
+    def set_topic(self, topic: str, role: int, own: LocalTopic) -> None:
         """Declare that the module publishes or subscribes to a topic."""
         self._topics[topic, role] = own
         self._dirty.add((topic, role))
@@ -136,14 +130,14 @@ class TokenSet:
         nodes = self._nodes.get(key) or {"": 0}
         return {self._token(key, own, node, publisher_class) for node, publisher_class in nodes.items()}
 
-    def _token(self, key: TopicRole, own: DeclaredTopic, node: str, publisher_class: int) -> str:
+    def _token(self, key: TopicRole, own: LocalTopic, node: str, publisher_class: int) -> str:
         topic, role = key
         size, fingerprint = own.type.size, own.type.fingerprint
-        return liveliness.encode(
-            TopicToken(
-                self._instance, role, topic, self._instance, node, publisher_class, size, fingerprint, own.window
-            )
+        window = own.queue if role == ROLE_SUBSCRIBES else 0
+        token = TopicToken(
+            self._instance, role, topic, self._instance, node, publisher_class, size, fingerprint, window
         )
+        return liveliness.encode(token)
 
 
 class _PeerSession(msgspec.Struct):
@@ -202,7 +196,7 @@ class Matching:
 
     def changed(self, topic: str, role: int) -> None:
         """Match a topic anew that this module begins or ceases to have in this role, or has with another type."""
-        theirs = topic, _counterpart(role)
+        theirs = topic, counterpart(role)
         for number, session in list(self._sessions_of.get(theirs, {}).items()):
             self._clear_mismatch(session, theirs)
             self._match(number, session, theirs)
@@ -215,7 +209,7 @@ class Matching:
     def _match(self, number: int, session: _PeerSession, key: TopicRole) -> None:
         topic, role = key
         tokens = session.tokens.get(key)
-        own = self._own.get(topic, _counterpart(role))
+        own = self._own.get(topic, counterpart(role))
         if not tokens or own is None:
             self._clear_mismatch(session, key)
             self._end(number, session, key)
@@ -268,7 +262,7 @@ class Matching:
 
     def _remove_role(self, topic: str, role: int) -> None:
         """Forget the role of a topic that has lost its last token, and the topic without the other role."""
-        if (topic, _counterpart(role)) not in self._sessions_of:
+        if (topic, counterpart(role)) not in self._sessions_of:
             del self.topics[topic]
         else:
             self.topics[topic].set_heard(role, None)
@@ -286,8 +280,3 @@ def _detail(tokens: dict[str, TopicToken], role: int) -> int:
     if role == ROLE_PUBLISHES:
         return _type_of(tokens).size
     return max(each.window for each in tokens.values())
-
-
-def _counterpart(role: int) -> int:
-    """Return the role at the other end of a topic."""
-    return ROLE_SUBSCRIBES if role == ROLE_PUBLISHES else ROLE_PUBLISHES
