@@ -135,8 +135,9 @@ class Directory:
         return self._names.get(instance, "")
 
     def lease_of(self, source: PeerAddress) -> int | None:
-        """The longest lease of the r2p modules directly at an address; None where there are none."""
-        return max(self._leases.get(source, ()), default=None)
+        """The longest lease of the r2p modules directly at an address; None where there are none, or it never ends."""
+        lease = max(self._leases.get(source, ()), default=FOR_EVER)
+        return lease if lease < FOR_EVER else None
 
     def is_alone(self, source: PeerAddress, instance: int) -> bool:
         """Whether no other module than this one is known directly at an address."""
@@ -262,10 +263,6 @@ class Directory:
         if self.endpoints.pop(key, None) is not None:
             self.generation += 1
             self._drop_endpoint(key)
-
-    def forget_endpoints(self) -> None:
-        for key in list(self.endpoints):
-            self.forget_endpoint(key)
 
     def _drop_endpoint(self, key: EndpointKey) -> None:
         """Forget what belongs to an endpoint that has left the table."""
@@ -421,9 +418,9 @@ class LeasedDemand(Demand):
     It uses the timers of its discovery, with keys that begin with "demand".
     """
 
-    def __init__(self, timers: KeyedTimers, directory: Directory) -> None:
+    def __init__(self, directory: Directory) -> None:
         super().__init__()
-        self._timers = timers
+        self._timers = directory.timers
         self._directory = directory
         self._permanent: dict[PeerAddress, dict[_TopicRole, None]] = {}
         """Entries without a lease, by source."""
@@ -461,7 +458,8 @@ class LeasedDemand(Demand):
                     self.expired(topic, role, source)
 
     def _enter(self, now: int, topic: str, role: int, source: PeerAddress) -> None:
-        lease = self._lease(source)  # None also while an r2p module's HELLO has not come: see `_start_leases`
+        # None also while the HELLO of an r2p module has not come: see `_start_leases`.
+        lease = self._directory.lease_of(source)
         if not self.add(topic, role, source):
             return
         if lease is not None:
@@ -471,12 +469,8 @@ class LeasedDemand(Demand):
             self._permanent.setdefault(source, {})[topic, role] = None
 
     def _start_leases(self, now: int, source: PeerAddress) -> None:
-        """What a module said before its first HELLO is a lease, too."""
-        lease = self._lease(source) if source in self._permanent else None
+        """Make a lease of what a module said before its first HELLO, too."""
+        lease = self._directory.lease_of(source) if source in self._permanent else None
         if lease is not None:
             for topic, role in self._permanent.pop(source):
                 self._timers.set(("demand", topic, role, source), now + lease)
-
-    def _lease(self, source: PeerAddress) -> int | None:
-        lease = self._directory.lease_of(source)
-        return lease if lease is not None and lease < FOR_EVER else None

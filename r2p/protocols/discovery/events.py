@@ -86,8 +86,9 @@ class Send(msgspec.Struct, frozen=True):
 
 
 class SubscriberJoined(msgspec.Struct, frozen=True):
-    """A remote subscriber is new, or is back after a restart. Attach the topic to this link if it is not attached yet,
-    and send its latched value; `queue` is the length that the subscriber asked for.
+    """A remote subscriber is new, or back after a restart: attach the topic to this link, and send its latched value.
+
+    `queue` is the length that the subscriber asked for.
     """
 
     topic: str
@@ -103,9 +104,9 @@ class SubscribersGone(msgspec.Struct, frozen=True):
 
 
 class SubscriberLeft(msgspec.Struct, frozen=True):
-    """One remote subscriber gets no more messages; `SubscribersGone` follows the last one. Only where the link can tell
-    subscribers apart. `gone`: the subscriber has ended; else it still subscribes, and this module publishes no more, or
-    another type.
+    """One remote subscriber of a topic has left; `SubscribersGone` follows the last. Only where links tell them apart.
+
+    `gone`: the subscriber has ended; else it still subscribes, and this module publishes it no longer, or otherwise.
     """
 
     topic: str
@@ -123,7 +124,7 @@ class PublisherFound(msgspec.Struct, frozen=True):
 
 
 class PublisherGone(msgspec.Struct, frozen=True):
-    """A remote publisher is gone, or has a type that does not fit: accept no more messages from it."""
+    """A remote publisher is gone, or has a type that does not fit: stop accepting messages from it."""
 
     topic: str
     source: PeerAddress

@@ -120,7 +120,8 @@ class PeerLiveness:
 
     def link_down(self, now: int) -> None:
         """Remove all r2p modules."""
-        self._directory.forget_endpoints()
+        for key in list(self._directory.endpoints):
+            self._directory.forget_endpoint(key)
         self._echoing_until = 0
         for info in [info for info in self._directory.modules.values() if info.r2p]:
             self._remove(now, info)

@@ -268,7 +268,7 @@ class Discovery(DiscoveryProtocol):
     def demand(self) -> Demand:
         """What the other modules publish and subscribe to. It is kept from the first call on."""
         if self._demand is None:
-            self._demand = LeasedDemand(self._timers, self._directory)
+            self._demand = LeasedDemand(self._directory)
         return self._demand
 
     # What this module has
