@@ -12,6 +12,7 @@ They are forwarded if it may forward afterwards.
 import functools
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator
+from typing import TYPE_CHECKING
 
 from r2p.bridge.options import RelayedPeriodic, Shaper
 from r2p.log_lines import LineLimit
@@ -22,6 +23,9 @@ from r2p.runtime.sample import DuplicateFilter, LastReceived, PublisherClass, Sa
 from r2p.runtime.topic import RemoteSubscriber, SlotPublisher, Topic
 from r2p.transports.link import Link
 from r2p.units import LONG_AGO
+
+if TYPE_CHECKING:
+    from r2p.protocols.discovery.events import TopicType
 
 HOPS_MAX = 15
 """Gateways that a message crosses at most: the last defence against loops where messages carry hops."""
@@ -48,6 +52,10 @@ class BridgePort:
         """As it was reported last."""
         self.dropped: Counter[str] = Counter()
         """Messages that came in, or were published here, while nothing was forwarded."""
+        self.announced_types: dict[str, tuple[TopicType, TopicType]] = {}
+        """Those with which the link publishes and subscribes to forwarded topics, by canonical name. Kept here, as
+        clients come and go under new names: what another table had of them would stay.
+        """
         self.demand = link.discovery.demand()
         self.denied_at = LONG_AGO
         """When it was answered last that an order does not pass (monotonic ns)."""

@@ -49,8 +49,6 @@ class RoutingTable:
         self._reviewing = False
         self._idle: set[str] = set()
         """Topics that are published or subscribed, and may go nowhere as long as no other link comes."""
-        self._announced: dict[tuple[str, str], _Types] = {}
-        """The types that are announced, by topic and link."""
         self._known: dict[tuple[str, int], list[tuple[BridgePort, TopicType]]] | None = None
         """What `_known_types` found, while all links are asked about the same topics one after the other."""
         self._too_long: dict[str, None] = {}
@@ -82,14 +80,15 @@ class RoutingTable:
         """See whether other types, or sizes, are known than those that are announced."""
         self._known = {}
         try:
-            changed = {topic for (topic, link), types in self._announced.items() if self._differs(topic, link, types)}
+            changed = {
+                topic
+                for port in self._ports.values()
+                for topic, types in port.announced_types.items()
+                if topic in self.by_name and self._types(topic, port) != types
+            }
         finally:
             self._known = None
         self._review_all(changed)
-
-    def _differs(self, topic: str, link: str, types: _Types) -> bool:
-        port = self._ports.get(link)
-        return port is not None and topic in self.by_name and self._types(topic, port) != types
 
     def _review_all(self, topics: Iterable[str]) -> None:
         """Look at these anew, at once: what comes in next may need a new route."""
@@ -230,9 +229,9 @@ class RoutingTable:
     def _announce_on(self, topic: str, port: BridgePort, ended: dict[str, BridgedTopic] | None = None) -> None:
         here = (ended or self._space.topics).get(self._policy.to_link_name(topic, port.name))
         if ended is not None:
-            self._announced.pop((topic, port.name), None)
+            port.announced_types.pop(topic, None)
         elif here is not None:
-            self._announced[topic, port.name] = self._types(topic, port)
+            port.announced_types[topic] = self._types(topic, port)
         if here is not None:
             port.link.stats.lost.guard(port.link.topic_changed, here)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import struct
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -12,8 +14,14 @@ import r2p
 from r2p.codecs import management
 from r2p.msg import Led
 from r2p.testing.network import node_in
+from r2p.transports.line import LineLink
 from tests.bridge.test_bridge import CONVERGED, Tap, drain, gateway, node
 from tests.transports.conversation import Script, line, manage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from r2p.transports.link import Hub
 
 pytestmark = pytest.mark.virtual_time
 
@@ -57,6 +65,45 @@ async def test_more_clients_than_ports() -> None:
         await asyncio.sleep(0.1)
         assert [each.topics("leds") for each in (clients[0], clients[-1])] == [[Led(led=7).encode()]] * 2
         assert len(gw.links) == 301
+
+
+class Visitors(Client):
+    """Clients that come one after the other, each on a link with a name of its own."""
+
+    async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
+        self.hub = hub
+        opened()
+        await asyncio.get_running_loop().create_future()
+
+    async def visit(self, number: int) -> None:
+        client = Client()
+        client.link = link = LineLink(f"tcp:127.0.0.1:{number}", self.hub)
+        link.admits_gateways = False
+        self.hub.attach(link)
+        link.connect(client)
+        client.hear(manage(management.SubscribeRequest("leds", 5, 5)))
+        await asyncio.sleep(1)
+        link.close()
+        self.hub.detach(link)
+
+
+async def test_a_client_that_left_leaves_nothing_behind(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.CRITICAL, "r2p")  # pytest keeps what is logged
+    visitors = Visitors()
+
+    async def objects_after(visits: range) -> int:
+        for number in visits:
+            await visitors.visit(number)
+        await asyncio.sleep(60)
+        gc.collect()
+        return len(gc.get_objects())
+
+    async with r2p.Module("GW", via=["memory:a", visitors], bridge=True) as gw, node("A", "a") as a:
+        a.advertise("leds", Led)
+        before = await objects_after(range(10_000, 10_100))
+        after = await objects_after(range(10_100, 10_400))
+        assert len(gw.links) == 1
+    assert after - before < 150  # half an object each; none but for timers and what the interpreter caches
 
 
 async def test_clients_reach_each_other_and_the_rest() -> None:
