@@ -226,10 +226,10 @@ class BusMonitor:
 
     # What the port calls (`CanPortListener`)
 
-    def received(self, frame: Frame, stamp: int) -> None:
+    def on_frame(self, frame: Frame, stamp: int) -> None:
         self._saw(self._monitor.frame(frame, stamp))
 
-    def other(self, frame: OtherFrame, stamp: int) -> None:
+    def on_other_frame(self, frame: OtherFrame, stamp: int) -> None:
         self._saw(self._monitor.other(frame, stamp))
 
     def _saw(self, seen: SeenFrame) -> None:
@@ -240,22 +240,22 @@ class BusMonitor:
             queue.append(seen)
             self._arrived.set()
 
-    def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+    def on_confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         pass  # nothing is sent, so nothing is confirmed
 
-    def up(self) -> None:
+    def on_up(self) -> None:
         self._waits_for = ""
         self._report(f"{self.via} is up")
 
-    def down(self, reason: str) -> None:
+    def on_down(self, reason: str) -> None:
         self._report(f"{self.via} is down: {reason}")
 
-    def waits(self, reason: str) -> None:
+    def on_waiting(self, reason: str) -> None:
         if reason != self._waits_for:  # each reason is reported once
             self._waits_for = reason
             self._report(f"{self.via}: {reason}; trying again")
 
-    def fault(self, kind: str) -> None:
+    def on_fault(self, kind: str) -> None:
         self._monitor.fault(kind)
 
     def internal_error(self, error: Exception) -> None:

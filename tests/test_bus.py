@@ -191,9 +191,9 @@ async def test_what_it_waits_for_is_reported_once() -> None:
     reported: list[str] = []
     async with BusMonitor(SimPort(SimCan(), CanNode("listener")), on_status=reported.append) as listener:
         for reason in ("no adapter", "no adapter", "no power"):
-            listener.waits(reason)
-        listener.up()
-        listener.waits("no power")
+            listener.on_waiting(reason)
+        listener.on_up()
+        listener.on_waiting("no power")
     assert reported == [
         "listener is up",
         "listener: no adapter; trying again",
@@ -237,7 +237,7 @@ class LatePort(CanPort):
         while True:
             for _ in range(8):  # as much as one turn of the loop reads
                 if stamp <= self.now():
-                    listener.received(frame, stamp)
+                    listener.on_frame(frame, stamp)
                     stamp += self.APART
             await asyncio.sleep(0.001)
 

@@ -114,7 +114,7 @@ class SimPort(CanPort):
     async def run(self, listener: CanPortListener, opened: Callable[[], object]) -> None:
         self._listener = listener
         controller = self.controller
-        controller.on_receive = listener.received
+        controller.on_receive = listener.on_frame
         controller.on_sent = self._sent
         controller.on_lost = self._lost
         controller.on_error = self._failed
@@ -125,7 +125,7 @@ class SimPort(CanPort):
                 self._goes_up()
             else:
                 controller.power_off()
-                listener.waits(_NO_POWER)
+                listener.on_waiting(_NO_POWER)
             opened()
             await asyncio.get_running_loop().create_future()
         finally:
@@ -173,23 +173,23 @@ class SimPort(CanPort):
 
     def _sent(self, frame: Frame, stamp: int) -> None:
         if self._listener is not None and self._up:
-            self._listener.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _SENT, stamp - self.receive_latency)
+            self._listener.on_confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _SENT, stamp - self.receive_latency)
 
     def _lost(self, frame: Frame, stamp: int) -> None:
         if self._listener is not None and self._up:
-            self._listener.confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _LOST, stamp)
+            self._listener.on_confirmed(_MAILBOXES[rtcan.laxity_of(frame.id)], _LOST, stamp)
 
     def _late(self, frame: Frame, stamp: int) -> None:
         self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], _LATE, stamp)
 
     def _failed(self, frame: Frame, kind: ErrorKind, stamp: int) -> None:
         if self._listener is not None and self._up:
-            self._listener.fault(kind.value)
+            self._listener.on_fault(kind.value)
         self._confirm(_MAILBOXES[rtcan.laxity_of(frame.id)], Outcome.ERROR, stamp)
 
     def _confirm(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         if self._listener is not None and self._up:
-            self._listener.confirmed(mailbox, outcome, at)
+            self._listener.on_confirmed(mailbox, outcome, at)
 
     def _state(self, state: ControllerState, _stamp: int) -> None:
         if state is ControllerState.BUS_OFF:
@@ -197,17 +197,17 @@ class SimPort(CanPort):
         elif state is ControllerState.ACTIVE:
             self._goes_up()
         elif self._listener is not None:
-            self._listener.fault(state.value)
+            self._listener.on_fault(state.value)
 
     def _goes_up(self) -> None:
         if self._listener is not None and not self._up:
             self._up = True
-            self._listener.up()
+            self._listener.on_up()
 
     def _goes_down(self, reason: str) -> None:
         if self._listener is not None and self._up:
             self._up = False
-            self._listener.down(reason)
+            self._listener.on_down(reason)
 
 
 class SimTransport(Transport):

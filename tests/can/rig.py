@@ -114,31 +114,31 @@ class RecordingListener:
         self.on_confirm: Callable[[], object] = lambda: None
         self._changed = asyncio.Event()
 
-    def received(self, frame: Frame, stamp: int) -> None:
+    def on_frame(self, frame: Frame, stamp: int) -> None:
         self.frames.append(frame)
         self.stamps.append(stamp)
         self._changed.set()
 
-    def other(self, frame: OtherFrame, stamp: int) -> None:
+    def on_other_frame(self, frame: OtherFrame, stamp: int) -> None:
         self.others.append(frame)
         self._changed.set()
 
-    def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+    def on_confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         self.outcomes.append((mailbox, outcome))
         self.instants.append(at)
         self.on_confirm()
         self._changed.set()
 
-    def up(self) -> None:
+    def on_up(self) -> None:
         self._note("up")
 
-    def down(self, reason: str) -> None:
+    def on_down(self, reason: str) -> None:
         self._note(f"down: {reason}")
 
-    def waits(self, reason: str) -> None:
+    def on_waiting(self, reason: str) -> None:
         self._note(f"waits: {reason}")
 
-    def fault(self, kind: str) -> None:
+    def on_fault(self, kind: str) -> None:
         self.faults.append(kind)
         self._changed.set()
 

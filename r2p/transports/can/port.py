@@ -30,28 +30,28 @@ RETRY_INTERVAL = 500_000
 class CanPortListener(Protocol):
     """The calls of a port, in the event loop, also from within `transmit` and `withdraw`. None of these raises."""
 
-    def received(self, frame: Frame, stamp: int) -> None:
+    def on_frame(self, frame: Frame, stamp: int) -> None:
         """Handle a frame of another node. `stamp` is the end of the frame plus `receive_latency`."""
 
-    def other(self, frame: OtherFrame, stamp: int) -> None:
+    def on_other_frame(self, frame: OtherFrame, stamp: int) -> None:
         """Handle a frame that RTCAN does not use. Called only while there are no filters."""
 
-    def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+    def on_confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         """Note that the frame in this mailbox is done, and the mailbox empty. `at` is the frame's end if it was SENT.
 
-        Called exactly once for each `transmit` while the port is up; `down` ends all of them without a call.
+        Called exactly once for each `transmit` while the port is up; `on_down` ends all of them without a call.
         """
 
-    def up(self) -> None:
+    def on_up(self) -> None:
         """Begin to use the bus."""
 
-    def down(self, reason: str) -> None:
+    def on_down(self, reason: str) -> None:
         """Stop using the bus: interface down or gone, or bus-off. No frame that is in a mailbox is sent later."""
 
-    def waits(self, reason: str) -> None:
+    def on_waiting(self, reason: str) -> None:
         """Report that the bus can't be used yet. The port goes on trying."""
 
-    def fault(self, kind: str) -> None:
+    def on_fault(self, kind: str) -> None:
         """Count a fault of the bus by its kind, such as what an error frame reports."""
 
     def internal_error(self, error: Exception) -> None:
@@ -134,7 +134,7 @@ class OpenInterface(abc.ABC):
         self._listener = listener
         self._mailboxes = TxMailboxes(
             self._send,
-            listener.confirmed,
+            listener.on_confirmed,
             latency=latency,
             confirm_timeout=confirm_timeout,
             one_at_a_time=one_at_a_time,
@@ -206,7 +206,7 @@ class InterfacePort(CanPort, Generic[B]):
         bus.set_filters(self._filters)
         self._bus = bus
         try:
-            listener.up()
+            listener.on_up()
             return await bus.ended
         finally:
             self._bus = None

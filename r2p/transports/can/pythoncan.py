@@ -78,12 +78,12 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
             problem = await self._open(bus)
             opened()
             if problem:
-                listener.waits(problem)
+                listener.on_waiting(problem)
                 return False
             reason = await self._use(bus, listener)
         finally:
             await bus.aclose()
-        listener.down(reason)
+        listener.on_down(reason)
         return True
 
     async def _open(self, bus: "_PythonCanBus") -> str:
@@ -184,27 +184,27 @@ class _PythonCanBus(OpenInterface):
                 self._listener.internal_error(error)
         while self._reported < self._dropped:
             self._reported += 1
-            self._listener.fault("receive queue full")
+            self._listener.on_fault("receive queue full")
         if self._queue:
             self._schedule_batch()
         self._arm()
 
     def _receive(self, message: "can.Message", stamp: int) -> None:
         if message.is_error_frame:
-            self._listener.fault("bus error")
+            self._listener.on_fault("bus error")
         elif message.is_fd:
             return
         elif message.is_remote_frame or not message.is_extended_id:
             remote = message.dlc if message.is_remote_frame else None
             frame = OtherFrame(message.arbitration_id, bytes(message.data), message.is_extended_id, remote)
             if message.is_rx:
-                self._listener.other(frame, stamp)
+                self._listener.on_other_frame(frame, stamp)
         else:
             data = bytes(message.data)
             # udp_multicast does not mark own frames: they are known by their content.
             own = self._echo and self._mailboxes.seen(message.arbitration_id, data, stamp, self._clock.monotonic())
             if not own and message.is_rx:
-                self._listener.received(Frame(message.arbitration_id, data), stamp)
+                self._listener.on_frame(Frame(message.arbitration_id, data), stamp)
 
     def _call_in_thread(self, action: Callable[[], object], finished: Callable[[BaseException | None], object]) -> None:
         """Call `action` in the thread, then `finished` in the event loop with what it raised."""

@@ -79,14 +79,14 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
         """Use the interface until it is gone. False if it can't be used now."""
         bus = self._open(listener)
         if isinstance(bus, str):
-            listener.waits(bus)
+            listener.on_waiting(bus)
             return False
         bus.start()
         try:
             reason = await self._use(bus, listener)
         finally:
             bus.close()
-        listener.down(reason)
+        listener.on_down(reason)
         return True
 
     def _open(self, listener: CanPortListener) -> "_SocketCanBus | str":
@@ -170,7 +170,7 @@ class _SocketCanBus(OpenInterface):
 
     def _hand_out(self, frames: list[rawsocket.ReceivedFrame]) -> None:
         # Runs for every frame on the bus: names are local to save look-ups, and the most frequent kind comes first.
-        received, mask, own = self._listener.received, _MASK, rawsocket.OWN
+        received, mask, own = self._listener.on_frame, _MASK, rawsocket.OWN
         flags_of_id, data_frame = rawsocket.FLAGS, rawsocket.DATA
         for identifier, data, flags, stamp in frames:
             kind = identifier & flags_of_id
@@ -187,22 +187,22 @@ class _SocketCanBus(OpenInterface):
                 self._listener.internal_error(error)
         while self._dropped < self._socket.dropped:
             self._dropped += 1
-            self._listener.fault("receive queue full")
+            self._listener.on_fault("receive queue full")
 
     def _own_frame(self, identifier: int, data: bytes, stamp: int) -> None:
         if not self._mailboxes.seen(identifier, data, stamp, self._clock.monotonic()):
-            self._listener.fault("confirmed too late")  # it was given up as UNKNOWN, and is not sent again
+            self._listener.on_fault("confirmed too late")  # it was given up as UNKNOWN, and is not sent again
 
     def _other_frame(self, identifier: int, data: bytes, stamp: int) -> None:
         extended, remote = bool(identifier & rawsocket.DATA), bool(identifier & socket.CAN_RTR_FLAG)
         number = identifier & (_MASK if extended else socket.CAN_SFF_MASK)
         frame = OtherFrame(number, b"", extended, len(data)) if remote else OtherFrame(number, data)
-        self._listener.other(frame, stamp)
+        self._listener.on_other_frame(frame, stamp)
 
     def _error_frame(self, identifier: int, data: bytes) -> None:
         report = rawsocket.decode_error(identifier, data)
         for kind in report.kinds:
-            self._listener.fault(kind)
+            self._listener.on_fault(kind)
         if report.bus_off:
             self._end("bus-off: too many errors, most often a wrong bit rate or a cable")
         elif self._one_shot and (report.arbitration_lost or report.destroyed):

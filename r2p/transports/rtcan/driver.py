@@ -73,16 +73,16 @@ class EngineDriver:
         self._pending: Callable[[], object] = lambda: engine.waiting
         self._drained: asyncio.Future[None] | None = None
 
-    # Feed: events of the port (as its `CanPortListener`) and of the timer. `received`, `confirmed` and `_poll` run for
-    # every frame on the bus, so the three steps are written out in each of them.
+    # Feed: events of the port (as its `CanPortListener`) and of the timer. `on_frame`, `on_confirmed` and `_poll` run
+    # for every frame on the bus, so the three steps are written out in each of them.
 
-    def received(self, frame: Frame, stamp: int) -> None:
+    def on_frame(self, frame: Frame, stamp: int) -> None:
         try:
             self.carry_out(self.engine.receive(self.now(), frame, stamp))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next frame follows
             self._failed(error)
 
-    def confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
+    def on_confirmed(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
         try:
             self.carry_out(self.engine.confirm(self.now(), mailbox, outcome, at))
         except Exception as error:  # noqa: BLE001 - counted and logged; the next confirmation follows
@@ -94,7 +94,7 @@ class EngineDriver:
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
 
-    def up(self) -> None:
+    def on_up(self) -> None:
         try:
             self.update_filters()
             self.carry_out(self.engine.start(self.now()))
@@ -102,7 +102,7 @@ class EngineDriver:
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
 
-    def down(self, reason: str) -> None:
+    def on_down(self, reason: str) -> None:
         try:
             discarded = self.engine.stop(self.now())
             self._owner.bus_down(reason)  # first: publishers are to learn that the link is down before what they lose
@@ -110,13 +110,13 @@ class EngineDriver:
         except Exception as error:  # noqa: BLE001 - counted and logged
             self._failed(error)
 
-    def waits(self, reason: str) -> None:
+    def on_waiting(self, reason: str) -> None:
         self._owner.bus_waits(reason)
 
-    def fault(self, kind: str) -> None:
+    def on_fault(self, kind: str) -> None:
         self._owner.bus_fault(kind)
 
-    def other(self, frame: OtherFrame, stamp: int) -> None:
+    def on_other_frame(self, frame: OtherFrame, stamp: int) -> None:
         pass  # it does not concern RTCAN
 
     # Act, and re-arm the timer

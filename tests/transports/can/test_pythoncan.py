@@ -271,7 +271,7 @@ async def test_a_frame_that_raises_does_not_stop_the_others(
 ) -> None:
     port = port_on(channel)
     async with using(port) as listener:
-        monkeypatch.setattr(listener, "received", once(listener.received))
+        monkeypatch.setattr(listener, "on_frame", once(listener.on_frame))
         for number in range(3):
             peer.send(can.Message(arbitration_id=SRT | number, is_extended_id=True))
         await listener.until(lambda: listener.has(2))

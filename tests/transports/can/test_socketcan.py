@@ -17,7 +17,7 @@ async def test_a_frame_that_raises_does_not_stop_the_others_of_its_batch(monkeyp
     listener = RecordingListener()
     frames = [(rawsocket.DATA | number, b"", 0, 0) for number in range(3)]
     sock: Any = SimpleNamespace(receive=lambda: frames, dropped=0, close=lambda: None)
-    monkeypatch.setattr(listener, "received", once(listener.received))
+    monkeypatch.setattr(listener, "on_frame", once(listener.on_frame))
     bus = _SocketCanBus(sock, listener, one_shot=False)
     assert bus._read_batch() == 3
     assert ([frame.id for frame in listener.frames], listener.faults) == ([1, 2], ["internal error: injected"])

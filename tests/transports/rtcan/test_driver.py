@@ -39,10 +39,10 @@ class Port(CanPort):
     def transmit(self, order: Transmit) -> None:
         self.sent.append(order.frame)
         if not self.stuck:
-            self.driver.confirmed(order.mailbox, Outcome.SENT, self.now())
+            self.driver.on_confirmed(order.mailbox, Outcome.SENT, self.now())
 
     def withdraw(self, order: Withdraw) -> None:
-        self.driver.confirmed(order.mailbox, Outcome.LATE, self.now())
+        self.driver.on_confirmed(order.mailbox, Outcome.LATE, self.now())
 
     def set_filters(self, filters: list[tuple[int, int]] | None) -> None:
         self.filters = filters
@@ -91,7 +91,7 @@ def make() -> tuple[EngineDriver, Port, Owner]:
 
 async def test_it_polls_when_the_engine_wants() -> None:
     driver, port, owner = make()
-    driver.up()
+    driver.on_up()
     assert port.filters == [(0, 0)]
     await asyncio.sleep(2.0)
     assert owner.changes == ["up"]
@@ -108,7 +108,7 @@ async def test_a_port_that_confirms_at_once_and_an_owner_that_publishes_at_once(
     driver, port, owner = make()
     payload = bytes(range(100))
     owner.on_ready = lambda: driver.carry_out(driver.engine.publish(port.now(), 0x42, payload, handle="bulk"))
-    driver.up()
+    driver.on_up()
     await asyncio.sleep(3.0)
     data = [frame for frame in port.sent if rtcan.high_byte(rtcan.decode_identifier(frame.id).message_id) == 0x42]
     assert b"".join(frame.data for frame in data) == payload
@@ -118,7 +118,7 @@ async def test_a_port_that_confirms_at_once_and_an_owner_that_publishes_at_once(
 
 async def test_drained_when_all_is_on_the_bus_or_it_takes_too_long() -> None:
     driver, port, _ = make()
-    driver.up()
+    driver.on_up()
     await asyncio.sleep(3.0)
     await driver.drain(1.0)
     port.stuck = True
@@ -129,23 +129,23 @@ async def test_drained_when_all_is_on_the_bus_or_it_takes_too_long() -> None:
     waiting = asyncio.create_task(driver.drain(0.5))
     await asyncio.sleep(0.1)
     port.stuck = False
-    driver.confirmed(Mailbox.SRT, Outcome.SENT, port.now())
+    driver.on_confirmed(Mailbox.SRT, Outcome.SENT, port.now())
     await waiting
     assert port.now() - before < 700_000_000
 
 
 async def test_what_is_discarded_follows_the_bus_being_down() -> None:
     driver, port, owner = make()
-    driver.up()
+    driver.on_up()
     await asyncio.sleep(3.0)
     port.stuck = True
     driver.carry_out(driver.engine.publish(port.now(), 0x42, b"x", handle="x"))
     owner.actions.clear()
-    driver.down("cable cut")
+    driver.on_down("cable cut")
     assert owner.changes == ["up", "cable cut"]
     assert owner.fates() == [Fate.DISCARDED]
-    driver.waits("no cable")
-    driver.fault("stuff error")
+    driver.on_waiting("no cable")
+    driver.on_fault("stuff error")
     assert owner.changes[2:] == ["waits: no cable", "fault: stuff error"]
 
 
@@ -167,7 +167,7 @@ async def test_a_port_that_is_not_exact_asks_for_slots_only_where_they_are_coars
 async def test_what_a_class_means_depends_on_the_controller() -> None:
     driver, port, _ = make()
     assert describe_guarantee(driver, PublisherClass.SPORADIC, None) == "nothing yet: not on the bus"
-    driver.up()
+    driver.on_up()
     await asyncio.sleep(3.0)
     assert "fixed when a frame is handed to the controller" in describe_guarantee(driver, PublisherClass.SPORADIC, None)
     port.one_shot = True
@@ -180,8 +180,8 @@ async def test_an_engine_that_raises_goes_on(call: str, monkeypatch: pytest.Monk
     place, _, name = f"engine.{call}".rpartition(".")
     part = operator.attrgetter(place)(driver)
     monkeypatch.setattr(part, name, once(getattr(part, name)))
-    driver.up()
-    driver.received(Frame(0, b""), 0)
+    driver.on_up()
+    driver.on_frame(Frame(0, b""), 0)
     await asyncio.sleep(3.0)
     assert [each for each in owner.changes if each != "up"] == ["internal error: injected"]
     assert any(isinstance(each, Ready) for each in owner.actions)
@@ -193,7 +193,7 @@ async def test_an_engine_that_raises_goes_on(call: str, monkeypatch: pytest.Monk
 async def test_an_engine_that_always_raises_does_not_take_all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     driver, _, owner = make()
     monkeypatch.setattr(driver.engine, "poll", lambda _now: 1 // 0)
-    driver.up()
+    driver.on_up()
     await asyncio.sleep(5.0)
     assert 10 < len(owner.changes) < 60
 

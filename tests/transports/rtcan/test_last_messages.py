@@ -82,7 +82,7 @@ async def test_what_comes_after_the_good_bye_is_counted_for_a_while() -> None:
         frame = rtcan.Frame(rtcan.encode_identifier(rtcan.NRT, message), Led().encode())
         for seconds, lost in (0.0, 1), (0.5, 2), (5.0, 2), (5.0, 2):
             await asyncio.sleep(seconds)
-            link.driver.received(frame, link.driver.now())
+            link.driver.on_frame(frame, link.driver.now())
             assert link.losses == {"not subscribed": lost}
             assert not subscriber.queue
         assert needed not in link.engine.filters()

@@ -257,7 +257,7 @@ async def test_message_ids_that_a_broken_node_has_taken_come_free() -> None:
             advertise = Advertise(f"broken{high}", 8, 0, management.rtcan_params(rtcan.message_id(high, 1)))
             for left, data in rtcan.fragments(management.encode(advertise)):
                 frame = rtcan.Frame(rtcan.encode_identifier(50, 0x0101, left), data)
-                link.driver.received(frame, link.driver.now())
+                link.driver.on_frame(frame, link.driver.now())
         assert publisher.subscribers == 0
         async with asyncio.timeout(25.0):
             await publisher.wait_subscriber()
