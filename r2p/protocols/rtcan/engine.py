@@ -33,7 +33,7 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.rtcan import HIGH_MAX, HIGH_SHIFT, ID8_MAX, MANAGEMENT, MESSAGE_SHIFT, NOT_SYNC, Frame
 from r2p.errors import DecodeError, MessageError
 from r2p.protocols.can_orders import Mailbox, Outcome
-from r2p.protocols.rtcan.events import Action, Done, Due, EngineContext, EngineSettings, Fate, Profile, Ready, Received
+from r2p.protocols.rtcan.events import Action, Done, EngineContext, EngineSettings, Fate, Profile, Ready, Received
 from r2p.protocols.rtcan.leases import PeriodicMessage, SlotGrants, SlotRequests
 from r2p.protocols.rtcan.management import ManagementHandlers, ManagementSender
 from r2p.protocols.rtcan.master import Role
@@ -78,9 +78,7 @@ class Engine:
             context, self.transmitter, self.node_id, self.grants, self.requests, self.management.send
         )
         self.election = self.network.election
-        self._handlers = ManagementHandlers(
-            self.network, self.grants, self.requests, self.management.send, self._start_ticking
-        )
+        self._handlers = ManagementHandlers(self.network, self.grants, self.requests, self.management.send)
         self._context = context
         self._actions = context.actions
         self._timers = context.timers
@@ -263,7 +261,7 @@ class Engine:
         message = self._message_id(high) if self.ready else 0
         periodic = self.periodics[high] = PeriodicMessage(high, message, size, fragments, interval, lead, handle)
         if self.ready:
-            self._start_periodic(now, periodic)
+            self.requests.start(now, periodic)
         return self._drain()
 
     def fill(self, now: int, high: int, payload: bytes | None) -> Sequence[Action]:
@@ -315,7 +313,7 @@ class Engine:
         self._joined = True
         self._actions.append(Ready(self.node_id.id8, self.profile))
         for periodic in self.periodics.values():
-            self._start_periodic(now, periodic)
+            self.requests.start(now, periodic)
 
     def _on_stage(self, now: int) -> None:
         """Adapt to the new stage of the id8: lost, claimed or owned."""
@@ -336,9 +334,9 @@ class Engine:
         """Give up everything that waits to be sent."""
         handles = self._limiter.clear() + [message.handle for message in self.transmitter.mailboxes.discard()]
         self._actions += [Done(each, Fate.DISCARDED, missed=True, at=now) for each in handles if each is not None]
-        for periodic in self.periodics.values():
-            self.requests.revoke(now, periodic, "the node may not send")
-            self._timers.clear(("tick", periodic.high))
+        self.requests.revoke_all(now, "the node may not send")
+        for high in self.periodics:
+            self._timers.clear(("tick", high))
 
     def _send_claim(self, now: int) -> None:
         electing = management.CLAIM_ELECTING if self.network.master is None else 0
@@ -431,31 +429,7 @@ class Engine:
             case ("granted", int(message)):
                 self.grants.remove(message)
             case (str(kind), int(high)) if high in self.periodics:
-                self._periodic_timer(now, kind, self.periodics[high])
-
-    def _periodic_timer(self, now: int, kind: str, periodic: PeriodicMessage) -> None:
-        if kind == "ask":
-            self.requests.request(now, periodic)
-        elif kind == "lease":
-            self.requests.suspend(now, periodic, "the master does not answer")
-            self._start_periodic(now, periodic)
-        elif not periodic.active or self.cycle.counter < periodic.from_cycle:
-            # In phase with the ticks before, however late this one is.
-            at = now if periodic.tick is None else now - (now - periodic.tick) % periodic.interval
-            periodic.tick = at + periodic.interval
-            periodic.ticked = True
-            self._timers.set(("tick", periodic.high), periodic.tick)
-            self._actions.append(Due(periodic.high, at, False))
-
-    def _start_periodic(self, now: int, periodic: PeriodicMessage) -> None:
-        """Ask for slots, and send without until they are granted."""
-        self.requests.schedule(now, periodic)
-        self._start_ticking(now, periodic)
-
-    def _start_ticking(self, now: int, periodic: PeriodicMessage) -> None:
-        """Let the node's own clock say when a periodic message without slots is due."""
-        if not periodic.active and self._joined and ("tick", periodic.high) not in self._timers:
-            self._timers.set(("tick", periodic.high), now)
+                self.requests.on_timer(now, kind, self.periodics[high])
 
     def _end_periodic(self, now: int, high: int) -> None:
         periodic = self.periodics.pop(high, None)
@@ -464,7 +438,6 @@ class Engine:
         if periodic.payload is not None:
             self.transmitter.abandon(now, periodic, "slots given back")
         self.transmitter.forget(periodic)
-        self._timers.clear(("tick", high))
         if self.requests.forget(periodic) and self.ready:
             if self.election.role is Role.MASTER:
                 self.grants.remove(periodic.message)

@@ -18,7 +18,7 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.management import NO_PHASE, Grant, Refuse, RefuseReason, Renew, Renewed, Reserve
 from r2p.protocols.rtcan.calendar import Calendar, Refusal, Reservation, occupied
 from r2p.protocols.rtcan.cycle import Timing, following
-from r2p.protocols.rtcan.events import EngineContext, SlotsGranted, SlotsLost, SlotsRefused
+from r2p.protocols.rtcan.events import Due, EngineContext, SlotsGranted, SlotsLost, SlotsRefused
 from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
 LEASE = 3_000_000_000  # ns, as the next two: two renewals may be lost
@@ -190,7 +190,7 @@ class SlotGrants:
 
 
 class SlotRequests:
-    """The owner's side: slots for the periodic messages of this node.
+    """The owner's side: slots for the periodic messages of this node, which go by its own clock until they have some.
 
     `ask` sends a request to the master, which may be this node; `abandon` gives up a message that waits for its slot.
     """
@@ -213,6 +213,26 @@ class SlotRequests:
         self._abandon = abandon
         self._enabled = context.settings.reserves
         self._serial = 0
+
+    def start(self, now: int, periodic: PeriodicMessage) -> None:
+        """Ask for slots, and let the message go without until they are granted."""
+        self.schedule(now, periodic)
+        self._start_ticking(now, periodic)
+
+    def on_timer(self, now: int, kind: str, periodic: PeriodicMessage) -> None:
+        """Ask for slots once more, give up those whose lease has ended, or ask for data by the node's own clock."""
+        if kind == "ask":
+            self.request(now, periodic)
+        elif kind == "lease":
+            self.suspend(now, periodic, "the master does not answer")
+            self.start(now, periodic)
+        elif not periodic.active or self._cycle.counter < periodic.from_cycle:
+            # In phase with the ticks before, however late this one is.
+            at = now if periodic.tick is None else now - (now - periodic.tick) % periodic.interval
+            periodic.tick = at + periodic.interval
+            periodic.ticked = True
+            self._timers.set(("tick", periodic.high), periodic.tick)
+            self._actions.append(Due(periodic.high, at, False))
 
     def resume(self, now: int) -> None:
         """Ask for slots, now that there is a master."""
@@ -246,7 +266,7 @@ class SlotRequests:
         had = periodic.reservation is not None
         periodic.reservation = None
         periodic.active = False
-        for kind in "ask", "lease":
+        for kind in "ask", "lease", "tick":
             self._timers.clear((kind, periodic.high))
         self._plan.invalidate()
         return had
@@ -312,6 +332,7 @@ class SlotRequests:
         """Give up slots that the master refuses, and ask again later: they may come free."""
         if periodic.active or refuse.serial not in periodic.asked:
             return
+        self._start_ticking(now, periodic)
         try:
             reason = RefuseReason(refuse.reason)
         except ValueError:  # of a newer version
@@ -341,6 +362,10 @@ class SlotRequests:
             periodic.restart()
             self._plan.invalidate()
             self._actions.append(SlotsLost(periodic.high, reason))
+
+    def _start_ticking(self, now: int, periodic: PeriodicMessage) -> None:
+        if ("tick", periodic.high) not in self._timers:
+            self._timers.set(("tick", periodic.high), now)
 
     def _next_serial(self, now: int, *periodics: PeriodicMessage) -> int:
         self._serial = (self._serial + 1) % management.REQUEST_SERIALS

@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable
 
 from r2p.codecs import management, rtcan
 from r2p.protocols.rtcan.events import EngineContext, Fate, Profile
-from r2p.protocols.rtcan.leases import PeriodicMessage, SlotGrants, SlotRequests
+from r2p.protocols.rtcan.leases import SlotGrants, SlotRequests
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.network import Detector, NetworkMembership
 from r2p.protocols.rtcan.node_id import NodeId
@@ -137,10 +137,7 @@ class ManagementSender:
 
 
 class ManagementHandlers:
-    """Acts on the management messages of the RTCAN bus itself.
-
-    `send(now, message)` sends management; `start_ticking(now, periodic)` lets a message go on without slots.
-    """
+    """Acts on the management messages of the RTCAN bus itself. `send(now, message)` sends management."""
 
     def __init__(
         self,
@@ -148,13 +145,11 @@ class ManagementHandlers:
         grants: SlotGrants,
         requests: SlotRequests,
         send: Callable[[int, management.Management], None],
-        start_ticking: Callable[[int, PeriodicMessage], None],
     ) -> None:
         self._network = network
         self._grants = grants
         self._requests = requests
         self._send = send
-        self._start_ticking = start_ticking
 
     def handle(self, now: int, message: management.Management, source: int) -> None:
         """Act on a message of the node with the id8 `source`.
@@ -205,6 +200,5 @@ class ManagementHandlers:
             return
         if isinstance(answer, management.Refuse):
             self._requests.on_refuse(now, periodic, answer)
-            self._start_ticking(now, periodic)
         elif answer.epoch == self._network.epoch:
             self._requests.on_grant(now, periodic, answer)
