@@ -381,9 +381,5 @@ def describe(message: management.Management) -> str:
     }
     if isinstance(message, management.SubscribeResponse):
         fields["id"] = f"0x{management.rtcan_message_id(message.params):04X}"
-    text = " ".join(f"{name}={_value(value)}" for name, value in fields.items())
+    text = " ".join(f"{name}={each.hex() if isinstance(each, bytes) else each}" for name, each in fields.items())
     return f"{type(message).__name__} {text}".rstrip()
-
-
-def _value(value: object) -> str:
-    return value.hex() if isinstance(value, bytes) else str(value)
