@@ -235,8 +235,8 @@ async def test_error_passive_colliders_do_not_acknowledge() -> None:
     watch = Watch()
     a, b = watch.attach("A", one_shot=True), watch.attach("B", one_shot=True)
     a.confinement.transmit = b.confinement.transmit = 150
-    a.disturbed(0)
-    b.disturbed(0)
+    a.disturb(0)
+    b.disturb(0)
     for controller, frame in zip((a, b), colliding(b"\xff", b"\x0f"), strict=True):
         controller.request(frame)
     await asyncio.sleep(0.1)
@@ -250,7 +250,7 @@ async def test_the_error_passive_ones_leave_one_after_the_other() -> None:
     watch.attach("D")
     for node, frame in zip(nodes, colliding(b"\x80", b"\x01", b"\x00"), strict=True):
         node.confinement.transmit = 150
-        node.disturbed(0)
+        node.disturb(0)
         node.request(frame)
     await asyncio.sleep(0.01)
     assert [name for name, *_ in watch.of("error")] == ["A", "B"]
@@ -356,7 +356,7 @@ async def test_frames_that_a_node_filters_out_make_up_for_errors_all_the_same() 
     watch = Watch()
     a, b = watch.attach("A"), watch.attach("B")
     b.filters = [(OTHER.id, -1)]
-    b.disturbed(2)
+    b.disturb(2)
     for number, frame in enumerate([FRAME, OTHER, FRAME, FRAME]):
         a.request(frame)
         await asyncio.sleep(0.001)
@@ -591,7 +591,7 @@ async def test_a_noisy_bus_drives_its_senders_to_bus_off() -> None:
 async def test_a_good_frame_takes_the_receive_counter_back_below_passive() -> None:
     watch = Watch()
     a, b = watch.attach("A"), watch.attach("B")
-    b.disturbed(200)
+    b.disturb(200)
     assert b.state is ControllerState.PASSIVE
     a.request(FRAME)
     await asyncio.sleep(0.001)

@@ -94,7 +94,7 @@ class CanBus(BusWire):
             raise ValueError(f"there is already a node {node.name} on this bus: give this one another name")
         self._names.add(node.name)
         controller = CanController(self, node, self._seed)
-        self.connected(controller)
+        self.connect(controller)
         self._noisy = self._noisy or node.noise > 0
         return controller
 
@@ -138,22 +138,22 @@ class CanBus(BusWire):
             return False
         return request.owner.mailboxes.choose(start, start + self.bit) is request
 
-    def request_withdrawn(self) -> None:
+    def replan(self) -> None:
         if not self._busy:
             self._plan_anew()
 
-    def disconnected(self, controller: CanController) -> None:
+    def disconnect(self, controller: CanController) -> None:
         self._listeners.leave(controller)
         if controller.state is ControllerState.DOWN:
             self._recovery.forget(controller)
         if self._transfer:
             self._node_died(self._transfer, controller)
-        self.request_withdrawn()
+        self.replan()
 
-    def connected(self, controller: CanController) -> None:
+    def connect(self, controller: CanController) -> None:
         self._listeners.join(controller)
 
-    def filters_changed(self) -> None:
+    def forget_filters(self) -> None:
         self._listeners.concerned.clear()
 
     def recover(self, controller: CanController) -> None:
@@ -202,7 +202,7 @@ class CanBus(BusWire):
             if request is not None:
                 contestants.append(request)
             if request is None or len(mailboxes.requests) > 1:  # some frame of this controller goes on waiting
-                mailboxes.frame_started(request)
+                mailboxes.watch_others(request)
         return contestants
 
     def _winners(self, contestants: list[Request], start: int) -> list[Request]:
@@ -212,7 +212,7 @@ class CanBus(BusWire):
             if request.frame.id != lowest:
                 at = start + bits_until_lost(lowest, request.frame.id) * self.bit
                 self.statistics.add_lost(request.owner.name, request.frame.id)
-                request.owner.lost_arbitration(request, at)
+                request.owner.lose_arbitration(request, at)
         return [request for request in contestants if request.frame.id == lowest]
 
     # A frame
@@ -245,10 +245,10 @@ class CanBus(BusWire):
             return
         frame = transfer.frame
         for request in transfer.requests:
-            request.owner.sent(request, end)
+            request.owner.complete(request, end)
         for node in self._listeners.concerned[frame.id]:
             if node in transfer.receivers:
-                node.arrived(frame, end)
+                node.receive(frame, end)
         self._over(transfer, transfer.bits, None, end)
 
     def _over(self, transfer: _Transfer, bits: int, error: ErrorKind | None, end: int) -> None:
@@ -277,7 +277,7 @@ class CanBus(BusWire):
             return True
         for node in list(transfer.receivers):
             if node.node.noise and node.numbers.random() < node.node.noise:
-                node.disturbed(8)
+                node.disturb(8)
                 if node.state is ControllerState.ACTIVE:
                     bit = node.numbers.randrange(1, transfer.bits + 1)
                     self._destroy(transfer, wire_bits(transfer.frame)[:bit], ErrorKind.BIT, [node])
@@ -297,7 +297,7 @@ class CanBus(BusWire):
         at = start + bit * self.bit
         for request in hit:  # error passive: their error flag is invisible, so the others go on
             request.busy_until = at
-            self.timeline.at(at, request.owner.failed, request, ErrorKind.BIT, at)
+            self.timeline.at(at, request.owner.fail, request, ErrorKind.BIT, at)
         rest = [request for request in requests if request not in hit]
         excluded = [*excluded, *(request.owner for request in hit)]
         if any(request.frame != rest[0].frame for request in rest):
@@ -321,9 +321,9 @@ class CanBus(BusWire):
     def _failed(self, transfer: _Transfer, kind: ErrorKind) -> None:
         now = self.timeline.now()
         for request in list(transfer.requests):
-            request.owner.failed(request, kind, now)
+            request.owner.fail(request, kind, now)
         for node in transfer.receivers:
-            node.disturbed(1)
+            node.disturb(1)
 
     def _node_died(self, transfer: _Transfer, controller: CanController) -> None:
         """Leave a controller out of the frame that is on the wire."""
@@ -427,7 +427,7 @@ class Recovery:
 
     def _check(self, controller: CanController, idle: int) -> None:
         if idle == self._idle and self.remaining.pop(controller, None) is not None:
-            controller.restarted()
+            controller.rejoin()
 
 
 # Error frames, bit by bit: slow, but needed only when an error happens.

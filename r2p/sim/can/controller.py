@@ -48,16 +48,16 @@ class BusWire(Protocol):
     def is_starting(self, request: Request) -> bool:
         """Return whether the start bit of this frame has begun, and arbitration is still open."""
 
-    def request_withdrawn(self) -> None:
+    def replan(self) -> None:
         """Plan the next frame anew: one has left its mailbox."""
 
-    def filters_changed(self) -> None:
+    def forget_filters(self) -> None:
         """Forget which controllers are concerned by which frames."""
 
-    def disconnected(self, controller: CanController) -> None:
+    def disconnect(self, controller: CanController) -> None:
         """Leave this controller out from now on: it has no power, or is in bus-off."""
 
-    def connected(self, controller: CanController) -> None:
+    def connect(self, controller: CanController) -> None:
         """Let this controller send and receive again."""
 
     def recover(self, controller: CanController) -> None:
@@ -151,7 +151,7 @@ class CanController:
     @filters.setter
     def filters(self, filters: Sequence[tuple[int, int]]) -> None:
         self._filters = filters
-        self._bus.filters_changed()
+        self._bus.forget_filters()
 
     def call_at(self, local: int, callback: Callable[..., object], *args: Any) -> TimelineTimer:
         """Call `callback(*args)` when this node's clock shows `local` ns: a timer interrupt, without latency."""
@@ -172,7 +172,7 @@ class CanController:
         """Send this frame over and over, as a babbling idiot does; None stops it."""
         self._babbled = frame
         self.mailboxes.requests.pop(_BABBLE, None)
-        self._bus.request_withdrawn()
+        self._bus.replan()
         self._babble()
 
     def lose_next(self, count: int = 1) -> None:
@@ -187,13 +187,13 @@ class CanController:
         self._babbled = None
         self._interrupts.discard()
         self.mailboxes.clear()
-        self._bus.disconnected(self)
+        self._bus.disconnect(self)
 
     def power_on(self) -> None:
         """Restore the power: it starts as new, and sends nothing before it has seen 11 recessive bits."""
         if self.state is ControllerState.DOWN:
             self.mailboxes.not_before = self._timeline.now() + RECESSIVE_BITS * self._bus.bit
-            self.restarted()
+            self.rejoin()
 
     # For the bus
 
@@ -201,11 +201,11 @@ class CanController:
         """Return whether a good frame of another node matters: it passes the filters, or decrements the error count."""
         return self.confinement.receive > 0 or self._is_wanted(identifier)
 
-    def arrived(self, frame: Frame, end: int) -> None:
+    def receive(self, frame: Frame, end: int) -> None:
         """Receive a good frame of another node that concerns this one."""
         if self.confinement.receive:
-            self.confinement.received()
-            self._bus.filters_changed()
+            self.confinement.count_received()
+            self._bus.forget_filters()
             if not self._is_wanted(frame.id):
                 return
         if self._lose_next:
@@ -216,14 +216,14 @@ class CanController:
         else:
             self._interrupts.deliver(end, self.on_receive, frame)
 
-    def sent(self, request: Request, end: int) -> None:
+    def complete(self, request: Request, end: int) -> None:
         """Complete this request: its frame was acknowledged."""
         if self.confinement.transmit:
             self.confinement.count(transmit=-1)
         if self.mailboxes.remove(request):
             self._interrupts.deliver(end, self.on_sent, request.frame)
 
-    def lost_arbitration(self, request: Request, at: int) -> None:
+    def lose_arbitration(self, request: Request, at: int) -> None:
         """Note that the frame of this request loses arbitration, at this instant."""
         request.busy_until = at
         if self.node.one_shot and request.mailbox != _BABBLE:
@@ -232,7 +232,7 @@ class CanController:
         elif request.last_start < NEVER:
             self._watch(request)
 
-    def failed(self, request: Request, kind: ErrorKind, at: int) -> None:
+    def fail(self, request: Request, kind: ErrorKind, at: int) -> None:
         """Note that the frame of this request was destroyed: an error frame begins."""
         # The standard's exception: a node that is alone on the bus stays error passive, and never goes to bus-off.
         alone = kind is ErrorKind.ACK and self.confinement.passive
@@ -241,15 +241,15 @@ class CanController:
         if self.node.one_shot and self.mailboxes.remove(request):
             self._interrupts.deliver(at, self.on_error, request.frame, kind)
 
-    def disturbed(self, count: int) -> None:
+    def disturb(self, count: int) -> None:
         """Note that a frame that this node was receiving was destroyed."""
         self.confinement.count(receive=count)
-        self._bus.filters_changed()
+        self._bus.forget_filters()
 
-    def restarted(self) -> None:
+    def rejoin(self) -> None:
         """Start again with the error counters at 0."""
         self.confinement.restart()
-        self._bus.connected(self)
+        self._bus.connect(self)
         self._babble()
 
     # Inside
@@ -286,7 +286,7 @@ class CanController:
         for frame in lost:
             self._interrupts.deliver(now, self.on_error, frame, ErrorKind.BUS_OFF)
         if state is ControllerState.BUS_OFF:
-            self._bus.disconnected(self)
+            self._bus.disconnect(self)
             if self.node.recovery:
                 self._bus.recover(self)
 
@@ -298,7 +298,7 @@ class CanController:
             or not self.mailboxes.remove(request)
         ):
             return False
-        self._bus.request_withdrawn()
+        self._bus.replan()
         return True
 
     def _lost(self, request: Request, stamp: int) -> None:
@@ -330,7 +330,7 @@ class Confinement:
         self.receive = 0
         self._on_change = on_change
 
-    def received(self) -> None:
+    def count_received(self) -> None:
         """Count a frame that was received without an error."""
         self.count(receive=-1 if self.receive <= _PASSIVE_ABOVE else _AFTER_GOOD_FRAME - self.receive)
 
@@ -419,7 +419,7 @@ class ControllerMailboxes:
                 earliest = begins
         return earliest
 
-    def frame_started(self, chosen: Request | None) -> None:
+    def watch_others(self, chosen: Request | None) -> None:
         """Watch all frames but `chosen`: another frame has started, and they may become too late."""
         for request in self.requests.values():
             if request.last_start < NEVER and request is not chosen:

@@ -69,11 +69,11 @@ class Interface(msgspec.Struct, frozen=True):
             return f"{self.name} is in bus-off: sudo ip link set {self.name} type can restart"
         return ""
 
-    def command_up(self, bitrate: int = 1_000_000) -> str:
+    def command_up(self) -> str:
         """The shell command that brings the interface up."""
         up = f"sudo ip link set {self.name} up"
         if self.kind in ("", "can"):
-            return f"{up} type can bitrate {self.bitrate or bitrate} one-shot on restart-ms 100"
+            return f"{up} type can bitrate {self.bitrate or 1_000_000} one-shot on restart-ms 100"
         return up
 
 

@@ -32,9 +32,7 @@ from r2p.protocols.rtcan.events import (
     Profile,
     Ready,
     Received,
-    SlotsGranted,
-    SlotsLost,
-    SlotsRefused,
+    SlotEvent,
 )
 from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
@@ -125,6 +123,9 @@ class RtcanLink(BufferedLink):
             self._done(action)
         elif isinstance(action, Due):
             self._slotted.fill(action)
+        elif isinstance(action, SlotEvent):
+            self._slotted.slots_changed(action)
+            self._slotted.wake_waiters()
         else:
             self._network_event(action)
             self._slotted.wake_waiters()
@@ -158,8 +159,6 @@ class RtcanLink(BufferedLink):
             case ParametersMatch() if self.engine.ready:  # else `Ready` follows, and announces
                 self._notice(event)
                 self._announce()
-            case SlotsGranted() | SlotsRefused() | SlotsLost():
-                self._slotted.slots_changed(event)
             case _ if not self._closed:
                 text = self._notice(event)
                 if isinstance(event, ParameterMismatch) or (isinstance(event, IdConflict) and event.yielded):

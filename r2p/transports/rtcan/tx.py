@@ -15,7 +15,7 @@ from r2p.codecs import management, rtcan
 from r2p.codecs.management import ManagementType
 from r2p.protocols.rtcan.calendar import Calendar, Refusal
 from r2p.protocols.rtcan.cycle import Timing
-from r2p.protocols.rtcan.events import Action, Done, Due, Fate, Profile, SlotsGranted, SlotsLost, SlotsRefused
+from r2p.protocols.rtcan.events import Action, Done, Due, Fate, Profile, SlotEvent, SlotsGranted, SlotsRefused
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import PublisherHandle, SlotPublisher, Topic
@@ -140,7 +140,7 @@ class SlottedTopics:
         slotted = self.by_topic.get(topic.name)
         return slotted is None or not (slotted.is_clock or slotted.clock_elsewhere)
 
-    def slots_changed(self, event: SlotsGranted | SlotsRefused | SlotsLost) -> None:
+    def slots_changed(self, event: SlotEvent) -> None:
         """Note that a topic got slots, was refused some, or lost them."""
         each = self._by_high.get(event.high)
         if each is None:
