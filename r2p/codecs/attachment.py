@@ -130,7 +130,10 @@ def encode(header: Header) -> bytes:
     flags = (0 if header.stamped else FLAG_RESTAMPED) | (0 if header.clock is None else FLAG_CLOCK)
     hops, more, serial = min(header.hops, 255), len(header.more), header.serial & SERIAL_WRAP
     fixed = _FIXED.pack(VERSION, flags, hops, more, serial, header.sequence, header.stamp, header.deadline)
-    return fixed + _encode_clock(header.clock) + _stamps(more).pack(*header.more) + _encode_origin(header.origin)
+    clock = header.clock
+    if clock is not None:
+        fixed += _CLOCK.pack(clock.epoch, clock.offset, min(clock.error, 0xFFFFFFFF))
+    return fixed + _stamps(more).pack(*header.more) + _encode_origin(header.origin)
 
 
 class HeaderReader(Generic[T]):
@@ -170,7 +173,9 @@ class HeaderReader(Generic[T]):
         at = _FIXED.size
         clock = None
         if flags & FLAG_CLOCK:
-            clock = _decode_clock(data)
+            if len(data) < at + _CLOCK.size:
+                raise _too_short("header with a clock", data, at + _CLOCK.size)
+            clock = ClockOffset(*_CLOCK.unpack_from(data, at))
             at += _CLOCK.size
         stamps: tuple[int, ...] = (stamp,)
         if more:
@@ -270,16 +275,6 @@ def _too_short(what: str, data: bytes, needed: int) -> DecodeError:
 @functools.cache
 def _stamps(count: int) -> struct.Struct:
     return struct.Struct(f"<{count}q")
-
-
-def _decode_clock(data: bytes) -> ClockOffset:
-    if len(data) < _FIXED.size + _CLOCK.size:
-        raise _too_short("header with a clock", data, _FIXED.size + _CLOCK.size)
-    return ClockOffset(*_CLOCK.unpack_from(data, _FIXED.size))
-
-
-def _encode_clock(clock: ClockOffset | None) -> bytes:
-    return b"" if clock is None else _CLOCK.pack(clock.epoch, clock.offset, min(clock.error, 0xFFFFFFFF))
 
 
 def _encode_origin(origin: Origin) -> bytes:

@@ -36,7 +36,7 @@ WINDOW = 2048
 _WINDOW_BYTES = 192 * 1024  # bytes of those: five topics at full speed fit into zenoh's own queue of 1 MB
 _OVERHEAD = 32  # bytes of a message besides its payload, in a packet of several: its stamp and its share of the header
 _FINAL_CREDITS_MAX = 256  # sessions that learn that a topic is no longer subscribed to; older ones may be long gone
-_SENDERS_MAX = 4096  # senders that are remembered: by a stream with their serials, by a link with their losses
+_SENDERS_MAX = 4096  # senders whose serials a stream remembers, and topics whose serials outlast an outage
 _RESUME_S = 10.0  # seconds after a link came up in which its topics are subscribed again, or are used on another link
 
 _NRT = PublisherClass.NON_REAL_TIME
@@ -324,7 +324,7 @@ class RxStream:
         """Count what is missing before this serial. False for one that came before."""
         gap = publisher.window.advance(serial)
         if gap > 0:
-            self._receiver.count_gap(self.topic.name, publisher.source, gap)
+            self._stats.lost["on the way"] += gap
             publisher.window.skip(gap)
         return gap >= 0
 
@@ -388,8 +388,6 @@ class ZenohReceiver:
         self.link = link
         self.loop = hub.space.loop
         self.clock = hub.space.clock
-        self.gaps: dict[tuple[str, Source], int] = {}
-        """Messages lost on the way, by topic and source."""
         self._instance = hub.instance
         self._session: ZenohSession | None = None
         self._prefix = ""
@@ -457,13 +455,6 @@ class ZenohReceiver:
             return 0
         size = self.link.max_payload if topic.layout is None else topic.layout.size
         return min(WINDOW, _WINDOW_BYTES // (size + _OVERHEAD))
-
-    def count_gap(self, topic: str, source: Source, gap: int) -> None:
-        """Count messages that were lost on the way."""
-        self.link.stats.lost["on the way"] += gap
-        if len(self.gaps) >= _SENDERS_MAX:
-            self.gaps.clear()
-        self.gaps[topic, source] = self.gaps.get((topic, source), 0) + gap
 
     # Publishers
 
