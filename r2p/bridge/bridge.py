@@ -153,8 +153,7 @@ class Bridge:
         if port.is_client:
             port.tree_port = self.tree.clients.open(now, port.number)
         elif port.number < FIRST_CLIENT:
-            self.tree.open(now, port.number, private=port.link.fixed_peer)
-            port.tree_port = self.tree.ports[port.number]
+            port.tree_port = self.tree.open(now, port.number, private=port.link.fixed_peer)
         port.tree_port.lost = port.link.stats.lost
 
     def _close(self, port: BridgePort) -> None:

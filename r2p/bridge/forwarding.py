@@ -387,7 +387,10 @@ def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sin
     if subscriber is None:  # it has left while the message was on its way through the routes
         return blocked
     route.forwarded += 1
-    if subscriber.offer_in_order(sample):
+    # `Sink.offer_in_order`, inlined as in `Topic._send`: each message that a gateway forwards passes here.
+    waiting = subscriber.wait_queue
+    in_line = (waiting.real_time or waiting.non_real_time) and waiting.line_of(sample)
+    if not in_line and subscriber.offer(sample):
         return blocked
     if not subscriber.blocks_publishers and sample.publisher_class == PublisherClass.NON_REAL_TIME:
         subscriber.force(sample)  # it had no room for long: one slow link must not hold up all the others

@@ -66,10 +66,11 @@ class SpanningTree:
 
     # Ports
 
-    def open(self, now: int, number: int, *, private: bool = False) -> None:
+    def open(self, now: int, number: int, *, private: bool = False) -> TreePort:
         """Add a port for a link that came up; `private`: see `TreePort`."""
-        self.ports[number] = TreePort(number, now, send_at=now, probe_at=now, private=private)
+        port = self.ports[number] = TreePort(number, now, send_at=now, probe_at=now, private=private)
         self._update(now)
+        return port
 
     def close(self, now: int, number: int) -> None:
         """Remove the port of a link that went down."""
