@@ -147,7 +147,7 @@ class MasterRole:
     def step_down(self) -> None:
         """Give up the role."""
         self._cycle.stop()
-        self._grants.clear()
+        self._grants.clear()  # their owners ask the next master for the same slots
 
     def _set_inherits(self, inherits: bool) -> None:
         self._inherits = self._grants.collecting = inherits

@@ -141,6 +141,7 @@ class MasterTracker:
             return None
         at, network = received
         counter = network.cycle + (now - at) // self._cycle.timing.cycle
+        # Before it is anchored, the cycle's own counter has only the 8 bits of a sync.
         near = (self._cycle.counter - counter + _NEAR) & CYCLE_MASK <= 2 * _NEAR
         if not near or not self.matches(network):
             return None

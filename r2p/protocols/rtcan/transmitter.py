@@ -118,6 +118,7 @@ class Mailboxes:
         if not self._queue.size:
             return
         self.expire(now)
+        # A non real-time frame that loses arbitration must not keep a real-time one waiting: each has its mailbox.
         if self.boxes[_SRT] is None:
             message = self._queue.best(now, nrt=False)
             if message is not None:
