@@ -24,7 +24,7 @@ from r2p.clock import clock_of
 from r2p.messages import Message
 from r2p.msg import Encoder, Led, StampedIMURaw9, StampedVelocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
-from r2p.tools.options import Quiet, Verbose, seconds
+from r2p.tools.options import Quiet, Verbose, time_option
 from r2p.tools.session import execute, moments, wait_until
 from r2p.tools.simulator import default_links, program, simulate
 from r2p.units import SECOND
@@ -55,10 +55,7 @@ def command(
         typer.Argument(help="robot: on a simulated CAN bus; line: the debug line, on TCP and on a serial port."),
     ] = "robot",
     duration: Annotated[
-        float | None,
-        typer.Option(
-            "--duration", parser=seconds, metavar="TIME", help="How long; default: 20 s (robot), 10 s (line)."
-        ),
+        float | None, time_option("--duration", "How long; default: 20 s (robot), 10 s (line).")
     ] = None,
     verbose: Verbose = 0,
     quiet: Quiet = 0,
@@ -77,6 +74,7 @@ def command(
         await simulate(duration=duration or _ROBOT, outside=default_links(), laps=1)
         typer.echo(_NEXT.format(r2p=program()))
 
+    # Only errors are logged: any other line would tear the display apart.
     execute(robot if what == "robot" else line, verbose=verbose, quiet=quiet + 2)
 
 

@@ -40,6 +40,11 @@ def class_choice(text: str) -> ClassOf:
     return ClassOf(by_name[name], seconds(time) if time else 0.0)
 
 
+def time_option(name: str, help: str) -> Any:
+    """Return an option with a duration in seconds."""
+    return typer.Option(name, parser=seconds, metavar="TIME", help=help)
+
+
 def valid_topic(text: str) -> str:
     """Parse the name of a topic."""
     try:
@@ -70,20 +75,9 @@ Format = Annotated[
     typer.Option("--format", help="Output format; default: text at a terminal, JSON lines in a pipe."),
 ]
 Timeout = Annotated[
-    float | None,
-    typer.Option(
-        "--timeout",
-        parser=seconds,
-        metavar="TIME",
-        help="Give up (exit code 3) when nothing arrives for this long: 2, 500ms.",
-    ),
+    float | None, time_option("--timeout", "Give up (exit code 3) when nothing arrives for this long: 2, 500ms.")
 ]
-Wait = Annotated[
-    float | None,
-    typer.Option(
-        "--wait", parser=seconds, metavar="TIME", help="Listen for this long; firmware announces one topic every 0.5 s."
-    ),
-]
+Wait = Annotated[float | None, time_option("--wait", "Listen for this long; firmware announces one topic every 0.5 s.")]
 Count = Annotated[int | None, typer.Option("--count", "-n", min=1, metavar="N", help="End after N.")]
 Once = Annotated[bool, typer.Option("--once", help="End after one.")]
 All = Annotated[bool, typer.Option("--all", "-a", help="Include tools, whose names begin with _.")]

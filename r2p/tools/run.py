@@ -200,13 +200,14 @@ def _load_file(where: str) -> ModuleType:
     for known in list(sys.modules.values()):
         if getattr(known, "__file__", None) == str(path):
             return known
+    # A file named json.py must not replace the module that others have imported.
     name = path.stem if path.stem not in sys.modules else f"_r2p_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise UsageError(f"{where} is not a Python file: its name must end with .py")
     module = importlib.util.module_from_spec(spec)
     _add_to_path(path.parent)
-    sys.modules[name] = module
+    sys.modules[name] = module  # before it is executed, as `import` does: its dataclasses look it up
     try:
         spec.loader.exec_module(module)
     except Exception as error:

@@ -30,7 +30,7 @@ from r2p.sim.physics.world import Triple, Wall, World, box
 from r2p.sim.robots.emulated import Triskar2
 from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, TopicFigures, WheelFigures
 from r2p.sim.robots.triskar2 import square
-from r2p.tools.options import Quiet, Verbose, Via, seconds
+from r2p.tools.options import Quiet, Verbose, Via, time_option
 from r2p.tools.session import UsageError, check_urls, execute, moments
 
 DEBUG = "tcp-listen:0"
@@ -67,10 +67,7 @@ def command(
         bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
     ] = False,
     duration: Annotated[
-        float | None,
-        typer.Option(
-            "--duration", parser=seconds, metavar="TIME", help="How long; default: until Ctrl-C; --fast: 60 s."
-        ),
+        float | None, time_option("--duration", "How long; default: until Ctrl-C; --fast: 60 s.")
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of all random numbers.")] = 0,
     square: Annotated[
@@ -106,6 +103,7 @@ def command(
     def virtually(_main: object) -> None:
         sim.run(main, seed=seed)
 
+    # Only errors are logged: any other line would tear the display apart.
     execute(main, verbose=verbose, quiet=quiet + 2, run=virtually if fast else None)
 
 

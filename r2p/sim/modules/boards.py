@@ -47,6 +47,7 @@ _CURRENT_COUNT = 50_000 / ADC_MAX  # mA per count
 _MDPS = math.degrees(1.0) * 1000  # mdps in one rad/s
 _MG = 1000 / GRAVITY  # mg in one m/s^2
 _BARO = 0.04  # seconds: the barometer makes 25 measurements a second
+_REACTION = 0.02  # s; a robot of 2 m/s drives 4 cm meanwhile
 
 
 class Part(Protocol):
@@ -140,6 +141,7 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
     def moved() -> Encoder:
         return Encoder(delta=float(drive.take_ticks()))
 
+    # Only the newest setpoint counts: a late one must not delay it.
     node.subscribe(
         config.setpoint, config.message, command, queue=1, lossy=True, timeout=config.timeout, on_timeout=drive.stop
     )
@@ -198,7 +200,7 @@ class RangeArray:
 
 async def proximity(node: r2p.Node, sensors: RangeArray, topic: str, period: float) -> None:
     """Publish what the sensors see: event-triggered, because an obstacle needs an immediate reaction."""
-    ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=0.02))
+    ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=_REACTION))
     async for _ in node.every(period):
         await ranges.publish(sensors.read())
 

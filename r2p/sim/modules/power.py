@@ -64,7 +64,7 @@ class Powered:
         for end in ends:
             end.close()
         await asyncio.gather(*(end.closed for end in ends if isinstance(end, _Client)))
-        for server in self._servers:
+        for server in self._servers:  # last: since Python 3.12 this waits until all connections are closed
             await server.wait_closed()
 
     # Lines

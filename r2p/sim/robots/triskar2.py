@@ -166,7 +166,7 @@ async def forward_kinematics(node: r2p.Node) -> None:
 
     It pauses while a wheel is silent; the readings of the others count as soon as that is back.
     """
-    odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=0.1))
+    odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=_ROUNDS * PERIOD))
     turned, readings = [0.0] * WHEELS, [0] * WHEELS
 
     def turn(wheel: int, encoder: Encoder) -> None:

@@ -17,7 +17,7 @@ import typer
 import r2p
 from r2p.bus import BusMonitor, BusSlot, Calendar, Refusal, Reservation, Timing, occupied, timing
 from r2p.codecs import rtcan
-from r2p.tools.options import Format, hertz, seconds
+from r2p.tools.options import Format, hertz, seconds, time_option
 from r2p.tools.output import Output, Record
 from r2p.tools.session import TimedOut, execute
 from r2p.units import SECOND
@@ -134,10 +134,7 @@ def admit(
     slots: Annotated[
         int, typer.Option("--slots", min=2, max=rtcan.SLOTS_MAX, metavar="N", help="Slots per cycle.")
     ] = 60,
-    cycle: Annotated[
-        float | None,
-        typer.Option("--cycle", parser=seconds, metavar="TIME", help="Nominal length of the cycle; default: 10ms."),
-    ] = None,
+    cycle: Annotated[float | None, time_option("--cycle", "Nominal length of the cycle; default: 10ms.")] = None,
     bitrate: Annotated[
         int, typer.Option("--bitrate", min=10_000, metavar="BIT/S", help="Bit rate of the bus.")
     ] = 1_000_000,
