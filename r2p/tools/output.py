@@ -134,7 +134,7 @@ class Output:
                 return
             data = memoryview(text.encode())
             while data:
-                await _wait_writable(fd)
+                await wait_ready(fd, write=True)
                 data = data[os.write(fd, data[:_ATOMIC]) :]
         except BrokenPipeError as error:
             raise PipeClosed from error
@@ -152,17 +152,19 @@ def waitable(stream: TextIO) -> int | None:
     return None if regular else fd
 
 
-async def _wait_writable(fd: int) -> None:
-    """Wait until a write does not block."""
-    if select.select([], [fd], [], 0)[1]:
+async def wait_ready(fd: int, *, write: bool = False) -> None:
+    """Wait until reading from `fd`, or writing to it, does not block."""
+    # What is ready already is found at once: a callback costs a turn of the event loop for each piece.
+    if any(select.select([] if write else [fd], [fd] if write else [], [], 0)):
         return
     loop = asyncio.get_running_loop()
-    writable = asyncio.Event()
-    loop.add_writer(fd, writable.set)
+    add, remove = (loop.add_writer, loop.remove_writer) if write else (loop.add_reader, loop.remove_reader)
+    ready = asyncio.Event()
+    add(fd, ready.set)
     try:
-        await writable.wait()
+        await ready.wait()
     finally:
-        loop.remove_writer(fd)
+        remove(fd)
 
 
 def flatten(record: Record) -> dict[str, Any]:

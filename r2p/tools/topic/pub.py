@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import select
 import sys
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, TextIO
@@ -13,7 +12,7 @@ import typer
 import r2p
 from r2p.bridge import ClassOf
 from r2p.tools.options import Count, Once, Rate, Timeout, class_choice
-from r2p.tools.output import notify, waitable
+from r2p.tools.output import notify, wait_ready, waitable
 from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError
 from r2p.tools.topic.watching import Topic, TypeName, hint, is_subscribed, suggest_topics, wait_until_passed_on
 from r2p.tools.types import find
@@ -184,24 +183,13 @@ def _decode(line: bytes) -> str:
 async def _chunks(stream: TextIO) -> AsyncIterator[bytes]:
     fd = waitable(stream)
     if fd is not None:
-        while data := await _read(fd):
+        await wait_ready(fd)
+        while data := os.read(fd, _CHUNK):
             yield data
+            await wait_ready(fd)
     elif (binary := getattr(stream, "buffer", None)) is not None:  # a regular file, which never blocks
         while data := binary.read1(_CHUNK):
             yield data
     else:  # text in memory
         while text := stream.read(_CHUNK):
             yield text.encode(errors="replace")
-
-
-async def _read(fd: int) -> bytes:
-    # What is there already is read at once: `add_reader` costs a turn of the event loop for each chunk.
-    if not select.select([fd], [], [], 0)[0]:
-        loop = asyncio.get_running_loop()
-        readable = asyncio.Event()
-        loop.add_reader(fd, readable.set)
-        try:
-            await readable.wait()
-        finally:
-            loop.remove_reader(fd)
-    return os.read(fd, _CHUNK)

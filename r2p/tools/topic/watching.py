@@ -49,30 +49,25 @@ async def received_samples(
 
     Without a type (`typed`), firmware that advertises nothing can't be asked for the topic: that is reported, too.
     """
+    topic = subscriber.topic
 
     def awaited() -> str:
-        return ("the first message" if subscriber.publishers else "a publisher") + f" of {subscriber.topic}"
+        return f"{'the first message' if subscriber.publishers else 'a publisher'} of {topic}"
 
-    def unadvertised() -> None:
-        if not typed:
-            _report_unadvertised(session, subscriber.topic)
+    def report_unadvertised() -> None:
+        view = session.module.network.topics().get(topic)
+        if not typed and session.may_have_firmware() and not (view and is_published(view)):
+            notify(f"{topic} has not been advertised: firmware may announce nothing, then give --type to subscribe")
 
     samples = subscriber.samples()
-    missing = f"{subscriber.topic} has no publisher"
-    waiting, hints = session.waiting(awaited), hint(session, missing, subscriber.topic, is_published)
-    with waiting, hints, call_after(HINT_AFTER, unadvertised):
+    waiting, hints = session.waiting(awaited), hint(session, f"{topic} has no publisher", topic, is_published)
+    with waiting, hints, call_after(HINT_AFTER, report_unadvertised):
         first = await anext(samples, None)
     if first is not None:
         yield first
     with _reporting_departure(session, subscriber):
         async for sample in samples:
             yield sample
-
-
-def _report_unadvertised(session: Session, topic: str) -> None:
-    view = session.module.network.topics().get(topic)
-    if session.may_have_firmware() and not (view and is_published(view)):
-        notify(f"{topic} has not been advertised: firmware may announce nothing, then give --type to subscribe")
 
 
 def suggest_topics(session: Session, topic: str, fits: Callable[[r2p.TopicView], bool]) -> str:
