@@ -22,9 +22,9 @@ import msgspec
 import r2p
 from r2p.clock import Ticker
 from r2p.names import module_name_from
-from r2p.tools.options import Format, Quiet, Verbose
+from r2p.tools.options import Format
 from r2p.tools.output import Output
-from r2p.tools.session import UsageError, execute, settings
+from r2p.tools.session import UsageError, settings, standalone
 from r2p.transports.can.netlink import ARPHRD_CAN, Interface, has_socketcan, list_interfaces
 from r2p.units import MILLISECOND
 
@@ -55,17 +55,14 @@ class Check(msgspec.Struct, frozen=True):
         return line + "".join(f"\n{'':18} > {step}" for step in self.do.split("\n") if step)
 
 
-def command(format: Format = None, verbose: Verbose = 0, quiet: Quiet = 0) -> None:
+@standalone
+async def command(*, format: Format = None) -> None:
     """Check what this machine has and lacks for r2p, and what to do about it. Sends nothing."""
-
-    async def main() -> None:
-        output = Output(format)
-        for check in checks():
-            await output.put(check.record(), check.text())
-        check = lateness(await measure())
+    output = Output(format)
+    for check in checks():
         await output.put(check.record(), check.text())
-
-    execute(main, verbose=verbose, quiet=quiet)
+    check = lateness(await measure())
+    await output.put(check.record(), check.text())
 
 
 def checks(root: Path = _ROOT) -> Iterator[Check]:

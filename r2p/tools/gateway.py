@@ -22,9 +22,9 @@ from r2p.bridge import BridgeOptions, GatewayStatistics
 from r2p.bridge.options import check_prefix, is_link, parse_rule
 from r2p.msg import GatewayStatus
 from r2p.names import module_name_from
-from r2p.tools.options import Format, Quiet, Verbose, Via, class_choice, hertz
+from r2p.tools.options import Format, Via, class_choice, hertz
 from r2p.tools.output import Output, aligned
-from r2p.tools.session import UsageError, check_urls, execute, settings
+from r2p.tools.session import UsageError, check_urls, settings, standalone
 
 logger = logging.getLogger("r2p.gateway")
 
@@ -67,7 +67,8 @@ _AllowControl = Annotated[
 ]
 
 
-def command(
+@standalone
+async def command(
     via: Via = None,
     name: _Name = None,
     allow: _Allow = None,
@@ -80,37 +81,31 @@ def command(
     reserve: _Reserve = None,
     allow_control: _AllowControl = False,
     format: Format = None,
-    verbose: Verbose = 0,
-    quiet: Quiet = 0,
 ) -> None:
     """Join two or more links to one network, until Ctrl-C or SIGTERM.
 
     Topics are forwarded where they have subscribers. LINK is a name as in the log, or a kind: rtcan, tcp, serial,
     zenoh.
     """
-
-    async def main() -> None:
-        chosen = settings(via)
-        if len(chosen.via) < 2 and not any(url.startswith("tcp-listen:") for url in chosen.via):
-            raise UsageError("a gateway needs at least two links, as in --via rtcan:can0 --via zenoh:")
-        check_urls(chosen.via)
-        if len(set(chosen.via)) < len(chosen.via):
-            raise UsageError("the same link is given twice: a gateway joins different networks")
-        options = BridgeOptions(
-            allow=_rules(allow, "--allow", chosen.via),
-            deny=_rules(deny, "--deny", chosen.via),
-            rate_limit={topic: hertz(value) for topic, value in _pairs(rate_limit, "--rate-limit", "TOPIC=HZ")},
-            read_only=_links(read_only, "--read-only", chosen.via),
-            prefix=_prefix(prefix),
-            prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or ("zenoh",),
-            classes={topic: class_choice(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
-            reserve=tuple(reserve or ()),
-            allow_control=allow_control,
-        )
-        own = name or chosen.module or f"GW_{module_name_from(socket.gethostname())[:4]}"
-        await serve(own, chosen.via, options, Output(format), quiet=format is None)
-
-    execute(main, verbose=verbose, quiet=quiet)
+    chosen = settings(via)
+    if len(chosen.via) < 2 and not any(url.startswith("tcp-listen:") for url in chosen.via):
+        raise UsageError("a gateway needs at least two links, as in --via rtcan:can0 --via zenoh:")
+    check_urls(chosen.via)
+    if len(set(chosen.via)) < len(chosen.via):
+        raise UsageError("the same link is given twice: a gateway joins different networks")
+    options = BridgeOptions(
+        allow=_rules(allow, "--allow", chosen.via),
+        deny=_rules(deny, "--deny", chosen.via),
+        rate_limit={topic: hertz(value) for topic, value in _pairs(rate_limit, "--rate-limit", "TOPIC=HZ")},
+        read_only=_links(read_only, "--read-only", chosen.via),
+        prefix=_prefix(prefix),
+        prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or ("zenoh",),
+        classes={topic: class_choice(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
+        reserve=tuple(reserve or ()),
+        allow_control=allow_control,
+    )
+    own = name or chosen.module or f"GW_{module_name_from(socket.gethostname())[:4]}"
+    await serve(own, chosen.via, options, Output(format), quiet=format is None)
 
 
 async def serve(name: str, via: list[str], options: BridgeOptions, output: Output, *, quiet: bool = False) -> None:

@@ -22,8 +22,8 @@ import typer
 
 import r2p
 from r2p.names import NODE_MAX, node_name, topic_name
-from r2p.tools.options import Quiet, Verbose, Via
-from r2p.tools.session import UsageError, check_urls, execute, settings
+from r2p.tools.options import Via
+from r2p.tools.session import UsageError, check_urls, settings, standalone
 
 logger = logging.getLogger("r2p.runner")
 
@@ -35,7 +35,8 @@ class Program(msgspec.Struct, frozen=True):
     name: str
 
 
-def command(
+@standalone
+async def command(
     functions: Annotated[
         list[str],
         typer.Argument(
@@ -58,31 +59,23 @@ def command(
     ] = None,
     restart: Annotated[bool, typer.Option("--restart", help="Restart a crashed node, after a pause.")] = False,
     via: Via = None,
-    verbose: Verbose = 0,
-    quiet: Quiet = 0,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
 
     A crash ends only that node; the command then exits with 1.
     """
-
-    async def main() -> None:
-        chosen = settings(via)
-        check_urls(chosen.via)
-        programs = load(functions)
-        priorities = _parse_priorities(priority or (), programs)
-        names = chosen.remap | _parse_remap(remap or ())
-        async with r2p.Module(module or chosen.module, via=chosen.via, remap=names) as host:
-            for program in programs:
-                host.start(
-                    program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart
-                )
-            nodes = ", ".join(program.name for program in programs)
-            links = ", ".join(chosen.via) or "none, local only (--via joins a network)"
-            logger.info("module %s runs %s; links: %s; Ctrl-C ends it", host.name, nodes, links)
-            await host.wait()
-
-    execute(main, verbose=verbose, quiet=quiet)
+    chosen = settings(via)
+    check_urls(chosen.via)
+    programs = load(functions)
+    priorities = _parse_priorities(priority or (), programs)
+    names = chosen.remap | _parse_remap(remap or ())
+    async with r2p.Module(module or chosen.module, via=chosen.via, remap=names) as host:
+        for program in programs:
+            host.start(program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart)
+        nodes = ", ".join(program.name for program in programs)
+        links = ", ".join(chosen.via) or "none, local only (--via joins a network)"
+        logger.info("module %s runs %s; links: %s; Ctrl-C ends it", host.name, nodes, links)
+        await host.wait()
 
 
 def load(targets: Iterable[str]) -> list[Program]:

@@ -12,7 +12,7 @@ A command is a coroutine function whose first parameter is a `Session`:
 SIGTERM and a closed pipe), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`. The function itself is
 unchanged, so tests call it under virtual time, inside `async with join(Settings(via=["memory:lab"])) as session`.
 Commands of the bus get a `BusMonitor` instead of a Session (`opening`). Commands that make a module of their own, such
-as `run`, use `settings()` and `execute()` with the options `Via`, `Verbose` and `Quiet`.
+as `run`, are `standalone`, with the option `Via` and `settings()`.
 
 Commands wait here: `Session.settle` for announcements, `Session.waiting` with a report, `patience` for messages,
 `wait_until` for a condition, and `moments` for the time.
@@ -359,28 +359,36 @@ def command(app: typer.Typer, name: str, *, opening: Opening | None = None) -> C
     """
 
     def register(body: B) -> B:
-        app.command(name)(_as_command(body, opening))
+        node = body.__name__.strip("_")
+
+        def run(*, via: list[str] | None, verbose: int, quiet: int, **given: Any) -> None:
+            async def main() -> None:
+                chosen = settings(via, tool=True)
+                async with join(chosen, name=node, verbose=verbose) if opening is None else opening(chosen) as opened:
+                    await body(opened, **given)
+
+            execute(main, verbose=verbose, quiet=quiet)
+
+        app.command(name)(_with_options(run, body, session=True))
         return body
 
     return register
 
 
-def _as_command(body: Callable[..., Awaitable[None]], opening: Opening | None) -> Callable[..., None]:
-    """Return the function that Typer expects, with the options of all commands."""
-    name = body.__name__.strip("_")
+def standalone(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make a command for `main.COMMANDS` of a coroutine function that joins no network as a tool; it adds -v and -q."""
 
-    def run(**given: Any) -> None:
-        via, verbose, quiet = (given.pop(name) for name in _COMMON)
+    def run(*, verbose: int, quiet: int, **given: Any) -> None:
+        execute(functools.partial(body, **given), verbose=verbose, quiet=quiet)
 
-        async def main() -> None:
-            chosen = settings(via, tool=True)
-            async with join(chosen, name=name, verbose=verbose) if opening is None else opening(chosen) as opened:
-                await body(opened, **given)
+    return _with_options(run, body, session=False)
 
-        execute(main, verbose=verbose, quiet=quiet)
 
-    own = list(inspect.signature(body, eval_str=True).parameters.values())[1:]
-    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *_COMMON.values())]
+def _with_options(run: Callable[..., None], body: Callable[..., object], *, session: bool) -> Callable[..., None]:
+    """Give `run` the name, the help and the options of `body` without its `session`, and the common options."""
+    own = list(inspect.signature(body, eval_str=True).parameters.values())
+    given = [*own[1:], *_COMMON] if session else [*own, *_COMMON[1:]]
+    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in given]
     function: Any = run
     function.__name__ = body.__name__
     function.__doc__ = body.__doc__
@@ -389,10 +397,10 @@ def _as_command(body: Callable[..., Awaitable[None]], opening: Opening | None) -
     return run
 
 
-_COMMON = {
-    name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+_COMMON = [
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
     for name, annotation, default in (("via", Via, None), ("verbose", Verbose, 0), ("quiet", Quiet, 0))
-}
+]
 
 
 def group(help: str) -> typer.Typer:
