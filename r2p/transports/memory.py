@@ -72,8 +72,8 @@ class MemoryNetwork:
     """A network of this process, and its faults: probabilities 0..1, `delay` and `jitter` in seconds.
 
     `reorder` is the probability that a message is held back long enough for the next ones to overtake it. Faults can be
-    changed while it runs; `counts` tells what happened. `seed` None: from the random numbers of the event loop that is
-    running at its first fault (under virtual time those of the test's seed).
+    changed while it runs; `counts` shows what happened. Without a `seed` the event loop that runs at its first fault
+    gives one (under virtual time that of the test).
     """
 
     def __init__(
@@ -200,7 +200,7 @@ class MemoryLink(BufferedLink):
         super().__init__(name, hub)
         self.network = network
         self._address = network.new_address()
-        self._port = MemoryPort(network, self._receive, self.made_room)
+        self._port = MemoryPort(network, lambda datagram: self.receive((datagram,)), self.made_room)
         self._times_left = TimesLeft()
 
     def connect(self) -> None:
@@ -274,9 +274,6 @@ class MemoryLink(BufferedLink):
     def close(self) -> None:
         super().close()
         self.network.unplug(self._address)
-
-    def _receive(self, datagram: Datagram) -> None:
-        self.receive((datagram,))
 
 
 class MemoryTransport(Transport):

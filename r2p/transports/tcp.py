@@ -37,9 +37,9 @@ MAX_CLIENTS = 200
 _REFUSED_MAX = 8  # refused clients that are sent the reason at a time; others are cut off
 _REFUSED_S = 0.5  # seconds for a refused client to read the reason and close
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
-_CONNECT_TIMEOUT_S = 5.0  # seconds
+_CONNECT_TIMEOUT_S = 5.0  # seconds; the kernel itself would try for two minutes where nothing answers
 _STABLE_S = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
-_DEAD_AFTER_S = 5  # seconds of silence
+_DEAD_AFTER_S = 5  # seconds without an answer to the kernel until a peer counts as gone
 
 
 class _TcpConnection(asyncio.BufferedProtocol, Connection):
