@@ -106,8 +106,9 @@ class Watchdog:
                 return
             if self._ended.is_set() or self._alive.wait(self._limit):
                 continue
-            if self._was_stopped(asked, used, self._limit) and self._alive.wait(self._limit):
-                self._log_stopped(asked)
+            stopped = self._stopped_for(asked, used, self._limit)
+            if stopped and self._alive.wait(self._limit):
+                logger.warning(STOPPED, stopped)
                 continue
             reported = self._report()
             self._alive.wait()  # close() sets it too
@@ -120,18 +121,14 @@ class Watchdog:
         start, used = self._clock.monotonic(), _used()
         if self._ended.wait(self._limit / 4):
             return True
-        if self._was_stopped(start, used, _STOPPED_MAX):
-            self._log_stopped(start)
+        if stopped := self._stopped_for(start, used, _STOPPED_MAX):
+            logger.warning(STOPPED, stopped)
         return False
 
-    def _was_stopped(self, since: int, used: float, limit: float) -> bool:
-        """Whether this thread's wait was late by more than `limit` seconds, while this process used no processor."""
+    def _stopped_for(self, since: int, used: float, limit: float) -> float:
+        """The seconds since then, if this thread waited over `limit` too long while this process used no processor."""
         passed = (self._clock.monotonic() - since) / SECOND
-        return passed > 2 * limit and _used() - used < _IDLE * passed
-
-    def _log_stopped(self, since: int) -> None:
-        passed = (self._clock.monotonic() - since) / SECOND
-        logger.warning(STOPPED, passed)
+        return passed if passed > 2 * limit and _used() - used < _IDLE * passed else 0.0
 
     def _report(self) -> bool:
         """Log where the loop is stuck; False if there was a report less than a second ago."""

@@ -222,15 +222,7 @@ class Node:
         Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or an option
         that makes no sense, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
-        options = SubscriberOptions(
-            queue=queue,
-            lossy=lossy,
-            keep=keep,
-            callback=callback,
-            max_age=max_age,
-            timeout=timeout,
-            on_timeout=on_timeout,
-        )
+        options = SubscriberOptions(callback, queue, lossy, keep, max_age, timeout, on_timeout)
         options.check(topic)
         shape = None if type is None else layout(type)
         where = self._space.open(self._resolve(topic), shape)

@@ -21,7 +21,10 @@ from r2p.runtime.backpressure import NO_ROOM, Sink, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample
 
 YIELD_EVERY = 16
-"""Messages that publish() or an iteration handles before it lets the event loop run once."""
+"""Messages that publish() or an iteration handles before it lets the event loop run once.
+
+A turn of the loop takes as long as a few messages, so not after each; other tasks wait for so many at most.
+"""
 
 _NRT = PublisherClass.NON_REAL_TIME
 

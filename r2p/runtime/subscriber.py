@@ -27,13 +27,13 @@ Callback = Callable[[T], object]
 Keep = Literal["newest", "oldest"]
 
 
-class SubscriberOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """The options of `Node.subscribe`, as described there."""
+class SubscriberOptions(msgspec.Struct, frozen=True):
+    """The options of `Node.subscribe`, as described there, and in the same order."""
 
+    callback: Callback[Any] | None
     queue: int
     lossy: bool
     keep: Keep
-    callback: Callback[Any] | None
     max_age: float | None
     timeout: float | None
     on_timeout: Callable[[], object] | None

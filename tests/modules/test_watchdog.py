@@ -159,7 +159,7 @@ async def test_what_was_going_on_when_the_process_was_stopped_is_not_blamed(
             return self.looks > 1
 
     watchdog._alive = Sign()
-    monkeypatch.setattr(watchdog, "_was_stopped", lambda _since, _used, limit: limit == 0.001)
+    monkeypatch.setattr(watchdog, "_stopped_for", lambda _since, _used, limit: 8.0 * (limit == 0.001))
     await asyncio.to_thread(watchdog._watch)
     (told,) = reports.texts
     assert told.startswith("this process did not run for")
