@@ -123,6 +123,13 @@ class PendingDelivery:
             sink.get_wait_queue().remove(sink, self)
         return without
 
+    def drop_remaining(self, loss: str) -> list[Sink]:
+        """Stop waiting, and let the remaining sinks count the sample as lost for this reason; returns them."""
+        without = self.withdraw()
+        for sink in without:
+            sink.count_lost(loss)
+        return without
+
 
 class _LatchedDelivery(PendingDelivery):
     """A latched value on its way to a new subscriber; its publisher does not wait for that."""

@@ -18,7 +18,7 @@ from r2p.clock import check_timeout
 from r2p.errors import Closed, MessageError
 from r2p.log_lines import LineLimit
 from r2p.messages import Layout, Message
-from r2p.runtime.backpressure import GIVEN_UP, LINK_DOWN, PendingDelivery, Sink
+from r2p.runtime.backpressure import LINK_DOWN, Sink
 from r2p.runtime.qos import Missed, NonRealTime, Periodic, Signal, Sporadic
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, pulse
 from r2p.runtime.sample import PublisherClass, Sample, Source
@@ -201,14 +201,6 @@ class BasePublisher(Generic[M, C]):
         for sink in sinks:
             sink.force(sample)
         self._miss(sample.sequence, LINK_DOWN, sinks)
-
-    def _withdraw(self, delivery: PendingDelivery, reason: str, lost: str = GIVEN_UP, late: float = 0.0) -> None:
-        """Count and report a sample as missed by the sinks that it still waits for; they count it as `lost`."""
-        without = delivery.withdraw()
-        for sink in without:
-            sink.count_lost(lost)
-        if without:
-            self._miss(delivery.sample.sequence, reason, without, late)
 
     def _report(self, missed: Missed, callback: Signal | None) -> None:
         """Log it, and call the user's callback; a link that is down has been logged as such."""

@@ -79,7 +79,8 @@ class Publisher(BasePublisher[M, NonRealTime]):
             await delivery.over
         finally:
             timer.cancel()
-            self._withdraw(delivery, CANCELLED, CANCELLED)  # nothing waits any longer, unless this task was cancelled
+            if without := delivery.drop_remaining(CANCELLED):  # only if this task was cancelled
+                self._miss(sample.sequence, CANCELLED, without)
             if delivery.failed:
                 self._miss(sample.sequence, delivery.reason, delivery.failed)
 

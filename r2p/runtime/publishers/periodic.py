@@ -15,7 +15,7 @@ from typing import Generic
 
 from r2p.clock import Ticker
 from r2p.messages import Layout
-from r2p.runtime.backpressure import NO_ROOM, PendingDelivery, Sink
+from r2p.runtime.backpressure import GIVEN_UP, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Periodic
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue
@@ -138,8 +138,8 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
     def _give_up(self, reason: str) -> None:
         """Withdraw what still waits from the period before: it is stale."""
         delivery, self._pending = self._pending, None
-        if delivery is not None:
-            self._withdraw(delivery, reason)
+        if delivery is not None and (without := delivery.drop_remaining(GIVEN_UP)):
+            self._miss(delivery.sample.sequence, reason, without)
 
 
 class _PeriodDelivery(PendingDelivery, Generic[M]):

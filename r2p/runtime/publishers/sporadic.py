@@ -4,7 +4,7 @@ from typing import Generic
 
 from r2p.clock import Alarm
 from r2p.messages import Layout
-from r2p.runtime.backpressure import PendingDelivery, Sink
+from r2p.runtime.backpressure import GIVEN_UP, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
 from r2p.runtime.qos import Missed, Sporadic
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, checkpoint
@@ -98,7 +98,7 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         if event in self._pending:  # a callback for an event before it may have closed the publisher
             self._pending.remove(event)
             late = max(0, self._clock.monotonic() - event.due) / SECOND
-            self._withdraw(event, reason, late=late)
+            self._miss(event.sample.sequence, reason, event.drop_remaining(GIVEN_UP), late)
 
 
 class _EventDelivery(PendingDelivery, Generic[M]):
