@@ -220,11 +220,12 @@ class MemoryLink(BufferedLink):
     def write(self, topic: str, sample: Sample) -> None:
         self.stats.sent += 1
         self.stats.bytes_sent += len(sample.data)
+        hooks = self.gateway_hooks
         datagram = Datagram(
             self._address,
             topic.encode(),
             sample.data,
-            sample.source.module,
+            sample.source.module if hooks is None else hooks.source_name(sample.source),
             sample.source.node,
             sample.stamp,
             sample.deadline,
