@@ -24,6 +24,8 @@ right before a block are notes, `<!-- key -->` or `<!-- key: value -->`:
 | `exits: 3` | console: the exit code of its commands, else 0 |
 | `not run: why` | console: shown, but not run |
 
+A block that consists of `--8<-- "FILE"` shows a file, which has tests of its own, and is not seen here.
+
 In what a block prints, `...` stands for any text in a line, and alone in a line for any lines; columns may be wider,
 and where a machine is slow, a command may say what it waits for.
 """
@@ -47,6 +49,7 @@ _NOTES = re.compile(r"(?:^ *<!-- [^\n]* -->\n+)+\Z", re.MULTILINE)
 _NOTE = re.compile(r"<!-- ([a-z ]+)(?:: (.*))? -->")
 _WAITING = "(?:r2p: waiting for .*\n)*"
 _TITLE = re.compile(r'title="([^"]+)"')
+_FILE = re.compile(r'\s*--8<-- "[^"\n]*"\s*')
 
 
 class Block(msgspec.Struct, frozen=True):
@@ -77,7 +80,7 @@ def pages() -> list[Path]:
 def of_page(page: Path) -> tuple[Block, ...]:
     """The blocks of a page, in order."""
     text = page.read_text(encoding="utf-8")
-    return tuple(_block(page, text, fence) for fence in _FENCE.finditer(text))
+    return tuple(_block(page, text, fence) for fence in _FENCE.finditer(text) if not _FILE.fullmatch(fence["text"]))
 
 
 def blocks(language: str) -> list[Block]:

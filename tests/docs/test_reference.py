@@ -4,15 +4,14 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import r2p
-from r2p.tools import main
 from tests.docs.blocks import ROOT, pages
+from tests.docs.commands import commands
 
 REFERENCE = ROOT / "docs" / "reference"
 COMMAND = ROOT / "docs" / "command.md"
@@ -30,17 +29,7 @@ def test_every_public_name_has_an_entry() -> None:
     assert others == {"messages", "errors", "msg", "testing", "codecs"}
 
 
-def _commands() -> Iterator[tuple[str, Any]]:
-    """All commands by the heading that they have."""
-    for name in main.GROUPS | main.COMMANDS:
-        command = main._load(name)
-        if name in main.GROUPS:
-            yield from ((f"r2p {name} {inner}", each) for inner, each in command.commands.items())
-        else:
-            yield f"r2p {name}", command
-
-
-@pytest.mark.parametrize(("heading", "command"), list(_commands()))
+@pytest.mark.parametrize(("heading", "command"), list(commands()))
 def test_every_option_of_every_command_is_told(heading: str, command: Any) -> None:
     sections = re.split(r"^## ", COMMAND.read_text(), flags=re.MULTILINE)
     own = [section for section in sections if section.startswith(f"{heading}\n")]
@@ -52,7 +41,7 @@ def test_every_option_of_every_command_is_told(heading: str, command: Any) -> No
 
 def test_no_section_tells_of_a_command_that_is_gone() -> None:
     told = set(re.findall(r"^## (r2p \S.*)$", COMMAND.read_text(), flags=re.MULTILINE)) - {"r2p.toml"}
-    assert told == {heading for heading, _ in _commands()}
+    assert told == {heading for heading, _ in commands()}
 
 
 @pytest.mark.parametrize("page", pages()[:2], ids=lambda page: page.name)
