@@ -71,7 +71,7 @@ def _check(graph: grimp.ImportGraph) -> None:
     for package in (f"r2p.{each}" for packages in LAYERS.values() for each in packages):
         if package not in graph.modules:
             raise DrawingError(f"{package} does not exist: remove it from LAYERS")
-    for module in sorted(graph.modules - {"r2p"}):
+    for module in sorted(graph.modules - {"r2p", "r2p.__main__"}):
         layer = _layer_of(module)
         for imported in sorted(graph.find_modules_directly_imported_by(module) - {"r2p"}):
             if _layer_of(imported) < layer:

@@ -20,14 +20,19 @@ GROUPS = {
     "node": ("r2p.tools.node", "List and inspect nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
     "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),
+    "config": ("r2p.tools.config_show", "Show the settings, and where they come from."),
 }
 COMMANDS = {
     "run": ("r2p.tools.run", "Run functions as the nodes of a module."),
+    "launch": ("r2p.tools.launch", "Start the commands of a file as one group, such as a robot."),
     "gateway": ("r2p.tools.gateway", "Join links to one network: a robot's bus, a debug line, zenoh."),
     "sim": ("r2p.tools.simulator", "Run an emulated robot, without hardware."),
     "doctor": ("r2p.tools.doctor", "Check what this machine has and lacks for r2p."),
     "demo": ("r2p.tools.demo", "Show r2p at work, without hardware."),
 }
+
+LAUNCHER_VARIABLE = "R2P_LAUNCHER"
+"""The environment variable by which `r2p launch` gives its process id to the commands that it starts."""
 
 
 class LazyGroup(TyperGroup):

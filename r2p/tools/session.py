@@ -12,7 +12,7 @@ A command is a coroutine function whose first parameter is a `Session`:
 SIGTERM and a closed pipe), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`. The function itself is
 unchanged, so tests call it under virtual time, inside `async with join(Settings(via=["memory:lab"])) as session`.
 Commands of the bus get a `BusMonitor` instead of a Session (`opening`). Commands that make a module of their own, such
-as `run`, are `standalone`, with the option `Via` and `settings()`.
+as `run`, are `standalone`, with the option `Via` and `settings()`. What commands need of `config` is here, too.
 
 Commands wait here: `Session.settle` for announcements, `Session.waiting` with a report, `patience` for messages,
 `wait_until` for a condition, and `moments` for the time.
@@ -24,28 +24,26 @@ import errno
 import functools
 import inspect
 import os
-import stat
 import string
-import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
-from pathlib import Path
 from typing import Any, TypeVar
 
-import msgspec
 import typer
 
 import r2p
 from r2p.clock import random_of
 from r2p.log_lines import printable
+from r2p.tools.config import Settings as Settings
+from r2p.tools.config import UsageError as UsageError
+from r2p.tools.config import settings as settings
 from r2p.tools.options import Quiet, Verbose, Via
 from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout, log_to_stderr, notify
 from r2p.transports.url import open_transport
 
 B = TypeVar("B", bound=Callable[..., Awaitable[None]])
-Opening = Callable[["Settings"], contextlib.AbstractAsyncContextManager[Any]]
+Opening = Callable[[Settings], contextlib.AbstractAsyncContextManager[Any]]
 """Opens what a command works on instead of a Session."""
 
-CONFIG = "r2p.toml"
 REPORT_WAITING_AFTER = 1.0
 """Seconds that a command waits before it reports what it waits for."""
 
@@ -57,37 +55,11 @@ _FIRMWARE = 1.5  # seconds in which firmware, which announces one item each half
 _SETTLE_MAX = 8.0  # seconds to listen while announcements arrive: a bus of 1 Mbit/s carries 100 of them a second
 _POLL = 0.02  # seconds between two checks of a condition
 _SETTLE_POLL = 0.05  # ... and between two counts of what was announced, which take longer
-_LOOPBACK = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 _LINK_UP = 5.0  # seconds to wait for the first link
-
-
-class UsageError(Exception):
-    """The command line asks for something impossible: exit code 2."""
 
 
 class TimedOut(Exception):
     """Something did not happen in time: exit code 3."""
-
-
-class Settings(msgspec.Struct, forbid_unknown_fields=True):
-    """The keys of r2p.toml; `via` can also come from R2P_VIA or the command line. `types`: "package.module:Class"."""
-
-    via: list[str] = []
-    module: str | None = None
-    types: dict[str, str] = {}
-    remap: dict[str, str] = {}
-
-
-def settings(via: list[str] | None = None, directory: Path | None = None, *, tool: bool = False) -> Settings:
-    """Return the settings. `via` is the argument, else R2P_VIA, else of r2p.toml in `directory` (default: the current).
-
-    R2P_VIA and r2p.toml are shared with the robot's program: where that listens, a `tool` on this machine connects.
-    Raises UsageError for an r2p.toml that can't be read, or that other users can write.
-    """
-    file = _read(directory)
-    shared = os.environ.get("R2P_VIA", "").split() or file.via
-    file.via = via or [_local_peer(url) if tool else url for url in shared]
-    return file
 
 
 def check_urls(via: list[str]) -> None:
@@ -99,64 +71,6 @@ def check_urls(via: list[str]) -> None:
             if isinstance(error.__cause__, ImportError):  # the URL is valid, but this installation lacks a package
                 raise
             raise UsageError(str(error)) from error
-
-
-def _local_peer(url: str) -> str:
-    """Return the URL by which a tool on the same machine reaches a program that has opened this one."""
-    scheme, _, address = url.partition(":")
-    if scheme != "tcp-listen":
-        return url
-    host, colon, port = address.rpartition(":")
-    if not colon or not port.isdecimal():  # only a host (and the usual port), or only a port
-        return f"tcp:127.0.0.1:{address}" if address.isdecimal() else f"tcp:{_LOOPBACK.get(address, address)}"
-    return f"tcp:{_LOOPBACK.get(host, host)}:{port}"
-
-
-def _read(directory: Path | None) -> Settings:
-    try:
-        path = (directory or Path.cwd()) / CONFIG
-    except FileNotFoundError:  # the working directory has been removed
-        return Settings()
-    try:
-        with path.open(encoding="utf-8") as file:
-            check_owned(path, os.fstat(file.fileno()))
-            table = tomllib.loads(file.read())
-        if isinstance(url := table.get("via"), str):
-            table["via"] = [url]
-        return msgspec.convert(table, Settings)
-    except FileNotFoundError:
-        return Settings()
-    except RecursionError as error:
-        raise UsageError(f"{path} is nested too deeply") from error
-    except msgspec.ValidationError as error:
-        raise UsageError(f"{path}: {error}; the keys are {', '.join(Settings.__struct_fields__)}") from error
-    except (OSError, ValueError) as error:  # unreadable, or not TOML
-        raise UsageError(f"{path}: {error}") from error
-
-
-def check_owned(path: Path, status: os.stat_result) -> None:
-    """Raise UsageError for a configuration that a user other than root can write: it can name code to run."""
-    if os.name != "posix":
-        return
-    owners = {0, os.geteuid()}
-    if os.geteuid() == 0:  # with sudo, the file may belong to the user who called it
-        owners.add(int(os.environ.get("SUDO_UID", "0")))
-    if status.st_uid not in owners:
-        raise UsageError(f"{path} belongs to another user and can name code to run: chown it, or use another directory")
-    if status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and not _is_private(status)):
-        raise UsageError(f"{path} is writable by other users and can name code to run: chmod go-w {path}")
-
-
-def _is_private(status: os.stat_result) -> bool:
-    """Return whether the group of a file is its owner's own: it has the same name and no other members."""
-    import grp
-    import pwd
-
-    try:
-        group, owner = grp.getgrgid(status.st_gid), pwd.getpwuid(status.st_uid).pw_name
-    except KeyError:
-        return False
-    return group.gr_name == owner and set(group.gr_mem) <= {owner}
 
 
 def _check_descriptors() -> None:

@@ -5,14 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import grp
 import itertools
 import logging
 import os
-import pwd
 import re
-import stat
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import pytest
@@ -23,12 +19,12 @@ import r2p
 from r2p.msg import Led
 from r2p.tools import options, session
 from r2p.tools.output import PipeClosed
-from r2p.tools.run import load_module
-from r2p.tools.session import Session, Settings, TimedOut, UsageError, check_owned, execute, join, settings
+from r2p.tools.session import Session, Settings, TimedOut, UsageError, execute, join
 from tests.tools.rig import Firmware, robot, tool
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 
 @pytest.fixture(autouse=True)
@@ -40,119 +36,6 @@ def _as_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]
     before = logger.handlers[:], logger.propagate, logger.level
     yield
     assert (logger.handlers, logger.propagate, logger.level) == before
-
-
-# Settings
-
-
-def test_the_command_line_goes_before_the_environment_before_the_file(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    assert settings().via == []
-    (tmp_path / "r2p.toml").write_text('via = "tcp:file"')
-    assert settings().via == ["tcp:file"]
-    monkeypatch.setenv("R2P_VIA", "tcp:a serial:b")
-    assert settings().via == ["tcp:a", "serial:b"]
-    assert settings(["tcp:c", "tcp:d"]).via == ["tcp:c", "tcp:d"]
-
-
-@pytest.mark.parametrize(
-    ("listens", "connects"),
-    [
-        ("tcp-listen:2323", "tcp:127.0.0.1:2323"),
-        ("tcp-listen:0.0.0.0:2323", "tcp:127.0.0.1:2323"),
-        ("tcp-listen:[::]:2323", "tcp:[::1]:2323"),
-        ("tcp-listen:10.0.0.5:2323", "tcp:10.0.0.5:2323"),
-        ("serial:/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
-    ],
-)
-def test_a_tool_connects_to_where_the_program_of_the_same_file_listens(
-    tmp_path: Path, listens: str, connects: str
-) -> None:
-    (tmp_path / "r2p.toml").write_text(f'via = "{listens}"')
-    assert settings(directory=tmp_path).via == [listens]
-    assert settings(directory=tmp_path, tool=True).via == [connects]
-    assert settings([listens], tmp_path, tool=True).via == [listens]
-
-
-def test_what_the_file_holds(tmp_path: Path) -> None:
-    (tmp_path / "r2p.toml").write_text(
-        'via = ["tcp:a", "tcp:b"]\nmodule = "PC1"\n[types]\nleds = "r2p.msg:Led"\n[remap]\nencoder = "enc1"\n'
-    )
-    assert settings() == Settings(
-        via=["tcp:a", "tcp:b"], module="PC1", types={"leds": "r2p.msg:Led"}, remap={"encoder": "enc1"}
-    )
-
-
-@pytest.mark.parametrize(
-    "text", ["via = 5", "via", "modul = 'PC1'", "[types]\nleds = 5", f"via = {'[' * 5000}", f"x{'.x' * 1000} = 1"]
-)
-def test_a_bad_file_is_told_with_its_name(text: str, tmp_path: Path) -> None:
-    (tmp_path / "r2p.toml").write_text(text)
-    with pytest.raises(UsageError, match=re.escape(str(tmp_path / "r2p.toml"))):
-        settings()
-
-
-def test_a_key_that_is_unknown_is_told_with_those_that_are_known(tmp_path: Path) -> None:
-    (tmp_path / "r2p.toml").write_text('vai = "tcp:there"')
-    with pytest.raises(UsageError, match="unknown field `vai`; the keys are via, module, types, remap"):
-        settings()
-
-
-def test_a_working_directory_that_is_gone_has_no_file(tmp_path: Path) -> None:
-    (gone := tmp_path / "gone").mkdir()
-    os.chdir(gone)
-    gone.rmdir()
-    try:
-        assert settings() == Settings()
-        with pytest.raises(UsageError, match="the working directory does not exist any more"):
-            load_module("robot")
-        with pytest.raises(UsageError, match=re.escape("there is no file robot.py")):
-            load_module("robot.py")
-    finally:
-        os.chdir(tmp_path)
-
-
-def status(mode: int = 0o644, user: int | None = None, group: int = 4711) -> os.stat_result:
-    return os.stat_result((stat.S_IFREG | mode, 1, 1, 1, os.geteuid() if user is None else user, group, 1, 0, 0, 0))
-
-
-@pytest.mark.parametrize(
-    ("file", "refused"),
-    [
-        (status(), ""),
-        (status(user=0), ""),
-        (status(user=4711), "belongs to another user and can name code to run: chown it"),
-        (status(0o646), "is writable by other users and can name code to run: chmod go-w"),
-        (status(0o664), "is writable by other users"),
-    ],
-)
-def test_a_file_that_others_may_write_is_refused(file: os.stat_result, refused: str) -> None:
-    with pytest.raises(UsageError, match=refused) if refused else contextlib.nullcontext():
-        check_owned(Path("r2p.toml"), file)
-
-
-def test_the_group_of_its_owner_alone_may_write_it() -> None:
-    owner = pwd.getpwuid(os.geteuid())
-    group = grp.getgrgid(owner.pw_gid)
-    alone = group.gr_name == owner.pw_name and set(group.gr_mem) <= {owner.pw_name}
-    with contextlib.nullcontext() if alone else pytest.raises(UsageError):
-        check_owned(Path("r2p.toml"), status(0o664, group=owner.pw_gid))
-
-
-def test_root_by_way_of_sudo_reads_the_file_of_the_caller(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "geteuid", lambda: 0)
-    monkeypatch.setenv("SUDO_UID", "4711")
-    check_owned(Path("r2p.toml"), status(user=4711))
-    with pytest.raises(UsageError):
-        check_owned(Path("r2p.toml"), status(user=4712))
-
-
-def test_the_file_itself_is_looked_at(tmp_path: Path) -> None:
-    (tmp_path / "r2p.toml").write_text('via = "tcp:there"')
-    (tmp_path / "r2p.toml").chmod(0o666)
-    with pytest.raises(UsageError, match="is writable by other users"):
-        settings()
 
 
 def test_too_few_files_may_be_open(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

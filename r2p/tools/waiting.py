@@ -1,0 +1,77 @@
+"""Waiting until something appears on the network: a topic, a node or a module.
+
+`r2p wait` and the ready conditions of `r2p launch` mean the same by it.
+"""
+
+import asyncio
+from typing import Literal, get_args
+
+import r2p
+from r2p.names import module_path, node_name, topic_name
+from r2p.tools.session import Session
+
+Kind = Literal["topic", "node", "module"]
+"""What one can wait for."""
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+_POLL = 0.05  # seconds between two looks at what is known of the network
+_QUERY = 1.0  # seconds between two queries: a module that starts later announces itself, but a gateway may forget it
+
+
+def check_name(kind: Kind, name: str) -> None:
+    """Raise InvalidName for what is not a valid name of a topic, a node (`NODE` or `MODULE/NODE`) or a module."""
+    if kind == "topic":
+        topic_name(name)
+    elif kind == "module":
+        module_path(name)
+    else:
+        module, slash, node = name.rpartition("/")
+        node_name(node)
+        if slash:
+            module_path(module)
+
+
+async def appeared(session: Session, kind: Kind, name: str) -> None:
+    """Wait until the topic, node or module is seen on the network; for ever, if need be.
+
+    A topic is seen when another module publishes it or subscribes to it; the subscriptions of tools do not count, as
+    `r2p topic echo` subscribes before there is a publisher. A node is seen when it has a topic: `NODE` is a node of any
+    module, `MODULE/NODE` of this one. Raises InvalidName.
+    """
+    check_name(kind, name)
+    is_seen = {"topic": _topic_is_seen, "node": _node_is_seen, "module": _module_is_seen}[kind]
+    loop = asyncio.get_running_loop()
+    next_query = loop.time()
+    while not is_seen(session.module.network, name):
+        if loop.time() >= next_query:
+            session.module.query()
+            next_query = loop.time() + _QUERY
+        await asyncio.sleep(_POLL)
+
+
+def _topic_is_seen(network: r2p.NetworkView, name: str) -> bool:
+    view = network.topics().get(topic_name(name))
+    if view is None:
+        return False
+    if any(view.published_on):  # "" is this module
+        return True
+    named = {each.link for each in view.subscribers}
+    of_firmware = any(link not in named for link in view.subscribed_on)  # it announces no nodes
+    return of_firmware or any(each.link and not _is_tool(each.module) for each in view.subscribers)
+
+
+def _node_is_seen(network: r2p.NetworkView, name: str) -> bool:
+    module, _, node = name.rpartition("/")
+    return any(
+        each.node == node and each.link and (each.module == module if module else not _is_tool(each.module))
+        for view in network.topics().values()
+        for each in view.publishers + view.subscribers
+    )
+
+
+def _module_is_seen(network: r2p.NetworkView, name: str) -> bool:
+    return any(view.name == name and view.link for view in network.modules())
+
+
+def _is_tool(module: str) -> bool:
+    return module.startswith("_")
