@@ -20,7 +20,7 @@ from r2p.log_lines import LineLimit
 from r2p.messages import Layout, Message
 from r2p.runtime.backpressure import LINK_DOWN, Sink
 from r2p.runtime.qos import Missed, NonRealTime, Periodic, Signal, Sporadic
-from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, pulse
+from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, Pulse
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic, TopicSpace
 
@@ -75,7 +75,7 @@ class BasePublisher(Generic[M, C]):
         self._last: Sample | None = None
         self._until_yield = YIELD_EVERY
         self._log_limit = LineLimit(_LOG_LINES)
-        self._subscriber_came = asyncio.Event()  # pulsed, never left set
+        self._subscriber_came = Pulse()
         self._in_callback = False
         self._deferred: list[tuple[Signal, Missed]] = []
         self._missed_lately: deque[int] = deque(maxlen=_REMEMBERED)
@@ -126,7 +126,7 @@ class BasePublisher(Generic[M, C]):
             self._encode = self._closed  # so that publish() does not have to look each time
             self._space.release(self._topic)
             self.node.forget(self)
-            pulse(self._subscriber_came)
+            self._subscriber_came.emit()
 
     def _closed(self, message: M) -> NoReturn:
         raise self._is_closed()
@@ -140,7 +140,7 @@ class BasePublisher(Generic[M, C]):
         """Send a latched value: a subscriber joined, or came back after a reboot."""
         if self._last is not None:
             sink.offer_latched(self._last)
-        pulse(self._subscriber_came)
+        self._subscriber_came.emit()
 
     def link_degraded(self, link: str, reason: str) -> None:
         """Report that a link no longer carries the topic, or has lost its slots."""
