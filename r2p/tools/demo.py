@@ -10,6 +10,7 @@ import contextlib
 import math
 from collections import deque
 from collections.abc import Iterator
+from pathlib import Path
 from statistics import median, quantiles
 from typing import Annotated, Literal, Self
 
@@ -42,10 +43,12 @@ Row = tuple[str, ...]
 _HEADER: Row = ("TOPIC", "LINK", "HZ", "LATENCY", "LAST VALUE", "COUNT", "LOST")
 _WIDTHS = (-12, -10, 5, 12, -22, 6, 4)  # negative: to the left
 
+_TELEOP = Path("examples", "teleop.py")
+_DRIVE = "topic pub velocity_cmd x=0.2 --type Velocity3 -r 20"
 _NEXT = """
-Try next, in two terminals: the same robot, and a program that drives it by keys
+Try next, in two terminals: the same robot, and {what}
   {r2p} sim triskar2 --via tcp-listen:2323
-  {r2p} run examples/teleop.py:keys --via tcp:127.0.0.1:2323
+  {r2p} {drive} --via tcp:127.0.0.1:2323
 Or: {r2p} demo line, and with your own robot: {r2p} doctor"""
 
 
@@ -72,10 +75,17 @@ def command(
 
     async def robot() -> None:
         await simulate(duration=duration or _ROBOT, outside=default_links(), laps=1)
-        typer.echo(_NEXT.format(r2p=program()))
+        typer.echo(_next_steps())
 
     # Only errors are logged: any other line would tear the display apart.
     execute(robot if what == "robot" else line, verbose=verbose, quiet=quiet + 2)
+
+
+def _next_steps() -> str:
+    """Return what to try next; only in a checkout there are examples."""
+    keys = _TELEOP.exists()
+    what = "a program that drives it by keys" if keys else "a command that drives it ahead"
+    return _NEXT.format(r2p=program(), what=what, drive=f"run {_TELEOP}:keys" if keys else _DRIVE)
 
 
 class TopicCounter:
@@ -264,8 +274,8 @@ class DemoScreen:
         self._print(
             f"IMU1, an emulated R2P module, serves the debug line on tcp:{robot.address}",
             f"MOTOR1, another one, serves it on serial:{robot.device}",
-            "PC1, in Python, talks to both. Watch them from a second terminal:",
-            f"  r2p topic hz imu_raw --via tcp:{robot.address}",
+            "PC1, in Python, talks to both. In another terminal:",
+            f"  {program()} topic hz imu_raw --via tcp:{robot.address}",
             "",
         )
 
@@ -290,9 +300,9 @@ class DemoScreen:
         self._print(
             "",
             "Try next, without hardware, in two terminals:",
-            "  r2p topic pub leds --type Led led=3 value=1 -r 2 --via tcp-listen:2323",
-            "  r2p topic echo leds --via tcp:127.0.0.1:2323",
-            "With a robot: r2p doctor, then r2p topic list --via serial:/dev/ttyUSB0",
+            f"  {program()} topic pub leds --type Led led=3 value=1 -r 2 --via tcp-listen:2323",
+            f"  {program()} topic echo leds --via tcp:127.0.0.1:2323",
+            f"With a robot: {program()} doctor, then {program()} topic list --via serial:/dev/ttyUSB0",
         )
 
     def _rows(self, robot: Robot) -> list[Row]:

@@ -28,7 +28,7 @@ from r2p.bridge import BridgeOptions
 from r2p.msg import Odometry
 from r2p.sim.physics.world import Triple, Wall, World, box
 from r2p.sim.robots.emulated import Triskar2
-from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, TopicFigures, WheelFigures
+from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, OdometryFigures, TopicFigures, WheelFigures
 from r2p.sim.robots.triskar2 import square
 from r2p.tools.options import Quiet, Verbose, Via, time_option
 from r2p.tools.session import UsageError, check_urls, execute, moments
@@ -172,6 +172,8 @@ def addresses(robot: Triskar2) -> list[str]:
 def program() -> str:
     """Return what to type for this program in another terminal in the same folder."""
     typed = sys.argv[0]
+    if Path(typed).name == "__main__.py" and not shutil.which("r2p"):
+        return f"{'python' if shutil.which('python') == sys.executable else sys.executable} -m r2p"
     if Path(typed).name != "r2p" or not os.access(typed, os.X_OK):  # not started as a command
         return "r2p"
     found = shutil.which("r2p")
@@ -237,20 +239,27 @@ class SimulatorScreen:
             self._view.update(self.draw(figures), refresh=True)
         else:
             self.print(line(figures))
+            if figures.too_slow:
+                self.print(f"          {_too_slow(figures)}")
 
     def print_summary(self, figures: Figures, *, fast: bool) -> None:
-        """Print a summary. In real time, a busy computer can be the reason for missed deadlines."""
+        """Print a summary; `fast`: of a run in virtual time, which no PC is too slow for."""
         x, y, _ = figures.pose
         self.print("", f"{figures.time:.1f} s, {figures.path:.2f} m driven; the robot is at x {x:.3f}, y {y:.3f} m")
-        if figures.off is not None:
-            self.print(f"odometry is off by {figures.off * 1000:.0f} mm: no two wheels have the same size")
+        if figures.odometry is not None:
+            self.print(_accuracy(figures.odometry, figures.off_max))
         count = sum(topic.sent for topic in figures.topics)
         self.print(f"{count} messages published, {figures.missed} missed a deadline")
         worst = max(figures.topics, key=lambda topic: topic.missed, default=None)
         if worst is not None and worst.missed:
-            self.print(f"  {worst.missed} of them of {worst.topic}{'' if fast else '; is this computer busy?'}")
+            self.print(f"  {worst.missed} of them of {worst.topic}{'' if fast else '; is this PC busy?'}")
         if figures.bus is not None:
             self.print(f"bus: {figures.bus.frames} frames, {figures.bus.errors} errors; load {figures.bus.mean:.0%}")
+        if figures.slow and not fast:
+            self.print(
+                f"this PC was too slow for {figures.slow:.1f} of {figures.time:.1f} s: messages were late or skipped;",
+                f"  end other programs, or simulate in virtual time: {program()} sim --fast",
+            )
 
     def draw(self, figures: Figures) -> RenderableType:
         """Return the figures, as many as fit the terminal."""
@@ -272,27 +281,46 @@ class SimulatorScreen:
 
 
 def _title(figures: Figures, duration: float | None, width: int) -> Text:
-    """Return the title line: how long, how far, and how many deadlines were missed."""
+    """Return the title line: how long, how far, and how many deadlines were missed, or that the PC is too slow."""
     until = f" of {duration:.0f}" if duration else ""
     late = f"{figures.missed or 'no'} deadline{'' if figures.missed == 1 else 's'} missed"
+    if figures.too_slow:
+        late = _too_slow(figures)
     text = f" Triskar2   {figures.time:.1f}{until} s   {figures.path:.2f} m driven  "
     return Text(f"{text:{max(0, width - len(late) - 1)}}{late} ", style="bold reverse", no_wrap=True)
 
 
+def _too_slow(figures: Figures) -> str:
+    return f"PC too slow: {figures.late:.0%} late"
+
+
 def state(figures: Figures) -> list[str]:
     """Return nine lines of 48 characters about the robot and its bus."""
-    x, y, w = figures.pose
-    off = "" if figures.off is None else f"  off by {figures.off * 1000:.0f} mm"
-    odometry = figures.odometry.pose if figures.odometry else None
+    # Position and odometry of one instant, so that they can be compared: in 0.1 s the robot drives 5 cm.
+    x, y, w = figures.odometry.truth if figures.odometry and figures.odometry.fresh else figures.pose
     volts, amperes, charge = figures.battery
     return [
         f"position  x {x:z6.2f}  y {y:z6.2f} m  heading {math.degrees(w):z4.0f} deg",
-        f"odometry  x {odometry.x:z6.2f}  y {odometry.y:z6.2f} m{off}" if odometry else "odometry  nothing yet",
+        "odometry  nothing yet" if figures.odometry is None else _odometry(figures.odometry),
         "motors     wanted     speed (rad/s)    current",
         *(_wheel(wheel) for wheel in figures.wheels),
         f"battery   {volts:.1f} V  {amperes:.1f} A  {charge:.0%}",
         *bus_lines(figures.bus),
     ]
+
+
+def _odometry(odometry: OdometryFigures) -> str:
+    note = f"off by {odometry.off * 1000:.0f} mm" if odometry.fresh else f"{odometry.age:.1f} s ago"
+    return f"odometry  x {odometry.pose.x:z6.2f}  y {odometry.pose.y:z6.2f} m  {note}"
+
+
+def _accuracy(odometry: OdometryFigures, off_max: float) -> str:
+    """Return a line about the odometry. On a square its errors cancel out: the one at the end says little."""
+    now, most = round(odometry.off * 1000), round(off_max * 1000)
+    if not most:
+        return "odometry: exact to the millimetre"
+    before = f", earlier by {most} mm" if most > now else ""
+    return f"odometry: off by {now} mm{before}: no two wheels have the same size"
 
 
 def bus_lines(bus: BusFigures | None) -> list[str]:

@@ -6,22 +6,25 @@ import asyncio
 import functools
 import io
 import re
+import shutil
 import signal
 import subprocess
 import sys
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
 import r2p
 from r2p import sim
-from r2p.msg import Odometry, Pose3
+from r2p.msg import Pose3
+from r2p.runtime.publishers import PeriodicPublisher
 from r2p.sim import can_bus
 from r2p.sim.physics.world import World, box
 from r2p.sim.robots.emulated import Triskar2
-from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, TopicFigures, WheelFigures
+from r2p.sim.robots.figures import BusFigures, Figures, FiguresReader, OdometryFigures, TopicFigures, WheelFigures
 from r2p.sim.robots.triskar2 import square
 from r2p.tools import simulator
 from r2p.tools.main import app
@@ -42,6 +45,7 @@ async def test_figures_of_a_drive() -> None:
     async with Triskar2(VIA, seed=1) as robot, r2p.Module("PC1", via=VIA) as pc:
         await robot.ready(10)
         reader = FiguresReader(robot, bus, [pc])
+        pc.start(functools.partial(simulator._watch, reader=reader), name="watch")
         pc.start(square, 1.0, 0.4, name="square")
         await asyncio.sleep(2)
         reader.read(2.0)
@@ -56,6 +60,10 @@ async def test_figures_of_a_drive() -> None:
     assert topics["odometry"].real_time == "soft: by deadline"
     assert not {"log", "power", "current1"} & set(topics)
     assert figures.missed == 0
+    assert (figures.late, figures.slow, figures.too_slow) == (0.0, 0.0, False)
+    assert figures.odometry is not None
+    assert figures.odometry.fresh
+    assert figures.odometry.off <= figures.off_max < 0.02
     assert figures.bus is not None
     assert 0.05 < figures.bus.load < 0.5
     assert figures.bus.frames == pytest.approx(3 * figures.bus.rate, rel=0.2)
@@ -83,6 +91,63 @@ async def test_what_was_missed_before_does_not_count_and_what_is_off_says_so() -
     text = "\n".join(simulator.state(figures))
     assert "MOTOR2    switched off" in text
     assert "a network in memory" in text
+
+
+@pytest.mark.virtual_time
+async def test_a_computer_that_is_too_slow_is_told_by_late_messages() -> None:
+    """And by those that were skipped; with the topics' rates it need not show."""
+    async with Triskar2("memory:slow") as robot:
+        await robot.ready(10)
+        reader = FiguresReader(robot, None)
+        await asyncio.sleep(1)
+        assert reader.read(1.0).late == 0
+        (encoder,) = (each for each in robot.modules["MOTOR1"].nodes["motor"].node.publishers)
+        assert isinstance(encoder, PeriodicPublisher)
+        encoder.late += 20
+        encoder.skipped += 50
+        await asyncio.sleep(1)
+        slow = reader.read(2.0)
+        await asyncio.sleep(2)
+        again = reader.read(4.0)
+    assert slow.late == pytest.approx((20 + 50) / (3 * 50 + 50), rel=0.1)
+    assert (slow.too_slow, slow.slow) == (True, 1.0)
+    assert (again.too_slow, again.late, again.slow) == (False, 0.0, 1.0)
+
+
+def test_a_slow_computer_is_named_as_the_reason(capsys: pytest.CaptureFixture[str]) -> None:
+    screen = simulator.SimulatorScreen(World(), live=False, duration=20.0)
+    screen.show(msgspec.structs.replace(moment(), late=0.62))
+    screen.print_summary(msgspec.structs.replace(moment(), slow=2.5), fast=False)
+    shown = capsys.readouterr().out
+    assert "PC too slow: 62% late\n" in shown
+    assert "this PC was too slow for 2.5 of 3.5 s: messages were late or skipped;" in shown
+    assert shown.endswith("sim --fast\n")
+    assert max(map(len, shown.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("age", "position", "odometry"),
+    [(0.1, "x   0.31  y  -0.01 m", "off by 14 mm"), (2.0, "x   0.44  y   0.00 m", "2.0 s ago")],
+)
+def test_position_and_odometry_are_of_one_instant(age: float, position: str, odometry: str) -> None:
+    """Else what the robot drove in the meantime would look like an error of the odometry."""
+    last = OdometryFigures(Pose3(0.30), (0.31, -0.01, 0.0), age)
+    lines = simulator.state(msgspec.structs.replace(moment(), pose=(0.44, 0.0, 0.0), odometry=last))
+    assert position in lines[0]
+    assert lines[1].startswith("odometry  x   0.30  y   0.00 m")
+    assert lines[1].endswith(odometry)
+
+
+@pytest.mark.parametrize(
+    ("off", "most", "text"),
+    [
+        (0.0, 0.0004, "odometry: exact to the millimetre"),
+        (0.041, 0.041, "odometry: off by 41 mm: no two wheels have the same size"),
+        (0.0, 0.041, "odometry: off by 0 mm, earlier by 41 mm: no two wheels have the same size"),
+    ],
+)
+def test_no_error_of_the_odometry_is_explained_that_is_not_there(off: float, most: float, text: str) -> None:
+    assert simulator._accuracy(OdometryFigures(Pose3(off), (0.0, 0.0, 0.0), 0.0), most) == text
 
 
 @pytest.mark.parametrize("allowed", [True, False])
@@ -134,8 +199,8 @@ def test_fast_prints_a_line_each_ten_seconds_and_sums_up(capsys: pytest.CaptureF
 def test_the_state_fits_beside_the_map() -> None:
     wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
     bus = BusFigures(1.0, 7654.3, 999_999, 99, 10.5, 60)
-    odometry = Odometry(Pose3(-10.5, -10.5, -3.0))
-    figures = Figures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, 0.123, wheels, (25.6, 10.0, 1.0), [], bus)
+    odometry = OdometryFigures(Pose3(-10.5, -10.5, -3.0), (-10.5, -10.377, -3.0), 0.1)
+    figures = Figures(3600.0, (-10.5, -10.5, -3.0), 999.99, odometry, wheels, (25.6, 10.0, 1.0), [], bus)
     lines = simulator.state(figures)
     assert len(lines) == 9
     assert max(len(line) for line in lines) <= 48
@@ -146,7 +211,7 @@ def moment() -> Figures:
     wheels = [WheelFigures(f"MOTOR{n}", True, -10.0, -10.12, -10.0) for n in (1, 2, 3)]
     bus = BusFigures(0.5, 1000.0, 9999, 0, 2.5, 60)
     rows = [TopicFigures(f"topic{n}", "MOTOR1", "soft: by deadline", 50.0, 1000, 1) for n in range(10)]
-    return Figures(3.5, (0.0, 0.0, 0.0), 1.0, None, None, wheels, (25.6, 10.0, 1.0), rows, bus)
+    return Figures(3.5, (0.0, 0.0, 0.0), 1.0, None, wheels, (25.6, 10.0, 1.0), rows, bus)
 
 
 @pytest.mark.parametrize(
@@ -185,6 +250,15 @@ def test_at_a_terminal_the_figures_stay_where_they_are(monkeypatch: pytest.Monke
     drawn = text.getvalue()
     assert drawn.count("deadlines missed") == drawn.count("  r2p topic list") >= 3
     assert drawn.count("\x1b[?25l") == drawn.count("\x1b[?25h") == 1  # the cursor comes back
+
+
+@pytest.mark.parametrize(
+    ("found", "typed"), [("r2p", "r2p"), ("python", "python -m r2p"), ("", f"{sys.executable} -m r2p")]
+)
+def test_hints_name_python_where_there_is_no_script(monkeypatch: pytest.MonkeyPatch, found: str, typed: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["/lib/r2p/__main__.py", "demo"])
+    monkeypatch.setattr(shutil, "which", lambda name: sys.executable if name == found else None)
+    assert program() == typed
 
 
 @pytest.mark.parametrize("found", [True, False])

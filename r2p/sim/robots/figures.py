@@ -8,9 +8,10 @@ from typing import NamedTuple
 import msgspec
 
 import r2p
+from r2p.clock import clock_of
 from r2p.codecs import rtcan
-from r2p.msg import Odometry
-from r2p.runtime.publishers import AnyPublisher
+from r2p.msg import Odometry, Pose3
+from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher
 from r2p.sim import SimCan
 from r2p.sim.physics.world import Triple
 from r2p.sim.robots.emulated import MOTORS, Triskar2
@@ -18,6 +19,8 @@ from r2p.transports.rtcan.link import RtcanLink
 from r2p.units import SECOND
 
 _WINDOW = 1.0  # seconds to average rates over
+_FRESH = 0.5  # seconds; odometry comes each 0.1 s
+_LATE_MAX = 0.1  # of all periodic messages; on a PC that is fast enough some are late all the same
 _LEFT_OUT = ("log", "current", "power")  # topics that are no part of the control chain
 _HARD, _PERIODIC, _SOFT, _NOT = "hard: in slots", "by the clock", "soft: by deadline", "no"
 _CLASSES = {
@@ -37,6 +40,24 @@ class TopicFigures(msgspec.Struct, frozen=True):
     rate: float
     sent: int
     missed: int
+
+
+class OdometryFigures(msgspec.Struct, frozen=True):
+    """The last odometry: its pose, the true one when it arrived (m, m, rad), and how long ago that was (s)."""
+
+    pose: Pose3
+    truth: Triple
+    age: float
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the next one is not overdue."""
+        return self.age <= _FRESH
+
+    @property
+    def off(self) -> float:
+        """Distance of the two positions, m."""
+        return math.hypot(self.pose.x - self.truth[0], self.pose.y - self.truth[1])
 
 
 class WheelFigures(msgspec.Struct, frozen=True):
@@ -69,14 +90,23 @@ class Figures(msgspec.Struct, frozen=True):
     time: float
     pose: Triple
     path: float
-    odometry: Odometry | None
-    off: float | None
-    """Distance of the last odometry from the true position when it arrived, m."""
+    odometry: OdometryFigures | None
     wheels: list[WheelFigures]
     battery: tuple[float, float, float]
     """V, A, and 0 to 1."""
     topics: list[TopicFigures]
     bus: BusFigures | None
+    off_max: float = 0.0
+    """The largest distance of an odometry from the true position so far, m."""
+    late: float = 0.0
+    """The share of periodic messages in the last second that began late, or were skipped: 0 to 1."""
+    slow: float = 0.0
+    """Seconds so far in which the computer was too slow."""
+
+    @property
+    def too_slow(self) -> bool:
+        """Whether the computer is too slow for the simulation: figures of real time then mean little."""
+        return self.late > _LATE_MAX
 
     @property
     def missed(self) -> int:
@@ -85,10 +115,13 @@ class Figures(msgspec.Struct, frozen=True):
 
 
 class _Reading(NamedTuple):
-    """The counters at a time (s): messages by publisher; frames, bit times and errors of the bus since it was made."""
+    """The counters at a time (s): messages by publisher; periodic ones, late and all; frames, bit times and errors of
+    the bus since it was made.
+    """
 
     time: float
     sent: dict[tuple[str, str], int]
+    periodic: tuple[int, int]
     bus: tuple[int, int, int]
 
 
@@ -97,8 +130,10 @@ class FiguresReader:
 
     def __init__(self, robot: Triskar2, bus: SimCan | None, modules: Iterable[r2p.Module] = ()) -> None:
         """`modules`: other modules whose topics count. Messages from before now do not."""
-        self._odometry: Odometry | None = None
-        self._off: float | None = None
+        self._odometry: OdometryFigures | None = None
+        self._heard = 0
+        self._off_max = self._slow = self._last = 0.0
+        self._clock = clock_of()
         self._robot = robot
         self._bus = bus
         self._others = list(modules)
@@ -108,9 +143,9 @@ class FiguresReader:
 
     def odometry_received(self, odometry: Odometry) -> None:
         """Compare an odometry message with the true pose."""
-        x, y, _ = self._robot.pose
-        self._odometry = odometry
-        self._off = math.hypot(odometry.pose.x - x, odometry.pose.y - y)
+        self._odometry = OdometryFigures(odometry.pose, self._robot.pose, 0.0)
+        self._heard = self._clock.monotonic()
+        self._off_max = max(self._off_max, self._odometry.off)
 
     def read(self, time: float) -> Figures:
         """Return the figures; `time` is now, in s since the start."""
@@ -121,17 +156,32 @@ class FiguresReader:
         while self._readings[1].time <= time - _WINDOW:
             self._readings.popleft()
         topics = (self._topic(*each, now) for each in self._publishers())
+        late = self._late(now)
+        if late > _LATE_MAX:
+            self._slow += time - self._last
+        self._last = time
         return Figures(
             time,
             self._robot.pose,
             hardware.body.path,
-            self._odometry,
-            self._off,
+            self._last_odometry(),
             [self._wheel(wheel, name) for wheel, name in enumerate(MOTORS)],
             (battery.voltage, battery.current, battery.charge),
             sorted(topics, key=lambda topic: (_URGENCY.index(topic.real_time), topic.topic)),
             None if self._bus is None else self._bus_figures(self._bus, now),
+            self._off_max,
+            late,
+            self._slow,
         )
+
+    def _last_odometry(self) -> OdometryFigures | None:
+        last = self._odometry
+        return last and OdometryFigures(last.pose, last.truth, (self._clock.monotonic() - self._heard) / SECOND)
+
+    def _late(self, now: _Reading) -> float:
+        """Return the share of late messages since the first reading that counts; 0 after a module was switched off."""
+        late, count = (new - old for new, old in zip(now.periodic, self._readings[0].periodic, strict=True))
+        return min(1.0, max(0, late) / count) if count > 0 else 0.0
 
     def _wheel(self, wheel: int, name: str) -> WheelFigures:
         drive = self._robot.hardware.drives[wheel]
@@ -152,11 +202,15 @@ class FiguresReader:
         ]
 
     def _count(self, time: float) -> _Reading:
-        sent = {_key(*each): each[1].sent for each in self._publishers()}
+        publishers = self._publishers()
+        sent = {_key(*each): each[1].sent for each in publishers}
+        periodic = [each for _, each in publishers if isinstance(each, PeriodicPublisher)]
+        late = sum(each.late + each.skipped for each in periodic)
+        ticks = late, sum(each.sent + each.skipped for each in periodic)
         if self._bus is None:
-            return _Reading(time, sent, (0, 0, 0))
+            return _Reading(time, sent, ticks, (0, 0, 0))
         total = self._bus.bus.statistics.total
-        return _Reading(time, sent, (total.frames, total.occupied, total.errors))
+        return _Reading(time, sent, ticks, (total.frames, total.occupied, total.errors))
 
     def _topic(self, module: r2p.Module, publisher: AnyPublisher, now: _Reading) -> TopicFigures:
         key = _key(module, publisher)
