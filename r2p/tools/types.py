@@ -123,8 +123,11 @@ def suggestion(size: int) -> str:
 
 
 def complete_type(incomplete: str) -> list[str]:
-    """Completions for --type."""
-    return [name for name in map(type_name, standard_types()) if name.startswith(incomplete)]
+    """Completions for --type: bare names, because a colon begins a new word in bash."""
+    names = [cls.__name__ for cls in standard_types()]
+    if ":" in incomplete:
+        names = [f"{STANDARD}:{name}" for name in names]
+    return [name for name in names if name.startswith(incomplete)]
 
 
 async def find(session: Session, topic: str, given: str | None) -> type[r2p.Message]:

@@ -67,6 +67,10 @@ class Process:
                 raise AssertionError(f"{self} is shown to print\n{shown.pattern}")
         self.printed = self.printed[found.end() :]
 
+    def type(self, keys: str) -> None:
+        """Press keys."""
+        os.write(self._terminal, keys.encode())
+
     def interrupt(self) -> None:
         """Ctrl-C."""
         os.kill(self._process.pid, signal.SIGINT)

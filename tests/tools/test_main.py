@@ -1,4 +1,4 @@
-"""The command itself: help, completion, and what it loads for them."""
+"""The command itself: help, mistakes, and what it loads for them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,6 @@ from typer.testing import CliRunner
 
 from r2p.tools.main import COMMANDS, GROUPS, app
 from r2p.transports.url import BUILT_IN
-from tests.tools.rig import process
-
-
-def run(*arguments: str, **environment: str) -> tuple[int, str, str]:
-    with process(*arguments, env=environment) as child:
-        out, err = child.communicate()
-        return child.returncode, out, err
 
 
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
@@ -117,22 +110,3 @@ def test_help_loads_no_command_and_no_library_that_it_does_not_need() -> None:
     loaded = set(text.partition("loaded ")[2].split())
     assert "r2p.tools.main" in loaded
     assert not loaded & {"yaml", "rich", "serial", "r2p.tools.session", "r2p.tools.topic", "r2p.tools.run"}
-
-
-@pytest.mark.processes
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [
-        ("to", "topic"),
-        ("topic e", "echo"),
-        ("topic echo --fi", "--field"),
-        ("topic echo leds --format j", "json"),
-        ("topic pub cmd --type r2p.msg:Velo", "r2p.msg:Velocity3"),
-    ],
-)
-def test_completion(words: str, found: str) -> None:
-    line = f"r2p {words}"
-    code, out, err = run(
-        _R2P_COMPLETE="complete_bash", COMP_WORDS=line, COMP_CWORD=str(len(line.split()) - 1), _TYPER_COMPLETE_ARGS=line
-    )
-    assert (code, out.split(), err) == (0, [found], "")

@@ -1,7 +1,8 @@
-"""The Debian packages that SocketCAN tests need: `python -m tests.uml.packages` gets them, `find` says where they are.
+"""The Debian packages that tests need: `python -m tests.uml.packages` gets them, `find` says where SocketCAN's are.
 
 Root installs them. Others unpack them into a cache folder; nothing of them has to be installed to run. Where neither
-works, the tests that need them are skipped, and say so; with CI set that is an error.
+works, the tests that need them are skipped, and say so; with CI set that is an error. The shells in which completion
+is tested work only where they are installed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 PACKAGES = {"user-mode-linux": "linux.uml", "can-utils": "candump", "socat": "socat", "iproute2": "ip"}
-"""Debian's packages, and a program of each."""
+"""Debian's packages for SocketCAN, and a program of each."""
+
+SHELLS = ("zsh", "fish")
+"""Debian's packages of shells, named like their programs."""
 
 _MODULES = "lib/uml/modules"
 
@@ -53,24 +57,26 @@ def cache() -> Path:
 
 def get() -> str:
     """Get what is missing. Empty, or why that failed."""
-    missing = find()
-    if not isinstance(missing, str) or sys.platform != "linux":
+    if sys.platform != "linux":
         return ""
-    if shutil.which("apt-get") is None:
-        return missing
+    found = find()
+    missing = found if isinstance(found, str) else ""
     try:
-        if os.geteuid() == 0:
+        if shutil.which("apt-get") is None:
+            return missing
+        if os.geteuid() == 0 and (missing or not all(map(shutil.which, SHELLS))):
             _install()
-        else:
+        elif missing:
             _unpack()
     except subprocess.CalledProcessError as error:
-        return f"{missing} ({' '.join(error.cmd[:2])} failed: {_last_line(error.stderr)})"
+        needed = missing or f"completion is tested in {' and '.join(SHELLS)}"
+        return f"{needed} ({' '.join(error.cmd[:2])} failed: {_last_line(error.stderr)})"
     found = find()
     return found if isinstance(found, str) else ""
 
 
 def _install() -> None:
-    command = ("apt-get", "install", "--quiet", "--yes", "--no-install-recommends", *PACKAGES)
+    command = ("apt-get", "install", "--quiet", "--yes", "--no-install-recommends", *PACKAGES, *SHELLS)
     try:
         _run(*command)
     except subprocess.CalledProcessError:  # most often the lists are old, or were never there
@@ -123,7 +129,7 @@ def _last_line(text: str) -> str:
 def main() -> None:
     problem = get()
     if problem:
-        print(f"{platform.node()}: tests with SocketCAN are skipped. {problem}", file=sys.stderr)  # noqa: T201
+        print(f"{platform.node()}: some tests are skipped. {problem}", file=sys.stderr)  # noqa: T201
         sys.exit(1 if os.environ.get("CI") else 0)
 
 

@@ -13,12 +13,17 @@ import typer
 
 import r2p
 from r2p.tools.output import notify
-from r2p.tools.session import Session, call_after, settings, wait_until
+from r2p.tools.session import Session, UsageError, call_after, settings, wait_until
 from r2p.tools.types import complete_type
 
 
 def _complete_topic(incomplete: str) -> list[str]:
-    return [name for name in settings().types if name.startswith(incomplete)]
+    """Completions for topics: those that r2p.toml names; to ask the network would take too long."""
+    try:
+        known = settings().types
+    except UsageError:  # what is wrong with the file is said when the command runs
+        return []
+    return [name for name in known if name.startswith(incomplete)]
 
 
 Topic = Annotated[str, typer.Argument(metavar="TOPIC", autocompletion=_complete_topic, show_default=False)]
