@@ -5,8 +5,9 @@ BIN := .venv/bin
 RUN := .venv/stamp-run
 STAMP := .venv/stamp
 LOWEST := .venv-lowest
+PYTHONS := 3.12 3.13
 
-.PHONY: demo test test-lowest lint bench soak docs clean
+.PHONY: demo test test-lowest test-pythons lint bench soak docs clean
 
 demo: $(RUN)
 	$(BIN)/r2p demo
@@ -17,6 +18,17 @@ test: $(STAMP) system
 # The tests with the lowest versions that pyproject.toml allows; `make test-lowest TESTS=tests/tools` runs some of them.
 test-lowest: $(LOWEST)/stamp system
 	$(LOWEST)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS)
+
+# The tests with other Pythons, of those that this machine has: `make test-pythons PYTHONS=3.13 TESTS=tests/tools`.
+test-pythons: $(PYTHONS:%=test-python-%)
+
+# The names of its versions let the shims of pyenv find all of them.
+test-python-%: export PYENV_VERSION = $(shell pyenv versions --bare 2>/dev/null | paste -sd :)
+test-python-%: $(BIN)/uv system
+	@if $(BIN)/uv python find --quiet --no-python-downloads $* >/dev/null 2>&1; then \
+		$(MAKE) --no-print-directory .venv-$*/stamp && \
+		.venv-$*/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS); \
+	else echo "Python $* is not on this machine: skipped"; fi
 
 lint: $(STAMP)
 	$(BIN)/ruff check
@@ -39,7 +51,7 @@ docs: $(STAMP)
 	$(BIN)/mkdocs build --strict
 
 clean:
-	rm -rf .venv $(LOWEST) site
+	rm -rf .venv .venv-* site
 
 $(RUN): pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -49,6 +61,14 @@ $(RUN): pyproject.toml
 
 $(STAMP): $(RUN)
 	$(BIN)/python -m pip install --quiet --group test --group lint --group docs --group bench
+	touch $@
+
+$(BIN)/uv: | $(STAMP)
+	$(BIN)/python -m pip install --quiet uv
+
+.venv-%/stamp: pyproject.toml | $(BIN)/uv
+	$(BIN)/uv venv --quiet --clear --no-python-downloads --python $* .venv-$*
+	$(BIN)/uv pip install --quiet --python .venv-$* --editable '.[all]' --group test --group docs mypy types-pyserial types-pyyaml
 	touch $@
 
 $(LOWEST)/stamp: pyproject.toml
