@@ -43,11 +43,11 @@ def recording(name: str) -> Iterator[str]:
     for cycle in range(CYCLES):
         frames = [(0.0, rtcan.encode_sync(cycle, 0b0011))]
         if cycle % 2 == 0:
-            frames.append((1.3, Frame(rtcan.encode_identifier(rtcan.HRT, ENCODER, 0), bytes((cycle, 0, 0, 0, 1)))))
+            frames.append((1.5, Frame(rtcan.encode_identifier(rtcan.HRT, ENCODER, 0), bytes((cycle, 0, 0, 0, 1)))))
         frames += [(2.3, frame) for frame in said(management.Alive("MOTOR", 0), MOTOR)]
         frames += [(2.4, frame) for frame in said(management.SubscribeResponse("encoder", 5, 1, params), MOTOR)]
         frames.append((2.5, Frame(rtcan.encode_identifier(20, SOFT, 0), bytes(2))))
-        frames.append((3.3, Frame(rtcan.encode_identifier(rtcan.NRT, BULK, 0), bytes(8))))
+        frames.append((3.5, Frame(rtcan.encode_identifier(rtcan.NRT, BULK, 0), bytes(8))))
         for slot, frame in frames:
             yield f"({(cycle * SLOTS + slot) * SLOT:.6f}) {name} {frame.id:08X}#{frame.data.hex().upper()}"
 
