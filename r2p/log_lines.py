@@ -1,12 +1,23 @@
-"""Lines of the log about what others send: their texts can't forge a line, and their number is limited.
+"""Lines of the log: short for people, safe with texts of other modules, limited in number.
 
 Names and texts of other modules may hold anything, also control sequences of terminals. A log is read at a terminal: so
 loggers made by `get_logger` show each character that would move the cursor as an escape. Tools do the same by
 `printable`. Events that another module can cause any number of times a second are logged within a `LineLimit`.
+
+A traceback ends at what the user wrote: `short_traceback` leaves out the frames of r2p and asyncio. Programs that don't
+configure logging get `default_logging` from `r2p.run`; the commands use the same `LineFormatter`.
 """
 
+import asyncio
+import contextlib
 import logging
+import os
+import sys
+import traceback
 import unicodedata
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 from r2p.units import SECOND
 
@@ -68,3 +79,138 @@ class LineLimit:
         left_out = lines[1] - rate if lines is not None else 0
         self._lines[kind] = [now, 1]
         return f" ({left_out} more since the last such line)" if left_out > 0 else ""
+
+
+# Tracebacks
+
+DEBUG = "R2P_DEBUG"
+"""The environment variable that, set to anything, makes tracebacks complete and the default level DEBUG."""
+
+_INTERNAL = tuple(str(Path(file).parent) + os.sep for file in (__file__, asyncio.__file__))
+
+
+def debugging() -> bool:
+    """Return whether tracebacks are to be complete: by R2P_DEBUG, or by the level DEBUG of the logger `r2p`."""
+    return bool(os.environ.get(DEBUG)) or logging.getLogger("r2p").isEnabledFor(logging.DEBUG)
+
+
+def short_traceback(error: BaseException) -> str:
+    """Format an exception with its traceback, without frames of r2p and asyncio unless there are no others.
+
+    While `debugging`, all frames stay.
+    """
+    report = traceback.TracebackException.from_exception(error)
+    if not debugging():
+        _shorten(report, error)
+    return "".join(report.format()).rstrip("\n")
+
+
+def _shorten(report: traceback.TracebackException | None, error: BaseException | None) -> None:
+    """Shorten the report of an error, and of those that led to it."""
+    if report is None or error is None:
+        return
+    own = [frame for frame in report.stack if not frame.filename.startswith(_INTERNAL)]
+    if own:
+        report.stack[:] = own
+    if isinstance(error, TimeoutError) and isinstance(error.__cause__, asyncio.CancelledError):
+        report.__cause__ = None  # how asyncio.timeout works inside
+        report.__suppress_context__ = True
+    _shorten(report.__cause__, error.__cause__)
+    _shorten(report.__context__, error.__context__)
+    if isinstance(error, BaseExceptionGroup):
+        for part, each in zip(report.exceptions or (), error.exceptions, strict=False):
+            _shorten(part, each)
+
+
+class _ShortTracebacks(logging.Filter):
+    """Gives records with an exception its short traceback, whatever formats them."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.exc_info and record.exc_info[1] is not None:
+            record.exc_text = short_traceback(record.exc_info[1])  # formatters of `logging` use this where it is set
+        return True
+
+
+_SHORT_TRACEBACKS = _ShortTracebacks()
+
+
+def node_logger(module: str, node: str) -> logging.Logger:
+    """The logger `r2p.MODULE.NODE`, whose records have short tracebacks."""
+    logger = logging.getLogger(f"r2p.{module}.{node}")
+    logger.addFilter(_SHORT_TRACEBACKS)
+    return logger
+
+
+# Output
+
+
+class LineFormatter(logging.Formatter):
+    """Formats a record as a short line that begins with `MODULE/NODE`, or with `r2p` where no node logs.
+
+    The level is shown from WARNING up. With `times` it is always shown, after the time.
+    """
+
+    def __init__(self, *, times: bool = False) -> None:
+        super().__init__()
+        self._times = times
+
+    def format(self, record: logging.LogRecord) -> str:
+        _, _, rest = record.name.partition(".")
+        module, _, node = rest.partition(".")
+        where = f"{module}/{node}" if node else "r2p"
+        text = record.getMessage()
+        if record.exc_info:
+            text += "\n" + (record.exc_text or self.formatException(record.exc_info))
+        text = printable(text, "\n\t")
+        if not self._times:
+            level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+            return f"{where}: {level}{text}"
+        time = f"{self.formatTime(record, '%H:%M:%S')}.{int(record.msecs):03}"
+        return f"{time} {_coloured(f'{record.levelname:<7}', record.levelno)} {where}: {text}"
+
+
+def _coloured(text: str, level: int) -> str:
+    """Return the text in yellow for WARNING and in red from ERROR up, where stderr is a terminal that has colours."""
+    plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or not sys.stderr.isatty()
+    if level < logging.WARNING or plain:
+        return text
+    return f"\x1b[{33 if level < logging.ERROR else 31}m{text}\x1b[0m"
+
+
+class StderrHandler(logging.StreamHandler[Any]):
+    """Writes to the `sys.stderr` of the moment, and is silent if that is closed."""
+
+    def __init__(self, *, times: bool = False) -> None:
+        super().__init__(sys.stderr)
+        self.setFormatter(LineFormatter(times=times))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.stream = sys.stderr
+        super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        if not isinstance(sys.exc_info()[1], OSError | ValueError):
+            super().handleError(record)
+
+
+@contextlib.contextmanager
+def default_logging() -> Iterator[None]:
+    """Log to stderr in the block, from INFO up, unless the root logger or `r2p` has handlers.
+
+    A level that the program has set stays as it is; R2P_DEBUG makes the default DEBUG.
+    """
+    logger, root = logging.getLogger("r2p"), logging.getLogger()
+    if logger.handlers or root.handlers:
+        yield
+        return
+    handler = StderrHandler(times=True)
+    handler.addFilter(lambda _record: not root.handlers)  # else a node that configures logging gets each line twice
+    level = logger.level
+    if level == logging.NOTSET and root.level == logging.WARNING:  # as Python starts
+        logger.setLevel(logging.DEBUG if os.environ.get(DEBUG) else logging.INFO)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)

@@ -76,14 +76,20 @@ def node_name(name: str) -> str:
 def topic_name(name: str) -> str:
     """Return a valid name of a topic: 1 to 16 characters of `[A-Za-z0-9_]`. Raises InvalidName or NameTooLong.
 
-    A leading slash, as in the thesis, is removed. The name may be in a namespace, such as `robot1/encoder`, whose name
-    follows the same rules.
+    One `/` may stand in it, after a namespace that follows the same rules: `robot1/encoder`. A leading slash, as in the
+    thesis and in ROS, is removed.
     """
-    name = name.removeprefix("/")
-    namespace, _, inner = name.partition("/")
-    if name.count("/") != 1:
-        return _checked("topic", name, TOPIC_MAX)
-    return f"{_checked('namespace', namespace, TOPIC_MAX)}/{_checked('topic', inner, TOPIC_MAX)}"
+    plain = name.removeprefix("/")
+    namespace, slash, inner = plain.rpartition("/")
+    if not _ALLOWED.fullmatch(inner) or (slash and not _ALLOWED.fullmatch(namespace)):
+        raise InvalidName(
+            f"topic name {name!r}: use letters, digits and underscores, and at most one `/`, after a namespace, as in "
+            "robot1/encoder"
+        )
+    if slash:
+        _check_length("namespace", namespace, TOPIC_MAX)
+    _check_length("topic", inner, TOPIC_MAX)
+    return plain
 
 
 def module_name_from(hostname: str) -> str:
@@ -95,6 +101,10 @@ def module_name_from(hostname: str) -> str:
 def _checked(what: str, name: str, longest: int) -> str:
     if not _ALLOWED.fullmatch(name):
         raise InvalidName(f"{what} name {name!r}: use letters, digits and underscores only")
+    _check_length(what, name, longest)
+    return name
+
+
+def _check_length(what: str, name: str, longest: int) -> None:
     if len(name) > longest:
         raise NameTooLong(f"{what} name {name!r} has {len(name)} characters, the wire carries {longest}: shorten it")
-    return name

@@ -2,11 +2,13 @@
 limited.
 """
 
+import contextlib
 import logging
+from collections.abc import Iterator
 
 import pytest
 
-from r2p.log_lines import LineLimit, get_logger, printable
+from r2p.log_lines import LineFormatter, LineLimit, StderrHandler, default_logging, get_logger, printable
 
 
 @pytest.mark.parametrize(
@@ -43,3 +45,73 @@ def test_the_lines_of_a_kind_are_limited_and_the_next_one_says_how_many_were_lef
     assert limit.suffix("b", 59) == ""
     assert limit.suffix("a", 60) == " (2 more since the last such line)"
     assert limit.suffix("a", 120) == ""
+
+
+# Output
+
+
+def _record(name: str, level: int, text: str) -> logging.LogRecord:
+    return logging.LogRecord(name, level, "", 0, text, (), None)
+
+
+def test_a_line_begins_with_its_node_and_may_have_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    info, warning = _record("r2p.PC1.arm", logging.INFO, "up\x1b"), _record("r2p.link", logging.WARNING, "down")
+    plain, timed = LineFormatter(), LineFormatter(times=True)
+    assert [plain.format(each) for each in (info, warning)] == ["PC1/arm: up\\x1b", "r2p: warning: down"]
+    assert [timed.format(each).partition(" ")[2] for each in (info, warning)] == [
+        "INFO    PC1/arm: up\\x1b",
+        "WARNING r2p: down",
+    ]
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert "\x1b[33mWARNING\x1b[0m r2p: down" in timed.format(warning)
+    assert "\x1b" not in timed.format(info)
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\x1b" not in timed.format(warning)
+
+
+@contextlib.contextmanager
+def unconfigured() -> Iterator[logging.Logger]:
+    """The logger `r2p` of a program that has configured nothing; within a test, which pytest adds handlers for."""
+    logger = logging.getLogger("r2p")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(logging.getLogger(), "handlers", [])
+        patch.setattr(logger, "handlers", [])
+        patch.delenv("R2P_DEBUG", raising=False)
+        yield logger
+
+
+def _logged(logger: logging.Logger, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    with default_logging():
+        logger.debug("debug")
+        logger.info("info")
+        logger.error("error")
+    assert not logger.handlers or not isinstance(logger.handlers[0], StderrHandler)
+    return [line.split()[-1] for line in capsys.readouterr().err.splitlines()]
+
+
+def test_a_program_that_configures_nothing_logs_from_info_up(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with unconfigured() as logger:
+        assert _logged(logger, capsys) == ["info", "error"]
+        assert logger.level == logging.NOTSET
+        monkeypatch.setenv("R2P_DEBUG", "1")
+        assert _logged(logger, capsys) == ["debug", "info", "error"]
+
+
+def test_what_a_program_has_configured_stays(capsys: pytest.CaptureFixture[str]) -> None:
+    with unconfigured() as logger:
+        for each in (logging.getLogger(), logger):
+            before = each.level
+            each.setLevel(logging.ERROR)
+            assert _logged(logger, capsys) == ["error"]
+            each.setLevel(before)
+            each.addHandler(logging.NullHandler())
+            assert _logged(logger, capsys) == []
+            each.handlers.clear()
+        with default_logging():  # and what a node configures later
+            logging.getLogger().addHandler(logging.NullHandler())
+            logger.error("error")
+    assert capsys.readouterr().err == ""

@@ -30,7 +30,7 @@ def test_as_long_as_the_field(check: Check, longest: int) -> None:
 @pytest.mark.parametrize(("check", "longest"), KINDS)
 @pytest.mark.parametrize("name", ["", " ", "a b", "a-b", "a/b/c", "é", "²", "a\n", "a\0", "à" * 40])
 def test_other_characters_are_refused(check: Check, longest: int, name: str) -> None:
-    with pytest.raises(InvalidName, match="use letters, digits and underscores only") as caught:
+    with pytest.raises(InvalidName, match="use letters, digits and underscores") as caught:
         check(name)
     assert not isinstance(caught.value, NameTooLong)
     assert repr(name) in str(caught.value)
@@ -45,9 +45,10 @@ def test_the_error_says_what_it_names() -> None:
 def test_one_leading_slash_of_a_topic_is_taken_off() -> None:
     assert topic_name("/leds") == topic_name("leds") == "leds"
     assert topic_name("/" + "x" * 16) == "x" * 16
-    for name in ("//leds", "/", "leds/", "/a/b/c"):
-        with pytest.raises(InvalidName):
+    for name in ("//leds", "/", "leds/", "/a/b/c", "a/b/c", "a b/c", ""):
+        with pytest.raises(InvalidName, match="and at most one `/`, after a namespace, as in robot1/encoder") as caught:
             topic_name(name)
+        assert f"topic name {name!r}: " in str(caught.value)
     with pytest.raises(InvalidName):
         module_name("/PC1")
 

@@ -8,12 +8,14 @@ import keyword
 import re
 from collections.abc import Iterator
 from hashlib import blake2b
+from types import UnionType
 from typing import (
     Annotated,
     Any,
     ClassVar,
     Self,
     TypeVar,
+    Union,
     dataclass_transform,
     get_args,
     get_origin,
@@ -32,6 +34,7 @@ SIZE_MAX = 1024
 
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _METHODS = frozenset({"encode", "decode"})  # a field of that name would hide the method
+_KINDS: dict[type, str] = {bool: "bool", int: "r2p.i32", float: "r2p.f32"}  # what to write for a type of Python
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
@@ -129,6 +132,8 @@ def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
     if not cls.__struct_config__.frozen:
         raise MessageError(f"{cls.__name__} is not frozen, but subscribers share one object: remove frozen=False")
     fields = tuple(Field(name, _shape(hint, f"{cls.__name__}.{name}", (*outer, cls))) for name, hint in _hints(cls))
+    if not fields:
+        raise MessageError(f"{cls.__name__} has no fields: annotate them, as in `{_example(cls)}`")
     size = sum(field.shape.size for field in fields)
     _check_size(cls.__name__, size)
     encode, decode = functions(cls, fields)
@@ -169,7 +174,7 @@ def _shape(hint: Any, path: str, outer: tuple[type, ...]) -> Shape:
         return scalar
     if isinstance(base, type) and issubclass(base, Message) and not length:
         return Nested(_find_or_compile(base, outer))
-    raise MessageError(f"{path}: {show(hint)} has no fixed size, use {_instead(base)}")
+    raise MessageError(f"{path}: {_spell(hint)} has no fixed size, use {_instead(base)}")
 
 
 def _length(count: Any, path: str) -> int:
@@ -196,8 +201,35 @@ def _check_size(path: str, size: int) -> None:
         raise MessageError(f"{path} has {size} bytes: a message has 1 to {SIZE_MAX}")
 
 
+def _spell(hint: Any) -> str:
+    """Write an annotation as in a program, `list[r2p.f32]`: without what the types of r2p are made of."""
+    base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    origin, items = get_origin(base), get_args(base)
+    if scalar := next((mark for mark in marks if isinstance(mark, Scalar)), None):
+        text = f"r2p.{scalar.kind}"
+    elif base is ...:
+        text = "..."
+    elif origin in (Union, UnionType):
+        text = " | ".join(map(_spell, items)).replace("NoneType", "None")
+    elif isinstance(origin, type):
+        text = f"{origin.__name__}[{', '.join(map(_spell, items))}]"
+    else:
+        text = base.__name__ if isinstance(base, type) else show(base)
+    length = next((mark for mark in marks if isinstance(mark, Len)), None)
+    return f"Annotated[{text}, r2p.Len({show(length.count)})]" if length else text
+
+
+def _example(cls: type[Message]) -> str:
+    """A field as it is to be written: the first of the class that lacks only its annotation."""
+    for name, value in vars(cls).items():
+        if type(value) in _KINDS and not name.startswith("_"):
+            return f"{name}: {_KINDS[type(value)]} = {show(value)}"
+    return "speed: r2p.f32 = 0.0"
+
+
 def _instead(base: Any) -> str:
-    array = "tuple[r2p.f32, r2p.f32] or Annotated[tuple[r2p.f32, ...], r2p.Len(16)]"
+    item = _item(base)
+    array = f"tuple[{item}, {item}] or Annotated[tuple[{item}, ...], r2p.Len(16)]"
     texts = {
         int: "one of r2p.u8 .. r2p.u64, r2p.i8 .. r2p.i64",
         float: "r2p.f32 or r2p.f64",
@@ -208,6 +240,15 @@ def _instead(base: Any) -> str:
     }
     others = "r2p.u8 .. r2p.f64, bool, a Message, a tuple of one of these, or Annotated[str, r2p.Len(16)]"
     return next((text for kind, text in texts.items() if kind is (get_origin(base) or base)), others)
+
+
+def _item(base: Any) -> str:
+    """The type of the items of an array, as it is to be written: what `base` has, or the nearest to it."""
+    item = next(iter(get_args(base)), float)
+    scalar = get_origin(item) is Annotated and any(isinstance(mark, Scalar) for mark in get_args(item))
+    if scalar or (isinstance(item, type) and issubclass(item, Message)):
+        return _spell(item)
+    return _KINDS.get(item, "r2p.f32") if isinstance(item, type) else "r2p.f32"
 
 
 def _leaves(shape: Shape, path: str) -> Iterator[str]:

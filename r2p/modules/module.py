@@ -145,7 +145,8 @@ class Module:
             await self._close(self._tasks)
         crashed = list(self._crashes.values())
         if crashed and (error is None or isinstance(error, asyncio.CancelledError)):
-            raise NodeCrashed(f"{len(crashed)} node(s) of module {self.name} crashed", crashed)
+            nodes = f"node{'s'[: len(crashed) - 1]} {', '.join(self._crashes)}"
+            raise NodeCrashed(f"{nodes} of module {self.name} crashed", crashed)
         for crash in crashed:
             assert error is not None
             error.add_note(f"before that: {crash!r} {' '.join(crash.__notes__)}")

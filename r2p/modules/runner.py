@@ -2,6 +2,9 @@
 
 The first SIGINT or SIGTERM cancels the program: it ends its nodes, says good-bye on its links, and returns. A second
 one ends the process at once; so does the first one, if the program has not ended GRACE seconds later.
+
+A program that `run` starts logs to stderr unless it has configured logging. Where nothing catches what `run` raises,
+Python prints it as one line: what crashed is in the log already, and a wrong name or URL is not in the stack.
 """
 
 import asyncio
@@ -9,13 +12,17 @@ import contextlib
 import functools
 import os
 import signal
+import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterable
-from types import FrameType
+from types import FrameType, TracebackType
 from typing import Any, Self, TypeVar
 
+from r2p.errors import Error, NodeCrashed
+from r2p.log_lines import debugging, default_logging, printable
 from r2p.modules.module import Module
-from r2p.modules.supervisor import NodeFunction
+from r2p.modules.supervisor import NodeFunction, name_of
+from r2p.names import node_name
 from r2p.transports.link import Transport
 
 T = TypeVar("T")
@@ -25,7 +32,8 @@ GRACE = 1.8
 
 
 def run(
-    *functions: NodeFunction,
+    *functions: NodeFunction | tuple[str, NodeFunction],
+    name: str | None = None,
     module: str | None = None,
     via: str | Transport | Iterable[str | Transport] | None = None,
     remap: dict[str, str] | None = None,
@@ -33,21 +41,76 @@ def run(
 ) -> None:
     """Run functions as the nodes of one module, until all have ended or a signal ends them.
 
-    `via` and `remap` are as for `Module`, which `module` is the name of; `restart` is as for `Module.start`. Raises
-    NodeCrashed at the end if a node crashed, and what `Module` and `Module.start` raise.
+    A node has the name of its function, of at most 8 characters, or another: `run(line_follower, name="follower")`, and
+    of several `run(blink, ("follower", line_follower))`. `via` and `remap` are as for `Module`, which `module` is the
+    name of; `restart` is as for `Module.start`.
+
+    Meanwhile the logger `r2p` writes to stderr, from INFO up, unless it or the root logger has handlers.
+
+    Raises NodeCrashed at the end if a node crashed, and what `Module` and `Module.start` raise. Where the program does
+    not catch that, it prints one line instead of a traceback (R2P_DEBUG=1: all of it), and the exit code is 1.
     """
 
     async def main() -> None:
+        nodes = _named(functions, name)
         async with Module(module, via=via, remap=remap) as host:
-            for function in functions:
-                host.start(function, restart=restart)
+            for node, function in nodes:
+                host.start(function, name=node, restart=restart)
             await host.wait()
 
-    run_main(main)
+    with default_logging():
+        try:
+            run_main(main)
+        except Error as error:
+            _print_in_one_line(error)
+            raise
+
+
+def _named(
+    functions: Iterable[NodeFunction | tuple[str, NodeFunction]], name: str | None
+) -> list[tuple[str, NodeFunction]]:
+    """Return the functions with the names of their nodes. Raises Error or InvalidName for those that can't run."""
+    named = [_pair(each, name) for each in functions]
+    if name is not None and len(named) != 1:
+        raise Error(f"name={name!r} is for one function, here are {len(named)}: write (name, function) for each")
+    return [(node_name(node), function) for node, function in named]
+
+
+def _pair(each: NodeFunction | tuple[str, NodeFunction], name: str | None) -> tuple[str, NodeFunction]:
+    if not isinstance(each, tuple):
+        return name if name is not None else name_of(each), each
+    pair: tuple[object, ...] = each
+    if len(pair) != 2 or not isinstance(pair[0], str):
+        raise Error(f"{each!r} is not a node: write a function, or (name, function)")
+    return each
+
+
+def _print_in_one_line(error: Error) -> None:
+    """Let Python print this error, if it ends the program, as one line; hooks of the program stay as they are."""
+    if sys.excepthook is sys.__excepthook__ and not debugging():
+        sys.excepthook = _excepthook
+    error.__r2p_one_line__ = True  # type: ignore[attr-defined]  # of this error only: others are the program's
+
+
+def _excepthook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if not hasattr(error, "__r2p_one_line__"):
+        sys.__excepthook__(kind, error, trace)
+        return
+    text = error.message if isinstance(error, NodeCrashed) else str(error)
+    with contextlib.suppress(OSError):  # stderr is closed
+        print(printable(f"r2p: {text}", "\n\t"), file=sys.stderr, flush=True)  # noqa: T201 - as Python itself
 
 
 def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
-    """Run `main()` on the fastest event loop, and return its result; None if SIGINT or SIGTERM ended it."""
+    """Run `main()` on the fastest event loop, and return its result; None if SIGINT or SIGTERM ended it.
+
+    Raises Error where an event loop runs already.
+    """
+    if asyncio._get_running_loop() is not None:  # noqa: SLF001 - as get_running_loop, without its RuntimeError
+        raise Error(
+            'an event loop runs already: in a file for `r2p run`, call r2p.run under `if __name__ == "__main__":`; '
+            "in a coroutine, use `async with r2p.Module(...)`"
+        )
 
     async def guarded() -> T | None:
         if not signals.guard(asyncio.get_running_loop(), asyncio.current_task()):

@@ -45,8 +45,10 @@ def name_of(function: NodeFunction) -> str:
     bare = check_function(function)
     name = getattr(bare, "__name__", type(bare).__name__)
     if len(name) > NODE_MAX:
+        short = name[:NODE_MAX].rstrip("_")
         raise NameTooLong(
-            f"function name {name!r} is not a valid node name: these have at most {NODE_MAX} characters; give name="
+            f"node name {name!r} has {len(name)} characters, the wire carries {NODE_MAX}: pass name={short!r}, or "
+            f"({short!r}, {name}) to r2p.run"
         )
     return node_name(name)
 
@@ -154,6 +156,7 @@ class Supervisor:
         self.node.started()
         try:
             await body
+            self.node.returned()
         except asyncio.CancelledError as error:
             if attempt.error is None and task.cancelling():
                 raise

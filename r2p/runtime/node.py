@@ -7,12 +7,12 @@ closed when its function ends, however it ends.
 import asyncio
 import logging
 import sys
-import traceback
 from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple, TypeVar, overload
 
-from r2p.clock import SHORTEST, Ticker, check_seconds, check_timeout
+from r2p.clock import SHORTEST, Alarm, Ticker, check_seconds, check_timeout
 from r2p.errors import Closed, Error, InvalidName, TransportError
+from r2p.log_lines import node_logger, short_traceback
 from r2p.messages import Message, layout
 from r2p.names import MANAGEMENT, topic_name
 from r2p.runtime.events import EventHub, ModuleEvent
@@ -62,7 +62,7 @@ def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -
     error = exc_info[1] if isinstance(exc_info, tuple) else exc_info
     if not isinstance(error, BaseException):  # True: the one that is being handled
         error = sys.exception()
-    return text if error is None else f"{text}\n{''.join(traceback.format_exception(error))}"
+    return text if error is None else f"{text}\n{short_traceback(error)}"
 
 
 def no_log(level: int, node: str, text: str) -> None:
@@ -87,9 +87,7 @@ class Node:
         """The name of its module."""
         self.priority = priority
         """Nodes of higher priority get their messages first."""
-        self.log = NodeLogger(
-            logging.getLogger(f"r2p.{space.module}.{name}"), lambda level, text: log(level, name, text)
-        )
+        self.log = NodeLogger(node_logger(space.module, name), lambda level, text: log(level, name, text))
         """Its logger; records from INFO up also go to the module's `log` topic."""
         self.publishers: dict[AnyPublisher, None] = {}
         """Its open publishers, in order (the values mean nothing)."""
@@ -105,6 +103,8 @@ class Node:
         self._remap = remap or {}
         self._events = events or EventHub()
         self._tickers: set[Ticker] = set()
+        self._reminder: _SpinReminder | None = None
+        """From the first subscription with a callback until `spin` is called."""
         self._started = False
 
     @overload
@@ -229,6 +229,8 @@ class Node:
         subscriber: Subscriber[Any] = Subscriber(self._space, self, where, shape, options)
         self.subscribers[subscriber] = None
         subscriber.open()
+        if callback is not None and self._reminder is None:
+            self._reminder = _SpinReminder(self, self._space)
         return subscriber
 
     async def spin(self, timeout: float | None = None) -> bool:
@@ -242,6 +244,8 @@ class Node:
         not a number of seconds.
         """
         check_timeout("the time-out of spin", timeout)
+        if self._reminder is not None:
+            self._forget_reminder()
         deadline = None if timeout is None else self._space.loop.time() + timeout
         while not await self._serve():
             try:
@@ -331,6 +335,11 @@ class Node:
         self.publishers.pop(endpoint, None)  # type: ignore[call-overload]
         self.subscribers.pop(endpoint, None)  # type: ignore[call-overload]
 
+    def returned(self) -> None:
+        """Warn of callbacks that were never called: its function has returned without `spin`."""
+        if self._reminder is not None:
+            self._reminder.returned()
+
     def started(self) -> None:
         """Note that the node's function starts: from now on its priority holds back less important nodes."""
         self._started = True
@@ -339,11 +348,17 @@ class Node:
     def close(self) -> None:
         """Close all its publishers and subscribers. The module does so when the node's function has ended."""
         self.closed = self._ending = True
+        self._forget_reminder()
         for each in (*self.publishers, *self.subscribers, *self._tickers):
             each.close()
         if self._started:
             self._started = False
             self._space.wake_scheduler.node_ended(self.priority)
+
+    def _forget_reminder(self) -> None:
+        if self._reminder is not None:
+            self._reminder.close()
+            self._reminder = None
 
     def _log_crash(self, error: Exception) -> None:
         self.log.error("node %s, which does not run: %r", self.name, error, exc_info=error)
@@ -394,3 +409,43 @@ class Node:
 
     def _with_callback(self) -> list[Subscriber[Any]]:
         return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
+
+
+class _SpinReminder:
+    """Warns once when messages wait for callbacks of a node that does not call `spin`, or returns without it.
+
+    It looks once a second at what waits, until `spin` is called: so messages on their way cost nothing more.
+    """
+
+    def __init__(self, node: Node, space: TopicSpace) -> None:
+        self._node = node
+        self._clock = space.clock
+        self._alarm = Alarm(space.loop, self._look, background=True)
+        self._waiting: set[str] = set()
+        """The topics of which messages waited at the last look."""
+        self._warned = False
+        self._alarm.set(self._clock.monotonic() + SECOND)
+
+    def close(self) -> None:
+        self._alarm.close()
+
+    def returned(self) -> None:
+        """Warn of all callbacks: the node's function has returned."""
+        topics = {each.topic for each in self._node.subscribers if each.callback is not None}
+        if topics:
+            self._warn("it has returned, so its callbacks for %s were never called", topics)
+
+    def _look(self) -> None:
+        waiting = {each.topic for each in self._node.subscribers if each.callback is not None and each.queue}
+        late = waiting & self._waiting
+        self._waiting = waiting
+        if late:
+            self._warn("messages on %s wait for its callbacks", late)
+        else:
+            self._alarm.set(self._clock.monotonic() + SECOND)
+
+    def _warn(self, text: str, topics: set[str]) -> None:
+        if not self._warned:
+            self._warned = True
+            advice = "node %s does not call spin(): " + text + "; write `while True: await node.spin()`"
+            self._node.log.warning(advice, self._node.name, ", ".join(sorted(topics)))

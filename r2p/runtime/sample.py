@@ -10,10 +10,21 @@ know the start, and the clock of a module without a battery may go back with it,
 has seen: else all messages of such a module would be lost behind the gateway.
 """
 
+from typing import TYPE_CHECKING, Generic
+
 import msgspec
 
 from r2p.codecs import PublisherClass as PublisherClass  # a part of each sample: imported from here
 from r2p.messages import ClockOffset, Message
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar  # in `typing` from Python 3.13 on
+
+    T = TypeVar("T", default=Message | None, covariant=True)
+else:
+    from typing import TypeVar
+
+    T = TypeVar("T")
 
 _KEPT_MAX = 64  # messages of each publisher
 _PUBLISHERS_MAX = 1024  # of a topic; with one more all are forgotten
@@ -34,10 +45,11 @@ class Source(msgspec.Struct, frozen=True):
         return "/".join(part for part in (self.module or "?", self.node) if part)
 
 
-class Sample(msgspec.Struct, gc=False):
+class Sample(msgspec.Struct, Generic[T], gc=False):
     """One published message, with what is known of its publication.
 
-    `data` are the packed bytes; `message` is None until a subscriber decodes a sample that came over a link.
+    `data` are the packed bytes. `message` is None until a subscriber decodes a sample that came over a link: never in
+    what `Subscriber.samples()` of a type yields, where `Sample[Led]` is a sample whose message is a `Led`.
 
     `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none) by the clock of the computer that stamped it,
     which may differ from this computer's. `expires` is the deadline by the clock here; 0: the same as `deadline`.
@@ -56,7 +68,7 @@ class Sample(msgspec.Struct, gc=False):
     deadline: int = 0
     sequence: int = 0
     publisher_class: PublisherClass = PublisherClass.NON_REAL_TIME
-    message: Message | None = None
+    message: T = None  # type: ignore[assignment]  # where T is its default; else `samples()` sees to it
     stamped: bool = True
     drop_late: bool = True
     hops: int = 0

@@ -8,13 +8,13 @@ import inspect
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from types import TracebackType
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import msgspec
 
 from r2p.clock import LONGEST, SHORTEST, Alarm, check_seconds, check_timeout
 from r2p.errors import Closed, DecodeError, MessageError
-from r2p.messages import Layout
+from r2p.messages import Layout, Message
 from r2p.runtime.qos import check_count
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, SubscriberQueue, checkpoint
 from r2p.runtime.sample import Sample
@@ -22,6 +22,7 @@ from r2p.runtime.topic import Topic, TopicSpace
 from r2p.units import SECOND
 
 T = TypeVar("T")
+M = TypeVar("M", bound=Message)
 
 Callback = Callable[[T], object]
 Keep = Literal["newest", "oldest"]
@@ -133,8 +134,17 @@ class Subscriber(Generic[T]):
     def __aiter__(self) -> AsyncIterator[T]:
         return self._iterate(whole=False)
 
-    def samples(self) -> AsyncIterator[Sample]:
-        """Iterate samples: messages with their source, stamp, deadline and packed bytes."""
+    @overload
+    def samples(self: "Subscriber[M]") -> AsyncIterator[Sample[M]]: ...
+
+    @overload
+    def samples(self: "Subscriber[bytes]") -> AsyncIterator[Sample]: ...
+
+    def samples(self) -> AsyncIterator[Sample[Any]]:
+        """Iterate samples: messages with their source, stamp, deadline and packed bytes.
+
+        `sample.message` is of the type that was subscribed to; without a type, it may be None.
+        """
         return self._iterate(whole=True)
 
     async def _iterate(self, *, whole: bool) -> AsyncIterator[Any]:  # noqa: C901 - see below
@@ -163,6 +173,8 @@ class Subscriber(Generic[T]):
                     message = self._examine(sample)
                     if message is None:
                         continue
+                    if whole and kind is not None and sample.message is not message:
+                        sample = msgspec.structs.replace(sample, message=message)  # decoded from another class
                 yield sample if whole else message
                 credit -= 1
                 if not credit:
@@ -184,8 +196,14 @@ class Subscriber(Generic[T]):
             return message
         if timeout is None:  # apart, as a time-out costs more than a message
             return await self._fetch_next()
-        async with asyncio.timeout(timeout):
-            return await self._fetch_next()
+        limit = asyncio.timeout(timeout)
+        try:
+            async with limit:
+                return await self._fetch_next()
+        except TimeoutError:
+            if not limit.expired():  # the subscription has a time-out of its own
+                raise
+            raise TimeoutError(self._nothing_within(timeout)) from None
 
     async def _fetch_next(self) -> T:
         while not self._closed:
@@ -289,6 +307,14 @@ class Subscriber(Generic[T]):
         finally:
             self.wait_no_more(waiter)
 
+    def _nothing_within(self, seconds: float) -> str:
+        """The text of a TimeoutError: what was waited for, and why nothing came, as far as that is known."""
+        text = f"no message on {self.topic!r} within {seconds:g} s"
+        count = self.publishers
+        known = "its publisher is silent" if count == 1 else f"its {count} publishers are silent"
+        stale = f", and {self.stale} messages so far were older than max_age" if self.stale else ""
+        return f"{text}; {known if count else 'it has no publisher yet'}{stale}"
+
     def _two_readers(self) -> RuntimeError:
         return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each task")
 
@@ -340,4 +366,4 @@ class Subscriber(Generic[T]):
         self._last_message = now
         self._alarm.set(now + self._timeout)
         if (reader := self._sink.waiter) is not None and not reader.done():
-            reader.set_exception(TimeoutError(f"nothing on {self.topic} for {self._timeout / SECOND} s"))
+            reader.set_exception(TimeoutError(self._nothing_within(self._timeout / SECOND)))

@@ -24,7 +24,7 @@ import textwrap
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, TextIO
 
-from r2p.log_lines import printable
+from r2p.log_lines import StderrHandler, printable
 
 Record = Mapping[str, Any]
 
@@ -272,37 +272,7 @@ def notify(text: str) -> None:
         print(printable(f"r2p: {text}", "\n\t"), file=sys.stderr, flush=True)  # noqa: T201 - the one place
 
 
-class _LineFormatter(logging.Formatter):
-    """Formats a log record as a short line; records of nodes begin with `module/node`."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        _, _, rest = record.name.partition(".")
-        module, _, node = rest.partition(".")
-        where = f"{module}/{node}: " if node else "r2p: "
-        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
-        text = where + level + record.getMessage()
-        if record.exc_info:
-            text += "\n" + self.formatException(record.exc_info)
-        return printable(text, "\n\t")
-
-
-class _StderrHandler(logging.StreamHandler[Any]):
-    """Writes to the `sys.stderr` of the moment, and is silent if that is closed."""
-
-    def __init__(self) -> None:
-        super().__init__(sys.stderr)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.stream = sys.stderr
-        super().emit(record)
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
-        if not isinstance(sys.exc_info()[1], OSError | ValueError):
-            super().handleError(record)
-
-
-_HANDLER = _StderrHandler()
-_HANDLER.setFormatter(_LineFormatter())
+_HANDLER = StderrHandler()
 
 
 @contextlib.contextmanager

@@ -136,15 +136,20 @@ def test_text_that_names_nothing_at_run_time(build: Callable[[], type[Message]])
         (float, "use r2p.f32 or r2p.f64"),
         (str, r"use Annotated\[str, r2p.Len"),
         (bytes, r"Annotated\[tuple\[r2p.u8, ...\], r2p.Len"),
-        (list[int], r"use tuple\[r2p.f32"),
+        (
+            list[int],
+            r": list\[int\] has no fixed size, use tuple\[r2p.i32, r2p.i32\] or Annotated\[tuple\[r2p.i32, ...\]",
+        ),
+        (list[f32], r": list\[r2p.f32\] has no fixed size, use tuple\[r2p.f32, r2p.f32\]"),
+        (list[Led], r": list\[Led\] has no fixed size, use tuple\[Led, Led\]"),
         (list, r"use tuple\[r2p.f32"),
         (tuple, r"use tuple\[r2p.f32"),
         (dict[str, int], r"use r2p.u8 .. r2p.f64, bool, a Message, a tuple"),
-        (u8 | None, "use r2p.u8 .. r2p.f64, bool"),
+        (u8 | None, r": r2p.u8 \| None has no fixed size, use r2p.u8 .. r2p.f64, bool"),
         (Any, "use r2p.u8 .. r2p.f64, bool"),
         (Literal[1, 2], "use r2p.u8 .. r2p.f64, bool"),
         (msgspec.Struct, "use r2p.u8 .. r2p.f64, bool"),
-        (Annotated[u8, Len(3)], "has no fixed size, use one of r2p.u8"),
+        (Annotated[u8, Len(3)], r": Annotated\[r2p.u8, r2p.Len\(3\)\] has no fixed size, use one of r2p.u8"),
         (Annotated[bool, Len(3)], "has no fixed size"),
         (Annotated[Led, Len(3)], "has no fixed size"),
         (tuple[u8, ...], "an array has one type and a fixed length"),
@@ -177,8 +182,16 @@ def test_size_limits() -> None:
 
     assert layout(made(Annotated[str, Len(SIZE_MAX)])).size == 1024
     for cls in (Empty, Message, made(Empty), made(tuple[Empty, Empty])):
-        with pytest.raises(MessageError, match="has 0 bytes: a message has 1 to 1024"):
+        with pytest.raises(MessageError, match=r"has no fields: annotate them, as in `speed: r2p.f32 = 0.0`"):
             layout(cls)
+
+
+def test_a_value_without_an_annotation_is_no_field() -> None:
+    class Bare(Message):
+        speed = 1.5
+
+    with pytest.raises(MessageError, match=r"Bare has no fields: annotate them, as in `speed: r2p.f32 = 1.5`"):
+        layout(Bare)
 
 
 def test_too_large_in_all() -> None:

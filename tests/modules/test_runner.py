@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import subprocess
 import sys
 import textwrap
 import threading
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+from unittest import mock
 
 import pytest
 
 import r2p
 from r2p.modules.runner import loop_factory, run_main
-from tests.bench import settle
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
 
 PROLOGUE = """
-import asyncio, os, signal, sys, threading, time
+import asyncio, logging, os, signal, sys, threading, time
 import r2p
 
 def ready() -> None:
@@ -130,18 +131,31 @@ def test_a_program_that_does_not_end_is_ended(hang: str) -> None:
 
 
 @pytest.mark.processes
-def test_a_crash_is_raised_at_the_end_also_after_a_signal() -> None:
+def test_a_crash_is_logged_once_and_is_one_line_at_the_end_also_after_a_signal() -> None:
     program = """
         async def broken(node: r2p.Node) -> None:
+            node.log.info("on")
+            logging.getLogger("r2p.link").warning("link is down")
             raise ValueError("no motor")
 
-        r2p.run(broken, waits)
+        try:
+            r2p.run(broken, waits, module="PC1")
+        except r2p.NodeCrashed as error:
+            print(*error.exceptions)
+            raise
     """
     ended = execute(program, signal.SIGINT)
-    assert (ended.code, ended.out) == (1, "ready\ncleaned up\n")
-    assert "NodeCrashed: 1 node(s) of module" in ended.err
-    assert "ValueError: no motor" in ended.err
-    assert "in node broken of module" in ended.err
+    assert (ended.code, ended.out) == (1, "ready\ncleaned up\nno motor\n")
+    timeless = re.sub(r"^\d\d:\d\d:\d\d\.\d\d\d ", "", ended.err, flags=re.MULTILINE)
+    assert timeless.splitlines() == [
+        "INFO    PC1/broken: on",
+        "WARNING r2p: link is down",
+        "ERROR   PC1/broken: node broken crashed: ValueError: no motor",
+        "Traceback (most recent call last):",
+        mock.ANY,  # the place in the program, and nothing of r2p
+        "ValueError: no motor",
+        "r2p: node broken of module PC1 crashed",
+    ]
 
 
 @pytest.mark.processes
@@ -195,6 +209,12 @@ def test_run_main_gives_the_result_and_raises_what_main_raises() -> None:
     assert handlers() == before
 
 
+@pytest.mark.virtual_time
+async def test_a_program_in_a_program_is_an_error() -> None:
+    with pytest.raises(r2p.Error, match=r"an event loop runs already: .* `async with r2p.Module\(...\)`"):
+        r2p.run(wink)
+
+
 def test_run_main_works_in_a_thread() -> None:
     async def main() -> None:
         await asyncio.sleep(0)
@@ -219,12 +239,61 @@ def test_a_program_runs_on_uvloop_where_there_is_one(monkeypatch: pytest.MonkeyP
     assert str(run_main(main)).startswith("asyncio")
 
 
-def test_wrong_functions_raise_before_anything_runs() -> None:
-    async def a_long_name(node: r2p.Node) -> None:
-        await settle()
+async def line_follower(node: r2p.Node) -> None:
+    print(node.name)  # noqa: T201
 
-    with pytest.raises(r2p.NameTooLong, match="function name 'a_long_name' is not a valid node name"):
-        r2p.run(a_long_name)
+
+async def wink(node: r2p.Node) -> None:
+    print(node.name)  # noqa: T201
+
+
+def test_nodes_get_their_names(capsys: pytest.CaptureFixture[str]) -> None:
+    r2p.run(line_follower, name="follower", via=[])
+    r2p.run(wink, ("left", wink), ("follow", line_follower), via=[])
+    assert capsys.readouterr().out.split() == ["follower", "wink", "left", "follow"]
+
+
+@pytest.mark.parametrize(
+    ("functions", "name", "kind", "text"),
+    [
+        ([line_follower], None, r2p.NameTooLong, "pass name='line_fol', or ('line_fol', line_follower) to r2p.run"),
+        ([wink, ("too_long_for_it", wink)], None, r2p.NameTooLong, "has 15 characters, the wire carries 8: shorten it"),
+        ([wink], "", r2p.InvalidName, "node name ''"),
+        ([wink, wink], None, r2p.Error, "already has a node wink"),
+        ([wink, line_follower], "x", r2p.Error, "name='x' is for one function, here are 2: write (name, function)"),
+        ([(wink, "x")], None, r2p.Error, "is not a node: write a function, or (name, function)"),
+        ([print], None, r2p.Error, "is not a coroutine function"),
+    ],
+)
+def test_what_can_not_run_is_one_line(
+    functions: list[Any],
+    name: str | None,
+    kind: type[Exception],
+    text: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+    with pytest.raises(kind) as caught:
+        r2p.run(*functions, name=name, via=[])
+    assert text in str(caught.value)
+    sys.excepthook(caught.type, caught.value, caught.tb)
+    assert capsys.readouterr().err == f"r2p: {caught.value}\n"
+    sys.excepthook(LookupError, LookupError("other"), None)
+    assert capsys.readouterr().err == "LookupError: other\n"
+
+
+def test_a_hook_of_the_program_stays_and_debugging_keeps_the_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    hook = mock.Mock()
+    monkeypatch.setattr(sys, "excepthook", hook)
+    with pytest.raises(r2p.NameTooLong):
+        r2p.run(line_follower)
+    assert sys.excepthook is hook
+    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+    monkeypatch.setenv("R2P_DEBUG", "1")
+    with pytest.raises(r2p.NameTooLong):
+        r2p.run(line_follower)
+    assert sys.excepthook is sys.__excepthook__
 
 
 @pytest.mark.processes

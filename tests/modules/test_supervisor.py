@@ -7,6 +7,7 @@ import contextlib
 import functools
 import itertools
 import logging
+import re
 from typing import TYPE_CHECKING
 
 import pytest
@@ -56,6 +57,44 @@ async def test_a_node_that_raises_ends_alone(caplog: pytest.LogCaptureFixture) -
 
 
 @pytest.mark.virtual_time
+@pytest.mark.parametrize("how", ["fetch", "limit", "group", "periodic"])
+async def test_a_crash_is_logged_with_the_frames_of_the_program_only(
+    how: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def late(node: r2p.Node) -> None:
+        leds = node.subscribe("leds", Led)
+        if how == "fetch":
+            await leds.fetch(timeout=1.0)
+        elif how == "limit":
+            async with asyncio.timeout(1.0):
+                await leds.fetch()
+        elif how == "group":
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(leds.fetch(timeout=1.0))
+        else:
+            node.advertise("state", Led, r2p.Periodic(0.01, lambda: led(1 // 0)))
+            await leds.fetch()
+
+    async def main() -> None:
+        async with local() as module:
+            module.start(late)
+            await module.wait()
+
+    monkeypatch.delenv("R2P_DEBUG", raising=False)
+    assert len(await crashes(main)) == 1
+    (record,) = [each for each in caplog.records if each.name == "r2p.PC1.late"]
+    assert record.exc_text is not None
+    files = re.findall(r'File "(.*)", line', record.exc_text)
+    if how == "group":  # what the task raises has no frame of the program
+        assert files.pop().endswith("subscriber.py")
+    assert set(files) == {__file__}
+    assert "CancelledError" not in record.exc_text
+    monkeypatch.setenv("R2P_DEBUG", "1")
+    assert len(await crashes(main)) == 1
+    assert "/r2p/" in str(caplog.records[-1].exc_text)
+
+
+@pytest.mark.virtual_time
 @pytest.mark.parametrize("restart", [False, True])
 async def test_a_node_with_wrong_arguments_ends_alone(restart: bool) -> None:
     async def needy(node: r2p.Node, number: int) -> None:
@@ -85,7 +124,7 @@ async def test_all_crashes_are_raised_in_one_group_at_the_end() -> None:
             module.start(broken, TypeError(2), name="b")
             await module.wait()
 
-    with pytest.raises(r2p.NodeCrashed, match=r"2 node\(s\) of module PC1 crashed") as caught:
+    with pytest.raises(r2p.NodeCrashed, match="nodes a, b of module PC1 crashed") as caught:
         await main()
     assert [repr(each) for each in caught.value.exceptions] == ["ValueError(1)", "TypeError(2)"]
 

@@ -77,6 +77,57 @@ async def test_what_a_callback_raises_comes_out_of_spin() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_messages_that_wait_for_a_node_that_does_not_spin_are_a_warning(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    got: list[Led] = []
+
+    async def deaf(node: r2p.Node) -> None:
+        node.subscribe("silent", Led, print)
+        node.subscribe("leds", Led, got.append)
+        await asyncio.sleep(10.0)
+        await node.spin()
+        await asyncio.sleep(10.0)
+
+    async with local() as module:
+        module.start(deaf)
+        publisher = module.start(hold).advertise("leds", Led)
+        await settle(3.5)
+        assert warnings(caplog) == []  # nothing waits yet
+        await publisher.publish(led(1))
+        await settle(2.0)
+        text = "node deaf does not call spin(): messages on leds wait for its callbacks; write "
+        assert warnings(caplog) == [text + "`while True: await node.spin()`"]
+        await settle(5.0)
+        assert got == [led(1)]
+        await publisher.publish(led(2))
+        await module.nodes["deaf"].stop()
+        assert len(warnings(caplog)) == 1  # once
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("spins", [False, True])
+async def test_callbacks_of_a_node_that_returns_without_spin_are_a_warning(
+    spins: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def short(node: r2p.Node) -> None:
+        node.subscribe("leds", Led, print)
+        node.subscribe("other", Led)
+        if spins:
+            await node.spin(0.1)
+
+    async with local() as module:
+        module.start(short)
+        await module.wait()
+    text = "node short does not call spin(): it has returned, so its callbacks for leds were never called; write "
+    assert warnings(caplog) == ([] if spins else [text + "`while True: await node.spin()`"])
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+
+
+@pytest.mark.virtual_time
 async def test_a_callback_may_close_its_subscription() -> None:
     async with local() as module:
         node = module.start(hold)

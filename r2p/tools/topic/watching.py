@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 import r2p
+from r2p.tools.options import valid_topic
 from r2p.tools.output import notify
 from r2p.tools.session import Session, UsageError, call_after, settings, wait_until
 from r2p.tools.types import complete_type
@@ -26,8 +27,13 @@ def _complete_topic(incomplete: str) -> list[str]:
     return [name for name in known if name.startswith(incomplete)]
 
 
-Topic = Annotated[str, typer.Argument(metavar="TOPIC", autocompletion=_complete_topic, show_default=False)]
-Topics = Annotated[list[str], typer.Argument(metavar="TOPIC...", autocompletion=_complete_topic, show_default=False)]
+Topic = Annotated[
+    str, typer.Argument(metavar="TOPIC", autocompletion=_complete_topic, parser=valid_topic, show_default=False)
+]
+Topics = Annotated[
+    list[str],
+    typer.Argument(metavar="TOPIC...", autocompletion=_complete_topic, parser=valid_topic, show_default=False),
+]
 TypeName = Annotated[
     str | None,
     typer.Option(

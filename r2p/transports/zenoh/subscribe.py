@@ -179,7 +179,7 @@ class RxStream:
             return 1
         # Sequence 0 means that it is not known, so it is 0 in each message of the packet.
         source, publisher_class, step = publisher.source, publisher.publisher_class, 1 if sequence else 0
-        samples = []
+        samples: list[Sample] = []
         for part, stamp in zip(parts, stamps, strict=True):
             samples.append(
                 Sample(part, source, stamp, deadline, sequence, publisher_class, None, stamped, True, hops, clock)

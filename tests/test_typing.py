@@ -1,0 +1,66 @@
+"""What type checkers see of the API: mypy and pyright check these lines; an ignore that nothing needs is an error.
+
+They run as well, so that what the checkers believe is what there is.
+"""
+
+from __future__ import annotations
+
+from typing import assert_type
+
+import pytest
+
+import r2p
+from r2p.msg import Encoder, Led
+
+
+class Lamp(r2p.Message):
+    """The layout of Led, as another program may have it."""
+
+    led: r2p.u32 = 0
+    value: r2p.u8 = 0
+
+
+async def talk(node: r2p.Node) -> None:
+    leds = node.subscribe("leds", Led)
+    assert_type(leds, r2p.Subscriber[Led])
+    raw = node.subscribe("leds", None)
+    assert_type(raw, r2p.Subscriber[bytes])
+    lamps = node.advertise("leds", Lamp)
+    assert_type(lamps, r2p.Publisher[Lamp])
+    assert_type(node.advertise("a", Led, r2p.Sporadic(1.0)), r2p.SporadicPublisher[Led])
+    assert_type(node.advertise("b", Led, r2p.Periodic(1.0, Led)), r2p.PeriodicPublisher[Led])
+    for _ in range(2):
+        await lamps.publish(Lamp(led=3))
+    async for sample in leds.samples():
+        assert_type(sample, r2p.Sample[Led])
+        assert_type(sample.message, Led)
+        assert sample.message == Led(led=3)  # of the subscriber's class, not of the publisher's
+        break
+    assert_type(await leds.fetch(timeout=1.0), Led)
+    async for packed in raw.samples():
+        assert_type(packed.message, r2p.Message | None)
+        assert packed.message == Lamp(led=3)
+        break
+    assert_type(await raw.fetch(timeout=1.0), bytes)
+
+
+async def mistake(node: r2p.Node) -> None:
+    with pytest.raises(r2p.MessageError):
+        node.subscribe("leds", int)  # type: ignore[type-var]
+    with pytest.raises(r2p.MessageError):
+        await node.advertise("encoder", Encoder).publish(Led())  # type: ignore[arg-type]
+
+
+def last_stamp(samples: list[r2p.Sample]) -> int:
+    """A sample without a type in brackets is one of any message."""
+    assert_type(samples[0].message, r2p.Message | None)
+    return samples[-1].stamp
+
+
+@pytest.mark.virtual_time
+async def test_what_type_checkers_see_is_what_there_is() -> None:
+    async with r2p.Module("PC1", via=[]) as module:
+        module.start(talk)
+        module.start(mistake)
+        await module.wait()
+    assert last_stamp([r2p.Sample(b"", r2p.Source(), 5)]) == 5
