@@ -7,7 +7,7 @@ STAMP := .venv/stamp
 LOWEST := .venv-lowest
 PYTHONS := 3.12 3.13
 
-.PHONY: demo test test-lowest test-pythons lint bench soak docs clean
+.PHONY: demo test test-lowest test-pythons lint bench soak docs docs-check pictures clean
 
 demo: $(RUN)
 	$(BIN)/r2p demo
@@ -36,6 +36,7 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
@@ -49,6 +50,18 @@ soak: $(STAMP)
 
 docs: $(STAMP)
 	$(BIN)/mkdocs build --strict
+
+# The built site in Debian's chromium, at the width of a phone and of a desktop, light and dark. `SHOTS=folder` takes
+# pictures of the pages.
+docs-check: docs
+	$(BIN)/python -m pip install --quiet --group browser
+	$(BIN)/python docs/check_site.py $(if $(SHOTS),--shots $(SHOTS))
+
+# The pictures of the documentation, from the code; tests say when that is due.
+pictures: $(STAMP)
+	$(BIN)/python docs/draw_architecture.py
+	$(BIN)/python docs/draw_diagrams.py
+	$(BIN)/python docs/draw_screens.py
 
 clean:
 	rm -rf .venv .venv-* site

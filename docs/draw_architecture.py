@@ -36,10 +36,15 @@ _WIDTH, _MARGIN, _LABEL, _GAP = 1000, 12, 112, 8  # px
 _LINE, _HEAD, _CHARACTER = 16, 28, 6.6  # px: a line of file names, the name of a box, a character of either
 _STYLE = """
     .layer { fill: #76808e; fill-opacity: .08 }
-    .label { fill: #76808e; font-size: 13px; font-weight: 600 }
+    .label { fill: #5f6977; font-size: 13px; font-weight: 600 }
     .box { fill: #4338ca; fill-opacity: .1; stroke: #4338ca; stroke-width: 1.2 }
     .name { fill: #4338ca; font-size: 13px; font-weight: 600 }
-    .files { fill: #76808e; font-size: 12px }"""
+    .files { fill: #5f6977; font-size: 12px }
+    @media (prefers-color-scheme: dark) {
+      .box { fill: #a5b4fc; stroke: #a5b4fc }
+      .name { fill: #a5b4fc }
+      .label, .files { fill: #a5afbd }
+    }"""
 
 _HEADER = f"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} %d" role="img" \
 aria-labelledby="title desc" font-family="system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif">

@@ -286,7 +286,9 @@ def _title(figures: Figures, duration: float | None, width: int) -> Text:
     late = f"{figures.missed or 'no'} deadline{'' if figures.missed == 1 else 's'} missed"
     if figures.too_slow:
         late = _too_slow(figures)
-    text = f" Triskar2   {figures.time:.1f}{until} s   {figures.path:.2f} m driven  "
+    text = f" Triskar2   {figures.time:.1f}{until} s   "
+    driven = f"{figures.path:.2f} m driven  "
+    text += driven if len(text + driven + late) < width else ""
     return Text(f"{text:{max(0, width - len(late) - 1)}}{late} ", style="bold reverse", no_wrap=True)
 
 

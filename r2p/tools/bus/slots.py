@@ -33,7 +33,8 @@ _ROW = 20  # slots in a line of text
 _SIDE = 26  # pixels of a slot in the SVG
 _LETTERS = string.ascii_uppercase.replace("S", "") + string.ascii_lowercase + string.digits
 _COLOURS = ("#4e79a7", "#f28e2b", "#59a14f", "#b07aa1", "#76b7b2", "#edc948", "#9c755f", "#ff9da7")
-_SYNC, _FREE, _EVENTS, _MISSED = "#444444", "#f4f4f4", "#cfe3f5", "#d62728"
+_SYNC, _FREE, _EVENTS, _MISSED = "#555555", "#76808e26", "#4e79a766", "#d62728"  # free ones let a dark page through
+_STYLE = "<style>.label { fill: #333 } @media (prefers-color-scheme: dark) { .label { fill: #ddd } }</style>"
 _KEY = "     S  sync    .  free    +  free, used by events    !  missed in some cycles"
 
 Svg = Annotated[Path | None, typer.Option("--svg", metavar="FILE", help="Also draw the cycle into this file.")]
@@ -253,7 +254,7 @@ def summary(calendar: Calendar, grid: Timing) -> str:
     left = grid.slots - reserved
     frames = left / grid.cycle * SECOND
     return (
-        f"{reserved:g} of {grid.slots} slots reserved (including the sync), {left:g} left for other traffic: "
+        f"{reserved:g} of {grid.slots} slots reserved (including the sync), {left:g} left for other traffic:\n"
         f"{frames:.0f} frames/s, {frames * 64 / 1000:.1f} kbit/s of data"
     )
 
@@ -301,15 +302,15 @@ def svg_of(cells: list[Cell], title: str) -> str:
     height = below + 20 * (len(names) + 1)
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">',
-        f'<rect width="{width}" height="{height}" fill="white"/>',
-        f'<text x="20" y="24">{escape(title)}</text>',
+        _STYLE,
+        f'<text class="label" x="20" y="24">{escape(title)}</text>',
     ]
     for i, cell in enumerate(cells):
         parts.append(_box(i, cell, 20 + i % _ROW * _SIDE, top + i // _ROW * (_SIDE + 6), names))
     for i, (owner, letter) in enumerate(names.items()):
         y = below + 20 * i
         parts.append(f'<rect x="20" y="{y - 11}" width="14" height="14" fill="{_colour(letter)}"/>')
-        parts.append(f'<text x="42" y="{y}" font-size="12">{letter}  {escape(owner)}</text>')
+        parts.append(f'<text class="label" x="42" y="{y}" font-size="12">{letter}  {escape(owner)}</text>')
     return "\n".join([*parts, "</svg>\n"])
 
 
