@@ -178,10 +178,12 @@ def _beside_the_robot() -> dict[str, Screen]:
 async def _robot() -> dict[str, Screen]:
     """The demo, as wide as a terminal and as a phone; and its odometry, as `hz` measures it meanwhile."""
     screens: dict[str, Screen] = {}
+    seen = asyncio.Event()
 
     def show(screen: SimulatorScreen, figures: Figures) -> None:
         screen.draw(figures)  # its map remembers the path
-        if "demo" not in screens and figures.time >= MOMENT - 0.01:
+        if not seen.is_set() and figures.time >= MOMENT - 0.01:
+            seen.set()
             screens["demo"] = _frame(screen, figures, COLUMNS, 24)
             screens["demo-narrow"] = _frame(screen, figures, NARROW, 24)
 
@@ -192,7 +194,9 @@ async def _robot() -> dict[str, Screen]:
             async with join(Settings(via=[_OUTSIDE]), name="hz") as session:
                 await hz(session, "odometry", count=3)
         screens["hz"] = Screen("r2p topic hz odometry -n 3", terminal.getvalue())
-        await robot
+        await seen.wait()
+        robot.cancel()
+        await asyncio.wait([robot])
     return screens
 
 

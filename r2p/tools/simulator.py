@@ -288,7 +288,7 @@ def _title(figures: Figures, duration: float | None, width: int) -> Text:
         late = _too_slow(figures)
     text = f" Triskar2   {figures.time:.1f}{until} s   "
     driven = f"{figures.path:.2f} m driven  "
-    text += driven if len(text + driven + late) < width else ""
+    text += driven if len(text + driven + late) <= width else ""
     return Text(f"{text:{max(0, width - len(late) - 1)}}{late} ", style="bold reverse", no_wrap=True)
 
 
