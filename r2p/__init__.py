@@ -36,8 +36,7 @@ from r2p.runtime.publishers import PeriodicPublisher, Publisher, SporadicPublish
 from r2p.runtime.qos import Missed, NonRealTime, Periodic, Sporadic
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.subscriber import Subscriber
-
-__version__ = "0.1.0"
+from r2p.version import __version__ as __version__
 
 __all__ = [
     "BridgeOptions",

@@ -384,7 +384,8 @@ class DirectoryRelay:
         if info.r2p and info.instance is not None:
             flags = management.HELLO_TOOL if info.observer else 0
             lease = min(max(info.lease, 3 * self._period()) // MILLISECOND, management.LEASE_MS_MAX)
-            messages.append(management.Hello(link_name, info.instance, flags, info.hops + 1, lease))
+            hello = management.Hello(link_name, info.instance, flags, info.hops + 1, lease, info.wire, info.release)
+            messages.append(hello)
         if not info.observer:
             messages.append(management.Alive(link_name, info.flags))
         return _Announced(tuple(messages), info.last_heard)

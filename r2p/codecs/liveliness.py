@@ -4,11 +4,13 @@ Each is a key that zenoh keeps while the session that declared it lives.
 
     1/SESSION/module/NAME/INSTANCE/FLAGS/HOPS
     1/SESSION/pub|sub/TOPIC/INSTANCE/NODE/CLASS/SIZE/FINGERPRINT/WINDOW/HOPS
+    2/SESSION/version/INSTANCE/WIRE/RELEASE
 
-The first part is the version. `SESSION` is the instance of the r2p module that declares the token, in hex; `INSTANCE`
-is that of the module concerned, another one where `HOPS` (gateways in between) is not 0, and `-` for firmware. `-`
-stands also for a node or a fingerprint that is not known; `%` for the slash of a topic or a module in a namespace.
-`SIZE` is that of a message, so 1024 at most. Tokens of another version are ignored.
+The first part is the version; tokens of another version are ignored. The last token was added later: with a 2, modules
+that know the first two only ignore it. `SESSION` is the instance of the r2p module that declares the token, in hex;
+`INSTANCE` is that of the module concerned, another one behind gateways (`HOPS` counts them), and `-` for firmware. `-`
+stands also for a node, a fingerprint or a release that is not known; `%` for the slash of a topic or a module in a
+namespace. `SIZE` is that of a message, so 1024 at most.
 
 In front of each token stands `live/*`, behind the name of the network; `live` alone is accepted, too. Every session
 numbers the keys that zenoh passes on to it, up to their first wildcard, and keeps these numbers for as long as it
@@ -20,12 +22,13 @@ import re
 import msgspec
 
 from r2p.codecs import UnknownType
-from r2p.codecs.management import ANY_TYPE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import ANY_TYPE, RELEASE_MAX, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 from r2p.messages import SIZE_MAX
 from r2p.names import MODULE_PATH, MODULE_PATH_MAX
 
 VERSION = "1"
+_SOFTWARE_VERSION = "2"
 
 KEY_PREFIX = "live"
 """The part of the key under which tokens are watched."""
@@ -41,7 +44,8 @@ _TOPIC = re.compile(
     rf"({_HEX32})/(pub|sub)/([A-Za-z0-9_]{{1,16}}(?:%[A-Za-z0-9_]{{1,16}})?)/({_HEX32}|-)/([A-Za-z0-9_]{{1,8}}|-)"
     r"/([0-9]{1,3})/([0-9]{1,6})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
 )
-_CLASS_MAX = 0xFF
+_SOFTWARE = re.compile(rf"({_HEX32})/version/({_HEX32})/([0-9]{{1,3}})/([A-Za-z0-9.+_-]{{1,{RELEASE_MAX}}})")
+_BYTE_MAX = 0xFF
 _OBSERVER = 0x80
 FLAGS_MASK = 0x7F
 """The flags of ALIVE that a token can hold."""
@@ -80,7 +84,16 @@ class TopicToken(msgspec.Struct, frozen=True):
     hops: int = 0
 
 
-Token = ModuleToken | TopicToken
+class SoftwareToken(msgspec.Struct, frozen=True):
+    """The versions of the module that runs as `instance`: `wire` and `release` as in its HELLO."""
+
+    session: int
+    instance: int
+    wire: int = 0
+    release: str = ""
+
+
+Token = ModuleToken | TopicToken | SoftwareToken
 
 
 def encode(token: Token) -> str:
@@ -90,6 +103,8 @@ def encode(token: Token) -> str:
         flags = token.flags | (_OBSERVER if token.observer else 0)
         name = token.name.replace("/", "%")
         return f"{VERSION}/{token.session:x}/module/{name}/{instance}/{flags:x}/{token.hops}"
+    if isinstance(token, SoftwareToken):
+        return f"{_SOFTWARE_VERSION}/{token.session:x}/version/{instance}/{token.wire}/{token.release or _NONE}"
     fingerprint = _NONE if token.fingerprint == ANY_TYPE else token.fingerprint.hex()
     topic = token.topic.replace("/", "%")
     return (
@@ -101,6 +116,9 @@ def encode(token: Token) -> str:
 def decode(key: str) -> Token:
     """Decode a key. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
     version, _, rest = key.partition("/")
+    if version == _SOFTWARE_VERSION and (found := _SOFTWARE.fullmatch(rest)) and int(found[3]) <= _BYTE_MAX:
+        session, instance, wire, release = found.groups()
+        return SoftwareToken(int(session, 16), int(instance, 16), int(wire), _text(release))
     if version != VERSION:
         raise UnknownType(f"version {version[:8]} of a token")
     if (found := _MODULE.fullmatch(rest)) and len(found[2]) <= MODULE_PATH_MAX:
@@ -114,14 +132,14 @@ def decode(key: str) -> Token:
             bool(bits & _OBSERVER),
             int(hops),
         )
-    if (found := _TOPIC.fullmatch(rest)) and int(found[6]) <= _CLASS_MAX and int(found[7]) <= SIZE_MAX:
+    if (found := _TOPIC.fullmatch(rest)) and int(found[6]) <= _BYTE_MAX and int(found[7]) <= SIZE_MAX:
         session, role, topic, instance, node, publisher_class, size, fingerprint, window, hops = found.groups()
         return TopicToken(
             int(session, 16),
             _ROLES[role],
             topic.replace("%", "/"),
             _instance(instance),
-            "" if node == _NONE else node,
+            _text(node),
             int(publisher_class),
             int(size),
             ANY_TYPE if fingerprint == _NONE else bytes.fromhex(fingerprint),
@@ -158,6 +176,10 @@ def is_module(key: str) -> bool:
     except DecodeError:
         return False
     return isinstance(token, ModuleToken) and not token.observer
+
+
+def _text(text: str) -> str:
+    return "" if text == _NONE else text
 
 
 def _instance(text: str) -> int | None:

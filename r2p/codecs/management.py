@@ -107,6 +107,11 @@ HELLO_LEAVING = 4
 LEASE_MS_MAX = 0xFFFF
 """The longest lease that a Hello can carry (ms)."""
 
+WIRE_VERSION = 1
+"""Hello.wire: the version of PROTOCOL.md, which grows when modules of before can't understand all of what is new."""
+RELEASE_MAX = 14
+"""Characters of Hello.release."""
+
 # TypeInfo.role and Endpoint.role
 ROLE_PUBLISHES = 1
 ROLE_SUBSCRIBES = 2
@@ -244,13 +249,18 @@ class Path(msgspec.Struct, frozen=True, gc=False):
 
 
 class Hello(msgspec.Struct, frozen=True, gc=False):
-    """An r2p module runs. `instance` is the random number of its start; it is gone after `lease_ms` of silence."""
+    """An r2p module runs. `instance` is the random number of its start; it is gone after `lease_ms` of silence.
+
+    `wire` is its WIRE_VERSION, `release` the version of its software; 0 and empty before r2p announced them.
+    """
 
     module: str
     instance: int
     flags: int = 0
     hops: int = 0
     lease_ms: int = 5000
+    wire: int = 0
+    release: str = ""
 
 
 class TypeInfo(msgspec.Struct, frozen=True, gc=False):
@@ -466,7 +476,7 @@ _CODEC = Codec[Management](
     Record(Release, ManagementType.RELEASE, "H", version=_VERSION),
     Record(Renew, ManagementType.RENEW, "B 24s", version=_VERSION),
     Record(Renewed, ManagementType.RENEWED, "B B H 24s", version=_VERSION),
-    Record(Hello, ManagementType.HELLO, "7s I B B H", version=_VERSION),
+    Record(Hello, ManagementType.HELLO, "7s I B B H B 14s", version=_VERSION, may_be_empty=("release",)),
     Record(TypeInfo, ManagementType.TYPE, "B 16s 8s H", version=_VERSION),
     Record(Unsubscribe, ManagementType.UNSUBSCRIBE, "16s I", version=_VERSION),
     Record(Endpoint, ManagementType.ENDPOINT, "B I 8s 16s B", version=_VERSION, may_be_empty=("node",)),

@@ -9,14 +9,16 @@ from typing import Any
 
 import msgspec
 
-from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES
+from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES, WIRE_VERSION
 from r2p.messages import Layout, Message
 from r2p.modules.link_manager import LinkManager
+from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.sample import PublisherClass
 from r2p.runtime.topic import Topic
 from r2p.transports.link import Link
 from r2p.units import SECOND
+from r2p.version import __version__
 
 
 class Endpoint(msgspec.Struct, frozen=True, order=True):
@@ -53,7 +55,8 @@ class TopicView(msgspec.Struct):
 class ModuleView(msgspec.Struct):
     """A module. `state` is "running", "stopped", "boot" or "observer"; `age` is in s since it was heard (0: this one).
 
-    `link` is empty for this module, `instance` is None for firmware.
+    `link` is empty for this module, `instance` is None for firmware. `wire` is the version of the wire formats that the
+    module uses, `release` its version of r2p: None where it does not announce them, as firmware.
     """
 
     name: str
@@ -62,6 +65,8 @@ class ModuleView(msgspec.Struct):
     age: float
     link: str
     instance: int | None
+    wire: int | None = None
+    release: str | None = None
 
 
 class NetworkView:
@@ -76,7 +81,8 @@ class NetworkView:
         module = self._opened()
         now = module.space.clock.monotonic()
         state = _state(module.flags, observer=module.observer)
-        own = ModuleView(module.space.module, state, bool(module.flags & FLAG_REBOOTED), 0.0, "", module.instance)
+        rebooted = bool(module.flags & FLAG_REBOOTED)
+        own = ModuleView(module.space.module, state, rebooted, 0.0, "", module.instance, WIRE_VERSION, __version__)
         others = [_module_view(link, info, now) for link in module.links for info in link.discovery.modules.values()]
         return [own, *sorted(others, key=lambda view: (view.name, view.link))]
 
@@ -116,7 +122,8 @@ class NetworkView:
 def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:
     state = _state(info.flags, observer=info.observer)
     age = (now - info.last_heard) / SECOND
-    return ModuleView(info.name, state, bool(info.flags & FLAG_REBOOTED), age, link.name, info.instance)
+    rebooted, wire, release = bool(info.flags & FLAG_REBOOTED), info.wire or None, info.release or None
+    return ModuleView(info.name, state, rebooted, age, link.name, info.instance, wire, release)
 
 
 def _state(flags: int, *, observer: bool) -> str:
@@ -156,12 +163,20 @@ def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
         age = (now - announced) / SECOND
         view.age = age if view.age is None else min(view.age, age)
     names = {info.instance: info.name for info in link.discovery.modules.values()}
+    named = {(each.node, each.topic, each.role) for each in link.discovery.endpoints.values() if _module(each, names)}
     for endpoint in link.discovery.endpoints.values():
-        module = endpoint.module or names.get(endpoint.instance, "")  # it may be announced before its module's name
+        module = _module(endpoint, names)
+        if not module and (endpoint.node, endpoint.topic, endpoint.role) in named:
+            continue  # most likely an earlier start of that module, which a gateway has not forgotten yet
         view = views.setdefault(endpoint.topic, TopicView(endpoint.topic))
         publishes = endpoint.role == ROLE_PUBLISHES
         klass = PublisherClass(endpoint.publisher_class & 3 or 1) if publishes else None  # a byte from outside
         (view.publishers if publishes else view.subscribers).append(Endpoint(module, endpoint.node, klass, link.name))
+
+
+def _module(endpoint: EndpointInfo, names: dict[int | None, str]) -> str:
+    """Return the name of an endpoint's module; empty: the endpoint was announced before it."""
+    return endpoint.module or names.get(endpoint.instance, "")
 
 
 def _add(names: list[str], name: str) -> None:

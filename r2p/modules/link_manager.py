@@ -12,7 +12,7 @@ import msgspec
 
 from r2p.bridge import Bridge, BridgeOptions, MultihomedModule
 from r2p.clock import in_background, random_of
-from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY, ROLE_PUBLISHES
+from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY, ROLE_PUBLISHES, WIRE_VERSION
 from r2p.errors import Error
 from r2p.log_lines import LineLimit, get_logger
 from r2p.names import module_alias
@@ -34,6 +34,7 @@ from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import Link, is_booting
 from r2p.transports.stats import LinkStats
 from r2p.units import SECOND
+from r2p.version import __version__
 
 logger = get_logger("r2p.module")
 
@@ -42,6 +43,7 @@ _PROMPT = 1.0  # seconds in which a tool's link may come up without a line of th
 _DENIAL_EXPECTED = 5 * SECOND  # ns after a command in which gateways may answer that they do not pass it on
 _MISMATCH_LINES = 1  # of the log in a second about one topic whose types differ
 _ACCEPTED_AFTER = 3.0  # seconds that a connection lasts which the other end did not refuse: it would have said so
+_OTHER_VERSIONS_MAX = 64  # modules of another wire version that are reported, each once
 _REFUSED_APART = 60 * SECOND  # ns between two lines about connections that one URL refuses, or that are refused
 
 _DENIED = {
@@ -94,6 +96,10 @@ class LinkManager:
         """Names that two modules may have."""
         self._commands: dict[tuple[Command, str], tuple[int, str]] = {}
         """Commands that were sent, by the module's alias: when (monotonic ns), and its name."""
+        self._other_versions: set[str] = set()
+        """Names of modules whose wire version was reported."""
+        self._used_clients: set[Link] = set()
+        """Links of clients, of which a module was heard that is not a tool."""
         self._limits: dict[Link, LineLimit] = {}
         self._clients = LineLimit()
         self._refusals = LineLimit(1, _REFUSED_APART)
@@ -148,6 +154,7 @@ class LinkManager:
         self.space.links.remove(link)
         self._bridging.detach(link)
         del self._limits[link]
+        self._used_clients.discard(link)
         self._link_accepted(link)
         self.closed_links.add(link.stats, link.losses)
 
@@ -214,6 +221,8 @@ class LinkManager:
             case ModuleChanged():
                 self._link_accepted(link)  # a module that refuses the connection announces nothing
                 self._suspect_conflict(link, event.info)
+                self._check_version(link, event.info)
+                self._note_client(link, event.info)
                 self._events.emit(event)
             case ModuleGone():
                 self._report_gone(link, event)
@@ -230,14 +239,36 @@ class LinkManager:
         meanwhile = "" if first else f", after {outage:.1f} s"
         if lost:
             meanwhile += f"; {lost} messages lost meanwhile"
-        expected = self.observer and first and outage < _PROMPT
+        # A client says who it is a moment later: tools, which come and go with each command, fill no log.
+        expected = link.transient or (self.observer and first and outage < _PROMPT)
         self._log_change(link, logging.DEBUG if expected else logging.INFO, "up", f"is up{meanwhile}")
         self._events.emit(LinkUp(link.name, outage, lost))
 
     def _report_down(self, link: Link, reason: str) -> None:
-        lost_modules = bool(link.discovery.modules)  # a module that said good-bye is forgotten by now
-        self._log_change(link, logging.WARNING if lost_modules else logging.INFO, "down", f"is down: {reason}")
+        # A module that said good-bye is forgotten by now.
+        lost_modules = any(not info.observer for info in link.discovery.modules.values())
+        unused = link.transient and link not in self._used_clients
+        level = logging.WARNING if lost_modules else logging.DEBUG if unused else logging.INFO
+        self._log_change(link, level, "down", f"is down: {reason}")
         self._events.emit(LinkDown(link.name, reason))
+
+    def _note_client(self, link: Link, info: ModuleInfo) -> None:
+        """Log the first module on the link of a client: of one with only tools, nothing is logged."""
+        if link.transient and not info.observer and link not in self._used_clients:
+            self._used_clients.add(link)
+            self._log_change(link, logging.INFO, "up", f"is up, with module {info.name}")
+
+    def _check_version(self, link: Link, info: ModuleInfo) -> None:
+        """Report once for each module that its wire version is another one."""
+        known = info.name in self._other_versions or len(self._other_versions) >= _OTHER_VERSIONS_MAX
+        if info.wire in {0, WIRE_VERSION} or known:
+            return
+        self._other_versions.add(info.name)
+        text = (
+            f"module {info.name} has wire version {info.wire} (r2p {info.release or 'unknown'}), this one "
+            f"{WIRE_VERSION} (r2p {__version__}): what only one of them knows is ignored; install the same r2p on both"
+        )
+        self._log_limited(link, logging.WARNING, "version", text)
 
     def _report_command_denied(self, link: Link, event: CommandDenied) -> None:
         """Report that a gateway does not pass a command on, if it was this module's."""
@@ -259,7 +290,8 @@ class LinkManager:
 
     def _log_change(self, link: Link, level: int, kind: str, text: str) -> None:
         """Log that a link went up or down; those of clients have one limit, as they may come and go by the thousand."""
-        suffix = self._clients.suffix(kind, self.space.clock.monotonic()) if link.transient else ""
+        limited = link.transient and level > logging.DEBUG
+        suffix = self._clients.suffix(kind, self.space.clock.monotonic()) if limited else ""
         if suffix is not None:
             logger.log(level, "link %s %s%s", link.title, text, suffix)
 

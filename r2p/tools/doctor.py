@@ -1,30 +1,34 @@
 """`r2p doctor`: what this machine has and lacks for r2p, and what to do about it. It sends nothing.
 
 Each check is a function that inspects one thing and returns what it found; checks that read system files have the root
-folder as an argument, for tests.
+folder as an argument, for tests. With --via, it tries a link instead, step by step, as a tool that joins for a moment.
 """
 
 import asyncio
+import contextlib
 import ctypes
+import ipaddress
 import os
 import platform
 import socket
 import statistics
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+import typer
 
 import r2p
 from r2p.clock import Ticker
+from r2p.codecs.management import WIRE_VERSION
 from r2p.names import module_name_from
 from r2p.tools.options import Format
 from r2p.tools.output import Output
-from r2p.tools.session import UsageError, settings, standalone
+from r2p.tools.session import Session, Settings, UsageError, check_urls, join, settings, standalone, wait_until
 from r2p.transports.can.netlink import ARPHRD_CAN, Interface, has_socketcan, list_interfaces
 from r2p.units import MILLISECOND
 
@@ -36,7 +40,16 @@ _UP = 1  # IFF_UP
 _PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttyS*", "rfcomm*", "cu.usb*")
 _TICK = MILLISECOND  # ns
 _SAMPLE = 0.2  # seconds
+_CONNECT = 6.0  # seconds to wait for a link: TCP gives up after 5
+_ROUND = 5.0  # seconds in which firmware sends its name at least once
+_STRAY = 3  # pieces of garbage that are usual when a line is opened in the middle of a message
 _LATE = MILLISECOND  # ns; a 99th percentile above this is too much for periods of a few milliseconds
+
+
+Try = Annotated[
+    list[str] | None,
+    typer.Option("--via", metavar="URL", help="Try this link: tcp:HOST:PORT, serial:DEVICE, ... (repeatable)."),
+]
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -50,15 +63,21 @@ class Check(msgspec.Struct, frozen=True):
     def record(self) -> dict[str, Any]:
         return {"check": self.what, "ok": self.ok, "found": self.found, "do": self.do or None}
 
-    def text(self) -> str:
-        line = f"{'has' if self.ok else 'lacks':<6} {self.what:<11} {self.found}"
+    def text(self, yes: str = "has", no: str = "lacks") -> str:
+        line = f"{yes if self.ok else no:<6} {self.what:<11} {self.found}"
         return line + "".join(f"\n{'':18} > {step}" for step in self.do.split("\n") if step)
 
 
 @standalone
-async def command(*, format: Format = None) -> None:
-    """Check what this machine has and lacks for r2p, and what to do about it. Sends nothing."""
+async def command(*, via: Try = None, format: Format = None) -> None:
+    """Check what this machine has and lacks for r2p, and what to do about it; with --via, try a link.
+
+    Without --via it sends nothing.
+    """
     output = Output(format)
+    if via:
+        await try_links(via, output)
+        return
     for check in checks():
         await output.put(check.record(), check.text())
     check = lateness(await measure())
@@ -269,6 +288,186 @@ def lateness(late: list[int]) -> Check:
     found = f"at 1 kHz {statistics.median(late) / 1000:.0f} us late (median), {p99 / 1000:.0f} us (99 %)"
     do = "" if p99 < _LATE else "end other programs, or use a real-time priority (see above)"
     return Check("timers", p99 < _LATE, found, do)
+
+
+# A link
+
+
+async def try_links(urls: list[str], output: Output) -> None:
+    """Try each link. Raises r2p.Error if one of them has a problem."""
+    check_urls(urls)
+    failed = []
+    for url in urls:
+        async with contextlib.aclosing(_try_url(url)) as checks:
+            async for check in checks:
+                await output.put({"via": url} | check.record(), check.text("ok", "fails"))
+                if not check.ok:
+                    failed.append(url)
+    if failed:
+        raise r2p.Error(f"{', '.join(dict.fromkeys(failed))}: see what to do at each line that fails")
+
+
+async def _try_url(url: str) -> AsyncGenerator[Check, None]:
+    """Yield a check for each step of joining a network by this URL, until one fails that the next ones need."""
+    name = await resolve(url)
+    if name is not None:
+        yield name
+        if not name.ok:
+            return
+    try:
+        async with join(Settings(via=[url])) as session:
+            async for check in try_link(session):
+                yield check
+    except r2p.TransportError as error:
+        yield Check("opens", False, str(error), _advice(url, _CONNECTING))
+
+
+async def resolve(url: str) -> Check | None:
+    """Look up the name of the computer in a `tcp:` URL; None if it has none."""
+    scheme, _, address = url.partition(":")
+    host = address.rpartition(":")[0] or address
+    if scheme != "tcp" or host.startswith("[") or host.isdecimal():
+        return None
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        pass
+    else:
+        return None
+    try:
+        found = await asyncio.get_running_loop().getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except OSError as error:
+        do = f"ping {host}\nor give the address instead of the name: --via tcp:192.168.0.10:23"
+        return Check("name", False, f"{host} is not known here: {error.strerror}", do)
+    return Check("name", True, f"{host} is {', '.join(dict.fromkeys(str(each[4][0]) for each in found))}")
+
+
+async def try_link(session: Session) -> AsyncIterator[Check]:
+    """Yield what is found on the way: the link, bytes, modules with their versions, losses, and notices."""
+    url, started = session.settings.via[0], asyncio.get_running_loop().time()
+    notices: dict[str, r2p.LinkNotice] = {}  # the last of each kind
+    listening = asyncio.create_task(_collect_notices(session.module, notices))
+    try:
+        reason = await _reason_unreachable(session)
+        if reason:
+            yield Check("connects", False, reason, _advice(url, _CONNECTING))
+            return
+        yield Check("connects", True, f"after {asyncio.get_running_loop().time() - started:.1f} s")
+        await session.settled()
+        await wait_until(lambda: bool(_named(session)) or not session.may_have_firmware(), _ROUND)
+        for check in (*_received(session, url), *_losses(session), *map(_notice, notices.values())):
+            yield check
+    finally:
+        listening.cancel()
+
+
+async def _collect_notices(module: r2p.Module, notices: dict[str, r2p.LinkNotice]) -> None:
+    async for event in module.events():
+        if isinstance(event, r2p.LinkNotice):
+            notices[event.kind] = event
+
+
+async def _reason_unreachable(session: Session) -> str:
+    """Wait for the link; return why there is none, or nothing."""
+    try:
+        async with asyncio.timeout(_CONNECT):
+            await session.fail_unless_connected()
+    except (r2p.TransportError, TimeoutError):
+        reasons = [link.unreachable_reason for link in session.module.links if link.unreachable_reason]
+        return "; ".join(reasons) or f"nothing has connected within {_CONNECT:g} s"
+    return ""
+
+
+def _named(session: Session) -> list[r2p.ModuleView]:
+    return [view for view in session.module.network.modules() if view.link and view.state != "observer"]
+
+
+def _received(session: Session, url: str) -> Iterator[Check]:
+    """Check what arrives: nothing, bytes that are not r2p, firmware that has not sent its name, or modules."""
+    received = sum(link.stats.bytes_received for link in session.module.links)
+    modules = _named(session)
+    if modules:
+        yield from map(_module, modules)
+    elif session.module.network.topics():
+        topics = ", ".join(session.module.network.topics())
+        yield Check(
+            "modules", False, f"topics, but no module's name: {topics}", "listen again: firmware sends it seldom"
+        )
+    elif any(view.link for view in session.module.network.modules()):
+        yield Check("modules", False, "only tools, no module", "start a program there: r2p run, r2p gateway")
+    elif received:
+        yield Check("modules", False, f"{received} bytes received, none of them r2p", _advice(url, _GARBAGE))
+    else:
+        on_line = all(link.point_to_point for link in session.module.links)
+        yield Check("modules", False, "nothing received" if on_line else "no module heard", _advice(url, _SILENCE))
+
+
+def _module(view: r2p.ModuleView) -> Check:
+    kind = "firmware" if view.instance is None else f"r2p {view.release or 'of unknown version'}"
+    found = f"{view.name}: {kind}, {view.state}" + (f", wire version {view.wire}" if view.wire else "")
+    if view.wire not in {None, WIRE_VERSION}:
+        do = f"install the same r2p on both: this one is {r2p.__version__} with wire version {WIRE_VERSION}"
+        return Check("module", False, found, do)
+    return Check("module", True, found, "" if view.state == "running" else f"r2p module reboot {view.name}")
+
+
+def _losses(session: Session) -> Iterator[Check]:
+    """Check what the link has dropped; a tool subscribes to nothing, so that is not counted."""
+    for link in session.module.links:
+        counts = {reason: n for reason, n in link.losses.items() if n and reason not in {"not subscribed", "link down"}}
+        counts |= {reason: n for reason, n in link.stats.faults.items() if n}
+        if not counts:
+            yield Check("losses", True, "none")
+            continue
+        stray = all(reason in {"garbage", "cut short"} and n <= _STRAY for reason, n in counts.items())
+        do = (
+            ""
+            if stray
+            else "docs: Troubleshoot, Messages are missing; each reason is explained in Guarantees, Counters"
+        )
+        yield Check("losses", stray, ", ".join(f"{reason} {n}" for reason, n in sorted(counts.items())), do)
+
+
+def _notice(event: r2p.LinkNotice) -> Check:
+    return Check(event.kind, event.kind in _GOOD, event.text, _NOTICES.get(event.kind, ""))
+
+
+def _advice(url: str, advice: dict[str, str]) -> str:
+    scheme, _, address = url.partition(":")
+    return advice.get(scheme, "").replace("DEVICE", address.partition(",")[0].partition("?")[0])
+
+
+_CONNECTING = {
+    "tcp": "on the other computer: ss -ltn lists the ports where programs listen\nis a firewall in between?",
+    "tcp-listen": "on the other computer: r2p topic list --via tcp:THIS_COMPUTER:PORT",
+    "serial": "ls -l DEVICE; groups\nls /dev/serial/by-id",
+    "rtcan": "r2p doctor\nip -details -statistics link show DEVICE",
+    "zenoh": "is a zenoh 1 router or an r2p program running there? ss -ltn | grep 7447",
+}
+"""What to do if a link does not come up, by scheme."""
+
+_GARBAGE = {
+    "serial": "most likely another baud rate: --via serial:DEVICE,baud=57600\nwho else reads it? fuser -v DEVICE",
+    "tcp": "another program listens at this port: r2p needs the debug line, from r2p or from R2P firmware",
+    "rtcan": "another bit rate, or a bus without RTCAN: r2p bus dump --via rtcan:DEVICE",
+}
+"""What to do if bytes arrive that are not r2p."""
+
+_SILENCE = {
+    "serial": "is the module powered? are TX and RX crossed, and the grounds connected?",
+    "tcp": "the connection is open, but silent: is there an r2p program, or firmware, at the other end?",
+    "rtcan": "is another node powered? are both ends of the bus terminated?\nr2p bus dump --via rtcan:DEVICE",
+    "zenoh": "is there a module on this network? on zenoh, networks have names: ?network=NAME",
+}
+"""What to do if nothing arrives."""
+
+_GOOD = {"master", "own parameters"}  # notices that are no problem
+_NOTICES = {
+    "no master": "firmware needs its master's board; of r2p modules, one must have priority= (docs: RTCAN)",
+    "other parameters": "give slots, slot length and bit rate as the other nodes have them (docs: RTCAN)",
+    "id conflict": "give one of them another id: rtcan:can0,id=0x22",
+}
+"""What to do about a notice of a link, by its kind."""
 
 
 def _read(path: Path) -> str:

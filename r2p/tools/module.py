@@ -4,6 +4,7 @@ A command may get lost, so it is repeated until the module's ALIVE confirms it. 
 """
 
 import asyncio
+import difflib
 from collections.abc import AsyncIterator
 from itertools import pairwise
 from typing import Annotated, Any
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 import r2p
-from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
+from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, WIRE_VERSION
 from r2p.names import module_path
 from r2p.tools import session
 from r2p.tools.options import All, Format, Timeout, Wait
@@ -33,15 +34,16 @@ Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
 
 @session.command(app, "list")
 async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
-    """List the modules: state, kind (r2p or firmware), link, and seconds since the last message from each."""
+    """List the modules: state, kind (r2p or firmware), versions, link, and seconds since the last message from each."""
     output = Output(format)
     await session.settle(wait, of="modules")
     if wait is None:
         await _wait_for_firmware(session)
     known = [view for view in session.module.network.modules() if view.link]
     views = [view for view in known if all or not view.name.startswith("_")]
-    columns = ["module", "state", "rebooted", "kind", "link", "age"]
-    await output.table([_row(view) for view in views], columns, units={"age": "s"})
+    columns = ["module", "state", "rebooted", "kind", "version", "wire", "link", "age"]
+    rows = [_row(view, for_people=output.format == "text") for view in views]
+    await output.table(rows, columns, units={"age": "s"})
     if not views:
         session.report_none("modules", hidden=bool(known))
 
@@ -88,13 +90,14 @@ async def _send(session: Session, command: r2p.Command, name: str, timeout: floa
     sender = _CommandSender(session, command, name)
     watching = asyncio.create_task(sender.watch(session.module.events()))
     try:
-        with session.waiting(f"{name} to confirm {command.name}"):
+        with session.waiting(sender.awaited):
             async with asyncio.timeout(limit):
                 await sender.repeat_until_confirmed()
     except TimeoutError:
         raise TimedOut(_timeout_text(session, command, name, limit)) from None
     finally:
         watching.cancel()
+        sender.close()
     notify(f"{name}: {_DONE[command]} after {loop.time() - started:.1f} s")
 
 
@@ -108,6 +111,17 @@ class _CommandSender:
         self._flags = [_flags(view) for view in [_find(session, name)] if view is not None]  # in order
         self._sent_at = 0.0
         self._denied = ""  # why a gateway does not forward the command
+        self._settled = asyncio.create_task(session.settled())
+        self._firmware_heard_at = asyncio.get_running_loop().time() + _ROUND  # by then each has sent ALIVE
+
+    def close(self) -> None:
+        self._settled.cancel()
+
+    def awaited(self) -> str:
+        """Say what the command waits for."""
+        if self._flags:
+            return f"{self._name} to confirm {self._command.name}"
+        return f"{self._name} (firmware announces itself within {_ROUND:g} s)"
 
     async def watch(self, events: AsyncIterator[r2p.ModuleEvent]) -> None:
         """Note each change of the module's flags, and whether a gateway denies the command."""
@@ -119,15 +133,31 @@ class _CommandSender:
                     self._denied = text
 
     async def repeat_until_confirmed(self) -> None:
-        """Send the command until the module confirms it. Raises TimedOut if a gateway denies it."""
-        await wait_until(lambda: bool(self._flags), _FIRST_STATE)
+        """Send the command until the module confirms it.
+
+        Raises r2p.Error if there is no such module, and TimedOut if a gateway denies the command.
+        """
+        await wait_until(lambda: bool(self._flags) or self._is_unknown(), _FIRST_STATE)
         while True:
+            if self._is_unknown():
+                raise r2p.Error(_unknown_text(self._session, self._name))
             self._session.module.command(self._command, self._name)
             self._sent_at = asyncio.get_running_loop().time()
-            if await wait_until(lambda: bool(self._denied) or self._confirmed(), _REPEAT):
+            if await wait_until(self._is_over, _REPEAT) and not self._is_unknown():
                 break
         if self._denied:
             raise TimedOut(self._denied)
+
+    def _is_over(self) -> bool:
+        return bool(self._denied) or self._confirmed() or self._is_unknown()
+
+    def _is_unknown(self) -> bool:
+        """Return whether the module would have been heard by now."""
+        if self._flags or not self._settled.done():
+            return False
+        on_bus = any(link.up and link.has_slots for link in self._session.module.links)
+        may_be_firmware = on_bus or self._session.may_have_firmware()
+        return not may_be_firmware or asyncio.get_running_loop().time() >= self._firmware_heard_at
 
     def _confirmed(self) -> bool:
         if not self._flags:
@@ -167,11 +197,17 @@ def _find(session: Session, name: str) -> r2p.ModuleView | None:
     return min(views, key=lambda view: view.age, default=None)
 
 
+def _unknown_text(session: Session, name: str) -> str:
+    found = sorted({view.name for view in session.module.network.modules() if view.link and view.state != "observer"})
+    close = difflib.get_close_matches(name, found, n=1, cutoff=0.5)
+    question = f"; did you mean {close[0]}?" if close else ""
+    return f"there is no module {name} on {session.network_name}; modules found: {', '.join(found) or 'none'}{question}"
+
+
 def _timeout_text(session: Session, command: r2p.Command, name: str, timeout: float) -> str:
     view = _find(session, name)
     if view is None:
-        found = sorted({view.name for view in session.module.network.modules() if view.state != "observer"})
-        return f"module {name} was not found in {timeout:g} s; modules found: {', '.join(found) or 'none'}"
+        return f"{_unknown_text(session, name)}; gave up after {timeout:g} s"
     text = f"{name} did not confirm {command.name} in {timeout:g} s: it is {view.state}, last seen {view.age:.1f} s ago"
     if command is r2p.Command.BOOTLOAD and view.instance is not None:
         text += "; it is a program on a PC, which has no boot loader and refuses"
@@ -182,12 +218,15 @@ def _timeout_text(session: Session, command: r2p.Command, name: str, timeout: fl
     return text
 
 
-def _row(view: r2p.ModuleView) -> dict[str, Any]:
+def _row(view: r2p.ModuleView, *, for_people: bool) -> dict[str, Any]:
+    other = for_people and view.wire not in {None, WIRE_VERSION}
     return {
         "module": view.name,
         "state": view.state,
         "rebooted": view.rebooted,
         "kind": "firmware" if view.instance is None else "r2p",
+        "version": view.release,
+        "wire": f"{view.wire}, not {WIRE_VERSION}" if other else view.wire,
         "link": view.link,
         "age": round(view.age, 1),
     }

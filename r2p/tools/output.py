@@ -81,10 +81,16 @@ class Output:
         finally:
             loop.remove_reader(fd)
 
-    async def put(self, record: Record, text: str | None = None) -> None:
-        """Write one record of a stream; at a terminal as `text`, by default as YAML. Raises PipeClosed."""
+    async def put(self, record: Record, text: str | None = None, *, colour: int | None = None) -> None:
+        """Write one record of a stream; at a terminal as `text`, by default as YAML. Raises PipeClosed.
+
+        `colour` is the SGR number of the text's colour; without effect where the environment has NO_COLOR.
+        """
+        written = self._record(record, text)
+        if colour is not None and self.format == "text" and not os.environ.get("NO_COLOR"):
+            written = f"\x1b[{colour}m{written.rstrip()}\x1b[0m\n"
         async with self._lock:
-            await self._write(self._record(record, text))
+            await self._write(written)
 
     async def table(self, rows: Iterable[Record], columns: list[str], *, units: Mapping[str, str] = _NONE) -> None:
         """Write records with the same keys; at a terminal in aligned columns, with `units`. Raises PipeClosed."""

@@ -56,6 +56,7 @@ _SETTLE_MAX = 8.0  # seconds to listen while announcements arrive: a bus of 1 Mb
 _POLL = 0.02  # seconds between two checks of a condition
 _SETTLE_POLL = 0.05  # ... and between two counts of what was announced, which take longer
 _LINK_UP = 5.0  # seconds to wait for the first link
+_GIVE_UP_AFTER = 0.9  # seconds after which a tool ends if it is known of each link why it does not come up
 
 
 class TimedOut(Exception):
@@ -158,7 +159,17 @@ class Session:
 
     def report_none(self, things: str, *, hidden: bool = False) -> None:
         """Report that there are no topics, nodes or modules; `hidden`: only those of tools, which are not shown."""
-        notify(f"no {things} found on {self.network_name}{'; use --all to include tools' if hidden else ''}")
+        hint = "; use --all to include tools" if hidden else f": {self._heard()}" if self.settings.via else ""
+        notify(f"no {things} found on {self.network_name}{hint}")
+
+    def _heard(self) -> str:
+        """Say what was heard on the network, and what to try."""
+        names = sorted({view.name for view in self.module.network.modules() if view.link and view.state != "observer"})
+        if names:
+            return f"heard {', '.join(names)}; listen longer with --wait 5"
+        received = sum(link.stats.bytes_received for link in self.module.links)
+        what = f"received {received} bytes, but no module's name" if received else "heard no module"
+        return f"{what}; try r2p doctor --via {self.settings.via[0]}"
 
     @contextlib.contextmanager
     def waiting(self, what: str | Callable[[], str]) -> Iterator[None]:
@@ -195,13 +206,29 @@ class Session:
             await asyncio.sleep(wait)
             return
         self.module.query()
-        settled = await self._settled()
+        settled = await self.settled()
         if self._has_firmware() and (not settled or self._expects_more()):
             notify(f"firmware announces one item every 0.5 s, so there may be more {of}: listen longer with --wait 5")
         elif not settled:
             notify(f"announcements kept arriving, so there may be more {of}: listen longer with --wait 20")
 
-    async def _settled(self) -> bool:
+    async def fail_unless_connected(self) -> None:
+        """Return when a link is up; wait for ever where none is tried, as when this tool listens for connections.
+
+        Raises r2p.TransportError when it has been known for a moment of each link why it does not come up.
+        """
+        loop = asyncio.get_running_loop()
+        failed_at: float | None = None
+        while not any(link.up for link in self.module.links):
+            if not self.module.links or not all(link.unreachable_reason for link in self.module.links):
+                failed_at = None
+            elif failed_at is None:
+                failed_at = loop.time()
+            elif loop.time() - failed_at >= _GIVE_UP_AFTER:
+                raise r2p.TransportError(f"no connection on {self.network_name}")
+            await asyncio.sleep(_SETTLE_POLL)
+
+    async def settled(self) -> bool:
         """Wait until no new announcements arrive; False if they still did after the longest time."""
         quiet = _SETTLED_ON_BUS if any(link.has_slots for link in self.module.links) else _SETTLED
         loop = asyncio.get_running_loop()
@@ -223,8 +250,12 @@ class Session:
     def _expects_more(self) -> bool:
         """Return whether a link lacks r2p modules, which would answer at once, or has modules without topics.
 
-        Modules have topics, but a gateway announces those of others only after it has looked for other gateways.
+        Modules have topics, but a gateway announces those of others only after it has looked for other gateways. And
+        nodes have modules, but may be announced before these.
         """
+        topics = self.module.network.topics().values()
+        if any(not each.module for view in topics for each in view.publishers + view.subscribers):
+            return True
         complete = self._links_with_r2p() & self._links_with_topics()
         return any(link.up and link.name not in complete for link in self.module.links)
 
@@ -273,20 +304,33 @@ def command(app: typer.Typer, name: str, *, opening: Opening | None = None) -> C
     """
 
     def register(body: B) -> B:
-        node = body.__name__.strip("_")
-
-        def run(*, via: list[str] | None, verbose: int, quiet: int, **given: Any) -> None:
-            async def main() -> None:
-                chosen = settings(via, tool=True)
-                async with join(chosen, name=node, verbose=verbose) if opening is None else opening(chosen) as opened:
-                    await body(opened, **given)
-
-            execute(main, verbose=verbose, quiet=quiet)
-
-        app.command(name)(_with_options(run, body, session=True))
+        app.command(name)(joined(body, opening=opening))
         return body
 
     return register
+
+
+def joined(
+    body: Callable[..., Awaitable[None]], *, opening: Opening | None = None, keep_trying: bool = False
+) -> Callable[..., None]:
+    """Make a command for `main.COMMANDS` of a coroutine function that takes a Session, or what `opening` opens.
+
+    Unless it is to `keep_trying`, the command fails as soon as no link can come up.
+    """
+    node = body.__name__.strip("_")
+
+    def run(*, via: list[str] | None, verbose: int, quiet: int, **given: Any) -> None:
+        async def main() -> None:
+            chosen = settings(via, tool=True)
+            async with join(chosen, name=node, verbose=verbose) if opening is None else opening(chosen) as opened:
+                if opening is not None or keep_trying:
+                    await body(opened, **given)
+                else:
+                    await _while_connected(opened, body(opened, **given))
+
+        execute(main, verbose=verbose, quiet=quiet)
+
+    return _with_options(run, body, session=True)
 
 
 def standalone(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
@@ -309,6 +353,14 @@ def _with_options(run: Callable[..., None], body: Callable[..., object], *, sess
     function.__annotations__ = {each.name: each.annotation for each in parameters}
     function.__signature__ = inspect.Signature(parameters)
     return run
+
+
+async def _while_connected(session: Session, body: Awaitable[None]) -> None:
+    """Run a command. Raises r2p.TransportError if no link can come up."""
+    async with asyncio.TaskGroup() as tasks:
+        watching = tasks.create_task(session.fail_unless_connected())
+        await body
+        watching.cancel()
 
 
 _COMMON = [

@@ -1,14 +1,18 @@
-"""Waiting until something appears on the network: a topic, a node or a module.
+"""Waiting until something appears on the network, a topic, a node or a module; and `r2p wait`, which does so.
 
-`r2p wait` and the ready conditions of `r2p launch` mean the same by it.
+The command and the ready conditions of `r2p launch` mean the same by it.
 """
 
 import asyncio
-from typing import Literal, get_args
+import difflib
+from typing import Annotated, Literal, get_args
+
+import typer
 
 import r2p
 from r2p.names import module_path, node_name, topic_name
-from r2p.tools.session import Session
+from r2p.tools.options import time_option
+from r2p.tools.session import Session, TimedOut, UsageError, joined
 
 Kind = Literal["topic", "node", "module"]
 """What one can wait for."""
@@ -75,3 +79,39 @@ def _module_is_seen(network: r2p.NetworkView, name: str) -> bool:
 
 def _is_tool(module: str) -> bool:
     return module.startswith("_")
+
+
+async def wait(
+    session: Session,
+    kind: Annotated[Kind, typer.Argument(metavar="topic|node|module", show_default=False)],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A node: NODE or MODULE/NODE.", show_default=False)],
+    *,
+    timeout: Annotated[float | None, time_option("--timeout", "Give up (exit code 3) after this long.")] = None,
+) -> None:
+    """Wait until a topic, node or module is on the network, for scripts: exit code 0, or 3 at --timeout.
+
+    It also waits for the link, and prints nothing on stdout.
+    """
+    check_name(kind, name)
+    if not session.settings.via:
+        raise UsageError("no network to wait on: give --via tcp:HOST:PORT or set R2P_VIA")
+    try:
+        with session.waiting(f"{kind} {name}"):
+            async with asyncio.timeout(timeout):
+                await appeared(session, kind, name)
+    except TimeoutError:
+        close = difflib.get_close_matches(name, _names(session.module.network, kind), n=1)
+        question = f"; did you mean {close[0]}?" if close else ""
+        raise TimedOut(f"no {kind} {name} on {session.network_name} within {timeout:g} s{question}") from None
+
+
+command = joined(wait, keep_trying=True)
+
+
+def _names(network: r2p.NetworkView, kind: Kind) -> list[str]:
+    """Return the names that are on the network."""
+    if kind == "topic":
+        return list(network.topics())
+    if kind == "module":
+        return [view.name for view in network.modules() if view.link]
+    return [name for module, node in network.nodes() for name in (node, f"{module}/{node}")]

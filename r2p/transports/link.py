@@ -196,6 +196,8 @@ class Link(abc.ABC):
         self.title = self.name.removesuffix(":")
         """The name as it stands in texts."""
         self.up = False
+        self.unreachable_reason = ""
+        """Why its other end can't be reached, once that has been reported; empty while it is up."""
         self.admits_gateways = True
         """Whether a gateway at its other end takes part in the mesh of this module's; else the link is for clients."""
         self.gateway_hooks: GatewayHooks | None = None
@@ -220,7 +222,6 @@ class Link(abc.ABC):
         self._acting = False
         self._down_at = self._clock.monotonic()
         self._lost_at_down = 0
-        self._unreachable = ""
         self._closed = False
 
     # For the transport that owns the link
@@ -230,7 +231,7 @@ class Link(abc.ABC):
         outage = (self._clock.monotonic() - self._down_at) / SECOND
         lost = self.stats.lost[LINK_DOWN] - self._lost_at_down
         self.up = True
-        self._unreachable = ""
+        self.unreachable_reason = ""
         self.stats.ups += 1
         self._hub.link_changed(self, "", outage, lost)
         for name in self._lapsed:  # before discovery finds out who subscribes now
@@ -240,8 +241,8 @@ class Link(abc.ABC):
 
     def unreachable(self, reason: str) -> None:
         """Report that the other end can't be reached yet, once for each reason."""
-        if reason != self._unreachable:
-            self._unreachable = reason
+        if reason != self.unreachable_reason:
+            self.unreachable_reason = reason
             self._hub.link_waits(self, reason)
 
     def on_down(self, reason: str) -> None:

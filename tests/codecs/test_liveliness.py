@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.codecs import UnknownType, liveliness
-from r2p.codecs.liveliness import ModuleToken, TopicToken
+from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 
@@ -19,6 +19,13 @@ TOKENS = st.one_of(
         flags=st.integers(0, 0x7F),
         observer=st.booleans(),
         hops=st.integers(0, 99),
+    ),
+    st.builds(
+        SoftwareToken,
+        session=U32,
+        instance=U32,
+        wire=st.integers(0, 255),
+        release=st.just("") | st.from_regex(r"[A-Za-z0-9][A-Za-z0-9.+_-]{0,13}", fullmatch=True),
     ),
     st.builds(
         TopicToken,
@@ -47,6 +54,7 @@ def test_what_is_encoded_is_decoded(token: liveliness.Token) -> None:
 def test_keys_as_people_see_them() -> None:
     assert liveliness.encode(ModuleToken(0xAB, "PC1", 0xAB, 1)) == "1/ab/module/PC1/ab/1/0"
     assert liveliness.encode(ModuleToken(0xAB, "IMU", None, 0, hops=1)) == "1/ab/module/IMU/-/0/1"
+    assert liveliness.encode(SoftwareToken(0xAB, 0xAB, 1, "0.1.0")) == "2/ab/version/ab/1/0.1.0"
     token = TopicToken(0xAB, ROLE_PUBLISHES, "leds", 0xAB, "blink", 1, 5, bytes.fromhex("9ef58fbde4f40142"))
     assert liveliness.encode(token) == "1/ab/pub/leds/ab/blink/1/5/9ef58fbde4f40142/0/0"
     assert liveliness.encode(TopicToken(1, ROLE_SUBSCRIBES, "a/leds", None)) == "1/1/sub/a%leds/-/-/0/0/-/0/0"
@@ -88,9 +96,12 @@ def test_any_text_is_a_token_or_counted(key: str) -> None:
         raise AssertionError("found a token by chance")
 
 
-def test_another_version_is_left_alone() -> None:
-    with pytest.raises(UnknownType, match="version 2"):
-        liveliness.decode("2/ab/module/PC1/ab/0/0")
+@pytest.mark.parametrize(
+    "key", ["2/ab/module/PC1/ab/0/0", "2/ab/version/ab/256/0.1.0", "2/ab/version/ab/1/more than that", "3/ab"]
+)
+def test_another_version_is_left_alone(key: str) -> None:
+    with pytest.raises(UnknownType, match=r"version [23]"):
+        liveliness.decode(key)
 
 
 @pytest.mark.parametrize("name", ["a#b", "a*b", "a//b", "$*", "a/b/c", "a-b", "a%b", "-", " ", "a?b", "a" * 25])

@@ -67,6 +67,10 @@ LAYOUTS = [
         padded(b"\x01PC1\0\0\0\0\x78\x56\x34\x12\x03\x02\x88\x13", 0x50),
     ),
     (
+        m.Hello("PC1", 0x12345678, 0, 0, 5000, 1, "12.34.56.dev78"),
+        b"\x01PC1\0\0\0\0\x78\x56\x34\x12\0\0\x88\x13\x0112.34.56.dev78\x50",
+    ),
+    (
         m.TypeInfo(m.ROLE_SUBSCRIBES, "leds567890123456", b"ABCDEFGH", 5),
         padded(b"\x01\x02leds567890123456ABCDEFGH\x05\0", 0x51),
     ),
@@ -156,7 +160,7 @@ roles = st.sampled_from([m.ROLE_PUBLISHES, m.ROLE_SUBSCRIBES])
 messages: st.SearchStrategy[m.Management] = st.one_of(
     st.builds(m.Alive, names, u8),
     st.builds(m.SubscribeRequest, names, u16, st.integers(1, 0xFFFF), st.binary(min_size=10, max_size=10)),
-    st.builds(m.Hello, names, u32, u8, u8, u16),
+    st.builds(m.Hello, names, u32, u8, u8, u16, u8, names),
     st.builds(m.TypeInfo, roles, names, st.binary(min_size=8, max_size=8), u16),
     st.builds(m.Endpoint, roles | roles.map(lambda role: role | m.ROLE_GONE), u32, st.just("") | names, names, u8),
     st.builds(m.Conflict, names, u32, u32),
@@ -220,6 +224,12 @@ def test_serials_start_again_and_keep_their_order(serial: int, steps: int) -> No
 def test_a_leaf_names_its_link_by_one_byte() -> None:
     assert m.leaf_port(0x1FE) == 0xFE
     assert m.encode(m.Leaf(7, m.leaf_port(0x1FE), 1, bytes(18)))
+
+
+def test_a_hello_of_before_has_no_versions() -> None:
+    of_before = bytes.fromhex("01 50433100000000 78563412 01 00 8813") + bytes(15) + b"\x50"
+    assert m.decode(of_before) == m.Hello("PC1", 0x12345678, m.HELLO_QUERY)
+    assert m.encode(m.Hello("PC1", 0x12345678, m.HELLO_QUERY)) == of_before
 
 
 def test_a_hello_carries_the_longest_lease() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 import r2p
 from r2p.codecs import management
-from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES, WIRE_VERSION
 from r2p.messages import layout
 from r2p.modules.graph import Endpoint, ModuleView
 from r2p.modules.link_manager import describe_mismatch
@@ -24,7 +24,9 @@ async def test_a_module_alone_knows_itself() -> None:
         node = module.start(hold)
         node.advertise("leds", Led, r2p.Sporadic(1.0))
         node.subscribe("leds", Led)
-        assert module.network.modules() == [ModuleView("PC1", "running", False, 0.0, "", module.instance)]
+        assert module.network.modules() == [
+            ModuleView("PC1", "running", False, 0.0, "", module.instance, WIRE_VERSION, r2p.__version__)
+        ]
         view = module.network.topics()["leds"]
         assert (view.size, view.fingerprint, view.age) == (5, layout(Led).fingerprint, 0.0)
         assert view.publishers == [Endpoint("PC1", "hold", SPORADIC)]
@@ -85,6 +87,35 @@ async def test_any_byte_from_outside_makes_a_view() -> None:
         assert len(view.publishers) == 256 + 1
         assert {each.publisher_class for each in view.publishers} == set(r2p.PublisherClass)
         assert {each.name: each.state for each in a.network.modules()}["Y"] == "boot"
+
+
+@pytest.mark.virtual_time
+async def test_an_endpoint_without_a_module_is_hidden_by_the_same_of_a_module() -> None:
+    async with joined("A") as a:
+        link = a.links[0]
+        for message in (
+            management.Endpoint(ROLE_PUBLISHES, 7, "drive", "leds", 1),
+            management.Endpoint(ROLE_PUBLISHES, 7, "blink", "leds", 1),
+            management.Endpoint(ROLE_PUBLISHES, 8, "drive", "leds", 1),
+            management.Hello("X", 8),
+        ):
+            link.discovery.receive(0, management.encode(message), 9)
+        publishers = a.network.topics()["leds"].publishers
+        assert {(each.module, each.node) for each in publishers} == {("X", "drive"), ("", "blink")}
+
+
+@pytest.mark.virtual_time
+async def test_another_wire_version_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    async with joined("A") as a:
+        for flags in (0, 1, 0):
+            for message in (management.Hello("X", 8, wire=2, release="9.9"), management.Alive("X", flags)):
+                a.links[0].manage(management.encode(message), 9)
+            await settle(1.5)
+        view = next(each for each in a.network.modules() if each.name == "X")
+    assert (view.wire, view.release) == (2, "9.9")
+    (line,) = [each.getMessage() for each in caplog.records if "wire version" in each.getMessage()]
+    assert "module X has wire version 2 (r2p 9.9), this one 1" in line
+    assert "install the same r2p on both" in line
 
 
 def test_a_mismatch_is_described_with_what_to_do() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import sys
@@ -10,10 +11,18 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+import r2p
+from r2p.codecs import management
+from r2p.msg import Led
+from r2p.sim.modules import FirmwareModule, Powered, Publishes
 from r2p.tools import doctor
 from r2p.tools.doctor import Check
+from r2p.tools.output import Output
+from r2p.tools.session import Session, Settings
 from r2p.transports.can.netlink import Interface
-from tests.tools.rig import process
+from tests.ports import free_port
+from tests.tools.rig import printed, process, robot, tool
+from tests.transports.conversation import Script
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -197,6 +206,78 @@ def test_text_names_each_step() -> None:
         "                   > and that",
     ]
     assert Check("python", True, "3.11").text() == "has    python      3.11"
+
+
+# A link
+
+
+async def findings_of_link(session: Session) -> list[tuple[str, bool, str]]:
+    return [(check.what, check.ok, check.found) async for check in doctor.try_link(session)]
+
+
+@pytest.mark.virtual_time
+async def test_a_link_with_modules() -> None:
+    async with robot(), robot(name="NEW") as new, tool() as session:
+        newer = management.encode(management.Hello("NEW", new.instance, wire=2, release="9.9"))
+        await new.stop()
+        asyncio.get_running_loop().call_later(0.1, session.module.links[0].manage, newer, 9)
+        assert await findings_of_link(session) == [
+            ("connects", True, "after 0.0 s"),
+            ("module", True, f"BOT: r2p {r2p.__version__}, running, wire version 1"),
+            ("module", False, "NEW: r2p 9.9, stopped, wire version 2"),
+            ("losses", True, "none"),
+        ]
+
+
+@pytest.mark.virtual_time
+async def test_a_link_with_firmware_that_sends_its_name_late() -> None:
+    async with Powered(FirmwareModule("IMU1", publishers=[Publishes("leds", Led)])) as power:
+        await asyncio.sleep(1.03)  # it has just sent it
+        async with r2p.Module("_tool01", via=power.wire(), observer=True, watchdog=False) as module:
+            found = await findings_of_link(Session(module, Settings(via=["wire:IMU1"])))
+    assert found[1] == ("module", True, "IMU1: firmware, running")
+
+
+@pytest.mark.virtual_time
+async def test_a_link_where_nothing_is_heard_or_only_a_tool() -> None:
+    async with tool() as session:
+        assert (await findings_of_link(session))[1] == ("modules", False, "no module heard")
+    async with tool(), tool() as session:
+        assert (await findings_of_link(session))[1] == ("modules", False, "only tools, no module")
+
+
+@pytest.mark.virtual_time
+async def test_a_link_to_something_else_than_r2p() -> None:
+    script = Script()
+    async with r2p.Module("_tool01", via=script, observer=True, watchdog=False) as module:
+        script.hear(b"SSH-2.0-OpenSSH_9.6\r\n" * 8)
+        session = Session(module, Settings(via=["tcp:robot1:22"]))
+        *_, modules, losses = [check async for check in doctor.try_link(session)]
+    assert (modules.found, modules.ok) == ("168 bytes received, none of them r2p", False)
+    assert modules.do.startswith("another program listens at this port")
+    assert (losses.ok, losses.found) == (False, "garbage 8")
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_a_link_that_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(r2p.Error, match=r"tcp:localhost:\d+: see what to do at each line that fails"):
+        await doctor.try_links([f"tcp:localhost:{free_port()}"], Output("json"))
+    name, connects = printed(capsys)
+    assert (name["check"], name["ok"], connects["check"], connects["ok"]) == ("name", True, "connects", False)
+    assert connects["found"].startswith("Connection refused: nothing listens there")
+    assert connects["do"].startswith("on the other computer: ss -ltn")
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_the_name_of_a_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    for url in ("tcp:127.0.0.1:23", "tcp:[::1]:23", "tcp:2323", "tcp:127.0.0.1", "serial:/dev/ttyUSB0"):
+        assert await doctor.resolve(url) is None
+    unknown = await doctor.resolve("tcp:no-such-computer.invalid:23")
+    assert unknown is not None
+    assert not unknown.ok
+    assert unknown.do.startswith("ping no-such-computer.invalid")
 
 
 @pytest.mark.processes

@@ -53,6 +53,22 @@ async def test_r2p_modules_are_listed(capsys: pytest.CaptureFixture[str]) -> Non
     ]
 
 
+async def test_versions_are_listed_also_behind_a_gateway(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gateway = r2p.Module("GW", via=["memory:lab", "memory:bus"], bridge=True)
+    async with gateway, r2p.Module("ARM", via="memory:bus"), tool() as session:
+        newer = management.encode(management.Hello("NEW", 7, 0, 0, 60_000, 2, "9.9"))
+        network("bus").send(Datagram(99, b"R2P", newer))
+        await asyncio.sleep(5)
+        await list_(session)
+        rows = {row["module"]: (row["version"], row["wire"]) for row in printed(capsys)}
+        assert rows == {"ARM": (r2p.__version__, 1), "GW": (r2p.__version__, 1), "NEW": ("9.9", 2)}
+        monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+        await list_(session)
+        assert re.search(r"NEW +running +False +r2p +9.9 +2, not 1 ", capsys.readouterr().out)
+
+
 async def test_ages_have_a_unit_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     async with robot(), tool() as session:
@@ -85,7 +101,10 @@ async def test_nobody_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:
         await list_(session)
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert "no modules found on memory:lab" in captured.err
+    assert captured.err == (
+        "r2p: waiting for ALIVE of firmware on memory:lab\n"
+        "r2p: no modules found on memory:lab: heard no module; try r2p doctor --via memory:lab\n"
+    )
 
 
 async def test_stop_and_reboot_an_r2p_module(capsys: pytest.CaptureFixture[str]) -> None:
@@ -218,10 +237,28 @@ async def test_a_program_refuses_to_enter_a_boot_loader() -> None:
         assert bot.nodes["hold"].running
 
 
-async def test_somebody_unknown() -> None:
+async def test_an_unknown_module_is_reported_as_soon_as_all_have_answered() -> None:
     async with robot(name="ARM"), tool(), tool() as session:
-        with pytest.raises(TimedOut, match=r"module BOT was not found in 2 s; modules found: ARM$"):
-            await stop(session, "BOT", timeout=2.0)
+        started = asyncio.get_running_loop().time()
+        with pytest.raises(r2p.Error, match=r"no module ARMS on memory:lab; modules found: ARM; did you mean ARM\?$"):
+            await stop(session, "ARMS")
+        assert asyncio.get_running_loop().time() - started < 0.5
+
+
+async def test_firmware_is_waited_for_as_it_announces_itself_seldom(capsys: pytest.CaptureFixture[str]) -> None:
+    async with board(age=1.03) as (power, session):
+        started = asyncio.get_running_loop().time()
+        with pytest.raises(r2p.Error, match=r"no module IMU2 on wire:IMU1; modules found: IMU1; did you mean IMU1\?$"):
+            await stop(session, "IMU2")
+        assert 4.0 < asyncio.get_running_loop().time() - started < 7.0
+        assert power.module.flags == 0
+    assert "waiting for IMU2 (firmware announces itself within 5 s) on wire:IMU1" in capsys.readouterr().err
+
+
+async def test_a_command_may_time_out_before_firmware_was_heard() -> None:
+    async with board(age=1.03) as (_, session):
+        with pytest.raises(TimedOut, match=r"no module IMU2 on wire:IMU1; .*; gave up after 2 s$"):
+            await stop(session, "IMU2", timeout=2.0)
 
 
 async def test_usage() -> None:

@@ -7,6 +7,7 @@ import asyncio
 import pytest
 
 import r2p
+from r2p.codecs import management
 from r2p.msg import Encoder, Led, Velocity3
 from r2p.tools.module import list_ as modules
 from r2p.tools.node import info, list_
@@ -89,6 +90,23 @@ async def test_nobody_but_tools(capsys: pytest.CaptureFixture[str]) -> None:
     no_node, *_, no_module = capsys.readouterr().err.splitlines()
     assert no_node == "r2p: no nodes found on memory:lab; use --all to include tools"
     assert no_module == "r2p: no modules found on memory:lab; use --all to include tools"
+
+
+async def test_a_node_is_listed_when_its_module_is_known(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        firmware = Firmware()
+        firmware.send(management.Endpoint(management.ROLE_PUBLISHES, 7, "drive", "leds", 1))
+        hello = management.Hello("BOT", 7)
+        asyncio.get_running_loop().call_later(1.0, firmware.send, hello)
+        await list_(session)
+    assert [row["node"] for row in printed(capsys)] == ["BOT/drive"]
+
+
+async def test_modules_without_nodes_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session:
+        Firmware("IMU1").alive()
+        await list_(session)
+    assert "no nodes found on memory:lab: heard IMU1; listen longer with --wait 5" in capsys.readouterr().err
 
 
 async def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,8 @@ from r2p.msg import Led
 from r2p.tools import options, session
 from r2p.tools.output import PipeClosed
 from r2p.tools.session import Session, Settings, TimedOut, UsageError, execute, join
-from tests.tools.rig import Firmware, robot, tool
+from tests.ports import free_port
+from tests.tools.rig import Firmware, process, robot, tool
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -168,6 +169,37 @@ async def test_no_link_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
             link.on_down("unplugged")
         with pytest.raises(r2p.TransportError, match="no connection on memory:lab"):
             await session.settle()
+
+
+@pytest.mark.virtual_time
+async def test_a_tool_ends_soon_where_no_link_can_come_up() -> None:
+    async with tool() as session:
+        (link,) = session.module.links
+        link.on_down("unplugged")
+        start = asyncio.get_running_loop().time()
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(30.0):
+                await session.fail_unless_connected()  # it may come up yet
+        link.unreachable("refused")
+        with pytest.raises(r2p.TransportError, match="no connection on memory:lab"):
+            await session.fail_unless_connected()
+        assert asyncio.get_running_loop().time() - start == pytest.approx(30.9, abs=0.1)
+        link.on_up()
+        await session.fail_unless_connected()
+
+
+@pytest.mark.processes
+def test_the_command_goes_on_trying_where_others_give_up() -> None:
+    via = f"tcp:127.0.0.1:{free_port()}"
+    with process("wait", "module", "BOT", "--timeout", "1.5", "--via", via) as child:
+        _, err = child.communicate()
+    assert child.returncode == 3
+    assert "Connection refused" in err
+    assert f"no module BOT on {via} within 1.5 s" in err
+    with process("topic", "echo", "leds", "--via", via) as child:
+        _, err = child.communicate()
+    assert child.returncode == 1
+    assert err.endswith(f"r2p: no connection on {via}\n")
 
 
 # Ends

@@ -10,11 +10,11 @@ import pytest
 import r2p
 from r2p.codecs import management
 from r2p.msg import Led
-from r2p.tools.waiting import appeared
+from r2p.tools.session import Session, Settings, TimedOut, UsageError
+from r2p.tools.waiting import appeared, wait
 from tests.tools.rig import Firmware, robot, tool
 
 if TYPE_CHECKING:
-    from r2p.tools.session import Session
     from r2p.tools.waiting import Kind
 
 pytestmark = pytest.mark.virtual_time
@@ -91,3 +91,34 @@ async def test_a_name_that_is_not_valid_is_an_error(kind: Kind, name: str) -> No
     async with tool() as session:
         with pytest.raises(r2p.InvalidName):
             await appeared(session, kind, name)
+
+
+# The command
+
+
+async def test_it_ends_when_the_module_is_there(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool() as session, asyncio.TaskGroup() as tasks:
+        waiting = tasks.create_task(wait(session, "module", "BOT", timeout=60.0))
+        await asyncio.sleep(30)
+        assert not waiting.done()
+        async with robot():
+            await asyncio.sleep(1)
+            assert waiting.done()
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "r2p: waiting for module BOT on memory:lab\n")
+
+
+@pytest.mark.parametrize(("kind", "name", "close"), [("module", "BOAT", "BOT"), ("node", "BOT/long", "BOT/log")])
+async def test_it_times_out_with_a_name_that_is_there(kind: Kind, name: str, close: str) -> None:
+    async with robot(), tool() as session:
+        with pytest.raises(TimedOut, match=rf"no {kind} {name} on memory:lab within 2 s; did you mean {close}\?"):
+            await wait(session, kind, name, timeout=2.0)
+
+
+async def test_usage() -> None:
+    async with tool() as session:
+        with pytest.raises(r2p.InvalidName):
+            await wait(session, "topic", "a b")
+    async with r2p.Module("_tool01", via=[], observer=True) as module:
+        with pytest.raises(UsageError, match="give --via"):
+            await wait(Session(module, Settings()), "module", "BOT")

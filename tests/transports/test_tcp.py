@@ -305,14 +305,19 @@ async def test_clients_that_come_and_go_do_not_fill_the_log(caplog: pytest.LogCa
     caplog.set_level("INFO", "r2p")
     transport = listen()
     async with asyncio.timeout(GUARD), r2p.Module("A", via=transport, watchdog=False) as module:
-        for _ in range(100):
+        for number in range(101):
             _, writer = await dial(transport)
             await until(lambda: module.links)
+            if number:  # the first comes as a tool does, of which the log need not know
+                writer.write(manage(m.Alive("IMU1")))
+                await until(lambda: module.links[0].discovery.modules)
+            else:
+                assert "link tcp" not in caplog.text
             writer.close()
             await until(lambda: not module.links)
-        assert module.closed_links.ups == 100
+        assert module.closed_links.ups == 101
     seconds = 1 + round(caplog.records[-1].created - caplog.records[0].created)
-    assert 0 < caplog.text.count("is up") <= 10 * seconds
+    assert 0 < caplog.text.count("is up, with module IMU1") <= 10 * seconds
     assert 0 < caplog.text.count("is down") <= 10 * seconds
 
 

@@ -13,6 +13,7 @@ from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory
 from r2p.protocols.discovery.events import Outbox, TopicType
 from r2p.protocols.discovery.schedule import Item, ItemKind, Schedule
 from r2p.units import MILLISECOND
+from r2p.version import __version__
 
 Relayed = management.Hello | management.Alive | management.Endpoint
 """What a gateway passes on of other modules."""
@@ -154,7 +155,8 @@ class Announcer:
         """This module's HELLO. Its lease outlasts two lost rounds of repetition."""
         tool = management.HELLO_TOOL if self._observer else 0
         lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // MILLISECOND
-        return management.Hello(self.module, self.instance, flags | tool, 0, lease)
+        release = __version__[: management.RELEASE_MAX]
+        return management.Hello(self.module, self.instance, flags | tool, 0, lease, management.WIRE_VERSION, release)
 
     def requests(self, topic: str, own: LocalTopic, size: int = 0) -> list[management.Management]:
         """The request for a topic, of which a publisher said this `size` (0: unknown), if it may be sent.

@@ -168,6 +168,8 @@ class Directory:
             lease=max(LEASE, message.lease_ms * MILLISECOND),
             hops=message.hops,
             source=source,
+            wire=message.wire,
+            release=message.release,
         )
 
     def enter(self, info: ModuleInfo) -> ModuleInfo | None:

@@ -57,7 +57,7 @@ class ModuleInfo(msgspec.Struct, frozen=True):
 
     `flags` are those of its ALIVE, `last_heard` is in monotonic ns. Only an r2p module has an `instance` (the random
     number of its start), a `lease` (ns that it may be silent), and can be an `observer`, a tool that sends no ALIVE.
-    `hops` is the number of gateways in between.
+    `hops` is the number of gateways in between. `wire` and `release` are those of its HELLO (0 and empty: not known).
     """
 
     name: str
@@ -68,6 +68,8 @@ class ModuleInfo(msgspec.Struct, frozen=True):
     lease: int = 0
     hops: int = 0
     source: PeerAddress = None
+    wire: int = 0
+    release: str = ""
 
     @property
     def r2p(self) -> bool:

@@ -4,7 +4,7 @@ from collections import Counter
 
 import msgspec
 
-from r2p.codecs.liveliness import ModuleToken, TopicToken
+from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.protocols.discovery.directory import FOR_EVER, TABLE_MAX, EndpointInfo, EndpointKey, decrement
 from r2p.protocols.discovery.events import ModuleChanged, ModuleGone, ModuleInfo, NameConflict, Outbox
 from r2p.units import SECOND
@@ -28,6 +28,7 @@ class ModuleRegistry:
         self._outbox = outbox
         self._counts = counts
         self._tokens: dict[str, dict[str, ModuleToken]] = {}  # by name and key
+        self._software: dict[int, dict[str, SoftwareToken]] = {}  # by instance and key
         self._endpoint_tokens: Counter[EndpointKey] = Counter()
         self._names: dict[int, str] = {}  # by instance
         self._endpoints_of: dict[int, dict[EndpointKey, None]] = {}  # by instance
@@ -47,6 +48,17 @@ class ModuleRegistry:
         if not named:
             del self._tokens[token.name]
         self._update(now, token.name)
+
+    def software_appeared(self, now: int, key: str, token: SoftwareToken) -> None:
+        self._software.setdefault(token.instance, {})[key] = token
+        self._update_software(now, token.instance)
+
+    def software_disappeared(self, now: int, key: str, token: SoftwareToken) -> None:
+        tokens = self._software[token.instance]
+        del tokens[key]
+        if not tokens:
+            del self._software[token.instance]
+        self._update_software(now, token.instance)
 
     def endpoint_appeared(self, token: TopicToken) -> None:
         key = _endpoint_key(token)
@@ -115,12 +127,27 @@ class ModuleRegistry:
             if before is not None:
                 self._remove(before)
             return
-        self._keep(before, _info(min(reversed(tokens), key=lambda each: each.hops), now))
+        nearest = min(reversed(tokens), key=lambda each: each.hops)
+        self._keep(before, self._info(nearest, now))
         own = {self._instance} if name == self._module else set()
         if len({each.instance for each in tokens} | own) > 1:
             self._conflict_at.setdefault(name, now + _CONFLICT_AFTER)
         else:
             self._conflict_at.pop(name, None)
+
+    def _update_software(self, now: int, instance: int) -> None:
+        """The versions of a module have changed; those of one without a token of its own wait for that."""
+        name = self._names.get(instance)
+        if name in self._tokens:
+            self._update(now, name)
+
+    def _info(self, token: ModuleToken, now: int) -> ModuleInfo:
+        info = _info(token, now)
+        found = self._software.get(token.instance, {}) if token.instance is not None else {}
+        software = next(iter(found.values()), None)
+        if software is None:
+            return info
+        return msgspec.structs.replace(info, wire=software.wire, release=software.release)
 
     def _keep(self, before: ModuleInfo | None, info: ModuleInfo) -> None:
         if before is None and len(self.modules) >= TABLE_MAX:

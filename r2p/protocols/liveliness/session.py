@@ -11,7 +11,7 @@ from collections import Counter
 import msgspec
 
 from r2p.codecs import liveliness, management
-from r2p.codecs.liveliness import ModuleToken, TopicToken
+from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import LocalTopic, Relayed
 from r2p.protocols.discovery.directory import TABLE_MAX, Aliases, Demand
@@ -88,7 +88,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         age can be seen.
         """
         match message:
-            case management.Hello(name, instance, flags, hops):
+            case management.Hello(name, instance, flags, hops, _, wire, release):
                 token = ModuleToken(self._instance, name, instance, 0, bool(flags & management.HELLO_TOOL), hops)
                 before = self._own.relayed(("module", name))
                 if isinstance(before, ModuleToken):
@@ -96,6 +96,9 @@ class LivelinessDiscovery(DiscoveryProtocol):
                 gone = bool(flags & management.HELLO_LEAVING)
                 if not gone or (isinstance(before, ModuleToken) and before.instance == instance):
                     self._relay(("module", name), token, gone=gone)  # its next start may have been announced already
+                    if wire and not token.observer:
+                        software = SoftwareToken(self._instance, instance, wire, release)
+                        self._relay(("version", name), software, gone=gone)
             case management.Alive(name, flags):
                 known = self._own.relayed(("module", name))
                 if isinstance(known, ModuleToken):
@@ -189,6 +192,8 @@ class LivelinessDiscovery(DiscoveryProtocol):
             self._mark_at = now + _MARK_EVERY
         if isinstance(token, ModuleToken):
             self._modules.module_appeared(now, key, token)
+        elif isinstance(token, SoftwareToken):
+            self._modules.software_appeared(now, key, token)
         else:
             self._modules.endpoint_appeared(token)
             if not token.hops:  # behind a gateway: its own tokens say what it passes on
@@ -246,6 +251,8 @@ class LivelinessDiscovery(DiscoveryProtocol):
         token = self._tokens.pop(key, None)
         if isinstance(token, ModuleToken):
             self._modules.module_disappeared(now, key, token)
+        elif isinstance(token, SoftwareToken):
+            self._modules.software_disappeared(now, key, token)
         elif token is not None:
             self._modules.endpoint_disappeared(token)
             if not token.hops:

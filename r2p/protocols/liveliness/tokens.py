@@ -9,11 +9,12 @@ fit, and report it to their own user.
 """
 
 from collections import Counter
+from collections.abc import Iterator
 
 import msgspec
 
-from r2p.codecs import liveliness
-from r2p.codecs.liveliness import ModuleToken, TopicToken
+from r2p.codecs import liveliness, management
+from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.codecs.management import ANY_TYPE, NO_PARAMS, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.protocols.discovery.announcer import LocalTopic
 from r2p.protocols.discovery.directory import Demand, TopicInfo, counterpart, decrement
@@ -29,6 +30,7 @@ from r2p.protocols.discovery.events import (
     TopicType,
     Undeclare,
 )
+from r2p.version import __version__
 
 TopicRole = tuple[str, int]
 """A topic, and ROLE_PUBLISHES or ROLE_SUBSCRIBES."""
@@ -120,8 +122,7 @@ class TokenSet:
 
     def _wanted(self, key: TopicRole) -> set[str]:
         if key == _MODULE:
-            module = ModuleToken(self._instance, self._module, self._instance, self._flags, self._observer)
-            return {liveliness.encode(module)}
+            return {liveliness.encode(token) for token in self._module_tokens()}
         if key == _RELAYED:
             return {liveliness.encode(token) for token in self._relayed.values()}
         own = self._topics.get(key)
@@ -129,6 +130,12 @@ class TokenSet:
             return set()
         nodes = self._nodes.get(key) or {"": 0}
         return {self._token(key, own, node, publisher_class) for node, publisher_class in nodes.items()}
+
+    def _module_tokens(self) -> Iterator[liveliness.Token]:
+        yield ModuleToken(self._instance, self._module, self._instance, self._flags, self._observer)
+        if not self._observer:  # a tool is gone before its version matters
+            release = __version__[: management.RELEASE_MAX]
+            yield SoftwareToken(self._instance, self._instance, management.WIRE_VERSION, release)
 
     def _token(self, key: TopicRole, own: LocalTopic, node: str, publisher_class: int) -> str:
         topic, role = key

@@ -12,7 +12,21 @@ from r2p.protocols.discovery.events import (
     ModuleGone,
 )
 from r2p.protocols.discovery.session import Discovery
-from tests.protocols.discovery.wire import ME, MS, PC2, PEER, REQUEST, SOON, S, hear, joined, run, sent, started
+from tests.protocols.discovery.wire import (
+    ME,
+    MS,
+    PC2,
+    PEER,
+    REQUEST,
+    SOON,
+    S,
+    hear,
+    joined,
+    own_hello,
+    run,
+    sent,
+    started,
+)
 
 
 class TestStart:
@@ -29,7 +43,7 @@ class TestStart:
         discovery.advertise(0, "leds", 5, params=b"\x28\x18" + bytes(8))
         discovery.subscribe(0, "cmd", 12, 5)
         assert sent(discovery.link_up(S)) == [
-            m.Hello("PC1", ME, m.HELLO_QUERY),
+            own_hello(m.HELLO_QUERY),
             m.Alive("PC1", m.FLAG_STOPPED),
             m.Advertise("leds", 5, 0, b"\x28\x18" + bytes(8)),
             m.SubscribeRequest("cmd", 12, 5),
@@ -37,7 +51,7 @@ class TestStart:
 
     def test_a_tool_is_no_module(self) -> None:
         discovery = Discovery("_x1y2z3", ME, observer=True)
-        assert sent(discovery.link_up(0)) == [m.Hello("_x1y2z3", ME, m.HELLO_QUERY | m.HELLO_TOOL)]
+        assert sent(discovery.link_up(0)) == [own_hello(m.HELLO_QUERY | m.HELLO_TOOL, "_x1y2z3")]
         assert {type(message) for _, event in run(discovery, 0, 9 * S) for message in sent([event])} == {m.Hello}
 
     def test_what_is_new_is_announced_at_once(self) -> None:
@@ -79,7 +93,7 @@ class TestStart:
 
     def test_good_bye_is_the_last_word(self) -> None:
         discovery = started()
-        assert sent(discovery.leave(S)) == [m.Hello("PC1", ME, m.HELLO_LEAVING)]
+        assert sent(discovery.leave(S)) == [own_hello(m.HELLO_LEAVING)]
         assert hear(discovery, S, REQUEST) == []
         assert discovery.next_deadline() is None
         assert discovery.counts["link down"] == 1
@@ -142,7 +156,7 @@ class TestRepetition:
 
     def test_a_tool_asks(self) -> None:
         discovery = started(observer=True)
-        assert sent(discovery.query(SOON)) == [m.Hello("PC1", ME, m.HELLO_QUERY | m.HELLO_TOOL)]
+        assert sent(discovery.query(SOON)) == [own_hello(m.HELLO_QUERY | m.HELLO_TOOL)]
 
     def test_a_quiet_line_is_waited_for_but_not_for_ever(self) -> None:
         discovery = started(quiet=0.033)

@@ -19,6 +19,7 @@ from r2p.protocols.discovery.events import (
 )
 from r2p.protocols.discovery.negotiation import GRACE
 from r2p.protocols.discovery.session import Discovery
+from r2p.version import __version__
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -147,6 +148,13 @@ ME, PEER = 0x1111, 0x2222
 SOON = 200 * MS
 """Before the next step of what is repeated."""
 PC2 = m.Hello("PC2", PEER)
+
+
+def own_hello(flags: int = 0, module: str = "PC1") -> m.Hello:
+    """The HELLO of the module under test."""
+    return m.Hello(module, ME, flags, wire=m.WIRE_VERSION, release=__version__)
+
+
 REQUEST = m.SubscribeRequest("leds", 5, 8)
 RESPONSE = m.SubscribeResponse("cmd", 12)
 

@@ -2,6 +2,7 @@
 
 from typing import TypeVar
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,6 +28,7 @@ from r2p.protocols.discovery.events import (
     Undeclare,
 )
 from r2p.protocols.liveliness.session import LivelinessDiscovery
+from r2p.version import __version__
 
 E = TypeVar("E")
 SECOND = 1_000_000_000
@@ -131,6 +133,29 @@ def test_modules_see_each_other_whoever_comes_first(world: World) -> None:
     world.crash(2)
     assert not a.modules
     assert [event.info.name for event in world.news(1, ModuleGone)] == ["B"]
+
+
+def test_modules_know_each_others_versions(world: World) -> None:
+    a, b = world.add("A", 1), world.add("B", 2, observer=True)
+    assert (b.modules["A"].wire, b.modules["A"].release) == (management.WIRE_VERSION, __version__)
+    assert (a.modules["B"].wire, a.modules["B"].release) == (0, ""), "a tool declares none"
+    hello = management.Hello("C", 3, 0, 1, 5000, 2, "9.9")
+    world.act(1, a.relay(world.now, hello))
+    world.settle()
+    assert (b.modules["C"].wire, b.modules["C"].release, b.modules["C"].hops) == (2, "9.9", 1)
+    world.act(1, a.relay(world.now, msgspec.structs.replace(hello, flags=management.HELLO_LEAVING)))
+    world.settle()
+    assert "C" not in b.modules
+    assert not any("version/3" in key for key in world.keys)
+
+
+def test_versions_may_come_before_their_module(world: World) -> None:
+    a = world.add("A", 1)
+    for key in ("2/7/version/7/1/0.2.0", "1/7/module/B/7/0/0"):
+        world.act(1, a.appeared(world.now, key))
+    assert [(each.info.name, each.info.release) for each in world.news(1, ModuleChanged)] == [("B", "0.2.0")]
+    world.act(1, a.disappeared(world.now, "2/7/version/7/1/0.2.0"))
+    assert (a.modules["B"].wire, a.modules["B"].release) == (0, "")
 
 
 @pytest.mark.parametrize("publisher_first", [True, False])
