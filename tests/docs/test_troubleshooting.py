@@ -105,3 +105,20 @@ async def test_a_message_is_too_long_for_a_link(caplog: pytest.LogCaptureFixture
         pc.start(big)
         await pc.wait()
     assert _told(caplog.messages[-1].replace("big", "...", 1).replace("wire:IMU1", "..."))
+
+
+@pytest.mark.virtual_time
+async def test_callbacks_without_spin_and_a_fetch_without_a_publisher(caplog: pytest.LogCaptureFixture) -> None:
+    async def odo(node: r2p.Node) -> None:
+        with pytest.raises(TimeoutError) as caught:
+            await node.subscribe("encoder", Led).fetch(timeout=2)
+        assert f"TimeoutError: {caught.value}" in PAGE
+        node.subscribe("encoder", Led, print)
+        await node.advertise("encoder", Led).publish(Led())
+        await asyncio.sleep(5.0)
+
+    async with r2p.Module("PC1", via=[]) as module:
+        module.start(odo)
+        await module.wait()
+    (text,) = [each.getMessage() for each in caplog.records if each.name == "r2p.PC1.odo"]
+    assert text.partition(";")[0] in PAGE
