@@ -33,6 +33,7 @@ def test_every_command_has_help(name: str) -> None:
         (["topc"], "Did you mean 'topic'?"),
         (["topic", "ehco"], "Did you mean 'echo'?"),
         (["topic", "echo"], "Missing"),
+        (["topic", "echo", "a/b/c"], "topic name 'a/b/c': use letters, digits and underscores, and at most one `/`"),
         (["topic", "list", "--format", "xml"], "Invalid value for '--format': 'xml' is not one of 'yaml'"),
     ],
 )

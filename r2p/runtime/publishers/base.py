@@ -115,9 +115,15 @@ class BasePublisher(Generic[M, C]):
         Raises TimeoutError after `timeout` seconds, and MessageError for a time-out that is not a number of seconds.
         """
         check_timeout(f"topic {self.topic}: the time-out of ready", timeout)
-        async with asyncio.timeout(timeout):
-            for link in list(self._space.links):
-                await link.admission(self.topic)
+        end = None if timeout is None else self._space.loop.time() + timeout
+        for link in list(self._space.links):
+            try:
+                async with asyncio.timeout_at(end):
+                    await link.admission(self.topic)
+            except TimeoutError:
+                state = link.guarantee(self.topic, self.publisher_class)
+                text = f"topic {self.topic!r} was not admitted by link {link.name} within {timeout} s: {state}"
+                raise TimeoutError(text) from None
 
     def close(self) -> None:
         """Stop publishing; the links inform their peers."""

@@ -51,7 +51,7 @@ async def test_ready_waits_for_admission() -> None:
             await asyncio.Event().wait()
 
         module.links[0].admission = never  # type: ignore[method-assign]
-        with pytest.raises(TimeoutError):
+        with pytest.raises(TimeoutError, match=r"topic 'a' was not admitted by link \S+ within 1.0 s: .+"):
             await publisher.ready(1.0)
 
 
