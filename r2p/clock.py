@@ -49,7 +49,7 @@ class Clock(Protocol):
     """A source of time."""
 
     virtual: bool
-    """Whether time is simulated: then it stands still while code runs, and only loop timers know it."""
+    """True if time is simulated: it stands still while code runs, and only loop timers know it."""
 
     def now(self) -> int:
         """UTC in ns since 1970. Never jumps back, even when the computer's clock is set back."""
@@ -220,7 +220,7 @@ class ExactAlarm(Alarm):
 
     @property
     def repeats(self) -> bool:
-        """Whether it goes off again without being set."""
+        """Return whether the alarm goes off again without being set."""
         return self._period > 0 and self._fd is not None
 
     def close(self) -> None:

@@ -64,7 +64,7 @@ class LineLimit:
         self._rate = rate
         self._period = period
         self._lines: dict[str, list[int]] = {}
-        """Of each kind: the start of its period (ns), and how many lines there would have been since."""
+        """For each kind: the start of its period (ns), and how many lines there would have been since."""
 
     def suffix(self, kind: str, now: int, rate: int = 0) -> str | None:
         """The text to append to one more line at `now` (monotonic ns); None if the line is left out.

@@ -337,7 +337,7 @@ class Log(Message):
     """A log record of a node (topic `log` of every module). 19 CAN fragments."""
 
     stamp: Timestamp = Timestamp()
-    """When it was logged, UTC."""
+    """Time of the record, UTC."""
     level: u8 = 0
     """As in Python's logging: 10 debug, 20 info, 30 warning, 40 error, 50 critical."""
     node: Annotated[str, Len(8)] = ""

@@ -14,9 +14,9 @@ MODULE_MAX = 7
 NODE_MAX = 8
 TOPIC_MAX = 16
 MODULE_PATH_MAX = 24
-"""Of `robot1/MOTOR1`: a module of one robot on a network of several."""
+"""Characters of `robot1/MOTOR1` at most: a module of one robot on a network of several."""
 NAMESPACED_MAX = 2 * TOPIC_MAX + 1
-"""Of `robot1/encoder`: a topic of one robot on a network of several."""
+"""Characters of `robot1/encoder` at most: a topic of one robot on a network of several."""
 
 MODULE_PATH = r"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,24}"
 """The name of a module on a network of several robots, as a regular expression; at most MODULE_PATH_MAX characters."""

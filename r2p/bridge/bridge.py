@@ -83,7 +83,7 @@ class PortStatistics(msgspec.Struct, frozen=True):
 
 
 class GatewayStatistics(msgspec.Struct, frozen=True):
-    """What a gateway has forwarded and dropped so far, on all links and topics."""
+    """Totals of what a gateway has forwarded and dropped, on all links and topics."""
 
     ports: list[PortStatistics]
     routes: list[RouteStatistics]
@@ -208,7 +208,7 @@ class Bridge:
         return probe is not None
 
     def _is_own(self, port: BridgePort, message: management.Management) -> bool:
-        """Whether another link of this module on the same network sent it; discovery finds echoes of this one."""
+        """Return whether another link of this module on the same network sent it; discovery finds own echoes."""
         if port.tree_port.echoes:
             return False
         if isinstance(message, management.Hello):
@@ -333,7 +333,7 @@ class Bridge:
 
 
 class _PortHooks(GatewayHooks):
-    """What the gateway decides about one of its links."""
+    """Decisions of the gateway about one of its links."""
 
     def __init__(self, bridge: Bridge, port: BridgePort) -> None:
         self._bridge = bridge

@@ -52,7 +52,7 @@ class _ModuleFact(msgspec.Struct, frozen=True):
 
     @property
     def rank(self) -> tuple[bool, int]:
-        """Of several links the one with the lowest rank is believed."""
+        """Return the link's rank: of several links, the lowest is believed."""
         return self.foreign, self.info.hops
 
 
@@ -68,14 +68,14 @@ _Fact = _ModuleFact | _NodeFact
 
 
 class _Announced(msgspec.Struct, frozen=True):
-    """What was passed on of a fact, and when the module was heard."""
+    """The part of a fact that was passed on, and when the module was heard."""
 
     messages: tuple[Relayed, ...]
     heard_at: int
 
 
 class _LinkDirectory(msgspec.Struct, eq=False):
-    """What is known on one link, and what has been announced there; instants in monotonic ns, None before the first.
+    """Facts known and announced on one link; instants in monotonic ns, None before the first.
 
     `dirty`: the facts may have changed. `joined`: it is in the tree, and knows all. `behind`: it has to wait until the
     gateways agree, and lacks what has changed meanwhile. `met` are the instances there that have got everything, or
@@ -97,7 +97,7 @@ class _LinkDirectory(msgspec.Struct, eq=False):
 
 
 class DirectoryRelay:
-    """What is known of modules and nodes on each link of the gateway `instance`, announced on the others.
+    """Announces on each link of the gateway `instance` the modules and nodes that are known on its others.
 
     `repeating` is called whenever something is repeated.
     """
@@ -248,7 +248,7 @@ class DirectoryRelay:
         link.met = here
 
     def _is_open(self, port: BridgePort, now: int) -> bool:
-        """Whether it need not wait until the gateways agree."""
+        """Return whether the relay need not wait until the gateways agree."""
         return not port.in_tree or now < port.tree_port.forwards_until
 
     # What is known
@@ -361,7 +361,7 @@ class DirectoryRelay:
         port.link.stats.lost.guard(port.link.relay, message)
 
     def _desired(self, port: BridgePort, key: _Key) -> _Announced | None:
-        """What others are to know of a fact on this link, if anything."""
+        """Return what others are to know of a fact on this link, if anything."""
         sources = self._sources.get(key, {})
         names = [name for name in sources if name != port.name]
         if not names:
@@ -403,7 +403,7 @@ class DirectoryRelay:
 
 
 def _subject(message: Relayed) -> object:
-    """What a message is about."""
+    """Return what a message is about."""
     match message:
         case management.Hello(_, instance):
             return instance

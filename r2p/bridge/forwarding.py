@@ -46,19 +46,19 @@ class BridgePort:
         self.kind = kind
         self.now = now
         self.is_client = not link.admits_gateways
-        """Whether no gateway may be at the link's other end."""
+        """True if no gateway may be at the link's other end."""
         self.tree_port = TreePort(number, 0)
         self.state = PortState.LISTENING
         """As it was reported last."""
         self.dropped: Counter[str] = Counter()
         """Messages that came in, or were published here, while nothing was forwarded."""
         self.announced_types: dict[str, tuple[TopicType, TopicType]] = {}
-        """Those with which the link publishes and subscribes to forwarded topics, by canonical name. Kept here, as
+        """Types with which the link publishes and subscribes to forwarded topics, by canonical name. Kept here, as
         clients come and go under new names: what another table had of them would stay.
         """
         self.demand = link.discovery.demand()
         self.denied_at = LONG_AGO
-        """When it was answered last that an order does not pass (monotonic ns)."""
+        """Time of the last answer that an order does not pass (monotonic ns)."""
         self.refusal_lines = LineLimit(1)  # a second
         """For the lines of the log that say so."""
 
@@ -72,7 +72,7 @@ class BridgePort:
 
     @property
     def resumes(self) -> bool:
-        """Whether it forwards nothing just because this program stood still, and is likely to go on."""
+        """Return whether the port pauses only because this program stood still, and is likely to go on."""
         return self.tree_port.resumes or self.tree_port.state is PortState.ALONE
 
     def count_dropped(self, reason: str) -> None:
@@ -151,7 +151,7 @@ class BridgedTopic(Topic):
     ) -> None:
         super().__init__(name, wake_scheduler)
         self.relayed: RelayedTopic | None = None
-        """Set while the gateway forwards the topic."""
+        """The forwarded topic, while the gateway forwards it."""
         self.active_routes: dict[str, list[Route]] = {}
         """The routes that messages take now, by the name of the link that they come from: looked up when the first one
         comes. A change replaces the whole dict, as a message may be on its way through one of the lists.
@@ -159,7 +159,7 @@ class BridgedTopic(Topic):
         self.by_link: dict[object, RemoteSubscriber] = {}
         """Remote subscribers by their links."""
         self.reserved: RelayedPeriodic | None = None
-        """Set where a bus is to send the topic in slots of its own."""
+        """The periodic publisher, where a bus is to send the topic in slots of its own."""
         self._ports = ports
         self._monotonic = monotonic
         self._duplicates = DuplicateFilter()

@@ -254,7 +254,7 @@ class _MultihomedPort(GatewayHooks):
         self.link = link
         self.number = number
         self.generation = -1
-        """That of discovery when it was looked at last."""
+        """Generation of discovery at the last look."""
         self._owner = owner
 
     def handle_management(self, data: bytes) -> bool:
@@ -279,5 +279,5 @@ class _MultihomedPort(GatewayHooks):
 
 
 def _cannot_carry(link: Link, name_length: int, size: int) -> bool:
-    """Whether a topic's name, or its messages of `size` bytes (0: not known), are too long for the link."""
+    """Return whether a topic's name, or its messages of `size` bytes (0: not known), are too long for the link."""
     return name_length > link.max_name or (size > 0 and link.refusal(size) is not None)

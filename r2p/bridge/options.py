@@ -1,4 +1,4 @@
-"""What a gateway lets through, under which names, and what it changes: `BridgeOptions` as the user gives them.
+"""A gateway's rules: what it lets through, renames and changes. Users give them as `BridgeOptions`.
 
 `Policy` applies them to topics, modules and links. A topic, and a module of this robot, have one canonical name: the
 one without a prefix. On the links of `prefix_on` they have another one, so that several robots can share a network.
@@ -94,12 +94,12 @@ def check_prefix(text: str) -> str:
 
 
 def is_link(name: str, pattern: str) -> bool:
-    """Whether a pattern matches the link: its name, its scheme, or either with wildcards."""
+    """Return whether a pattern matches the link: its name, its scheme, or either with wildcards."""
     return pattern in (name, name.partition(":")[0]) or fnmatchcase(name, pattern)
 
 
 class Policy:
-    """What the options say about a topic, a module or a link. Raises Error for invalid rules and prefixes."""
+    """Applies the options to topics, modules and links. Raises Error for invalid rules and prefixes."""
 
     def __init__(self, options: BridgeOptions) -> None:
         self._options = options
@@ -109,7 +109,7 @@ class Policy:
         self._deny = [parse_rule(each) for each in options.deny]
 
     def kind(self, link: str) -> tuple[bool, ...]:
-        """What distinguishes a link for `allows`: between links of the same kinds the answers are the same.
+        """Return what distinguishes a link for `allows`: links of one kind get the same answers.
 
         So a gateway with a thousand clients asks once for each pair of kinds, not for each pair of links.
         """
@@ -118,7 +118,7 @@ class Policy:
         return (*ends, self._is_read_only(link), self._may_control(link))
 
     def allows(self, topic: str, source: str, target: str) -> bool:
-        """Whether a topic (by its canonical name) may go from one link to another (by name)."""
+        """Return whether a topic (by its canonical name) may go from one link to another (by name)."""
         if self._is_read_only(target):
             return False
         if topic.startswith(LOADER_PREFIX) and not self._may_control(source):
@@ -128,13 +128,13 @@ class Policy:
         return not self._allow or any(each.matches(topic, source, target) for each in self._allow)
 
     def allows_nowhere(self, topic: str) -> bool:
-        """Whether a topic can't go from any link to any other one, whatever links there are."""
+        """Return whether a topic can't go from any link to any other one, whatever links there are."""
         if any(each.source == each.target == "*" and fnmatchcase(topic, each.topic) for each in self._deny):
             return True
         return bool(self._allow) and not any(fnmatchcase(topic, each.topic) for each in self._allow)
 
     def order_denied(self, source: str, target: str | None, *, harmless: bool) -> int:
-        """Why an order may not go from one link to another (DENIED_..., 0: it may); STOP is harmless.
+        """Return why an order may not go from one link to another (DENIED_..., 0: it may); STOP is harmless.
 
         `target` None: why the gateway itself does not obey it.
         """
@@ -148,7 +148,7 @@ class Policy:
         return _first(self._options.classes, topic) if is_line else None
 
     def reserves(self, topic: str) -> bool:
-        """Whether the topic is to have slots of its own on a bus."""
+        """Return whether the topic is to have slots of its own on a bus."""
         return any(fnmatchcase(topic, each) for each in self._options.reserve)
 
     def shaper(
@@ -191,7 +191,7 @@ class Policy:
         return module.removeprefix(before) if before and not after else module
 
     def prefix(self, link: str) -> str:
-        """What stands before the names of topics and modules on a link; empty: nothing."""
+        """Return the prefix of topics and modules on a link, or an empty string."""
         prefix = self._prefixes.get(link)
         if prefix is None:
             if len(self._prefixes) >= _CACHED_MAX:

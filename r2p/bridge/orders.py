@@ -30,7 +30,7 @@ _REASONS = {
 
 
 class ModuleNames:
-    """What modules are called on each link of a gateway."""
+    """The names of modules on each link of a gateway."""
 
     def __init__(self, policy: Policy, directory: DirectoryRelay) -> None:
         self._policy = policy
@@ -137,7 +137,7 @@ class OrderRelay:
         return [each for each in others if now < each.tree_port.forwards_until]
 
     def _denied(self, port: BridgePort, other: BridgePort, order: management.Order, link_name: str) -> int:
-        """Why an order may not go to another link, where its module has this name (DENIED_..., 0: it may)."""
+        """Return why an order may not go to another link, where its module has this name (DENIED_..., 0: it may)."""
         harmless = isinstance(order, management.Stop)
         if harmless and is_booting(other.link, link_name):
             return management.DENIED_BOOT

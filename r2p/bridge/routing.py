@@ -1,4 +1,4 @@
-"""Which topics a gateway forwards, and what it announces of them on each link: worked out whenever demand changes.
+"""The topics that a gateway forwards, and announces on each link: worked out whenever demand changes.
 
 On a link, a gateway publishes what other links may send there, and subscribes to what is subscribed on
 another one to which it may go. All of that only on links that are in the tree; so demand travels along the tree, and
@@ -50,7 +50,7 @@ class RoutingTable:
         self._idle: set[str] = set()
         """Topics that are published or subscribed, and may go nowhere as long as no other link comes."""
         self._known: dict[tuple[str, int], list[tuple[BridgePort, TopicType]]] | None = None
-        """What `_known_types` found, while all links are asked about the same topics one after the other."""
+        """A cache of `_known_types`, for a pass over all links that asks about the same topics."""
         self._too_long: dict[str, None] = {}
         self._limit = LineLimit(_LINES)
 
@@ -127,7 +127,7 @@ class RoutingTable:
     def _is_used(
         self, topic: str, ports: list[BridgePort], published_on: list[BridgePort], subscribed_on: list[BridgePort]
     ) -> bool:
-        """Whether messages flow anywhere, or would if there were any."""
+        """Return whether messages may go from a publisher to any link, or from any link to a subscriber."""
         if self._policy.allows_nowhere(topic):
             return False
         everywhere = by_kind(ports)
@@ -136,7 +136,7 @@ class RoutingTable:
         )
 
     def _is_allowed(self, topic: str, sources: PortsByKind, targets: PortsByKind) -> bool:
-        """Whether the topic may go from one of these links to another one of those."""
+        """Return whether the topic may go from one of the sources to another of the targets."""
         return next(self._allowed_pairs(topic, sources, targets), None) is not None
 
     def _allowed_pairs(self, topic: str, sources: PortsByKind, targets: PortsByKind) -> Iterator[_Pair]:
@@ -302,7 +302,7 @@ class RoutingTable:
         return topic if topic and _NAME.fullmatch(topic) else None
 
     def _carries(self, topic: str, port: BridgePort) -> bool:
-        """Whether the topic's name fits there."""
+        """Return whether the topic's name fits the link."""
         name = self._policy.to_link_name(topic, port.name)
         if not _NAME.fullmatch(name):
             return False  # a namespace within that of a prefix

@@ -32,7 +32,7 @@ def next_serial(serial: int) -> int:
 
 
 def is_newer_serial(serial: int, last: int) -> bool:
-    """Whether such a number comes after `last`: at most half the range ahead of it."""
+    """Return whether `serial` comes after `last`: at most half the range ahead of it."""
     return 0 < (serial - last) % _SERIALS < _SERIALS // 2
 
 

@@ -74,7 +74,7 @@ def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
 
 
 def start_of_frame(frame: Frame, end: int, bit: int) -> int:
-    """When a frame began that ended at `end`, exact to the stuff bits. All in ns, also the bit time `bit`."""
+    """Return when a frame that ended at `end` began, exact to the stuff bits. All in ns, also the bit time `bit`."""
     return end - frame_bits(frame.id, frame.data) * bit
 
 
@@ -133,13 +133,13 @@ def _arbitration(identifier: int) -> int:
 
 @lru_cache(maxsize=4096)
 def _stuffed(bits: int, count: int) -> int:
-    """How many bits are stuffed into the first `count` of a frame."""
+    """Return how many bits are stuffed into the first `count` of a frame."""
     return _stuff(_START, bits, count) >> 3
 
 
 @lru_cache(maxsize=4096)
 def _header(identifier: int, size: int, extended: bool) -> tuple[_Row, int, int]:
-    """What the bits before the data leave: state of the stuffing, CRC as if all data were 0, bits so far."""
+    """Return the state after the bits before the data: stuffing, CRC as if all data were 0, bits so far."""
     width = IDENTIFIER_BITS if extended else 11
     if identifier >> width or size > FRAME_MAX:
         parts = f"identifier {identifier:#x} ({width} bits), {size} bytes (0..{FRAME_MAX})"
@@ -174,7 +174,7 @@ def _stuff(state: int, bits: int, count: int) -> int:
 
 
 def _remainder(byte: int) -> int:
-    """What CRC-15 makes of one byte."""
+    """Return the CRC-15 of one byte."""
     crc = byte << 7
     for _ in range(8):
         crc = crc << 1 ^ (0x4599 if crc & 0x4000 else 0)

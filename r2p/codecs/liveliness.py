@@ -150,8 +150,8 @@ def decode(key: str) -> Token:
 
 
 def is_representable(token: Token) -> bool:
-    """Whether the token survives encoding and decoding. Names from another link may contain what means something else
-    in a key, or in a key expression of zenoh, such as `/` and `*`.
+    """Return whether the token survives encoding and decoding. Names from another link may contain characters with a
+    meaning in keys or key expressions of zenoh, such as `/` and `*`.
     """
     try:
         return decode(encode(token)) == token
@@ -170,7 +170,7 @@ def token_of(suffix: str) -> str:
 
 
 def is_module(key: str) -> bool:
-    """Whether a key is the token of a module, not of a tool."""
+    """Return whether a key is the token of a module, not of a tool."""
     try:
         token = decode(key)
     except DecodeError:

@@ -154,7 +154,7 @@ CLAIM_ELECTING = 2  # the module knows no master
 
 
 class RefuseReason(enum.IntEnum):
-    """Why a master has no slots: `Refuse.reason`."""
+    """The reason why a master grants no slots: `Refuse.reason`."""
 
     PERIOD = 1  # not harmonic with the cycle: neither divides the other
     OTHER = 2  # not harmonic with the period of another message
@@ -568,7 +568,7 @@ def unmark(data: bytes) -> bytes:
 
 
 def is_marked(data: bytes) -> bool:
-    """Whether an encoded message carries the mark."""
+    """Return whether an encoded message carries the mark."""
     return type_of(data) in PARAMS_TYPES and data[_MARKED] == _MARK
 
 

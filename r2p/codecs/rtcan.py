@@ -126,7 +126,7 @@ def srt_laxity(remaining: int) -> int:
 
 
 def fragment_count(size: int) -> int:
-    """How many frames carry `size` bytes. Raises `MessageError` beyond 1..1024."""
+    """Return how many frames carry `size` bytes. Raises `MessageError` beyond 1..1024."""
     if not 1 <= size <= PAYLOAD_MAX:
         raise MessageError(f"RTCAN carries 1 to {PAYLOAD_MAX} bytes in a message, not {size}")
     return (size + FRAME_MAX - 1) // FRAME_MAX
@@ -148,12 +148,12 @@ def encode_sync(cycle: int, mask: int) -> Frame:
 
 
 def decode_sync(frame: Frame) -> Sync:
-    """What the master says. Raises `DecodeError` when this is not a sync frame."""
+    """Return the master's cycle and slots. Raises `DecodeError` for any other frame than a sync."""
     if not is_sync(frame.id) or len(frame.data) != FRAME_MAX:
         raise DecodeError(f"{frame.id:#010x} with {len(frame.data)} bytes is not a sync frame")
     return Sync(message_of(frame.id), int.from_bytes(frame.data, "little"))
 
 
 def is_sync(identifier: int) -> bool:
-    """Whether a frame is a sync: laxity 0, high byte 0, no fragments left. Firmware may send management like that."""
+    """Return whether a frame is a sync: laxity 0, high byte 0, no fragments left. Firmware may send such management."""
     return not identifier & NOT_SYNC

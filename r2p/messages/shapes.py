@@ -44,7 +44,7 @@ class Scalar(msgspec.Struct, frozen=True):
         return other.get(self.kind) or "an integer from {} to {}".format(*self.limits)
 
     def holds(self, value: object) -> bool:
-        """Whether the value packs."""
+        """Return whether the value packs."""
         if self.kind == "bool":
             return value is True or value is False
         try:
@@ -76,7 +76,7 @@ class Chars(msgspec.Struct, frozen=True):
         return f"at most {self.length} ASCII characters without a NUL"
 
     def holds(self, value: object) -> bool:
-        """Whether the value packs."""
+        """Return whether the value packs."""
         return isinstance(value, str) and value.isascii() and "\0" not in value and len(value) <= self.length
 
 

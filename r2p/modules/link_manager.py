@@ -86,9 +86,9 @@ class LinkManager:
         """The module's state, as in ALIVE."""
         self.bridge: Bridge | None = None
         self.closed_links = LinkStats()
-        """The sum of what links counted that are closed for good."""
+        """The totals of links that are closed for good."""
         self.addresses: list[tuple[str, str]] = []
-        """Where it accepts connections: the URL that was opened, and the address."""
+        """URLs that accept connections, each with its address."""
         self._bridging: Bridge | MultihomedModule
         self._events = events
         self._on_command = on_command

@@ -78,11 +78,11 @@ class Module:
     ) -> None:
         self.name = module_name(name) if name is not None else module_name_from(socket.gethostname())
         self.observer = observer
-        """Whether it is a tool that only looks."""
+        """True for a tool that only looks."""
         self.rebooted = False
-        """Whether REBOOT has restarted its nodes."""
+        """True once REBOOT has restarted the nodes."""
         self.stopped = False
-        """Whether STOP has ended its nodes; REBOOT starts them again."""
+        """True after STOP has ended the nodes; REBOOT starts them again."""
         self.refused: dict[str, int] = {}
         """Commands from the network that it refused, by name: how many."""
         self.network = NetworkView(lambda: self._opened)
@@ -164,7 +164,7 @@ class Module:
 
     @property
     def space(self) -> TopicSpace:
-        """Its topics. Raises Closed before it is opened."""
+        """The module's topics. Raises Closed before it is opened."""
         return self._opened.space
 
     @property
@@ -174,12 +174,12 @@ class Module:
 
     @property
     def links(self) -> list[Link]:
-        """Its links, also those that are down."""
+        """The module's links, also those that are down."""
         return [] if self._link_manager is None else self._link_manager.links
 
     @property
     def addresses(self) -> list[tuple[str, str]]:
-        """Where it accepts connections: the URLs that were opened, each with its address. Raises Closed before it is
+        """The URLs that accept connections, each with its address. Raises Closed before it is
         opened.
         """
         return list(self._opened.addresses)
@@ -290,7 +290,7 @@ class Module:
 
     @property
     def nodes(self) -> dict[str, Supervisor]:
-        """Its nodes by name, also the ones that have ended."""
+        """Nodes by name, also those that have ended."""
         return dict(self._supervisors)
 
     async def wait(self) -> None:
@@ -329,7 +329,7 @@ class Module:
 
     @property
     def _held(self) -> bool:
-        """Whether nodes that have ended will start again, or may."""
+        """Return whether ended nodes will start again, or may."""
         return self.stopped or self._switching.locked()
 
     def _node_ended(self, supervisor: Supervisor) -> None:

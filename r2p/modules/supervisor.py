@@ -203,7 +203,7 @@ class _Attempt:
             self._cancel(self._loop.time())
 
     def _is_unwinding(self) -> bool:
-        """Whether the function is in its clean-up.
+        """Return whether the function is in its clean-up.
 
         Each tick of a periodic publisher asks this, and it is slow to find out. So the answer is kept while the task
         waits for the same future: it does not move meanwhile.

@@ -1,4 +1,4 @@
-"""Whether a coroutine that waits is in its clean-up: in a `finally`, or on its way out of an `async with`.
+"""Detect that a coroutine waits in its clean-up: in a `finally`, or on its way out of an `async with`.
 
 An exception on its way through a node's function can't be seen from outside before the function has ended, and
 clean-up, such as stopping a motor, takes time. The only trace is the place where each frame waits: the compiler makes a
@@ -30,7 +30,7 @@ class _Handler(NamedTuple):
 
 
 def ends(coroutine: object) -> bool:
-    """Whether an exception that no `except` will catch has reached a `finally` or an `async with` in which it waits."""
+    """Return whether the coroutine waits in a `finally` or `async with` after an exception that nothing catches."""
     return cleans_up(coroutine) and _uncaught(
         [(each.f_code, each.f_lasti) for each in frames(coroutine, closing=False)]
     )
@@ -46,7 +46,7 @@ def _uncaught(places: list[tuple[CodeType, int]]) -> bool:
 
 
 def cleans_up(coroutine: object, *, handlers: bool = False) -> bool:
-    """Whether an exception has reached a `finally` or `async with` in which it waits; with `handlers`, or an `except`.
+    """Return whether the coroutine waits in a `finally`, `async with` or (`handlers`) `except` after an exception.
 
     An `except` further out does not matter: clean-up is not to be disturbed in the middle of a program either.
     """
@@ -117,7 +117,7 @@ def _find_handlers(code: CodeType) -> tuple[_Handler, ...]:
 
 @functools.lru_cache(maxsize=_REMEMBERED)
 def _escapes(code: CodeType, offset: int) -> bool:
-    """Whether an exception that is raised at this offset leaves the function without an `except` that catches it."""
+    """Return whether an exception raised at this offset leaves the function uncaught."""
     entries = dis.Bytecode(code).exception_entries  # type: ignore[attr-defined]  # since Python 3.11, unlisted
     by_start = {handler.start: handler for handler in _handlers(code)}
     for _ in range(len(entries) + 1):  # outwards: each step leaves one handler, so this ends

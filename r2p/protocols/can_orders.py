@@ -12,7 +12,7 @@ from r2p.units import NEVER
 
 
 class Mailbox(enum.IntEnum):
-    """Where a frame waits in the controller. Each holds one frame; HRT goes before SRT before NRT."""
+    """The controller's transmit buffers. Each holds one frame; HRT goes before SRT before NRT."""
 
     HRT = 0  # sync and hard real-time
     SRT = 1  # soft real-time and management
@@ -20,7 +20,7 @@ class Mailbox(enum.IntEnum):
 
 
 class Outcome(enum.Enum):
-    """What became of a frame that the port had to transmit."""
+    """The outcome of an order to transmit a frame."""
 
     SENT = "sent"
     LOST = "arbitration lost"  # one-shot controllers only

@@ -33,7 +33,7 @@ class _SubscriberWindow(msgspec.Struct):
 
 
 class SendWindow:
-    """What goes out on one topic in one class, and how far each subscriber has come."""
+    """The messages sent on one topic in one class, and how far each subscriber has come."""
 
     def __init__(self) -> None:
         self.serial = 0
@@ -101,7 +101,7 @@ class SendWindow:
 
 
 class ReceiveWindow:
-    """What comes in from one session on one topic in one class."""
+    """The messages received from one session on one topic in one class."""
 
     def __init__(self, size: int) -> None:
         self.size = size

@@ -1,4 +1,4 @@
-"""How much time until its deadline a message has left when it arrives, whatever the publisher's clock shows.
+"""Work out the time left until a message's deadline on arrival, whatever the publisher's clock shows.
 
 The clocks of two computers are not compared: they may differ by seconds. A message's delay, the instant of its arrival
 less its stamp, is the difference of the clocks plus the time on the way. The least delay of a publisher's messages is

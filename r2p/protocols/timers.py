@@ -15,7 +15,7 @@ class KeyedTimers:
 
     def __init__(self) -> None:
         self.due = NEVER
-        """When the next key runs out (ns), or NEVER. Kept up to date: an RTCAN engine looks at it after each frame."""
+        """Expiry of the next key (ns), or NEVER. Kept up to date: an RTCAN engine reads it after each frame."""
         self._due: dict[Hashable, int] = {}
         self._heap: list[tuple[int, int, Hashable]] = []
         self._pushed = 0
@@ -36,7 +36,7 @@ class KeyedTimers:
         self._update()
 
     def next(self) -> int | None:
-        """When the next key runs out (ns)."""
+        """Return when the next key expires (ns)."""
         return self.due if self.due < NEVER else None
 
     def put_off(self, until: int) -> None:

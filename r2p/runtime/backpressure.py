@@ -42,7 +42,7 @@ class Sink(abc.ABC):
     def __init__(self) -> None:
         self.lost = 0
         self.blocks_publishers = True
-        """Whether publishers wait while it is full; False while it is considered lossy."""
+        """True if publishers wait while the sink is full; False while it is considered lossy."""
 
     @property
     @abc.abstractmethod
@@ -51,7 +51,7 @@ class Sink(abc.ABC):
 
     @property
     def reachable(self) -> bool:
-        """Whether it can accept anything at all."""
+        """Return whether the sink can accept anything at all."""
         return True
 
     @abc.abstractmethod

@@ -71,7 +71,7 @@ class EndpointOwner(Protocol):
 
     @property
     def ending(self) -> bool:
-        """Whether the node's callbacks must no longer be called."""
+        """Return whether the node's callbacks must no longer be called."""
 
     def crash(self, error: Exception) -> None:
         """End the node with an error of a function that it gave away."""
@@ -161,7 +161,7 @@ class SubscriberQueue(Sink):
         self.publisher_came = Pulse()
         """Pulsed, never left set: what waits for a publisher is woken."""
         self.wait_queue: WaitQueue | None = None
-        """Set only while something waits for room: then each reader that pops a message has to call `refill`."""
+        """Deliveries that wait for room; while there are any, each reader that pops a message has to call `refill`."""
 
     @property
     def owner(self) -> str:
@@ -193,7 +193,7 @@ class SubscriberQueue(Sink):
             delivery.complete(self, NO_ROOM)
 
     def waits_for(self, sample: Sample) -> bool:
-        """Whether a full queue that became lossy comes back to the sender of this sample all the same.
+        """Return whether a full queue that became lossy still comes back to the sender of this sample.
 
         It became lossy for what does not expire: events wait until their deadline as before. A publisher of this module
         gets it back, too, and counts what is lost there.

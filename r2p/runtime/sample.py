@@ -31,7 +31,7 @@ _PUBLISHERS_MAX = 1024  # of a topic; with one more all are forgotten
 
 
 class Source(msgspec.Struct, frozen=True):
-    """Where a sample comes from; names that the link does not carry are empty.
+    """The origin of a sample; names that the link does not carry are empty.
 
     `link` names the link of this module by which it came in; it is empty for a sample that was published in this
     module.

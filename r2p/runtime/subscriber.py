@@ -83,7 +83,7 @@ class Subscriber(Generic[T]):
         options: SubscriberOptions,
     ) -> None:
         self.topic = topic.name
-        """Its name, after remapping."""
+        """The topic's name, after remapping."""
         self.callback: Callback[T] | None = options.callback
         """The function that `Node.spin` calls with each message; None if they are read by iteration or `fetch`."""
         self.undecodable = 0
@@ -345,7 +345,7 @@ class Subscriber(Generic[T]):
                 self._alarm.set(self._last_message + self._timeout)
 
     def _is_idle(self) -> bool:
-        """Whether a time-out has no effect now: no reader waits, and there is no function to call."""
+        """Return whether a time-out has no effect now: no reader waits, and there is no function to call."""
         return self._sink.waiter is None and self._on_timeout is None
 
     def _check_silence(self) -> None:

@@ -112,7 +112,7 @@ class Topic:
         # Both lists are replaced at a change, never changed in place: a sink may call the user's code, as where a line
         # breaks when it is written to, and that may close what is in them while a sample is on its way through them.
         self.queues: list[SubscriberQueue] = []
-        """Of the subscribers of this module, by descending priority."""
+        """Queues of this module's subscribers, by descending priority."""
         self.remote_subscribers: list[RemoteSubscriber] = []
         self.remote_publishers = 0
         """Publishers at the other ends of links."""
@@ -227,7 +227,7 @@ class Topic:
 
     @property
     def unused(self) -> bool:
-        """Whether no node of this module publishes or subscribes to it."""
+        """Return whether no node of this module publishes or subscribes to the topic."""
         return not (self.publishers or self.queues)
 
     @property
@@ -237,12 +237,12 @@ class Topic:
 
     @property
     def wanted(self) -> bool:
-        """Whether links are to receive it."""
+        """Return whether links are to receive the topic."""
         return bool(self.queues)
 
     @property
     def in_use(self) -> bool:
-        """Whether links carry it."""
+        """Return whether links carry the topic."""
         return bool(self.remote_subscribers or self.remote_publishers)
 
 
@@ -256,7 +256,7 @@ class LinkView(Protocol):
         """Describe, for people, how well this link serves the topic in this class."""
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
-        """Whether the link gives less than the class asks for."""
+        """Return whether the link gives less than the class asks for."""
 
     def refusal(self, size: int) -> str | None:
         """Return the reason why messages of `size` bytes can't be sent on this link, if there is one."""

@@ -69,7 +69,7 @@ def run(
 
 
 Event: TypeAlias = tuple[int, int, Callable[..., object], tuple[Any, ...]]
-"""When (ns since the start), the order within one instant, what to call, and with which arguments."""
+"""Time (ns since the start), order within one instant, function and arguments of a call."""
 
 
 class VirtualClock:
@@ -282,7 +282,7 @@ class _VirtualTimer(asyncio.TimerHandle):
         super().__init__(when, callback, args, loop, context)
         self.order = (when, number)
         self.background: bool | Callable[[], bool] = False
-        """Set by `r2p.clock.in_background`."""
+        """True for a timer that does not keep the loop alive; set by `r2p.clock.in_background`."""
         self._scheduled = True  # asyncio's mark for timers in its heap
 
     def cancel(self) -> None:

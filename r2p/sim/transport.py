@@ -48,7 +48,7 @@ class SimCan:
         numbers = random_of(loop).getrandbits(32) if seed is None else seed
         self.bus = CanBus(loop, bitrate=bitrate, noise=noise, seed=numbers)
         self.powered = True
-        """Whether modules that connect have power."""
+        """True if modules that connect have power."""
         self._ports: dict[str, SimPort] = {}
         self._unplugged: dict[str, CanController] = {}
 

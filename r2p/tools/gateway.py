@@ -29,7 +29,7 @@ from r2p.tools.session import UsageError, check_urls, settings, standalone
 logger = logging.getLogger("r2p.gateway")
 
 TOPIC = "gateway"
-"""Where a gateway publishes its counters, as GatewayStatus."""
+"""The topic of a gateway's counters, as GatewayStatus."""
 
 _ROWS = 30  # routes that the table on a terminal shows at most
 _SUMMARY = 60  # seconds between two log lines, where there is no terminal

@@ -38,7 +38,7 @@ DEBUG = "tcp-listen:0"
 ZENOH = "zenoh:?listen=tcp/127.0.0.1:0&scouting=off"
 """On the loopback interface, too, and without scouting: two robots on one computer stay separate."""
 SIDE, SPEED, WAIT = 2.0, 0.5, 1.0
-"""Of the square: m, m/s, and seconds until it starts; one lap takes 18 s."""
+"""The square: m, m/s, and seconds until it starts; one lap takes 18 s."""
 
 _NAME = "triskar2"
 _INSIDE = "memory:triskar2-pc"  # the network of PC1, outside the robot but in this process
@@ -208,7 +208,7 @@ class SimulatorScreen:
         """`duration` in s, if it is known."""
         self.console = Console(highlight=False)
         self.live = live and self.console.is_terminal and not self.console.is_dumb_terminal
-        """Whether the figures are drawn in place."""
+        """True if the figures are drawn in place."""
         self._duration = duration
         self._map = Map(world, _WIDTH, _HEIGHT)
         self._view = Live(console=self.console, auto_refresh=False)

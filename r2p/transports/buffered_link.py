@@ -32,7 +32,7 @@ _NOT_SUBSCRIBED = "not subscribed"
 
 
 class Arrival(Protocol):
-    """What came in: a topic's name as it is on this link, and packed bytes."""
+    """A received message: the topic's name as it is on this link, and packed bytes."""
 
     @property
     def topic(self) -> bytes: ...
@@ -56,7 +56,7 @@ class BufferedLink(Link):
     """A link that buffers what it sends, and delivers what it receives in the order in which that came."""
 
     in_order: ClassVar[bool] = True
-    """Whether what is sent first comes first; else a message may overtake the answer that announces it."""
+    """True if the link keeps the order; else a message may overtake the answer that announces it."""
 
     def __init__(
         self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: DiscoveryProtocol | None = None
@@ -79,7 +79,7 @@ class BufferedLink(Link):
     @property
     @abc.abstractmethod
     def full(self) -> bool:
-        """Whether the send buffer has no room."""
+        """Return whether the send buffer has no room."""
 
     @abc.abstractmethod
     def write(self, topic: str, sample: Sample) -> None:
@@ -90,7 +90,7 @@ class BufferedLink(Link):
         """Make a sample of what came in."""
 
     def has_room_for(self, sample: Sample) -> bool:
-        """Whether there is room for this very sample now; asked before each `write`."""
+        """Return whether there is room for this very sample now; called before each `write`."""
         return not self.full
 
     def discard(self) -> int:
@@ -102,7 +102,7 @@ class BufferedLink(Link):
 
     @property
     def flow_controlled(self) -> bool:
-        """Whether the other end waits while nothing is read, and nothing is lost by that."""
+        """Return whether the other end waits while nothing is read, and nothing is lost by that."""
         return False
 
     def pause(self) -> None:

@@ -51,7 +51,7 @@ class Carrier(abc.ABC):
     """
 
     flow_controlled: ClassVar[bool] = False
-    """Whether the other end waits while nothing is read, and nothing is lost by that."""
+    """True if the other end waits while nothing is read, and nothing is lost by that."""
 
     unconfirmed = 0
     """Bytes that it was given and that the other end has not confirmed, as far as that is known when it breaks."""
@@ -78,7 +78,7 @@ class Connection(Carrier):
 
     def __init__(self) -> None:
         self.ended = asyncio.Event()
-        """Set when the connection is gone for good, or was never there."""
+        """An event that is set once the connection is gone for good, or was never made."""
 
     @abc.abstractmethod
     def abort(self) -> None:

@@ -96,7 +96,7 @@ def _announcement_of(topic: Topic) -> Announcement:
 
 
 class Hub(Protocol):
-    """What a transport gets from the module that opened it."""
+    """The module as a transport sees it."""
 
     @property
     def space(self) -> TopicSpace: ...
@@ -107,7 +107,7 @@ class Hub(Protocol):
 
     @property
     def observer(self) -> bool:
-        """Whether the module is a tool that only looks."""
+        """Return whether the module is a tool that only looks."""
 
     @property
     def random(self) -> random.Random:
@@ -139,7 +139,7 @@ class Hub(Protocol):
 
 
 class GatewayHooks(Protocol):
-    """What a gateway decides for one of its links, and a module with several links to networks that gateways join."""
+    """Decisions about one link: by its gateway, or by a module with several links to networks that gateways join."""
 
     def handle_management(self, data: bytes) -> bool:
         """Handle a management message before discovery does; return True if it concerns gateways only."""
@@ -149,11 +149,11 @@ class GatewayHooks(Protocol):
 
     @property
     def may_announce(self) -> bool:
-        """Whether discovery may send: where two links lead to one network, it does on one of them only."""
+        """Return whether discovery may send: of two links that lead to one network, only one announces."""
 
     @property
     def has_other_gateways(self) -> bool:
-        """Whether there are other gateways on the link's network."""
+        """Return whether there are other gateways on the link's network."""
 
     def source_name(self, source: Source) -> str:
         """The name of the module that published a message, as it is on the link's network."""
@@ -163,7 +163,7 @@ class GatewayHooks(Protocol):
 
 
 class Transport(abc.ABC):
-    """What a URL names: it opens links to a hub, and keeps them up until it is cancelled."""
+    """The object behind a URL: opens links to a hub, and keeps them up until it is cancelled."""
 
     @abc.abstractmethod
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
@@ -182,11 +182,11 @@ class Link(abc.ABC):
     max_name: ClassVar[int] = TOPIC_MAX
     """Characters of the longest topic's name."""
     passes_probes: ClassVar[bool] = True
-    """Whether there may be gateways of firmware on it."""
+    """True if firmware gateways may be on the link."""
     point_to_point: ClassVar[bool] = False
-    """Whether it has only one other end."""
+    """True if the link has only one other end."""
     has_slots: ClassVar[bool] = False
-    """Whether it sends periodic messages in slots of their own, which a publisher has to ask for."""
+    """True if periodic messages have slots of their own, which a publisher has to ask for."""
 
     def __init__(
         self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: DiscoveryProtocol | None = None
@@ -199,15 +199,15 @@ class Link(abc.ABC):
         self.unreachable_reason = ""
         """Why its other end can't be reached, once that has been reported; empty while it is up."""
         self.admits_gateways = True
-        """Whether a gateway at its other end takes part in the mesh of this module's; else the link is for clients."""
+        """True if a gateway at the other end joins the mesh of this module's gateway; else the link is for clients."""
         self.gateway_hooks: GatewayHooks | None = None
-        """Set by the module where gateways join networks: what it decides for the link."""
+        """Decisions of the module about this link, where gateways join networks."""
         self.denied = False
-        """Set by the module: whether its other end has refused it, and no connection has been of use since."""
+        """True if the other end has refused the link, and no connection has been of use since; set by the module."""
         self.transient = False
-        """Whether it is closed for good when it goes down: that of a client."""
+        """True for the link of a client: it is closed for good when it goes down."""
         self.stands_by = ""
-        """Why another link is used in place of this one, where gateways join their networks; empty while it is used."""
+        """The reason to use another link instead, where gateways join both networks; empty while this one is used."""
         self.stats = LinkStats(lost=LoggedCounter(name, hub.space.clock))
         self.discovery: DiscoveryProtocol = discovery or _discovery(name, hub, management_rate)
         self._hub = hub
@@ -308,7 +308,7 @@ class Link(abc.ABC):
 
     @property
     def fixed_peer(self) -> bool:
-        """Whether its other end stays the same for as long as it is up."""
+        """Return whether the other end stays the same for as long as the link is up."""
         return False
 
     def module_changed(self, module: str) -> None:
@@ -322,7 +322,7 @@ class Link(abc.ABC):
         return self.stats.lost + self.discovery.counts
 
     def latched(self, topic: str) -> bool:
-        """Whether a publisher at the other end latches the topic; only r2p modules announce that."""
+        """Return whether a publisher at the other end latches the topic; only r2p modules announce that."""
         return any(each.latches(topic) for each in self.discovery.endpoints.values())
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
@@ -330,7 +330,7 @@ class Link(abc.ABC):
         return "best effort, in order" + (", waits for room" if publisher_class == PublisherClass.NON_REAL_TIME else "")
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
-        """Whether the link gives less than the class asks for."""
+        """Return whether the link gives less than the class asks for."""
         return publisher_class != PublisherClass.NON_REAL_TIME
 
     def refusal(self, size: int) -> str | None:
@@ -521,7 +521,7 @@ class LinkSubscriber(RemoteSubscriber):
 
 
 def is_booting(link: Link, module: str) -> bool:
-    """Whether a module that is heard on the link is in boot mode, where a STOP does lasting harm."""
+    """Return whether a module on the link is in boot mode, where a STOP does lasting harm."""
     info = link.discovery.modules.get(module)
     return info is not None and bool(info.flags & FLAG_BOOT)
 

@@ -1,4 +1,4 @@
-"""How a message that came by a link waits for room in a full queue.
+"""Let a message from a link wait for room in a full queue.
 
 A `BlockedMessage` waits FULL_QUEUE_TURNS turns of the event loop: most readers make room within them. Then its owner
 decides. There are two, as a slow reader must not stop what others receive, and a fast one should lose nothing:
@@ -111,7 +111,7 @@ class BlockedMessage(PendingDelivery):
 
 
 class LinkBackpressure(ReceiveBackpressure):
-    """What waits for room on a link with one way in. While a message waits, the link delivers no other.
+    """Backpressure of a link with one way in. While a message waits for room, the link delivers no other.
 
     `resume` is called when the message has been delivered or given up. `flow_controlled` says whether the other end
     waits while nothing is read, and nothing is lost by that.
@@ -199,7 +199,7 @@ class LinkBackpressure(ReceiveBackpressure):
 
 
 class Backlog(ReceiveBackpressure, Generic[P]):
-    """What waits for room on one topic: the message that is blocked, and those behind it.
+    """Messages that wait for room on one topic: the blocked one, and those behind it.
 
     `deliver` gets each message when it has its turn, and None for the blocked one when every sink has it; `resume` is
     called when reading may go on.
@@ -215,7 +215,7 @@ class Backlog(ReceiveBackpressure, Generic[P]):
         super().__init__(loop, lost)
         self.blocked: BlockedMessage | None = None
         self.holds = False
-        """Whether the blocked message waits without a limit; reading goes on, and events overtake it."""
+        """True if the blocked message waits without a limit; reading goes on, and events overtake it."""
         self._deliver = deliver
         self._resume = resume
         self._blocked_serial: tuple[P, int]  # whose message is blocked, and its serial

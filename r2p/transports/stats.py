@@ -1,4 +1,4 @@
-"""What a link counts: messages, bytes and connections, and by reason what it dropped.
+"""The counters of a link: messages, bytes and connections, and by reason what it dropped.
 
 All who drop something count it in the link's `LoggedCounter`. That one logs, too, within limits: so no place that drops
 needs a logger, and a flood of bad messages can't fill the log.

@@ -226,7 +226,7 @@ class TcpListenTransport(Transport):
         self.admits_gateways = bool(options.get("gateways", False))
         self.served: set[_ServerConnection] = set()
         self.refused: set[_ServerConnection] = set()
-        """Those that are sent the reason, and have not closed yet."""
+        """Refused connections that are being sent the reason, and have not closed yet."""
         self.closing = False
         host, self._port = _host_port(url)
         self._host = host or "127.0.0.1"

@@ -98,7 +98,7 @@ def schemes() -> list[str]:
 
 
 def yes_or_no(text: str) -> bool:
-    """True from "yes", False from "no"."""
+    """Return True for "yes" and False for "no"."""
     if text not in ("yes", "no"):
         raise ValueError("write yes or no")
     return text == "yes"

@@ -1,4 +1,4 @@
-"""How gateways agree on one forwarding tree, so that no message goes round, or arrives twice.
+"""Spanning tree: gateways agree on one, so that no message goes round or arrives twice.
 
 CAN and debug frames carry no sequence number, so nothing can be mended behind a loop: there must not be one, not even
 while messages of gateways are lost, late, doubled or out of order. A spanning tree protocol does not promise that while

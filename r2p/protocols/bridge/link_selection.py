@@ -1,4 +1,4 @@
-"""Which links a module with several links uses, so that it gives and gets nothing twice.
+"""Choose which of its links a module uses, so that it sends and receives nothing twice.
 
 Where gateways join the networks of two links, what is sent by both arrives twice: so only one of them is used, the one
 that comes first, and the others stand by. A module learns of gateways by their BRIDGE, of two links to one network by
@@ -61,7 +61,7 @@ class CandidateLink(msgspec.Struct, eq=False):
 
     @property
     def leads_to(self) -> set[tuple[str, int]]:
-        """What two links that lead to the same modules have in common."""
+        """Return what two links that lead to the same modules have in common."""
         places = {("network", number) for number in (self.number, *self.twins, *self.loops)}
         places |= {("mesh", each.root) for each in self.gateways.values()}
         return places if self.remote is None else places | {("module", self.remote)}
@@ -72,16 +72,16 @@ class CandidateLink(msgspec.Struct, eq=False):
         return min((each.acked_at for each in self.gateways.values()), default=NEVER) + LEASE
 
     def is_contested(self, now: int) -> bool:
-        """Whether gateways may join its network to others."""
+        """Return whether gateways may join the link's network to others."""
         return bool(self.gateways) or now < self.known_at
 
     def is_busy(self, now: int) -> bool:
-        """Whether anything was heard of its network that time may change, or there is something to send."""
+        """Return whether time may change what is known of the link's network, or there is something to send."""
         return bool(self.gateways or self.twins or self.loops) or self.asks or now < self.known_at
 
 
 class LinkChoice:
-    """Which links are used for topics that all links can carry but those in `without`."""
+    """The links to use for topics that all links but those in `without` can carry."""
 
     def __init__(self, without: frozenset[int]) -> None:
         self.without = without
@@ -130,7 +130,7 @@ class LinkChoice:
         return len(contested) > 1
 
     def next_deadline(self, now: int) -> int:
-        """When to choose again, if nothing else happens."""
+        """Return when to choose again, if nothing else happens."""
         dues = [self.consent_until, self._closed_at + SETTLE, *(at + SETTLE for at in self._barred.values())]
         return min((due for due in dues if due > now), default=NEVER)
 
@@ -139,7 +139,7 @@ class LinkChoice:
         self._barred |= ended | dict.fromkeys(numbers, NEVER)
 
     def _candidates(self, now: int, links: list[CandidateLink]) -> tuple[list[CandidateLink], list[CandidateLink]]:
-        """Those that may be used together, if the gateways consent, and those that have to stand by for them."""
+        """Return links that may be used together, if the gateways consent, and those that have to stand by for them."""
         settled = any(link.is_contested(now) and (now >= link.known_at or link.number in self.used) for link in links)
         candidates: list[CandidateLink] = []
         barred: list[CandidateLink] = []
@@ -164,7 +164,7 @@ class LinkChoice:
         return candidates, barred
 
     def _may_begin(self, now: int, link: CandidateLink) -> bool:
-        """Whether what was sent by the link that was used before has arrived by now."""
+        """Return whether messages sent by the link that was used before have arrived by now."""
         if link.number in self.used:
             return True
         since = self._barred.get(link.number, LONG_AGO)
@@ -194,16 +194,16 @@ class LinkSelection:
         self._busy: list[CandidateLink] = []
         """Links of which something was heard, or may yet be: all others need no time."""
         self._links_to: Counter[int] = Counter()
-        """How many links lead to each module."""
+        """Number of links that lead to each module."""
 
     @property
     def needs_consent(self) -> bool:
-        """Whether more links are used than without the consent of gateways, until `consent_until`."""
+        """Return whether the consent of gateways, until `consent_until`, allows more links than without."""
         return self.consent_until < NEVER
 
     @property
     def may_announce(self) -> bool:
-        """Whether gateways are to know of this module."""
+        """Return whether gateways are to know of this module."""
         return self._updated_at < self._needed_at + _LINGER
 
     # Links
@@ -249,7 +249,7 @@ class LinkSelection:
         return choice.used
 
     def is_twin(self, number: int) -> bool:
-        """Whether it leads to the network of a link that is preferred."""
+        """Return whether the link leads to the network of a preferred link."""
         link = self.by_number.get(number)
         return link is not None and any(other < number for other in link.twins)
 
@@ -274,7 +274,7 @@ class LinkSelection:
                 self._send_leaf(now, link)
 
     def next_deadline(self) -> int | None:
-        """When to call `poll`."""
+        """Return when to call `poll`."""
         now = self._updated_at
         dues = [choice.next_deadline(now) for choice in self._choices.values()]
         if len(self.by_number) > 1:
@@ -377,7 +377,7 @@ class LinkSelection:
             del self._links_to[instance]
 
     def _stands_alone(self, link: CandidateLink) -> bool:
-        """Whether what becomes of the link makes no difference to others: one of a thousand clients costs no more."""
+        """Return whether other links don't depend on this one: one of a thousand clients costs no more."""
         alone = link.remote is None or self._links_to[link.remote] == 1
         return alone and link not in self._busy and not any(each.twins or each.loops for each in self._busy)
 
@@ -394,7 +394,7 @@ class LinkSelection:
         return {other: at for other, at in others.items() if other in self.by_number and now - at < TWIN_MEMORY}
 
     def _due(self, link: CandidateLink) -> int:
-        """When to send LEAF."""
+        """Return when to send LEAF."""
         now = self._updated_at
         if now < link.known_at and sum(each.is_contested(now) for each in self._busy) > 1:
             tick = TICK_LISTENING

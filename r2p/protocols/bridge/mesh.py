@@ -28,7 +28,7 @@ PortId = tuple[int, int]
 """A port: gateway, and the number of the port there."""
 
 Adjacency = tuple[int, int, int]
-"""What a gateway hears: own port, other gateway, its port."""
+"""A gateway that another one hears: own port, other gateway, its port."""
 
 Edge = tuple[PortId, PortId]
 
@@ -141,7 +141,7 @@ def digest(*things: object) -> int:
 
 
 class _GatewayRecord(msgspec.Struct):
-    """Whom another gateway hears."""
+    """The gateways that another gateway hears."""
 
     serial: int
     heard: frozenset[Adjacency]
@@ -162,7 +162,7 @@ class MeshMap:
         """The instant from which messages of this gateway name the root."""
         self._edges: frozenset[Edge] = frozenset()
         self.fingerprint = digest(self._edges)
-        """Of the edges: gateways agree where it is the same."""
+        """A digest of the edges: gateways agree where it is the same."""
         self._forwarding: frozenset[PortId] = frozenset()
         self._records: dict[int, _GatewayRecord] = {}
         self._heard_by_members: set[int] = set()
@@ -178,11 +178,11 @@ class MeshMap:
         return [*known[start:], *known[:start]][:most]
 
     def concerns(self, gateway: int) -> bool:
-        """Whether a gateway is in the mesh, or a member hears it. Any other may be forged."""
+        """Return whether a gateway is in the mesh, or a member hears it. Any other may be forged."""
         return gateway in self.members or gateway in self._heard_by_members
 
     def forwards(self, number: int) -> bool:
-        """Whether the tree contains this gateway's port of this number."""
+        """Return whether the tree contains this gateway's port of this number."""
         return (self.gateway, number) in self._forwarding
 
     def set_heard(self, now: int, heard: frozenset[Adjacency]) -> bool:

@@ -38,7 +38,7 @@ TICK_ALONE = 200 * MILLISECOND
 TICK_LISTENING = 50 * MILLISECOND
 """The same at a new port, so that several are sent, and answered, before it may forward."""
 LEASE = 600 * MILLISECOND
-"""How long an acknowledgement holds, from the instant at which the message that it acknowledges was sent."""
+"""Validity of an acknowledgement, from the instant at which the acknowledged message was sent."""
 DEAD = 650 * MILLISECOND
 """A gateway that is silent for this long is gone. More than a lease: what it was granted has run out by then."""
 LISTEN = 800 * MILLISECOND
@@ -69,7 +69,7 @@ LEAVES_MAX = 32
 
 
 class PortState(enum.Enum):
-    """What a port does; the values stand in the log and in statistics."""
+    """States of a port; the values stand in the log and in statistics."""
 
     LISTENING = "listening"
     ALONE = "alone"
@@ -144,7 +144,7 @@ class SentMessages:
         return self._count
 
     def acked_at(self, acks: bytes) -> int:
-        """When the message was sent that `acks` acknowledge; 0 if they name none, or one older than a lease."""
+        """Return when the message that `acks` acknowledge was sent; 0 if they name none, or one older than a lease."""
         for sender, count in decode_acks(acks):
             if sender == self._sender:
                 return next((at for each, at in reversed(self._sent) if each == count), 0)
@@ -152,7 +152,7 @@ class SentMessages:
 
 
 def is_late(count: int, last: int) -> bool:
-    """Whether the message numbered `count` was overtaken by the one numbered `last`; parts of one message share it."""
+    """Return whether message `last` has overtaken message `count`; parts of one message share their number."""
     return count != last and not is_newer_serial(count, last)
 
 
@@ -208,7 +208,7 @@ class TreePort(msgspec.Struct, eq=False):
         return {gateway for gateway, _ in self.neighbours}
 
     def next_deadline(self) -> int:
-        """When to send or to update, if nothing else happens."""
+        """Return when to send or to update, if nothing else happens."""
         due = min(self.send_at, self.probe_at)
         if self.state is PortState.LISTENING:
             due = min(due, self.opened_at + LISTEN)
@@ -364,7 +364,7 @@ class TreePort(msgspec.Struct, eq=False):
         return (self.state, self.in_tree) != before
 
     def is_agreed(self, now: int, mesh: MeshMap) -> bool:
-        """Whether all gateways there have acknowledged the very same mesh within a lease."""
+        """Return whether all gateways there have acknowledged the very same mesh within a lease."""
         return all(  # other ports of this gateway agree anyway
             each.agreement == self.agreement and now < each.acked_at + LEASE
             for (gateway, _), each in self.neighbours.items()
@@ -387,7 +387,7 @@ class TreePort(msgspec.Struct, eq=False):
         return PortState.FORWARDING if now >= self.agreed_since + SETTLE else PortState.CONVERGING
 
     def _is_in_tree(self, mesh: MeshMap) -> bool:
-        """Whether the port is in the tree, also at times when nothing may pass yet."""
+        """Return whether the port is in the tree, also at times when nothing may pass yet."""
         if self.state in (PortState.ALONE, PortState.FORWARDING):
             return True
         if self.state in (PortState.BLOCKED, PortState.LOOP):
@@ -407,7 +407,7 @@ class TreePort(msgspec.Struct, eq=False):
         return min([self.sent_at, *acked]) + LEASE
 
     def _loops(self, now: int, mesh: MeshMap) -> bool:
-        """Whether the port is part of a loop through a gateway that sends no BRIDGE, and is the end that yields.
+        """Return whether the port is in a loop through a gateway that sends no BRIDGE, and is the end that yields.
 
         A probe that came in proves the loop. Of two ports of one gateway the one with the higher number (modulo
         PORT_MODULUS) yields, of two gateways the one with the higher number.
@@ -427,6 +427,6 @@ def _fresh(now: int, heard: dict[PortId, Neighbour]) -> dict[PortId, Neighbour]:
 
 
 def _may_hear(message: Leaf, gateway: int) -> bool:
-    """Whether the module may hear the gateway. One that does not has lost its consent, and need not be waited for."""
+    """Return whether the module may hear the gateway. One that does not has lost its consent: don't wait for it."""
     names = [name for name, _ in decode_acks(message.acks)]
     return gateway in names or 0 not in names  # with no free entry it may be one of those that did not fit

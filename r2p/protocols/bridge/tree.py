@@ -86,7 +86,7 @@ class SpanningTree:
         return actions
 
     def next_deadline(self) -> int | None:
-        """When to call `poll`."""
+        """Return when to call `poll`."""
         due = min((port.next_deadline() for port in self.ports.values()), default=NEVER)
         due = min(due, self.clients.next_deadline())
         return due if due < NEVER else None
@@ -305,7 +305,7 @@ class ClientPorts:
             self.actions.append(SendToClients(self._bridge(now, _NO_ACKS)))
 
     def next_deadline(self) -> int:
-        """When to call `poll`."""
+        """Return when to call `poll`."""
         if not self.ports:
             return NEVER
         dues = [self._send_at]

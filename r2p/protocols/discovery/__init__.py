@@ -1,4 +1,4 @@
-"""How the modules of one link find each other, and agree on what flows (PROTOCOL.md 4 and 9).
+"""Discovery: the modules of one link find each other, and agree on what flows (PROTOCOL.md 4 and 9).
 
 Read `events` first, what discovery hands to its link; then `session`: `DiscoveryProtocol`, the interface that a link
 has to it, which `r2p.protocols.liveliness` implements as well, and `Discovery` itself, made of

@@ -1,4 +1,4 @@
-"""What this module announces on one link: what it publishes and subscribes to, and which of its nodes do so.
+"""Announce on one link what this module publishes and subscribes to, and which of its nodes do so.
 
 The schedule holds keys only. The announcer makes the messages of a key when its turn has come, from what is true then.
 """
@@ -16,7 +16,7 @@ from r2p.units import MILLISECOND
 from r2p.version import __version__
 
 Relayed = management.Hello | management.Alive | management.Endpoint
-"""What a gateway passes on of other modules."""
+"""Messages about other modules that a gateway passes on."""
 
 _KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}
 
@@ -53,9 +53,9 @@ class Announcer:
         self.flags = 0
         self.r2p = False
         self.topics: dict[int, dict[str, LocalTopic]] = {ROLE_PUBLISHES: {}, ROLE_SUBSCRIBES: {}}
-        """What the module publishes and subscribes to, by ROLE_... and name."""
+        """Topics that the module publishes and subscribes to, by ROLE_... and name."""
         self.publisher_counts: Counter[str] = Counter()
-        """How many peers publish each of the subscribed topics to this module; those that none does are missing."""
+        """Number of peers that publish each subscribed topic to this module; topics without one are missing."""
         self.subscriber_counts: Counter[str] = Counter()
         """The same of published topics, and of peers that subscribe to them."""
         self._observer = observer
@@ -152,7 +152,7 @@ class Announcer:
     # The messages
 
     def hello(self, flags: int = 0) -> management.Hello:
-        """This module's HELLO. Its lease outlasts two lost rounds of repetition."""
+        """Return this module's HELLO. Its lease outlasts two lost rounds of repetition."""
         tool = management.HELLO_TOOL if self._observer else 0
         lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // MILLISECOND
         release = __version__[: management.RELEASE_MAX]

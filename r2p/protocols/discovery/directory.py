@@ -1,4 +1,4 @@
-"""What the modules on one link have said: their names, topics and endpoints. Nothing here decides what flows.
+"""The announcements of the modules on one link: names, topics and endpoints. Nothing here decides what flows.
 
 `Directory` has it for one link. `Demand` is for gateways only: which topics the others publish and subscribe to,
 whether this module has them or not.
@@ -86,7 +86,7 @@ class EndpointInfo(msgspec.Struct, frozen=True):
     publisher_class: int
 
     def latches(self, topic: str) -> bool:
-        """Whether it publishes this topic, and latches it."""
+        """Return whether the endpoint publishes this topic, and latches it."""
         latches = self.publisher_class & management.CLASS_LATCHES
         return self.topic == topic and self.role == ROLE_PUBLISHES and latches > 0
 
@@ -112,9 +112,9 @@ class Directory:
         self.generation = 0
         """A number that changes when modules or endpoints change."""
         self.timers = timers
-        """Of everything that lasts for a while on this link."""
+        """Timers of everything that lasts for a while on this link."""
         self.counts = counts
-        """What was dropped on this link, by reason."""
+        """Counts of what was dropped on this link, by reason."""
         self._direct: dict[PeerAddress, dict[str, ModuleInfo]] = {}
         self._leases: dict[PeerAddress, Counter[int]] = {}
         self._names: dict[int, str] = {}
@@ -140,7 +140,7 @@ class Directory:
         return lease if lease < FOR_EVER else None
 
     def is_alone(self, source: PeerAddress, instance: int) -> bool:
-        """Whether no other module than this one is known directly at an address."""
+        """Return whether no other module than this one is known directly at an address."""
         return all(info.instance == instance for info in self._direct.get(source, {}).values())
 
     def read_alive(
@@ -197,7 +197,7 @@ class Directory:
             self._forget(info)
 
     def count_swaps(self, now: int, before: ModuleInfo | None, instance: int) -> int:
-        """How often a name has gone back and forth between two instances within a lease.
+        """Return how often a name has gone back and forth between two instances within a lease.
 
         Two modules of one name do so with every HELLO; a module that restarts never goes back.
         """
@@ -210,7 +210,7 @@ class Directory:
         return swaps
 
     def was_before(self, name: str, instance: int) -> bool:
-        """Whether a module had this instance just before its present one."""
+        """Return whether a module had this instance just before its present one."""
         known = self._starts.get(name)
         return known is not None and known.previous == instance
 
@@ -383,7 +383,7 @@ class Demand:
         return list(self._sources.get((topic, role), ()))
 
     def entries_of(self, source: Hashable) -> list[_TopicRole]:
-        """What a source publishes and subscribes to."""
+        """Return what a source publishes and subscribes to."""
         return [entry for entry, sources in self._sources.items() if source in sources]
 
     def pop_changed(self) -> set[str]:

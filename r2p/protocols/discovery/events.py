@@ -17,7 +17,7 @@ PeerAddress = Hashable
 
 
 class Command(enum.Enum):
-    """What one module can command another to do (PROTOCOL.md 4)."""
+    """Commands from one module to another (PROTOCOL.md 4)."""
 
     STOP = "stop"
     REBOOT = "reboot"
@@ -40,14 +40,14 @@ class TopicType(msgspec.Struct, frozen=True):
     fingerprint: bytes = management.ANY_TYPE
 
     def fits(self, other: "TopicType") -> bool:
-        """Whether the two don't contradict each other: what is unknown fits everything."""
+        """Return whether the two agree: what is unknown fits everything."""
         if self.size != other.size and self.size and other.size:
             return False
         typed = self.fingerprint != management.ANY_TYPE and other.fingerprint != management.ANY_TYPE
         return not typed or self.fingerprint == other.fingerprint
 
     def merged(self, other: "TopicType") -> "TopicType":
-        """What is known from either of two types that fit."""
+        """Return what is known from either of two types that fit."""
         typed = self.fingerprint != management.ANY_TYPE
         return TopicType(self.size or other.size, self.fingerprint if typed else other.fingerprint)
 
@@ -76,7 +76,7 @@ class ModuleInfo(msgspec.Struct, frozen=True):
         return self.instance is not None
 
     def differs(self, other: "ModuleInfo") -> bool:
-        """Whether more is another than when the module was heard."""
+        """Return whether anything but the time of the last message differs."""
         return msgspec.structs.replace(other, last_heard=self.last_heard) != self
 
 

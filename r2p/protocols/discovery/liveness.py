@@ -1,4 +1,4 @@
-"""Which modules are on one link: those that come, go and restart, two with one name, and echoes of this module.
+"""Track the modules on one link: those that come, go and restart, two with one name, and echoes of this module.
 
 Firmware is known by its ALIVE only. It never says good-bye, and is remembered for good. An r2p module also says HELLO
 with the random number of its start (its instance), which tells a restart from a second module with the same name.
@@ -139,8 +139,8 @@ class PeerLiveness:
         return message if name == message.module else msgspec.structs.replace(message, module=name)
 
     def _is_nearer(self, message: management.Hello) -> bool:
-        """Whether a module of this name is known to be nearer than a gateway says. What the gateway says may be about
-        its last start, if the gateway has not learnt that this is over.
+        """Return whether a module of this name is known to be nearer than a gateway says. The gateway may not have
+        learnt yet that the module has restarted.
         """
         if message.module == self._module:
             return message.hops > 0
@@ -233,5 +233,5 @@ class PeerLiveness:
 
 
 def _restarted(before: int, after: int) -> bool:
-    """Whether a module started anew between two ALIVEs: only a start changes its mode or ends a STOP."""
+    """Return whether a module started anew between two ALIVEs: only a start changes its mode or ends a STOP."""
     return bool((before ^ after) & _RESTART or before & ~after & management.FLAG_STOPPED)

@@ -1,4 +1,4 @@
-"""Which topics flow on one link: both sides of ADVERTISE, SUBSCRIBE_REQUEST and SUBSCRIBE_RESPONSE (PROTOCOL.md 4).
+"""Agree on what flows on one link: both sides of ADVERTISE, SUBSCRIBE_REQUEST and SUBSCRIBE_RESPONSE (PROTOCOL.md 4).
 
 Firmware is answered every time. Between r2p modules a repetition brings no more than a response, as both sides repeat;
 and where many of them ask at once, they share an answer (`SharedAnswers`). Only a change becomes an event.
@@ -338,11 +338,11 @@ class SubscriptionNegotiation:
             self._peers.pop(peer.source, None)
 
     def _counterpart(self, role: int) -> dict[str, LocalTopic]:
-        """This module's topics in the opposite role of a peer."""
+        """Return this module's topics in the opposite role of a peer."""
         return self._own.topics[counterpart(role)] if role in self._own.topics else {}
 
     def _fits(self, peer: Peer, topic: str, role: int, theirs: TopicType) -> bool:
-        """Whether a peer's type fits this module's. If not, nothing flows, and it is reported once."""
+        """Return whether a peer's type fits this module's. If not, nothing flows, and one event reports it."""
         ours = self._counterpart(role)[topic].type
         fits = ours.fits(theirs)  # what is unknown fits, so firmware, which has no fingerprints, is judged by size only
         self._directory.touch_topic(topic).mismatch = not fits
@@ -420,12 +420,12 @@ class SubscriptionNegotiation:
 
 
 def _receives(peer: Peer, message: management.Advertise) -> bool:
-    """Whether the messages of this publisher, with these params and size, are accepted already."""
+    """Return whether the messages of this publisher, with these params and size, are accepted already."""
     return peer.publishers.get(message.topic) == (message.params, message.size)
 
 
 def _needs_type(now: int, peer: Peer, message: management.SubscribeRequest) -> bool:
-    """Whether an r2p subscriber may not know this module's type yet. Later requests only extend its lease."""
+    """Return whether an r2p subscriber may still lack this module's type. Later requests only extend its lease."""
     if not peer.is_r2p(now):
         return False
     return message.params == UNANSWERED or peer.subscriptions.get(message.topic) is not False

@@ -1,4 +1,4 @@
-"""When to announce what again: a ring of everything to repeat, one step at a time, never faster than the link's rate.
+"""The schedule of announcements: a ring of everything to repeat, step by step, never faster than the link's rate.
 
 New items go first (`_fresh`), then join the ring. A request to hear everything again only raises the number of steps
 that don't wait (`_eager`) to one full turn, so that fifty requests at once cost one turn. Items that only describe,
@@ -36,7 +36,7 @@ _TOOL_INTERVAL = SECOND // 5
 
 
 class ItemKind(Enum):
-    """What an item of the schedule announces."""
+    """The subject of an item of the schedule."""
 
     PRESENCE = auto()
     QUERY = auto()
@@ -66,7 +66,7 @@ class TokenBucket:
         self._full_at = 0
 
     def ready_at(self, count: int) -> int:
-        """When `count` messages may go (ns)."""
+        """Return when `count` messages may go (ns)."""
         return self._full_at + count * self.gap - self._slack
 
     def spend(self, now: int, count: int) -> None:
@@ -74,7 +74,7 @@ class TokenBucket:
 
 
 class Schedule:
-    """What to announce next, and when. Each call costs the same, however much there is to repeat."""
+    """Chooses the next announcement and its time. Each call costs the same, however much there is to repeat."""
 
     def __init__(self, rate: float, burst: int, quiet: int) -> None:
         self.set_pace(rate, burst, quiet)
@@ -154,7 +154,7 @@ class Schedule:
         self._traffic_at = now
 
     def due(self) -> int:
-        """When to call `pop` (ns)."""
+        """Return when to call `pop` (ns)."""
         # What an item costs is known when its messages are made: there must be room for the most that it may cost.
         return max(0 if self._fresh or self._relayed else self._turn_at(), self._bucket.ready_at(_ITEM_MESSAGES))
 

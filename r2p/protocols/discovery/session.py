@@ -67,7 +67,7 @@ class DiscoveryProtocol(ABC):
     """
 
     flags: int
-    """This module's flags: FLAG_... of ALIVE."""
+    """Flags of this module: FLAG_... of ALIVE."""
     counts: Counter[str]
     """Received messages that were dropped, by reason."""
     modules: dict[str, ModuleInfo]
@@ -96,7 +96,7 @@ class DiscoveryProtocol(ABC):
 
     @abstractmethod
     def demand(self) -> Demand:
-        """What the other modules publish and subscribe to, for gateways."""
+        """Return what the other modules publish and subscribe to, for gateways."""
 
     # What this module has
 
@@ -171,7 +171,7 @@ class DiscoveryProtocol(ABC):
 
     @abstractmethod
     def next_deadline(self) -> int | None:
-        """When to call `poll` (monotonic ns); a time in the past means at once."""
+        """Return when to call `poll` (monotonic ns); a time in the past means at once."""
 
     @abstractmethod
     def poll(self, now: int) -> list[Event]:
@@ -266,7 +266,7 @@ class Discovery(DiscoveryProtocol):
         return self._directory.generation
 
     def demand(self) -> Demand:
-        """What the other modules publish and subscribe to. It is kept from the first call on."""
+        """Return what the other modules publish and subscribe to, which is tracked from the first call on."""
         if self._demand is None:
             self._demand = LeasedDemand(self._directory)
         return self._demand

@@ -100,7 +100,7 @@ class ModuleRegistry:
     # Deadlines
 
     def next_deadline(self) -> int | None:
-        """When to call `poll` (monotonic ns); a time in the past means at once."""
+        """Return when to call `poll` (monotonic ns); a time in the past means at once."""
         if self._without_room and len(self.modules) < TABLE_MAX:
             return 0
         return min(self._conflict_at.values(), default=None)

@@ -283,7 +283,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
 
 
 class RefusedTokens:
-    """How many tokens were refused as there were too many, and when to query them.
+    """Counts tokens that were refused as there were too many, and says when to query them.
 
     The network reports each token only once, so refused ones have to be queried when there is room. They are not kept,
     only counted: memory stays bounded. Many answers are work for a router, so this waits until all of them have room,
@@ -319,7 +319,7 @@ class RefusedTokens:
         self._query_at = None
 
     def next_deadline(self) -> int | None:
-        """When to call `begin_query` (monotonic ns)."""
+        """Return when to call `begin_query` (monotonic ns)."""
         return self._query_at
 
     def review(self, now: int, free: int) -> None:

@@ -1,4 +1,4 @@
-"""What this module has, as liveliness tokens, and which topics flow between it and each other session because of them.
+"""Liveliness tokens of this module, and which topics flow between it and each other session because of them.
 
 `TokenSet` says which tokens to declare, and which to undeclare. Changes are collected, and become events all at once:
 so a publisher that is announced first and gets the name of its node a moment later is one token, and a change declares
@@ -52,11 +52,11 @@ class TokenSet:
         self._relayed: dict[tuple[str | int, ...], liveliness.Token] = {}
         self._declared: dict[TopicRole, set[str]] = {}
         self._dirty: set[TopicRole] = {_MODULE}
-        """What may need other tokens than are declared."""
+        """Topics that may need other tokens than are declared."""
 
     @property
     def has_changes(self) -> bool:
-        """Whether something has changed since `pop_changes` was called."""
+        """Return whether something has changed since `pop_changes` was called."""
         return bool(self._dirty)
 
     def get(self, topic: str, role: int) -> LocalTopic | None:
@@ -161,7 +161,7 @@ class Matching:
     def __init__(self, own: TokenSet, outbox: Outbox) -> None:
         self.topics: dict[str, TopicInfo] = {}
         self.demand = Demand()
-        """What other modules publish and subscribe to, whether this one has anything to do with it or not."""
+        """Everything that other modules publish and subscribe to, used by this one or not."""
         self._own = own
         self._outbox = outbox
         self._sessions: dict[int, _PeerSession] = {}

@@ -32,7 +32,7 @@ _MICROSECOND = 1000
 
 
 class Timing(msgspec.Struct, frozen=True):
-    """What all nodes of a network agree on: slots in a cycle, length of a slot (ns), bit time (ns)."""
+    """Parameters shared by all nodes of a network: slots in a cycle, length of a slot (ns), bit time (ns)."""
 
     slots: int
     slot: int
@@ -55,7 +55,7 @@ def timing(slots: int = 60, nominal: int = 10_000_000, bit_rate: int = 1_000_000
 
 
 class CycleState(enum.Enum):
-    """How the node knows where in the cycle it is."""
+    """The node's way to know its place in the cycle."""
 
     NONE = "no cycle"
     FOLLOWING = "following"  # the last sync was received
@@ -67,7 +67,7 @@ _NONE = CycleState.NONE  # Python 3.11 takes its time to find a member of an enu
 
 
 class Alignment(enum.Enum):
-    """What a sync frame was to the cycle."""
+    """The effect of a sync frame on the cycle."""
 
     STARTED = "started"  # there was no cycle before
     RESUMED = "resumed"  # ... but one that was lost goes on, where it should be by now
@@ -111,7 +111,7 @@ class Cycle:
         return (now - self.reference) // self._slot
 
     def start_of(self, slot: int) -> int:
-        """When a slot of this cycle begins; may be one of a later cycle."""
+        """Return when a slot of this cycle, or of a later one, begins."""
         return self.reference + slot * self._slot
 
     def number_of(self, slot: int) -> int:
@@ -230,7 +230,7 @@ class Cycle:
 
     @property
     def end(self) -> int:
-        """When the master's next cycle begins."""
+        """Return when the master's next cycle begins."""
         return self._grid + self.timing.cycle - min(self._behind, self._slot // _CATCH_UP)
 
     def on_sync_sent(self, frame: Frame, at: int) -> None:
@@ -269,7 +269,7 @@ class Cycle:
             self.free, self.next_free = _free(mask, self.timing.slots)
 
     def _distance(self, start: int) -> tuple[int, int]:
-        """How many cycles after this one a start of frame lies, and by how much off (ns)."""
+        """Return how many cycles after this one a start of frame lies, and how far off (ns)."""
         cycles = (start - self.reference + self.timing.cycle // 2) // self.timing.cycle
         return cycles, start - self.reference - cycles * self.timing.cycle
 

@@ -64,7 +64,7 @@ class Engine:
         self.timing = context.timing
         self.cycle = context.cycle
         self.counts = context.counts
-        """What went wrong here, by kind."""
+        """Counts of what went wrong here, by kind."""
         self.reassembly = Reassembly()
         self.detector = Detector(settings.profile)
         self.node_id = NodeId(context, self._send_claim, self._on_stage)
@@ -92,17 +92,17 @@ class Engine:
 
     @property
     def id8(self) -> int | None:
-        """This node's id8; None while it has no id8."""
+        """The id8 of this node; None while it has none."""
         return self.node_id.id8 if self.ready else None
 
     @property
     def ready(self) -> bool:
-        """Whether messages can be sent."""
+        """Return whether messages can be sent."""
         return self._running and self._joined
 
     @property
     def profile(self) -> Profile:
-        """Whose network it is, as far as it is known."""
+        """The network's profile, as far as it is known."""
         return self.detector.profile
 
     @property
@@ -129,7 +129,7 @@ class Engine:
             self.network.utc_error = min(-(-error // 1000), management.NO_UTC - 1)
 
     def filters(self) -> list[tuple[int, int]]:
-        """Which frames are needed: those with `id & mask == identifier` of one of these (identifier, mask)."""
+        """Return the frames to receive: those with `id & mask == identifier` for one of these (identifier, mask)."""
         if not self.ready:
             return [(0, 0)]
         fixed = [rtcan.high_filter(rtcan.SYNC), rtcan.high_filter(MANAGEMENT), rtcan.id8_filter(self.node_id.id8)]
@@ -180,7 +180,7 @@ class Engine:
         return self._drain() if self._actions else _NOTHING
 
     def next_deadline(self) -> int | None:
-        """When to call `poll`; an instant in the past means at once."""
+        """Return when to call `poll`; an instant in the past means at once."""
         if not self._running:
             return None
         # No `min` over all parts: this is called after each frame.
@@ -346,7 +346,7 @@ class Engine:
     # Frames
 
     def _is_sync(self, identifier: int) -> bool:
-        """Whether a frame with the identifier of a sync is one.
+        """Return whether a frame with the identifier of a sync is one.
 
         When firmware has no time left it sends laxity 0: then the last frame of its management has the identifier of
         the sync of cycle 0, and in a network of firmware a topic may have that of another one.
@@ -370,7 +370,7 @@ class Engine:
             self._update_mode(now)
 
     def _learn(self, identifier: int) -> None:
-        """While the node listens: learn from any frame which id8 is taken, and whether there is firmware."""
+        """Learn, while the node listens, from any frame which id8 is taken, and whether there is firmware."""
         message = rtcan.message_of(identifier)
         if rtcan.high_byte(message) == rtcan.SYNC:
             self.detector.firmware_seen()

@@ -20,7 +20,7 @@ from r2p.protocols.timers import KeyedTimers
 
 
 class Profile(enum.Enum):
-    """How the modules of a network use the bus (PROTOCOL.md 9)."""
+    """The ways in which a network's modules use the bus (PROTOCOL.md 9)."""
 
     AUTO = "auto"
     RTCAN = "rtcan"
@@ -57,7 +57,7 @@ class EngineSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Fate(enum.Enum):
-    """What became of a message."""
+    """The fate of a message."""
 
     SENT = "sent"
     UNKNOWN = "unknown"  # sent, but not every frame was confirmed
@@ -196,7 +196,7 @@ Action = PortAction | Received | Done | Due | NetworkEvent | SlotEvent
 
 
 class EngineContext:
-    """What the parts of one engine share. Raises ValueError for slots that are too short."""
+    """State shared by the parts of one engine. Raises ValueError for slots that are too short."""
 
     def __init__(self, settings: EngineSettings) -> None:
         self.settings = settings
@@ -204,7 +204,7 @@ class EngineContext:
         self.cycle = Cycle(self.timing, settings.receive_latency)
         self.timers = KeyedTimers()
         self.actions: list[Action] = []
-        """What the owner of the engine has to do next, in order."""
+        """Actions for the owner of the engine, in order."""
         self.counts: Counter[str] = Counter()
         self._draws = 0
 

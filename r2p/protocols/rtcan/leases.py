@@ -71,7 +71,7 @@ _Fills = dict[int, list[tuple[PeriodicMessage, int]]]
 
 
 class SlotPlan:
-    """What to do in the slots of the current cycle. Slot 0 of the next cycle counts as the last one of this.
+    """The plan for the slots of the current cycle. Slot 0 of the next cycle counts as the last one of this.
 
     After the least common multiple of all periods, which is the longest of them, all comes again: each cycle up to
     there is worked out once.
@@ -145,7 +145,7 @@ class SlotGrants:
     def __init__(self, context: EngineContext) -> None:
         self.calendar = Calendar(context.timing.slots)
         self.collecting = False
-        """Whether only grants of another master are renewed for now."""
+        """True while only grants of another master are renewed."""
         self._cycle = context.cycle
         self._timers = context.timers
 
@@ -203,7 +203,7 @@ class SlotRequests:
         abandon: Callable[[int, PeriodicMessage, str], None],
     ) -> None:
         self.has_master = False
-        """Whether there is a master to ask."""
+        """True if there is a master to ask."""
         self._cycle = context.cycle
         self._plan = plan
         self._timers = context.timers

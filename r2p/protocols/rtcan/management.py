@@ -67,7 +67,7 @@ class RateLimiter:
 
     @property
     def due(self) -> int:
-        """When the next one may go."""
+        """Return when the next message may go."""
         if not self.waiting:
             return NEVER
         if self._delay is None:

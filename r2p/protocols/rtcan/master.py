@@ -30,7 +30,7 @@ _RETRY_PAUSE_MAX = 20_000_000  # ns, drawn at random: two nodes that collided wo
 
 
 class Role(enum.Enum):
-    """What the node is to the network."""
+    """The node's part in the network."""
 
     NONE = "no master"
     ELECTING = "electing"
@@ -83,7 +83,7 @@ class Election:
         self._timers.clear("election")
 
     def beats(self, id8: int, priority: int, other: int) -> bool:
-        """Whether this node, with this id8, is the better master than `other`."""
+        """Return whether this node, with this id8, is a better master than `other`."""
         return (self._priority, id8) > (priority, other)
 
 

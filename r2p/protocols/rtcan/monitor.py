@@ -23,7 +23,7 @@ _EARLY = 8  # a frame that starts less than this part of a slot early belongs to
 
 
 class FrameKind(enum.Enum):
-    """What a frame is."""
+    """The kinds of frames."""
 
     SYNC = "sync"
     HRT = "hrt"
@@ -77,7 +77,7 @@ class BusSlot(msgspec.Struct):
 
 
 class BusLoad(msgspec.Struct, frozen=True):
-    """What the bus carried in `elapsed` ns; shares are of the time: 1.0 is all of it.
+    """The load of the bus in `elapsed` ns; shares are of the time: 1.0 is all of it.
 
     `free` is the share without reservation, `free_frames` how many frames of full length fit in there. `nrt_gap` is
     the longest time without a non real-time frame (ns); None where none was seen at all.
@@ -105,7 +105,7 @@ class BusLoad(msgspec.Struct, frozen=True):
 
     @property
     def free_used(self) -> float:
-        """How much of the share without reservation was used: by time, or by frames, of which a slot has so many."""
+        """Return the used part of the unreserved time: by time, or by frames, of which a slot holds so many."""
         events = [tally for (_, _, kind), tally in self.tallies.items() if kind not in {FrameKind.SYNC, FrameKind.HRT}]
         by_time = self.share(sum(tally.bits for tally in events)) / self.free if self.free else 0.0
         by_frames = sum(tally.frames for tally in events) / self.free_frames if self.free_frames else 0.0
@@ -121,7 +121,7 @@ class BusDirectory:
     def __init__(self, timing: Timing) -> None:
         self.timing = timing
         self.timing_known = False
-        """Whether the timing is the master's, by its NETWORK; else it is the user's."""
+        """True if the timing comes from the master's NETWORK; else it is the user's."""
         self.modules: dict[int, str] = {}
         """Names by id8."""
         self.topics: dict[int, str] = {}
@@ -170,7 +170,7 @@ class Monitor:
         self.cycles = 0
         """Whole cycles watched since the last `reset`."""
         self.last_frame = 0
-        """When the last frame was on the bus."""
+        """Time of the last frame on the bus."""
         self._loads: deque[BusLoad] = deque()  # of the periods that are over
         self._reassembly = Reassembly()
         self._sync: int | None = None  # start of the current cycle

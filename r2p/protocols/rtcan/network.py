@@ -88,7 +88,7 @@ class MasterTracker:
         return True
 
     def matches(self, network: management.Network) -> bool:
-        """Whether a network has the number and length of slots of this node's."""
+        """Return whether a network has as many slots, of the same length, as this node."""
         timing = self._cycle.timing
         return (network.slots, network.slot) == (timing.slots, timing.slot)
 
@@ -111,7 +111,7 @@ class MasterTracker:
         self._rival = None
 
     def has_our_length(self, now: int) -> bool | None:
-        """Whether the cycle of a master that sends no NETWORK is as long as this node's; None if not known yet."""
+        """Return whether the cycle of a master that sends no NETWORK is as long as this node's; None if unknown."""
         measured = self._cycle.measured()
         if now < self._since + _UNKNOWN_MASTER or measured is None:
             return None
@@ -126,7 +126,7 @@ class MasterTracker:
             self._latest = None
 
     def _is_another(self, now: int, network: management.Network, master: int | None, epoch: int | None) -> bool:
-        """Whether it is of another master than the one whose syncs are followed; one of the two will yield."""
+        """Return whether a NETWORK is from another master than the one that is followed; one of the two will yield."""
         if not self._cycle.running or master is None or now > self._heard_at + FORGOTTEN:
             return False
         if (network.id8, network.epoch) == (master, epoch):
@@ -166,15 +166,15 @@ class NetworkMembership:
         self.master: int | None = None
         """The master's id8."""
         self.epoch: int | None = None
-        """Which run of the network this is; cycles are counted through it."""
+        """The current run of the network, through which cycles are counted."""
         self.utc_offset = 0
         """UTC less network time (ns), by the master."""
         self.utc_error = management.NO_UTC
-        """How far off that may be (us)."""
+        """Largest error of `utc_offset` (us)."""
         self.verified = False
-        """Whether the network's parameters are known to be those of this node."""
+        """True once the network's parameters are known to be those of this node."""
         self.mismatch: str | None = None
-        """Why the node sends nothing: the network has other parameters."""
+        """The reason why the node sends nothing: how the network's parameters differ."""
         self._context = context
         self._cycle = context.cycle
         self._timers = context.timers
@@ -189,7 +189,7 @@ class NetworkMembership:
 
     @property
     def decided(self) -> bool:
-        """Whether it is known how the bus may be used: in slots, or without."""
+        """Return whether it is known how to use the bus: in slots, or without."""
         decided = self.mismatch is None and self.election.role is not Role.ELECTING
         return decided and (self.verified or not self._cycle.running)
 

@@ -15,7 +15,7 @@ from r2p.units import LONG_AGO, SECOND
 
 # All in ns.
 OBJECTION = 250_000_000
-"""How long others may object to a claim."""
+"""Time in which others may object to a claim."""
 REPEAT = 3_000_000_000
 """Claims are repeated this often."""
 _YIELDS = SECOND  # a node that has claimed this id8 with a higher number has this long to yield
@@ -27,7 +27,7 @@ _SPREAD = 50_000_000  # nodes that are switched on together don't claim together
 
 
 class Stage(enum.Enum):
-    """How far the node is with its id8."""
+    """The node's progress towards an id8."""
 
     LISTENING = "listening"
     CLAIMING = "claiming"

@@ -41,7 +41,7 @@ class QueuedMessage(msgspec.Struct, eq=False):
 
     @property
     def expiry(self) -> int:
-        """When it is given up."""
+        """Return when the message is given up."""
         return NEVER if self.sent or not self.drop else self.deadline
 
 
@@ -64,7 +64,7 @@ class LaxityQueue:
 
     def __init__(self, capacity: int = 256, depth: int = 64) -> None:
         self.only: int | None = None
-        """While this is set, only the topic with this message id may send."""
+        """Message id of the only topic that may send, or None: all may."""
         self._capacity = capacity
         self._depth = depth
         self._fifos: dict[int, _MessageFifo] = {}  # by message id
@@ -117,7 +117,7 @@ class LaxityQueue:
 
     @property
     def next_expiry(self) -> int:
-        """When to call `expire` at the latest; may be early."""
+        """Return when to call `expire` at the latest; may be early."""
         return self._expiry if self.size else NEVER
 
     def best(self, now: int, *, nrt: bool = True) -> QueuedMessage | None:
@@ -204,7 +204,7 @@ class LaxityQueue:
         return gone
 
     def holds(self, message: int) -> bool:
-        """Whether messages of this topic wait."""
+        """Return whether messages of this topic are waiting."""
         return message in self._fifos
 
     def messages(self) -> Iterator[QueuedMessage]:

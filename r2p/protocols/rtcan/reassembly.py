@@ -42,7 +42,7 @@ class Reassembly:
 
     def __init__(self) -> None:
         self.losses: defaultdict[int, Counter[str]] = defaultdict(Counter)
-        """What was lost, by id8 of the source and reason."""
+        """Losses, by id8 of the source and reason."""
         self._buffers: dict[int, SourceBuffer] = {}
         self.open: dict[int, SourceBuffer] = {}
         """Unfinished messages by id, the oldest first."""
@@ -66,7 +66,7 @@ class Reassembly:
         return message in self._buffers
 
     def ends_with_next(self, message: int) -> bool:
-        """Whether a message with this id is being received, and only its last frame is missing."""
+        """Return whether a message with this id is being received, and only its last frame is missing."""
         buffer = self.open.get(message)
         return buffer is not None and buffer.expected == 0
 
@@ -92,7 +92,7 @@ class Reassembly:
 
     @property
     def due(self) -> int:
-        """When to call `poll`: that is when the oldest unfinished message is given up."""
+        """Return when to call `poll`, which then gives up the oldest unfinished message."""
         for oldest in self.open.values():
             return oldest.last + TIMEOUT
         return NEVER

@@ -101,11 +101,11 @@ class TopicIdAllocator:
         return list(self.refused) if freed else []
 
     def __len__(self) -> int:
-        """How many message ids of others are known."""
+        """Return the number of message ids of others that are known."""
         return len(self._announced)
 
     def _free(self, high: int, topic: str) -> bool:
-        """Whether no module uses it for another topic."""
+        """Return whether no module uses the high byte for another topic."""
         if high < rtcan.FIRST_TOPIC or high in self._ours.values():
             return False
         return all(other == topic for other in self._topics.get(high, {}).values())

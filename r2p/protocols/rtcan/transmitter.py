@@ -37,7 +37,7 @@ _LEADING = CycleState.LEADING
 
 
 class Mode(enum.Enum):
-    """How the node may use the bus."""
+    """The node's permission to use the bus."""
 
     SILENT = "silent"
     FREE = "without slots"
@@ -60,7 +60,7 @@ class FirstSync(msgspec.Struct, frozen=True):
 
 
 class NoMessage(enum.Enum):
-    """What stands in a mailbox for a frame that belongs to no message."""
+    """Marks in a mailbox for frames that belong to no message."""
 
     SYNC = "sync"
     DISCARDED = "its message was discarded"
@@ -76,7 +76,7 @@ class Mailboxes:
     def __init__(self, context: EngineContext, queue: LaxityQueue) -> None:
         self.boxes: list[Item | None] = [None, None, None]
         self.idle = True
-        """Whether no frame of the queue is with the port."""
+        """True if no frame of the queue is with the port."""
         self._context = context
         self._counts = context.counts
         self._actions = context.actions
@@ -86,7 +86,7 @@ class Mailboxes:
 
     @property
     def due(self) -> int:
-        """When to call `fill`, if nothing else calls for it."""
+        """Return when to call `fill`, if nothing else calls for it."""
         return min(self._queue.next_expiry, self._held)
 
     def put(self, item: Item, frame: Frame, mailbox: Mailbox, first: int, last: int) -> None:
@@ -391,7 +391,7 @@ class SlotTransmitter:
             self._try(now, current)
 
     def _try(self, now: int, slot: int) -> None:
-        """If this slot is free: try the message of the least laxity."""
+        """Try the message of the least laxity, if this slot is free."""
         if slot not in self._cycle.free or not self.mailboxes.idle:
             return
         self.mailboxes.expire(now)  # nothing overdue may use the slot

@@ -49,13 +49,13 @@ class BasePublisher(Generic[M, C]):
         latch: bool,
     ) -> None:
         self.topic = topic.name
-        """Its name, after remapping."""
+        """The topic's name, after remapping."""
         self.type = layout.cls
         """The message class."""
         self.node = node
         """The node that publishes."""
         self.latch = latch
-        """Whether the last message is sent to subscribers that join later."""
+        """True if the last message is sent to subscribers that join later."""
         self.sent = 0
         """Messages published; the sequence number of the last one."""
         self.missed = 0
@@ -193,7 +193,7 @@ class BasePublisher(Generic[M, C]):
             self._log_and_call(Missed(self.topic, reason, names, late, int(is_first)), self._on_missed, suffix)
 
     def _is_first_miss(self, sequence: int) -> bool:
-        """Whether this message has not been missed yet. One without a number counts each time."""
+        """Return whether this message has not been missed yet. One without a number counts each time."""
         if not sequence:
             return True
         if sequence <= self._newest_missed and (sequence == self._newest_missed or sequence in self._missed_lately):

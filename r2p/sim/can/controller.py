@@ -37,7 +37,7 @@ _AFTER_GOOD_FRAME: Final = 119  # a receive counter above 127 goes back to 119 t
 
 
 class BusWire(Protocol):
-    """What a controller needs of its bus, which is a layer above: it makes the controllers."""
+    """The bus as its controllers see it; a protocol, because the bus is a layer above and makes them."""
 
     timeline: Timeline
     bit: int
@@ -104,7 +104,7 @@ class CanController:
 
     @property
     def live(self) -> bool:
-        """Whether the controller sends and receives: it is neither down nor in bus-off."""
+        """Return whether the controller sends and receives: it is neither down nor in bus-off."""
         return self.confinement.live
 
     # For the node's software
@@ -324,7 +324,7 @@ class Confinement:
     def __init__(self, on_change: Callable[[ControllerState], object]) -> None:
         self.state = ControllerState.ACTIVE
         self.live = True
-        """Whether the controller sends and receives: it is neither down nor in bus-off."""
+        """True if the controller sends and receives: it is neither down nor in bus-off."""
         self.passive = False
         self.transmit = 0
         self.receive = 0

@@ -125,7 +125,7 @@ class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
     encoder: str = "encoder"
     """Topic of the movement in ticks since the message before."""
     period: float = 0.02
-    """Of `encoder`, time-triggered, s."""
+    """Period of `encoder`, time-triggered, s."""
     current: str = "current"
     """Topic of the motor's current in A."""
     current_period: float = 0.5

@@ -81,7 +81,7 @@ class FirmwareModule:
         self.flags = 0
         """The flags of its ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
         self.fault = ""
-        """Why it has failed; only `power_on` helps."""
+        """The reason why the module has failed; only `power_on` helps."""
         self.heap_free = 0
         """Bytes that are free for queues."""
         self.sent: Counter[str] = Counter()
@@ -110,7 +110,7 @@ class FirmwareModule:
 
     @property
     def halted(self) -> bool:
-        """Whether it has failed altogether, see `fault`. After a STOP in boot mode only its management hangs."""
+        """Return whether the module has failed, see `fault`. After a STOP in boot mode only its management hangs."""
         return bool(self.fault) and not self._management_hangs
 
     # Input

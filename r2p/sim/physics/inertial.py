@@ -27,7 +27,7 @@ class MemsSpec(msgspec.Struct, frozen=True, kw_only=True):
     rate: float
     """Samples per second, Hz."""
     density: float
-    """Of the noise, per root of Hz."""
+    """Noise density, per root of Hz."""
     bias: float
     """One sigma from device to device."""
 
@@ -53,7 +53,7 @@ class MemsSensor:
     def __init__(self, spec: MemsSpec, noise: random.Random) -> None:
         self.spec = spec
         self.counts: Counts = (0, 0, 0)
-        """Its last sample."""
+        """The last sample, in counts."""
         self.samples = 0
         """The number of samples so far."""
         self._noise = noise
@@ -73,7 +73,7 @@ class MemsSensor:
 
     @property
     def values(self) -> Vector:
-        """Its last sample, in the unit of the data sheet."""
+        """The last sample, in the unit of the data sheet."""
         x, y, z = self.counts
         return x * self.spec.resolution, y * self.spec.resolution, z * self.spec.resolution
 
@@ -100,7 +100,7 @@ class ComplementaryFilter:
         """`gain` (1/s): how fast gravity and field win; `bias_gain` (1/s^2): how fast the bias is learnt."""
         self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self.bias: Vector = (0.0, 0.0, 0.0)
-        """Of the gyroscope, rad/s."""
+        """Bias of the gyroscope, rad/s."""
         self._gain = gain
         self._bias_gain = bias_gain
 

@@ -19,9 +19,9 @@ class MotorSpec(msgspec.Struct, frozen=True, kw_only=True):
     """Data sheet of a motor with gear and encoder. Default: 70 W, 14:1, 2000 ticks/turn (thesis 8.1.1)."""
 
     voltage: float = 24.0
-    """Of the supply, V."""
+    """Voltage of the supply, V."""
     resistance: float = 1.11
-    """Of the winding, ohm."""
+    """Resistance of the winding, ohm."""
     torque_constant: float = 36.4
     """mNm/A; also the constant of the back EMF in mV s/rad."""
     rotor_inertia: float = 67.7
@@ -29,7 +29,7 @@ class MotorSpec(msgspec.Struct, frozen=True, kw_only=True):
     gear: float = 14.0
     """Turns of the motor per turn of the wheel."""
     ticks_per_turn: int = 2000
-    """Of the encoder, on the motor's shaft."""
+    """Resolution of the encoder, on the motor's shaft."""
     friction: float = 60.0
     """Dry friction of motor, gear and bearings, at the wheel, mNm."""
     damping: float = 0.5
@@ -72,9 +72,9 @@ class Motor:
         self.current = 0.0
         """A, of the last `torque()`."""
         self.angle = 0.0
-        """Of the wheel, rad."""
+        """Angle of the wheel, rad."""
         self.speed = 0.0
-        """Of the wheel, rad/s."""
+        """Speed of the wheel, rad/s."""
         self._constant = spec.constant
         self._ticks_per_radian = spec.ticks_per_radian
         self._dry, self._damping = spec.friction * 1e-3, spec.damping * 1e-3

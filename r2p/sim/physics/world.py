@@ -76,11 +76,11 @@ class RangeSpec(msgspec.Struct, frozen=True, kw_only=True):
     longest: float = 800.0
     """mm."""
     scale: float = 339.0
-    """Of the curve `scale / (distance + offset)`, V mm."""
+    """Scale of the curve `scale / (distance + offset)`, V mm."""
     offset: float = 47.0
     """mm."""
     noise: float = 3.0
-    """Of the voltage, one sigma, mV."""
+    """Noise of the voltage, one sigma, mV."""
 
     def voltage(self, distance: float) -> float:
         """Return the output (V) at a distance (mm); below the shortest distance it falls to 0 again."""
@@ -119,7 +119,7 @@ class OmniSpec(msgspec.Struct, frozen=True, kw_only=True):
     arm: float = 0.20
     """From the centre to each wheel, m."""
     radius: float = 0.22
-    """Of the outline, m."""
+    """Radius of the outline, m."""
     mass: float = 20.0
     """kg."""
     inertia: float = 0.4
@@ -155,9 +155,9 @@ class OmniBody:
         self.spec = spec
         self.motors = tuple(motors)
         self.x = self.y = self.w = 0.0
-        """True pose: m, m, rad (not wrapped)."""
+        """Pose without errors: m, m, rad (not wrapped)."""
         self.velocity: Triple = (0.0, 0.0, 0.0)
-        """True, in its own frame."""
+        """Velocity without errors, in the robot's frame."""
         self.path = 0.0
         """Length of the path so far, m."""
         self._wear = [noise.gauss(1.0, spec.wear / 100) for _ in range(3)]

@@ -125,7 +125,7 @@ class Triskar2:
             "PS": (self._power_supply, {"battery": triskar2.battery_monitor}),
             "GW": (self._gateway, {}),
         }
-        """How to make each module, and the robot's nodes on it, as in the thesis (figure 8.3)."""
+        """A factory for each module, and the robot's nodes on it, as in the thesis (figure 8.3)."""
         self._names = list(MODULES if modules is None else modules)
         for name in self._names:
             _check_name(name)

@@ -26,16 +26,16 @@ from r2p.sim.physics.world import OmniSpec
 
 M = TypeVar("M", bound=r2p.Message)
 Traffic = Literal["hrt", "srt", "nrt"]
-"""How messages of the chain are sent: hard real-time (`Periodic`), soft real-time (`Sporadic`), non real-time."""
+"""The class of the chain's messages: hard real-time (`Periodic`), soft real-time (`Sporadic`), non real-time."""
 
 BODY = OmniSpec()
 MOTOR = MotorSpec()
 BATTERY = BatterySpec()
 
 PERIOD = 0.02
-"""Of speeds and encoders, s; of the whole command chain where all of it is hard real-time."""
+"""Period of speeds and encoders, s; of the whole command chain if all of it is hard real-time."""
 COMMANDS = 0.05
-"""Of velocity commands, s."""
+"""Period of velocity commands, s."""
 FRESH = 0.15
 """Seconds for which a message of the chain is used."""
 TIMEOUT = 0.2
@@ -50,7 +50,7 @@ BEARINGS = (67.5, 22.5, -22.5, -67.5)
 REST = 0.5
 """Seconds that a robot rests at each corner of the square."""
 DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
-"""Of the sides of the square, in the robot's frame."""
+"""Directions of the square's sides, in the robot's frame."""
 
 _DEADLINE = 0.05  # s, of soft real-time messages
 _STOP = 0.15  # m: closer than this a sensor's reading always stops the robot

@@ -1,4 +1,4 @@
-"""What the topic commands share: arguments with completion, and waiting for messages, publishers and subscribers.
+"""Code of all topic commands: arguments with completion, and waiting for messages, publishers and subscribers.
 
 A command reports what it waits for, and suggests other topics where the name may be wrong.
 """

@@ -1,4 +1,4 @@
-"""What the kernel has for CAN: interfaces with their state, and when it changes, by rtnetlink. Read-only.
+"""The kernel's CAN interfaces, their state and its changes, by rtnetlink. Read-only.
 
 This file can be imported on any system, other than `socketcan`: `r2p doctor` needs it everywhere.
 """
@@ -55,7 +55,7 @@ class Interface(msgspec.Struct, frozen=True):
 
     @property
     def one_shot(self) -> bool:
-        """Whether the controller tries each frame once, instead of again after a lost arbitration or an error."""
+        """Return whether the controller tries each frame once, not again after a lost arbitration or an error."""
         return "one-shot" in self.modes
 
     @property
@@ -198,7 +198,7 @@ class InterfaceWatch:
 
 
 def has_socketcan() -> bool:
-    """Whether this kernel has CAN sockets."""
+    """Return whether this kernel has CAN sockets."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (AttributeError, OSError):

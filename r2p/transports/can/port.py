@@ -72,14 +72,14 @@ class CanPort(abc.ABC):
     """One CAN interface."""
 
     one_shot: bool = False
-    """Whether a frame that loses arbitration comes back (LOST), to be tried again with a fresh laxity."""
+    """True if a frame that loses arbitration comes back (LOST), to be tried again with a fresh laxity."""
     transmit_latency: int = 0
     """Ns from the hand-over of a frame to its start, typically. Frames are handed over that much before their instant.
     """
     receive_latency: int = 0
     """Ns from the end of a frame to its stamp, typically."""
     coarse: bool = False
-    """Whether it can't hit an instant to a few us. Then what is not hard real-time gets runs of free slots."""
+    """True if the port can't hit an instant to a few us. Then all but hard real-time gets runs of free slots."""
 
     def __init__(self, name: str) -> None:
         self.name = name

@@ -1,4 +1,4 @@
-"""Which message ids to receive on an RTCAN bus, and whose they are.
+"""The message ids to receive on an RTCAN bus, and the topics behind them.
 
 A publisher is known by its 16-bit message id, which it announces. The low byte is the sender's id8, by which discovery
 knows its module. Modules of 2014 send management with one id for all of them, so they share one address.

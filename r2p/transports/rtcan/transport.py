@@ -59,7 +59,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def holds_slots_on_coarse_port(self) -> bool:
-        """Whether the slots are so long that a port which can't hit an instant exactly stays inside of them."""
+        """Return whether the slots are long enough for a port that can't hit an instant exactly."""
         return self.timing.slot >= _SLOT_MIN_COARSE
 
     @property

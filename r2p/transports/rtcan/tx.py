@@ -134,7 +134,7 @@ class SlottedTopics:
             self._release(each)
 
     def undecided(self, topic: Topic) -> bool:
-        """Whether a topic wants slots, and may still get some."""
+        """Return whether a topic wants slots, and may still get some."""
         if not any(isinstance(each, SlotPublisher) for each in topic.publishers):
             return False
         slotted = self.by_topic.get(topic.name)
@@ -242,16 +242,16 @@ class Transmitter:
 
     @property
     def pending(self) -> bool:
-        """Whether any sample is in the engine."""
+        """Return whether any sample is in the engine."""
         return bool(self._frames or self._messages)
 
     @property
     def full(self) -> bool:
-        """Whether there is no room for messages that do not expire."""
+        """Return whether there is no room for messages that do not expire."""
         return self._frames >= NRT_FRAMES_MAX
 
     def has_room_for(self, sample: Sample) -> bool:
-        """Whether there is room for this sample."""
+        """Return whether there is room for this sample."""
         return self._frames < NRT_FRAMES_MAX if sample.publisher_class == _NRT else self._messages < SRT_MESSAGES_MAX
 
     def send(self, subscriber: LinkSubscriber | None, topic: str, high: int, sample: Sample) -> Sequence[Action]:
@@ -289,7 +289,7 @@ class Transmitter:
         return self._engine.manage(self._driver.now(), data, urgent=urgent, handle=handle)
 
     def waits_for_response(self, topic: str) -> bool:
-        """Whether a topic has to wait until the last response is on the bus.
+        """Return whether a topic has to wait until the last response is on the bus.
 
         A message with little laxity would overtake the response, and its subscriber does not know the id before.
         """

@@ -1,4 +1,4 @@
-"""What a `zenoh:` URL says, and zenoh's configuration for it.
+"""The options of a `zenoh:` URL, and zenoh's configuration for them.
 
 The configuration is what r2p needs, then what the user's file says, then what the URL says. So a file can change what
 r2p prefers, and the URL has the last word.
@@ -41,7 +41,7 @@ class ZenohOptions(msgspec.Struct, frozen=True):
     listen: str | None = None
     scouting: bool | None = None
     batching: bool = True
-    """Whether several messages may share a payload."""
+    """True if several messages may share a payload."""
     config: Path | None = None
 
     def error(self, text: str) -> TransportError:
@@ -102,7 +102,7 @@ def list_networks(networks: list[str]) -> str:
 
 
 def is_network_name(text: str) -> bool:
-    """Whether a network can have this name; keys of other programs may hold anything in its place."""
+    """Return whether a network can have this name; keys of other programs may hold anything in its place."""
     return _NETWORK.fullmatch(text) is not None
 
 
@@ -171,7 +171,7 @@ _NEEDED: dict[str, object] = {
 }
 
 _DEFAULT_LISTEN = ["tcp/[::]:7447"]
-"""Where the first peer on a computer listens, so that clients find it without a router."""
+"""The endpoint at which a computer's first peer listens, so that clients find it without a router."""
 
 _ANY_PORT: dict[str, object] = {  # for the other peers on the computer; without IPv6 not even this one listens
     "listen/endpoints": ["tcp/[::]:0"],
@@ -278,7 +278,7 @@ def _from_url(options: ZenohOptions) -> dict[str, object]:
 
 
 def _may_choose(options: ZenohOptions) -> bool:
-    """Whether this module chooses where to listen."""
+    """Return whether this module chooses where to listen."""
     return options.listen is None and options.mode == "peer" and options.config is None
 
 

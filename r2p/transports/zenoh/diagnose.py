@@ -33,7 +33,7 @@ class Tls(msgspec.Struct, frozen=True):
 
 
 class ConnectionSettings(msgspec.Struct, frozen=True):
-    """What a session connects to, and with what; and where it listens."""
+    """The endpoints that a session connects to and listens at, and its credentials."""
 
     endpoints: list[str]
     tls: Tls = Tls()

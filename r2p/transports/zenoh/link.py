@@ -294,7 +294,7 @@ class TokenDebouncer:
         self._early: dict[str, None] = {}
         self._going: dict[str, asyncio.TimerHandle] = {}
         self._went: set[str] | None = None
-        """What went since a query began: the answers about these may be older than their end. None without a query."""
+        """Tokens that ended since a query began: answers about them may be older than that. None without a query."""
 
     def on_change(self, key: str, there: bool) -> None:
         """Note that a token came or went."""

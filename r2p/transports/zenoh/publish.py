@@ -52,10 +52,10 @@ class TxStream:
     def __init__(self, window: SendWindow, *, urgent: bool) -> None:
         self.window = window
         self.urgent = urgent
-        """Whether messages never wait, not even for the end of the turn."""
+        """True if messages never wait, not even for the end of the loop's turn."""
         self.source: Source | None = None
         self.samples: list[Sample] = []
-        """Those that wait. Each already has its serial in the window: the last one here has the window's last."""
+        """Waiting samples. Each already has its serial in the window: the last one here has the window's last."""
         self._packer = _NO_PACKER
         self._put: Put = put_nowhere
 
@@ -214,7 +214,7 @@ class PublisherCache:
                 self._session.undeclare_publisher(publisher)
 
     def reaches(self, topic: str) -> bool:
-        """Whether zenoh knows a subscriber that messages of the topic reach. False while zenoh has yet to answer."""
+        """Return whether zenoh knows a subscriber that messages of the topic reach; False until zenoh answers."""
         publishers = [publisher for (name, _), publisher in self._publishers.items() if name == topic]
         if not publishers or self._session is None:
             return False

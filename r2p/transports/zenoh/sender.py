@@ -1,4 +1,4 @@
-"""What goes out by a link: to which subscribers in other modules, as far as their credit goes, and what they got.
+"""Send to subscribers in other modules as far as their credit goes, and track what they got.
 
     SubscriberJoined -> Reachability (do messages arrive there?) -> ZenohSubscriber -> TxStream
     credit           -> CreditReader -> ZenohSubscriber, whose waiting publishers go on
@@ -58,9 +58,9 @@ class ZenohSubscriber(LinkSubscriber):
             for each in PublisherClass
         }
         self.resending = False
-        """Whether latched values are being sent to a new subscriber, even if others have no room."""
+        """True if latched values are being sent to a new subscriber, even if others have no room."""
         self.silent_checks: Counter[int] = Counter()
-        """How often each session was found to have acknowledged nothing."""
+        """Checks in a row in which a session had acknowledged nothing."""
 
     # As a sink
 
@@ -82,7 +82,7 @@ class ZenohSubscriber(LinkSubscriber):
         return True
 
     def _has_credit(self, stream: TxStream) -> bool:
-        """Whether the subscribers have room, as far as their credit says; it is read now, if need be."""
+        """Return whether the subscribers have room, as far as their credit says; it is read now, if need be."""
         window = stream.window
         if window.serial < window.limit:
             return True
@@ -112,7 +112,7 @@ class ZenohSubscriber(LinkSubscriber):
     # For the sender
 
     def has_session(self, session: int) -> bool:
-        """Whether a session subscribes."""
+        """Return whether a session subscribes."""
         return session in self._streams[_NRT].window.subscribers
 
     def add_session(self, session: int, window: int) -> None:
@@ -150,7 +150,7 @@ class ZenohSubscriber(LinkSubscriber):
 
     @property
     def awaits_credit(self) -> bool:
-        """Whether a publisher waits, or went on without a session that may grant credit again."""
+        """Return whether a publisher waits, or went on without a session that may grant credit again."""
         return bool(self.wait_queue) or not all(
             each.waited_for for each in self._streams[_NRT].window.subscribers.values()
         )
@@ -181,7 +181,7 @@ class ZenohSender:
         self.reachability = Reachability(self)
         self.final_credits = FinalCredits(self)
         self.topics = hub.space.topics
-        """Those that this module has anything to do with."""
+        """Topics that this module publishes, subscribes to or forwards."""
         self._hub = hub
         self._subscribers = subscribers
         self._prefix = ""
@@ -371,7 +371,7 @@ class _PendingSubscriber(msgspec.Struct, eq=False):
 
 
 class Reachability:
-    """Whether messages reach the subscribers: checked before they are sent to, and after.
+    """Check that messages reach the subscribers: before sending to them, and after.
 
     Tokens and routes for messages spread through the network at different times, and a router's access control may let
     pass the one and not the other.

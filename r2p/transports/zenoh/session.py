@@ -45,7 +45,7 @@ _PRIORITIES: dict[PublisherClass, zenoh.Priority] = {
 
 
 class Unreachable(Exception):
-    """There is nothing to connect to, for now."""
+    """Raised while there is nothing to connect to."""
 
 
 class LoopQueue:

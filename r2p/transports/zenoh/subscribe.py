@@ -42,7 +42,7 @@ _RESUME_S = 10.0  # seconds after a link came up in which its topics are subscri
 _NRT = PublisherClass.NON_REAL_TIME
 
 ReceiveWindows = dict[tuple[int, PublisherClass], ReceiveWindow]
-"""How far each session has come in each class."""
+"""The progress of each session in each class."""
 
 
 class RemotePublisher(msgspec.Struct, eq=False):
@@ -287,7 +287,7 @@ class RxStream:
         self._stats.lost.guard(send, self.topic.name, origin.sender, origin.publisher_class, serial)
 
     def _is_new(self, publisher: RemotePublisher, serial: int, sample: Sample) -> bool:
-        """Whether it is a new message of the right type; all else is counted here."""
+        """Return whether the sample is a new message of the right type; all else is counted here."""
         size, sequence, stamp = len(sample.data), sample.sequence, sample.stamp
         window = publisher.window
         if size != publisher.last_size and not self._size_fits(publisher, size):
@@ -311,7 +311,7 @@ class RxStream:
         return True
 
     def _size_fits(self, publisher: RemotePublisher, size: int) -> bool:
-        """Whether a publisher's messages may have this many bytes; those that may not are counted."""
+        """Return whether a publisher's messages may have this many bytes; those that may not are counted."""
         if not publisher.type_fits:
             self._stats.lost["wrong type"] += 1
         elif size != publisher.size and (publisher.size >= 0 or not 0 < size <= self._receiver.link.max_payload):

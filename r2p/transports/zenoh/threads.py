@@ -90,12 +90,12 @@ class OutboundThread:
 
     @property
     def uses_thread(self) -> bool:
-        """Whether the thread makes the calls now; also the last ones that wait, to keep their order."""
+        """Return whether the thread makes the calls now; also the last ones that wait, to keep their order."""
         return self._many_tokens or self._submitted != self._done
 
     @property
     def full(self) -> bool:
-        """Whether too many calls wait already to add what can be sent later, or not at all."""
+        """Return whether too many calls wait already to add what can be sent later, or not at all."""
         return self.pending_calls >= PENDING_MAX
 
     def call(self, function: Callable[[], object]) -> None:

@@ -36,7 +36,7 @@ _ALONE_TOOL_S = 0.3  # the same for a tool, whose user waits
 _ALONE_MAX_S = 60.0  # and at most
 
 _RESTRICT = "zenoh:?listen=tcp/127.0.0.1:7447 restricts it to this one, docs/how-to/zenoh.md has TLS and passwords"
-"""What to do about a port that is open to all."""
+"""Advice about a port that is open to all."""
 
 
 class ZenohTransport(Transport):
@@ -160,7 +160,7 @@ class ZenohTransport(Transport):
 
 
 def _has_peers(link: "ZenohLink") -> bool:
-    """Whether there are modules besides tools."""
+    """Return whether the link has other modules than tools."""
     known = link.discovery
     publish = any(topic.advertised_at is not None for topic in known.topics.values())
     return publish or any(not module.observer for module in known.modules.values())
