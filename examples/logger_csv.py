@@ -30,7 +30,7 @@ async def imu_csv(node: r2p.Node) -> None:
 
 
 async def imu_demo(node: r2p.Node) -> None:
-    """Something to log where there is no robot."""
+    """Publish something to log without a robot."""
     imu = node.advertise("imu_raw", IMURaw9)
     async for _ in node.every(0.01):
         await imu.publish(IMURaw9(acc_z=1000, gyro_x=imu.sent % 100))

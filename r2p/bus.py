@@ -1,4 +1,4 @@
-"""A listener on an RTCAN bus: every frame described, the true load, the use of the slots. It never sends anything.
+"""A listener on an RTCAN bus: describes every frame, the true load, the use of the slots. It never sends.
 
     from r2p.bus import BusMonitor
 
@@ -6,9 +6,9 @@
         async for seen in bus:
             print(seen.kind.value, seen.topic, seen.frame.data.hex())
 
-`Calendar` is the one that the master uses: here it plans reservations without a bus.
+`Calendar` is the master's: here it plans reservations without a bus.
 
-The port is the one that a module would use, with a `Monitor` behind it in place of an engine.
+The port is that of a module, with a `Monitor` in place of an engine.
 """
 
 import asyncio
@@ -45,9 +45,9 @@ __all__ = [
 ]
 
 QUEUE_MAX = 8192
-"""Frames that wait for an iteration at most: a second of a saturated bus. Then the oldest are dropped and counted."""
+"""Unread frames at most: a second of a saturated bus. Then the oldest are dropped and counted."""
 
-# After a period, frames of it may still have to be read. These decide when there are none left.
+# After a period, frames of it may still be unread. These decide when none are left.
 _CHECK_INTERVAL = 10_000_000  # ns
 _QUIET_CHECKS = 4  # checks in a row without a new frame
 _STALLED = 40_000_000  # ns by which a check is late when the process stood still: what came meanwhile is not read yet
@@ -66,7 +66,7 @@ class BusMonitor:
         self.since = 0
         """The instant when the bus was opened."""
         self.lost = 0
-        """Frames that were dropped as an iteration was too slow."""
+        """Frames dropped because an iteration was too slow."""
         self._port = None if isinstance(via, str) else via
         self._report = on_status or (lambda _text: None)
         self._queues: list[deque[SeenFrame]] = []  # one for each iteration, while it lasts
@@ -78,11 +78,11 @@ class BusMonitor:
     async def __aenter__(self) -> Self:
         """Open the bus. Raises TransportError for a URL that can't work, and Error if it was open before.
 
-        An interface that is down is waited for.
+        Wait for an interface that is down.
         """
         if self._running is not None:
             raise Error(f"the monitor of {self.via} was opened before: make a new one")
-        # Not at the top: `Calendar` is used without a bus, and the transport takes its time to load.
+        # Not at the top: `Calendar` works without a bus, and the transport takes long to load.
         from r2p.transports.rtcan.transport import RtcanOptions, from_url
 
         if self._port is None:
@@ -130,7 +130,7 @@ class BusMonitor:
         return Closed(f"the monitor of {self.via} is not open: use it in an `async with` block")
 
     def _opened_monitor(self) -> Monitor:
-        """The monitor, also after the bus was closed: it keeps its results. Raises Closed before it was opened."""
+        """Return the monitor, which keeps its results after the bus was closed. Raises Closed before it was opened."""
         if self._running is None:
             raise self._closed()
         return self._monitor
@@ -143,7 +143,7 @@ class BusMonitor:
 
     @property
     def timing(self) -> Timing:
-        """The slots of the cycle: those that the master announces, else those of the URL."""
+        """The slots of the cycle, as the master announces them, else those of the URL."""
         return self._opened_monitor().directory.timing
 
     @property
@@ -153,7 +153,7 @@ class BusMonitor:
 
     @property
     def slot_cycles(self) -> int:
-        """The number of whole cycles that `slots` is about."""
+        """The number of whole cycles in `slots`."""
         return self._opened_monitor().cycles
 
     async def __aiter__(self) -> AsyncIterator[SeenFrame]:
@@ -171,10 +171,10 @@ class BusMonitor:
             self._queues = [each for each in self._queues if each is not queue]
 
     async def loads(self, period: float) -> AsyncIterator[BusLoad]:
-        """Iterate over what the bus carried in each `period` (seconds).
+        """Iterate over the load of the bus in each `period` (seconds).
 
-        Periods are those of the frames' stamps, so the loads are right even when this program is late. Raises
-        MessageError for what is not a number of seconds, and Closed outside of the `async with` block.
+        Periods follow the frames' stamps, so the loads are right even when this program is late. Raises MessageError
+        unless `period` is a number of seconds, and Closed outside of the `async with` block.
         """
         check_seconds("the period of loads", period, least=SHORTEST)
         self._check()
@@ -188,7 +188,7 @@ class BusMonitor:
             yield self._monitor.next_load()
 
     async def _read_until(self, end: int) -> None:
-        """Wait until all frames are read that were on the bus before `end`."""
+        """Wait until all frames that were on the bus before `end` are read."""
         if (left := end - self._now()) > 0:
             await self._sleep(left)
         quiet = 0
@@ -198,7 +198,7 @@ class BusMonitor:
             quiet = quiet + 1 if self._monitor.last_frame == last and before >= end and late < _STALLED else 0
 
     async def _sleep(self, duration: int) -> int:
-        """Sleep for so many ns. Returns by how many ns it woke up late."""
+        """Sleep for so many ns. Return how many ns too late the wake-up was."""
         due = self._now() + duration
         await asyncio.sleep(duration / SECOND)
         late = self._now() - due
@@ -207,9 +207,9 @@ class BusMonitor:
         return late
 
     async def cycles(self, count: int, timeout: float) -> bool:
-        """Watch so many whole cycles. False if there was no sync for `timeout` seconds.
+        """Watch so many whole cycles. Return False if there was no sync for `timeout` seconds.
 
-        Raises MessageError for what is not a number of seconds, and Closed outside of the `async with` block.
+        Raises MessageError unless `timeout` is a number of seconds, and Closed outside of the `async with` block.
         """
         check_seconds("the timeout of cycles", timeout, least=0.0)
         self._check()
@@ -224,7 +224,7 @@ class BusMonitor:
             self._check()
         return True
 
-    # What the port calls (`CanPortListener`)
+    # Called by the port (`CanPortListener`)
 
     def on_frame(self, frame: Frame, stamp: int) -> None:
         self._saw(self._monitor.frame(frame, stamp))

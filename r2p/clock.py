@@ -4,8 +4,8 @@ An event loop may bring its own clock and its own random numbers, as `loop.clock
 `random_of` ask it, and fall back to the computer's. So the same code runs live and under virtual time. All instants are
 integer nanoseconds; durations in programs are numbers of seconds, and texts such as "10ms" in URLs and options.
 
-`Alarm` is one timer that can be moved, for what drives a protocol. `Ticker` is a period that never drifts, and
-`ExactAlarm` an alarm that is exact: on Linux both use a timerfd, because event loops count in milliseconds.
+`Alarm` is one timer that can be moved, for drivers of protocols. `Ticker` is a period that never drifts, and
+`ExactAlarm` an exact alarm: on Linux both use a timerfd, because event loops count in milliseconds.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class SystemClock:
     """The computer's clock. When UTC is set back, `now()` goes on at half speed until UTC has caught up with it.
 
     Stamps must not repeat or run backwards: deadlines and the order of messages depend on them. Catching up takes twice
-    as long as UTC was set back by, and the log says so. Meanwhile `now()` is ahead of other computers' clocks.
+    the time by which UTC was set back, and the log says so. Meanwhile `now()` is ahead of other computers' clocks.
     """
 
     virtual = False
@@ -99,7 +99,7 @@ class SystemClock:
 def _warn_set_back(ahead: int) -> None:
     logger.warning(
         "the computer's clock was set back by %.1f s: r2p's goes on at half speed for %.0f s, until both agree again; "
-        "meanwhile what other computers stamp looks too old here (max_age= drops and counts it)",
+        "meanwhile stamps of other computers look too old here (max_age= drops and counts their messages)",
         ahead / SECOND,
         2 * ahead / SECOND,
     )
@@ -110,13 +110,13 @@ _RANDOM: Final = random.Random()
 
 
 def clock_of(loop: asyncio.AbstractEventLoop | None = None) -> Clock:
-    """The clock of a loop (default: the running one): its attribute `clock`, or else the computer's."""
+    """Return the clock of a loop (default: the running one): its attribute `clock`, or else the computer's."""
     clock: Clock = getattr(loop or _running(), "clock", _SYSTEM)
     return clock
 
 
 def random_of(loop: asyncio.AbstractEventLoop | None = None) -> random.Random:
-    """The random numbers of a loop (default: the running one): its attribute `random`, or else freely seeded ones."""
+    """Return the random numbers of a loop (default: the running one): its `random`, or else freely seeded ones."""
     numbers: random.Random = getattr(loop or _running(), "random", _RANDOM)
     return numbers
 
@@ -132,7 +132,7 @@ def _running() -> asyncio.AbstractEventLoop | None:
 
 
 def in_background(timer: asyncio.TimerHandle, background: bool | Callable[[], bool] = True) -> None:
-    """Mark a timer that only repeats itself, always or while a function says so: it keeps no virtual time going."""
+    """Mark a timer that only repeats itself, always or while a function is true: it keeps no virtual time going."""
     if hasattr(timer, "background"):
         timer.background = background
 
@@ -142,7 +142,7 @@ class Alarm:
 
     The call comes up to about a millisecond late on a real loop, and at the very nanosecond under virtual time.
 
-    `background` is for what only repeats itself, such as announcements: under virtual time it keeps no program going.
+    `background` is for timers that only repeat, such as announcements: under virtual time they keep no program going.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class Alarm:
         self._armed: int | None = None  # when the loop calls; earlier than the deadline, if that was put off
 
     def set(self, deadline: int | None) -> None:
-        """Move to this instant of `Clock.monotonic()` in ns; one in the past is as soon as possible, None is off."""
+        """Move the alarm to this instant of `Clock.monotonic()` in ns; the past means as soon as possible, None off."""
         self._deadline = deadline
         if self._armed is not None:
             if deadline is not None and self._armed <= deadline:
@@ -171,7 +171,7 @@ class Alarm:
             self._arm(deadline, max(0, deadline - self._clock.monotonic()))
 
     def close(self) -> None:
-        """Switch it off."""
+        """Switch the alarm off."""
         self.set(None)
 
     def _arm(self, deadline: int, delay: int) -> None:
@@ -200,7 +200,7 @@ class Alarm:
 
 
 class ExactAlarm(Alarm):
-    """An alarm that comes some ten microseconds late where the system has timerfds. Has to be closed.
+    """An alarm that is some ten microseconds late where the system has timerfds. Close it after use.
 
     With a `period` (ns) a timerfd goes off again by itself: `repeats`. That costs a quarter less than to set it anew.
     """
@@ -267,8 +267,8 @@ class Ticker:
     """A period on absolute phase: tick k is due at start + k * period of the monotonic clock.
 
     `callback(scheduled, late, skipped)` gets the instant at which the tick was due, by how much it is late (both ns),
-    and how many ticks before it were lost because the loop was blocked: those are not made up for. An exception that it
-    raises goes to the loop's exception handler, and the ticker goes on.
+    and how many ticks before it were lost because the loop was blocked: those are not made up for. An exception of the
+    callback goes to the loop's exception handler, and the ticker goes on.
     """
 
     def __init__(
@@ -290,14 +290,14 @@ class Ticker:
         self._next = 1
 
     def start(self) -> None:
-        """Start, or start anew: the first tick is due one period from now."""
+        """Start, or restart: the first tick is due one period from now."""
         self.close()
         self._start = self._clock.monotonic()
         self._next = 1
         self._alarm.set(self._start + self._period)
 
     def close(self) -> None:
-        """Stop: no callback comes after this."""
+        """Stop the ticks; there are no more calls of the callback."""
         self._alarm.close()
 
     def _tick(self) -> None:
@@ -323,7 +323,7 @@ else:
 
     @functools.cache
     def _ctypes() -> tuple[Any, Any]:
-        """The module, imported at the first use, and the C library."""
+        """Return `ctypes`, imported at the first use, and the C library."""
         import ctypes
 
         return ctypes, ctypes.CDLL(None, use_errno=True)
@@ -345,7 +345,7 @@ else:
 
 
 def duration(text: str) -> float:
-    """Seconds from "10ms", "20us", "1.5s" or "1.5". Raises ValueError for any other text."""
+    """Return the seconds of "10ms", "20us", "1.5s" or "1.5". Raises ValueError for any other text."""
     match = re.fullmatch(r"([0-9.eE+-]+)\s*(ns|us|ms|s|)", text.strip())
     if match is None:
         raise ValueError(f"{text!r} is not a duration: use 10ms, 20us or seconds")
@@ -356,13 +356,13 @@ def duration(text: str) -> float:
 
 
 def check_seconds(what: str, value: object, *, least: float) -> None:
-    """Raise MessageError for what is not a duration of `least` seconds or more that a clock can count."""
+    """Raise MessageError unless the value is a duration of at least `least` seconds that a clock can count."""
     if not _is_number(value) or not least <= value <= LONGEST:
         raise MessageError(f"{what} is in seconds, {least:g} to {LONGEST:g}, not {value!r}{_hint(value)}")
 
 
 def check_timeout(what: str, value: object) -> None:
-    """Raise MessageError for what is neither None (for ever) nor a number of seconds; 0 or less is over at once."""
+    """Raise MessageError unless the value is None (for ever) or a number of seconds; 0 or less is over at once."""
     if value is not None and (not _is_number(value) or not value <= LONGEST):
         raise MessageError(f"{what} is in seconds, or None to wait for ever, not {value!r}{_hint(value)}")
 
@@ -372,7 +372,7 @@ def _is_number(value: object) -> TypeGuard[float]:
 
 
 def _hint(value: object) -> str:
-    """A remedy for a text such as URLs have: the number of seconds."""
+    """Return a remedy for a text as in URLs: the number of seconds."""
     try:
         return f": write {duration(value):g}" if isinstance(value, str) else ""
     except ValueError:
@@ -382,7 +382,7 @@ def _hint(value: object) -> str:
 class Backoff:
     """Delays between tries, from `first` to `longest` seconds, doubling.
 
-    Each is shortened by up to a half at random: what failed together is not tried again together.
+    Each is shortened by up to a half at random, so that simultaneous failures are not retried at the same time.
     """
 
     def __init__(self, rng: random.Random, *, first: float = 0.1, longest: float = 2.0) -> None:

@@ -1,4 +1,4 @@
-"""Every exception that r2p raises, and what each of them means.
+"""Every exception that r2p raises, and its meaning.
 
     Error
     ├── InvalidName(ValueError)      a name with a character that the wire does not carry
@@ -9,7 +9,7 @@
     ├── TransportError               a transport that can't be made from its URL
     │   ├── Closed                   used after it was closed, or before it was opened
     │   └── Broken                   a transport that failed for good
-    ├── NodeCrashed(ExceptionGroup)  what the nodes of a module raised
+    ├── NodeCrashed(ExceptionGroup)  the exceptions of a module's nodes
     └── Deadlock                     virtual time with nothing left to wait for
 
 Bad bytes from a wire raise none of these: they are dropped, and counted in `link.stats`. Links that are down raise
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 
 class Error(Exception):
-    """The base class of all r2p exceptions; itself raised for calls that make no sense, as opening a module twice."""
+    """The base class of all r2p exceptions; raised itself for invalid calls, such as opening a module twice."""
 
 
 class InvalidName(Error, ValueError):
@@ -32,7 +32,7 @@ class NameTooLong(InvalidName):
 
 
 class MessageError(Error, ValueError):
-    """A message class without a fixed layout, a value that does not fit its field, or an option that makes no sense."""
+    """A message class without a fixed layout, a value that does not fit its field, or an invalid option."""
 
 
 class DecodeError(Error, ValueError):
@@ -45,7 +45,7 @@ class TypeMismatch(Error, TypeError):
 
 class TransportError(Error):
     """A transport that can't be made: its URL has an unknown scheme or option, its library is missing, its address is
-    refused; or, with `strict=True`, one that does not give what a publisher asks for.
+    refused; or, with `strict=True`, one that gives less than a publisher asks for.
     """
 
 
@@ -57,7 +57,7 @@ class Broken(TransportError):
     """A transport that failed for good: trying again can't help, and the module that uses it ends with this.
 
     The links of r2p never raise it: they report that they are down, and are tried again for ever. A transport of your
-    own raises it from `run` when what it works on is gone for good.
+    own raises it from `run` when its device or connection is gone for good.
     """
 
 
@@ -66,9 +66,9 @@ class NodeCrashed(Error, ExceptionGroup[Exception]):
 
     # Without the overload for BaseException: nodes raise Exceptions, so parts of this group hold nothing else.
     def derive(self, excs: Sequence[Exception]) -> "NodeCrashed":  # type: ignore[override]
-        """Keep the class for the parts that `except*` and `split` make."""
+        """Keep the class for the parts made by `except*` and `split`."""
         return NodeCrashed(self.message, excs)
 
 
 class Deadlock(Error):
-    """Virtual time can't go on: every task waits, and nothing is scheduled that could wake one."""
+    """Virtual time can't go on: every task waits, and no scheduled event could wake one."""

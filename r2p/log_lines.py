@@ -23,7 +23,7 @@ from r2p.units import SECOND
 
 
 def printable(text: str, allowed: str = "") -> str:
-    r"""The text with each character that shows nothing by itself as an escape: `\x1b`, `\n`, `\u202e`.
+    r"""Return the text with each character that shows nothing by itself as an escape: `\x1b`, `\n`, `\u202e`.
 
     Spaces stay, and so do the characters in `allowed`.
     """
@@ -51,7 +51,7 @@ _ESCAPE_ARGUMENTS = _EscapeArguments()
 
 
 def get_logger(name: str) -> logging.Logger:
-    """The logger of that name, for arguments that may come from outside: each record stays on its line."""
+    """Return the logger for arguments that may come from outside: each record stays on its line."""
     logger = logging.getLogger(name)
     logger.addFilter(_ESCAPE_ARGUMENTS)  # a second time it has no effect
     return logger
@@ -67,9 +67,9 @@ class LineLimit:
         """For each kind: the start of its period (ns), and how many lines there would have been since."""
 
     def suffix(self, kind: str, now: int, rate: int = 0) -> str | None:
-        """The text to append to one more line at `now` (monotonic ns); None if the line is left out.
+        """Return the text to append to one more line at `now` (monotonic ns); None if the line is left out.
 
-        `rate` is that of this kind, where it is not the same for all.
+        `rate` is the limit of this kind, if it differs from the others'.
         """
         rate = rate or self._rate
         lines = self._lines.get(kind)

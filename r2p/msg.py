@@ -76,14 +76,14 @@ class Speed3(Message):
 
 
 class QEI(Message):
-    """Movement of a quadrature encoder since the message before."""
+    """Movement of a quadrature encoder since the previous message."""
 
     delta: i16 = 0
     """Ticks."""
 
 
 class StampedQEI(Message):
-    """Movement of a quadrature encoder since the message before, with its time."""
+    """Movement of a quadrature encoder since the previous message, with its time."""
 
     timestamp: Timestamp = Timestamp()
     delta: i16 = 0
@@ -91,14 +91,14 @@ class StampedQEI(Message):
 
 
 class Encoder(Message):
-    """Movement of an encoder since the message before (topic `encoder`)."""
+    """Movement of an encoder since the previous message (topic `encoder`)."""
 
     delta: f32 = 0.0
     """In units of the node that publishes it."""
 
 
 class StampedEncoder(Message):
-    """Movement of an encoder since the message before, with its time (topic `encoder`)."""
+    """Movement of an encoder since the previous message, with its time (topic `encoder`)."""
 
     timestamp: Timestamp = Timestamp()
     delta: f32 = 0.0
@@ -106,7 +106,7 @@ class StampedEncoder(Message):
 
 
 class Encoder2(Message):
-    """Movement of the two wheels of a differential drive since the message before."""
+    """Movement of the two wheels of a differential drive since the previous message."""
 
     left_delta: f32 = 0.0
     """In units of the node that publishes it."""
@@ -162,7 +162,7 @@ class Tilt(Message):
 class IMURaw9(Message):
     """Unfiltered readings of accelerometer, gyroscope and magnetometer (topic `imu_raw`).
 
-    In counts of the sensors. What a count is depends on their full scale: at best 1 mg, 8.75 mdps and 0.9 mgauss
+    In counts of the sensors. The size of a count depends on their full scale: at best 1 mg, 8.75 mdps and 0.9 mgauss
     (thesis 7.4.1).
     """
 
@@ -292,7 +292,7 @@ class StampedGPS(Message):
 class Setpoint(Message):
     """The position or speed that a motor controller is to reach, as configured (topic `setpoint`, thesis 7.3.2).
 
-    The controller counts encoder ticks; how far a tick is, the kinematics know. 1 fragment.
+    The controller counts encoder ticks; the length of a tick is part of the kinematics. 1 fragment.
     """
 
     ticks: i32 = 0
@@ -348,19 +348,19 @@ class Log(Message):
 class GatewayStatus(Message):
     """The counters of a gateway, once a second (topic `gateway`). 12 CAN fragments.
 
-    There is one message for each link, where `topic` and `target` are empty, and one for each topic and pair of links
-    that it takes, where `state` is empty.
+    There is one message for each link, with `topic` and `target` empty, and one for each topic and pair of links on its
+    way, with `state` empty.
     """
 
     topic: Annotated[str, Len(16)] = ""
     source: Annotated[str, Len(24)] = ""
-    """The link that messages come from."""
+    """The link from which messages arrive."""
     target: Annotated[str, Len(24)] = ""
-    """The link that they go to."""
+    """The link to which they go."""
     state: Annotated[str, Len(12)] = ""
     """The state of a link: listening, alone, forwarding, blocked, converging, loop, down."""
     forwarded: u64 = 0
     """Messages since the gateway started."""
     dropped: u64 = 0
     rate: f32 = 0.0
-    """Messages a second, lately."""
+    """Messages in the last second."""

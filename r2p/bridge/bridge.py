@@ -44,7 +44,7 @@ _TEXTS = {
     PortState.BLOCKED: "is blocked: its network is joined to the others by {gateways}",
     PortState.CONVERGING: "is silent until it agrees with {gateways}",
     PortState.LISTENING: "listens for other gateways",
-    PortState.LOOP: "is blocked: what is sent on another link comes back here, through a gateway that is not r2p's",
+    PortState.LOOP: "is blocked: messages sent on another link come back here, through a gateway that is not r2p's",
     PortState.REFUSED: "no gateway may be there: nothing passes; listen with ?gateways=yes where gateways are to join",
 }
 

@@ -153,8 +153,8 @@ def _hints(cls: type[Message]) -> Iterator[tuple[str, Any]]:
         hints = get_type_hints(cls, include_extras=True)
     except (NameError, AttributeError, SyntaxError, TypeError) as error:
         raise MessageError(
-            f"{cls.__name__}: {error}: import what its annotations name at run time, not under TYPE_CHECKING; and "
-            "under `from __future__ import annotations` they can only name what its module holds, not a function"
+            f"{cls.__name__}: {error}: import the names in its annotations at run time, not under TYPE_CHECKING; "
+            "under `from __future__ import annotations` they must be names of its module, not of a function"
         ) from error
     for name, hint in hints.items():
         if name in cls.__struct_fields__:

@@ -1,7 +1,7 @@
 """The network as a module knows it: topics, nodes and modules, its own and those that its links have discovered.
 
 r2p modules announce all of it at once. Firmware announces its name and its topics, one of them each half second, and
-not the nodes that they belong to. The views have ages, which say how old the knowledge is.
+not the nodes that they belong to. The `age` of a view says how old the knowledge is.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ class TopicView(msgspec.Struct):
     `size` is in bytes (0: unknown), `fingerprint` that of its layout (None: unknown). `layout` is set only where this
     module uses the topic.
 
-    `publishers` and `subscribers` are those whose node is known; `published_on` and `subscribed_on` name all links
+    `publishers` and `subscribers` list endpoints whose node is known; `published_on` and `subscribed_on` name all links
     ("": this module) on which it is published and subscribed. `age` is in seconds since it was last announced.
     """
 
@@ -53,7 +53,7 @@ class TopicView(msgspec.Struct):
 
 
 class ModuleView(msgspec.Struct):
-    """A module. `state` is "running", "stopped", "boot" or "observer"; `age` is in s since it was heard (0: this one).
+    """A module. `state` is "running", "stopped", "boot" or "observer"; `age` is in s since its last message.
 
     `link` is empty for this module, `instance` is None for firmware. `wire` is the version of the wire formats that the
     module uses, `release` its version of r2p: None where it does not announce them, as firmware.
@@ -98,7 +98,7 @@ class NetworkView:
         return dict(sorted(views.items()))
 
     def nodes(self) -> dict[tuple[str, str], tuple[list[str], list[str]]]:
-        """(module, node) -> the topics that it publishes, and those that it subscribes to; in order."""
+        """Return the topics that each (module, node) publishes, and those that it subscribes to; in order."""
         table: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
         for view in self.topics().values():
             for index, endpoints in enumerate((view.publishers, view.subscribers)):
@@ -135,7 +135,7 @@ def _state(flags: int, *, observer: bool) -> str:
 
 
 def _add_own(view: TopicView, topic: Topic, module: str) -> None:
-    """Add what this module publishes and subscribes to."""
+    """Add the topics and nodes of this module."""
     view.age = 0.0
     view.layout = topic.layout
     if topic.layout is not None:
@@ -149,7 +149,7 @@ def _add_own(view: TopicView, topic: Topic, module: str) -> None:
 
 
 def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
-    """Add what the discovery of a link has found."""
+    """Add the topics and nodes that the discovery of a link has found."""
     for info in link.discovery.topics.values():
         view = views.setdefault(info.name, TopicView(info.name))
         view.size = view.size or info.size

@@ -1,7 +1,7 @@
-"""The links of one module: what transports attach them to, and what happens with what they report.
+"""The links of one module, and the handling of their reports.
 
-The `LinkManager` is the `Hub` that transports get. It keeps the module's links, informs all of them of what changes in
-the module, and passes what they find out on to the log, to the module's listeners, and to the bridge.
+The `LinkManager` is the `Hub` that transports get. It keeps the module's links, informs all of them of changes in the
+module, and passes their reports on to the log, to the module's listeners, and to the bridge.
 """
 
 import asyncio
@@ -47,15 +47,15 @@ _OTHER_VERSIONS_MAX = 64  # modules of another wire version that are reported, e
 _REFUSED_APART = 60 * SECOND  # ns between two lines about connections that one URL refuses, or that are refused
 
 _DENIED = {
-    DENIED_READ_ONLY: "it is read-only there",
+    DENIED_READ_ONLY: "the link there is read-only",
     DENIED_BOOT: "the module is in its boot loader, where a STOP hangs its management until its power is cut",
 }
 
 
 class _RefusedLink(msgspec.Struct, eq=False):
-    """A link whose connection the other end refused: each new try would look like a link that is up again.
+    """A link that the other end refused: otherwise each new try would look like a link that is up again.
 
-    It is down `since` then (monotonic ns), and `lost` messages found it down. The `timer` runs while it is connected.
+    The link is down `since` then (monotonic ns), and has lost `lost` messages. The `timer` runs while it is connected.
     """
 
     since: int | None = None
@@ -77,7 +77,7 @@ class LinkManager:
     ) -> None:
         self.space = space
         self.links: list[Link] = []
-        """Also those that are down."""
+        """All links, also those that are down."""
         self.random = random_of(space.loop)
         self.observer = observer
         self.instance = self.random.getrandbits(32)
@@ -93,9 +93,9 @@ class LinkManager:
         self._events = events
         self._on_command = on_command
         self._suspected: set[str] = set()
-        """Names that two modules may have."""
+        """Names that may belong to two modules."""
         self._commands: dict[tuple[Command, str], tuple[int, str]] = {}
-        """Commands that were sent, by the module's alias: when (monotonic ns), and its name."""
+        """Commands sent, by the module's alias: time (monotonic ns), and the module's name."""
         self._other_versions: set[str] = set()
         """Names of modules whose wire version was reported."""
         self._used_clients: set[Link] = set()
@@ -112,13 +112,13 @@ class LinkManager:
             self._bridging = MultihomedModule(space, self.instance, self.link_notice)
 
     def set_flags(self, flags: int) -> None:
-        """Announce another state of the module."""
+        """Announce a new state of the module."""
         self.flags = flags
         for link in self.links:
             link.set_flags(flags)
 
     def command(self, command: Command, module: str) -> None:
-        """Send a command to another module, by all links. Raises Error for one that would do harm."""
+        """Send a command to another module, by all links. Raises Error for a harmful one."""
         if command is Command.STOP and any(is_booting(link, module) for link in self.links):
             raise Error(
                 f"module {module} is in its boot loader, where a STOP hangs its management until its power is cut: "
@@ -129,7 +129,7 @@ class LinkManager:
             link.command(command, module)
 
     def close(self) -> None:
-        """End what bridges the links; transports detach these themselves."""
+        """Close the bridge; transports detach the links themselves."""
         self._bridging.close()
 
     def _topic_changed(self, topic: Topic) -> None:
@@ -216,7 +216,7 @@ class LinkManager:
                 self._events.emit(event)
             case EchoDetected():
                 logger.error(
-                    "link %s gives back what this module sends: switch off local echo at the other end", link.title
+                    "link %s returns this module's own messages: switch off local echo at the other end", link.title
                 )
             case ModuleChanged():
                 self._link_accepted(link)  # a module that refuses the connection announces nothing
@@ -271,7 +271,7 @@ class LinkManager:
         self._log_limited(link, logging.WARNING, "version", text)
 
     def _report_command_denied(self, link: Link, event: CommandDenied) -> None:
-        """Report that a gateway does not pass a command on, if it was this module's."""
+        """Report that a gateway does not pass on a command of this module."""
         at, name = self._commands.get((event.command, event.module), (-_DENIAL_EXPECTED, ""))
         if self.space.clock.monotonic() - at < _DENIAL_EXPECTED:
             what = f"{event.command.name} of {name}"
@@ -280,7 +280,7 @@ class LinkManager:
             self.link_notice(link, f"{event.command.name} denied", text, trouble=True)
 
     def _report_gone(self, link: Link, event: ModuleGone) -> None:
-        """Report that a module on the link itself is gone, while the link is up; without a good-bye it is trouble."""
+        """Report that a module on the link itself is gone, while the link is up; without a good-bye, as trouble."""
         info = event.info
         if link.up and not info.observer and not info.hops:
             silence = f": nothing heard of it for {info.lease / SECOND:.0f} s; does it hang?" if event.silent else ""
@@ -289,14 +289,14 @@ class LinkManager:
         self._events.emit(event)
 
     def _log_change(self, link: Link, level: int, kind: str, text: str) -> None:
-        """Log that a link went up or down; those of clients have one limit, as they may come and go by the thousand."""
+        """Log that a link went up or down; clients share one limit, as they may come and go by the thousand."""
         limited = link.transient and level > logging.DEBUG
         suffix = self._clients.suffix(kind, self.space.clock.monotonic()) if limited else ""
         if suffix is not None:
             logger.log(level, "link %s %s%s", link.title, text, suffix)
 
     def _log_limited(self, link: Link, level: int, kind: str, text: str, rate: int = 0) -> None:
-        """Log what the other end can make happen any number of times a second."""
+        """Log an event that the other end can cause any number of times a second."""
         suffix = self._limits[link].suffix(kind, self.space.clock.monotonic(), rate) if link in self._limits else ""
         if suffix is not None:
             logger.log(level, "link %s: %s%s", link.title, text, suffix)
@@ -325,7 +325,7 @@ class LinkManager:
             in_background(refused.timer)
 
     def _link_accepted(self, link: Link) -> None:
-        """Report that a link is up that the other end had refused, as it accepts it now; or forget one that closes."""
+        """Report that the other end accepts a link that it had refused; or forget a link that closes."""
         refused = self._refused.pop(link, None)
         if refused is None:
             return
@@ -339,7 +339,7 @@ class LinkManager:
     # Name conflicts between modules that can't hear each other, as they are on different links
 
     def _suspect_conflict(self, link: Link, info: ModuleInfo) -> None:
-        """Look again a while after a name was heard on two links: it may have moved, and its old link be down soon."""
+        """Check again a while after a name was heard on two links: the module may be moving from one to the other."""
         if info.name in self._suspected:
             return
         others = (other for each, other in self._same_name(link, info.name) if each is not link)
@@ -364,7 +364,7 @@ class LinkManager:
         self.discovered(link, NameConflict(name, one, other))
 
     def _same_name(self, link: Link, name: str) -> Iterator[tuple[Link, ModuleInfo]]:
-        """The modules with a name that was heard on a link, by link. On others a gateway may give it another prefix."""
+        """Return the modules with a name from one link, by link. On others a gateway may give it another prefix."""
         for other in self.links:
             name_there: str | None = name
             if self.bridge is not None and other is not link:
@@ -374,7 +374,7 @@ class LinkManager:
 
 
 def describe_mismatch(event: Mismatched) -> str:
-    """Say how the types differ, and what to do about it."""
+    """Describe how the types differ, and what to do about it."""
     role = "publish" if event.role == ROLE_PUBLISHES else "subscribe"
     if event.ours.size != event.theirs.size:
         what = f"messages of {event.theirs.size} bytes, here they have {event.ours.size}"

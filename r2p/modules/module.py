@@ -1,7 +1,7 @@
 """A module: nodes, the topics between them, and the links that make those topics part of a network.
 
-The module owns everything that runs: one task for each node and each transport, all of which have ended when its
-`async with` block has.
+The module owns everything that runs: one task for each node and each transport. All of them have ended when its `async
+with` block ends.
 
     STOP    LinkManager.discovered -> CommandHandler.handle -> Module.stop: cancel all nodes, wait for their clean-up
     REBOOT  ... -> Module.reboot: the same, then start the same functions from the beginning; links stay up throughout
@@ -41,7 +41,7 @@ from r2p.units import SECOND
 logger = get_logger("r2p.module")
 
 CLEANUP_WARNING_AFTER = 1.0
-"""Seconds after which the log names the nodes whose clean-up the module still waits for."""
+"""Seconds after which the log names nodes that are still cleaning up."""
 
 LOG_RATE = 50
 """Records a second on the topic `log`, and records that may come at once: an eighth of a CAN bus of 1 Mbit/s."""
@@ -58,12 +58,12 @@ class Module:
             await module.wait()
 
     `name` has at most 7 characters (default: from the host name). `via` are the URLs of its transports, one or several;
-    None takes those of the environment variable R2P_VIA, separated by blanks, and without it the module is local only.
+    None uses the environment variable R2P_VIA (URLs separated by blanks), and without it the module is local only.
     `remap` renames topics for all its nodes. An `observer` is a tool that only looks: it sends no ALIVE and has no
-    `log` topic. The `watchdog` logs which code blocks the event loop.
+    `log` topic. The `watchdog` logs code that blocks the event loop.
 
-    With `bridge` the module joins its links: it is a gateway, and forwards on each network what the gateways there have
-    agreed on. BridgeOptions say what it lets through. Raises InvalidName or NameTooLong.
+    With `bridge` the module is a gateway: it joins its links, and forwards on each network what the gateways there have
+    agreed on. BridgeOptions restrict that. Raises InvalidName or NameTooLong.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Module:
         self.stopped = False
         """True after STOP has ended the nodes; REBOOT starts them again."""
         self.refused: dict[str, int] = {}
-        """Commands from the network that it refused, by name: how many."""
+        """Numbers of refused commands from the network, by name."""
         self.network = NetworkView(lambda: self._opened)
         """The network as this module knows it."""
         self._via = _urls(via)
@@ -103,8 +103,8 @@ class Module:
     # Opening and closing
 
     async def __aenter__(self) -> Self:
-        """Open it, and wait until its transports work. Raises TransportError for a URL that can't work, and Error if it
-        was open before.
+        """Open the module, and wait until its transports work. Raises TransportError for a URL that can't work, and
+        Error for a module that was open before.
         """
         if self._tasks is not None:
             raise Error(f"module {self.name} was opened before: make a new one")
@@ -138,8 +138,8 @@ class Module:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the nodes, then the links. Raises NodeCrashed if nodes crashed; if another error is on its way, that one
-        gets a note of each crash.
+        """End the nodes, then the links. Raises NodeCrashed if nodes crashed; another error on its way gets a note of
+        each crash.
         """
         if self._tasks is not None:
             await self._close(self._tasks)
@@ -152,9 +152,9 @@ class Module:
             error.add_note(f"before that: {crash!r} {' '.join(crash.__notes__)}")
 
     def gateway_statistics(self) -> GatewayStatistics:
-        """Return how many messages it has forwarded so far, and where.
+        """Return how many messages the gateway has forwarded so far, and where.
 
-        Raises Closed unless it is open, and Error if it is not a gateway (`bridge`).
+        Raises Closed unless the module is open, and Error if it is not a gateway (`bridge`).
         """
         self._running()
         bridge = self._opened.bridge
@@ -164,12 +164,12 @@ class Module:
 
     @property
     def space(self) -> TopicSpace:
-        """The module's topics. Raises Closed before it is opened."""
+        """The module's topics. Raises Closed before the module is opened."""
         return self._opened.space
 
     @property
     def instance(self) -> int:
-        """The random 32-bit number of this run of the module. Raises Closed before it is opened."""
+        """The random 32-bit number of this run of the module. Raises Closed before the module is opened."""
         return self._opened.instance
 
     @property
@@ -179,14 +179,12 @@ class Module:
 
     @property
     def addresses(self) -> list[tuple[str, str]]:
-        """The URLs that accept connections, each with its address. Raises Closed before it is
-        opened.
-        """
+        """The URLs that accept connections, each with its address. Raises Closed before the module is opened."""
         return list(self._opened.addresses)
 
     @property
     def closed_links(self) -> LinkStats:
-        """The sum of what links counted that are closed for good, such as those of the clients of a `tcp-listen:`."""
+        """The totals of links that are closed for good, such as those of clients of a `tcp-listen:`."""
         return self._opened.closed_links
 
     @property
@@ -196,7 +194,7 @@ class Module:
         return self._link_manager
 
     def _running(self) -> asyncio.TaskGroup:
-        """The task group of all that it runs. Raises Closed unless it is open."""
+        """The task group of nodes and transports. Raises Closed unless the module is open."""
         if self._tasks is None or not self._open:
             raise self._not_open()
         return self._tasks
@@ -205,7 +203,9 @@ class Module:
         return Closed(f"module {self.name} is not open: use it in an `async with` block")
 
     async def _open_transport(self, tasks: asyncio.TaskGroup, via: str | Transport) -> None:
-        """Run a transport, and wait until it works. If it raises, that cancels the caller, and `_close` raises it."""
+        """Run a transport, and wait until it works. An error of the transport cancels the caller, and `_close` raises
+        it.
+        """
         transport = open_transport(via) if isinstance(via, str) else via
         opened = self.space.loop.create_future()
 
@@ -264,11 +264,11 @@ class Module:
     ) -> Node:
         """Run `function(node, *args)` as a node. Its name, at most 8 characters, is the function's unless given.
 
-        Nodes of higher `priority` get their messages first. `remap` renames topics for this node. With `restart` it is
-        started again after a crash, after a pause that grows from 0.5 to 30 s.
+        Nodes of higher `priority` get their messages first. `remap` renames topics for this node. With `restart` the
+        node is started again after a crash, after a pause that grows from 0.5 to 30 s.
 
-        Raises NameTooLong or InvalidName for the name; Error if another node has it, if `function` is not a coroutine
-        function, or if the module is stopped; and Closed if it is not open.
+        Raises NameTooLong or InvalidName for the name; Error if another node has the name, if `function` is not a
+        coroutine function, or if the module is stopped; and Closed if the module is not open.
         """
         tasks = self._running()
         if self.stopped:
@@ -300,7 +300,7 @@ class Module:
             await self._changed.wait()
 
     async def stop(self) -> None:
-        """End all nodes, and wait for that. Links stay up, and other modules are informed (by a flag of ALIVE)."""
+        """End all nodes, and wait for their end. Links stay up, and a flag of ALIVE informs other modules."""
         async with self._switching:
             self.stopped = True
             # Before the clean-up, which may take long: the module that sent STOP waits for this flag.
@@ -308,14 +308,14 @@ class Module:
             await self._end_nodes()
 
     async def reboot(self) -> None:
-        """End all nodes, wait for that, and start them from the beginning. Raises Closed if it is not open."""
+        """End all nodes, wait for their end, and start them anew. Raises Closed if the module is not open."""
         tasks = self._running()
         # In a task of its own: if a node calls this, the reboot cancels its caller.
         await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))
 
     async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
         async with self._switching:
-            # Stopped in between: by this others notice each reboot, as FLAG_REBOOTED stays set after the first one.
+            # Stopped in between, so that others notice each reboot: FLAG_REBOOTED stays set after the first one.
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
             await self._end_nodes()
             if not self._open:
@@ -349,7 +349,7 @@ class Module:
         self._opened.command(command, module_path(module))
 
     def query(self) -> None:
-        """Ask all other modules to announce their topics again. Raises Closed if it is not open."""
+        """Ask all other modules to announce their topics again. Raises Closed if the module is not open."""
         self._running()
         for link in self.links:
             link.query()
@@ -357,7 +357,7 @@ class Module:
     def events(self) -> AsyncIterator[ModuleEvent]:
         """Iterate over what happens to the links and on the network, from this call on, until the module closes.
 
-        The iterator holds 256 events; if it is read too slowly, the oldest are lost.
+        The iterator holds 256 events; a slow reader loses the oldest ones.
         """
         return self._events.listen()
 
@@ -373,7 +373,7 @@ def _checked_remap(remap: dict[str, str] | None) -> dict[str, str]:
 
 
 class LogTopic:
-    """Publishes log records; those beyond the rate are counted in `suppressed`, and the next one says how many."""
+    """Publishes log records; those beyond the rate are counted in `suppressed`, and the next record says how many."""
 
     def __init__(self, space: TopicSpace, remap: dict[str, str]) -> None:
         self.suppressed = 0
@@ -420,18 +420,18 @@ class LogTopic:
 
 
 class CommandHandler:
-    """Carries out the commands that come in from the network: STOP and REBOOT. A program on a PC refuses BOOTLOAD."""
+    """Carries out STOP and REBOOT from the network. A program on a PC refuses BOOTLOAD."""
 
     def __init__(self, module: Module) -> None:
         self.tasks: asyncio.TaskGroup | None = None
-        """The owner of the module's tasks while it is open; without it nothing is carried out."""
+        """The owner of the module's tasks while the module is open; without it, commands are ignored."""
         self._module = module
         self._limit = LineLimit(_COMMAND_LINES)
         self._latest: Command | None = None
         self._running: asyncio.Task[None] | None = None
 
     def handle(self, command: Command) -> None:
-        """Log a command, and carry it out in a task of its own; of those that come meanwhile only the last counts."""
+        """Log a command, and carry it out in a task of its own; of several that arrive meanwhile, the last counts."""
         name = self._module.name
         self._log(logging.WARNING, f"module {name}: {command.name} from the network")
         if self.tasks is None:
@@ -452,7 +452,7 @@ class CommandHandler:
             await (self._module.stop() if command is Command.STOP else self._module.reboot())
 
     def _log(self, level: int, text: str, detail: str = "") -> None:
-        """Log what other modules can make happen any number of times a second."""
+        """Log an event that other modules can cause any number of times a second."""
         suffix = self._limit.suffix(text, self._module.space.clock.monotonic())
         if suffix is not None:
             logger.log(level, "%s%s%s", text, detail, suffix)

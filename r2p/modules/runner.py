@@ -1,7 +1,7 @@
-"""Running a program: on the fastest event loop there is, with signals that end everything in order.
+"""Run a program: on the fastest event loop available, with signals that end everything in order.
 
 The first SIGINT or SIGTERM cancels the program: it ends its nodes, says good-bye on its links, and returns. A second
-one ends the process at once; so does the first one, if the program has not ended GRACE seconds later.
+one ends the process at once, as does the first one if the program is still running GRACE seconds later.
 
 A program that `run` starts logs to stderr unless it has configured logging. Where nothing catches what `run` raises,
 Python prints it as one line: what crashed is in the log already, and a wrong name or URL is not in the stack.
@@ -42,13 +42,13 @@ def run(
     """Run functions as the nodes of one module, until all have ended or a signal ends them.
 
     A node has the name of its function, of at most 8 characters, or another: `run(line_follower, name="follower")`, and
-    of several `run(blink, ("follower", line_follower))`. `via` and `remap` are as for `Module`, which `module` is the
-    name of; `restart` is as for `Module.start`.
+    of several `run(blink, ("follower", line_follower))`. `module` is the module's name; `via` and `remap` are as for
+    `Module`, `restart` as for `Module.start`.
 
     Meanwhile the logger `r2p` writes to stderr, from INFO up, unless it or the root logger has handlers.
 
-    Raises NodeCrashed at the end if a node crashed, and what `Module` and `Module.start` raise. Where the program does
-    not catch that, it prints one line instead of a traceback (R2P_DEBUG=1: all of it), and the exit code is 1.
+    Raises NodeCrashed at the end if a node crashed, and the errors of `Module` and `Module.start`. Where the program
+    does not catch that, it prints one line instead of a traceback (R2P_DEBUG=1: all of it), and the exit code is 1.
     """
 
     async def main() -> None:
@@ -127,7 +127,7 @@ def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    """uvloop's, where it is installed; otherwise None, which means asyncio's own."""
+    """Return uvloop's loop factory, if uvloop is installed; otherwise None, which means asyncio's own."""
     try:
         import uvloop
     except ImportError:
@@ -165,7 +165,7 @@ class _Signals:
         self._over.set()
 
     def guard(self, loop: asyncio.AbstractEventLoop, task: asyncio.Task[object] | None) -> bool:
-        """Cancel this task at the first signal. False if one has come already."""
+        """Cancel this task at the first signal. Return False if a signal has already arrived."""
         if task is not None:
             self._cancel = functools.partial(loop.call_soon_threadsafe, task.cancel)
         return not self.received

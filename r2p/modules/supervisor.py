@@ -1,9 +1,9 @@
 """The life of a node: start, end, crash, restart.
 
-A node that raises ends alone: its traceback is logged, the others run on, and the module raises what happened when it
-ends. Stopping is cancellation, so `try/finally` in the node's function stops the motor.
+A node that raises ends alone: its traceback is logged, the others run on, and the module raises the error at its end.
+Stopping is cancellation, so `try/finally` in the node's function stops the motor.
 
-Nothing disturbs that clean-up: neither an error in a function that the node gave away, nor a second reason to end it.
+Nothing disturbs that clean-up: neither an error in a callback of the node, nor a second reason to end it.
 Both wait while an exception, the node's own or a cancellation, is in a `finally`.
 """
 
@@ -38,9 +38,9 @@ def check_function(function: NodeFunction) -> Any:
 
 
 def name_of(function: NodeFunction) -> str:
-    """The name of the node that a function runs as unless `name=` is given: its own.
+    """Return the default name of a function's node: the function's own name.
 
-    Raises NameTooLong or InvalidName if that is not a valid node name, and Error for what is not a coroutine function.
+    Raises NameTooLong or InvalidName if that is not a valid node name, and Error if it is not a coroutine function.
     """
     bare = check_function(function)
     name = getattr(bare, "__name__", type(bare).__name__)
@@ -63,7 +63,7 @@ class Supervisor:
         self.error: Exception | None = None
         """The exception that ended the node, if one did."""
         self.restarts = 0
-        """Times that it was started again after a crash."""
+        """Number of restarts after a crash."""
         self._function = function
         self._args = args
         self._make_node = make_node
@@ -77,7 +77,7 @@ class Supervisor:
         return self._task is not None and not self._task.done()
 
     def start(self, tasks: asyncio.TaskGroup, ended: Callable[["Supervisor"], None]) -> None:
-        """Start it, or start it again from the beginning; `ended` is called when it has ended for good."""
+        """Start the node, or start it anew; `ended` is called when it has ended for good."""
         if self._task is not None:
             self.node = self._make_node()
         self.error = None
@@ -88,7 +88,7 @@ class Supervisor:
         tasks.create_task(self._guard(task), name=f"{name} guard")
 
     def cancel(self) -> asyncio.Task[None] | None:
-        """Ask it to end, without disturbing its clean-up; returns its task if it still runs."""
+        """Ask the node to end, without disturbing its clean-up; return its task if it still runs."""
         if self._task is None or self._task.done():
             return None
         if not self._stopping:
@@ -100,7 +100,7 @@ class Supervisor:
         return self._task
 
     async def stop(self) -> None:
-        """Cancel it, and wait for its end."""
+        """Cancel the node, and wait for its end."""
         task = self.cancel()
         if task is not None:
             await asyncio.wait([task])
@@ -143,7 +143,7 @@ class Supervisor:
             self.node = self._make_node()
 
     async def _try(self) -> Exception | None:
-        """Run the function to its end; returns what it raised."""
+        """Run the function to its end; return its exception, if any."""
         task = asyncio.current_task()
         assert task is not None
         try:  # wrong arguments raise here, before there is a coroutine
@@ -171,7 +171,7 @@ class Supervisor:
 
 
 class _Attempt:
-    """One run of a node's function: ends it, and keeps an error from outside of it, of a `fill` or a callback."""
+    """One run of a node's function: ends it, and keeps an error from outside of it, such as a `fill` or a callback."""
 
     def __init__(self, node: Node, task: asyncio.Task[None], body: Coroutine[Any, Any, object]) -> None:
         self.error: Exception | None = None
@@ -187,7 +187,7 @@ class _Attempt:
         node.is_unwinding = self._is_unwinding
 
     def crash(self, error: Exception) -> None:
-        """End the function with an error of something that the node gave away."""
+        """End the function with an error of a `fill` or a callback of the node."""
         if self._node.ending:
             self._node.log.error("node %s crashed while it ended: %r", self._node.name, error, exc_info=error)
         elif asyncio.current_task() is self._task:
@@ -205,8 +205,8 @@ class _Attempt:
     def _is_unwinding(self) -> bool:
         """Return whether the function is in its clean-up.
 
-        Each tick of a periodic publisher asks this, and it is slow to find out. So the answer is kept while the task
-        waits for the same future: it does not move meanwhile.
+        Each tick of a periodic publisher asks this, and the answer takes long. So it is kept while the task waits for
+        the same future: the function does not move meanwhile.
         """
         future = getattr(self._task, "_fut_waiter", None)  # asyncio's own
         if future is None or self._awaited() is not future:
@@ -215,7 +215,7 @@ class _Attempt:
         return self._was_unwinding
 
     def _cancel(self, since: float) -> None:
-        """Cancel the function, which is to end since `since` (loop time), or look again while it cleans up."""
+        """Cancel the function, whose end was requested at `since` (loop time), or look again while it cleans up."""
         self._timer = None
         failed = self.error is not None or self._task.cancelling() > 0
         if cleans_up(self._body, handlers=failed and self._loop.time() - since < _HANDLER_GRACE):
@@ -231,7 +231,7 @@ class _Attempt:
             self._timer.cancel()
 
     def result(self, error: Exception | None) -> Exception | None:
-        """The error that ended the node: one from outside of the function came first, and caused what that raised."""
+        """Return the error that ended the node: one from outside came first, and caused the function's own."""
         if self.error is None:
             return error
         if self._cancelled:
@@ -244,7 +244,7 @@ class _Attempt:
 
 
 def _from_inside(cancelled: asyncio.CancelledError) -> Error:
-    """The error of a node that was not cancelled itself, but awaited something that was: it would end silently."""
+    """Return an error for a node that awaited something cancelled: otherwise the node would end silently."""
     error = Error("something that the node awaited was cancelled")
     error.__cause__ = cancelled
     return error

@@ -2,8 +2,8 @@
 
 An exception on its way through a node's function can't be seen from outside before the function has ended, and
 clean-up, such as stopping a motor, takes time. The only trace is the place where each frame waits: the compiler makes a
-copy of each `finally` for the case of an exception. So this module looks the place up in the compiled code. Where it
-does not understand the code, the answer is no.
+copy of each `finally` for the case of an exception. So this module looks the place up in the compiled code. For code
+that it does not understand, the answer is no.
 """
 
 import dis
@@ -17,7 +17,7 @@ from typing import NamedTuple
 _CATCHES = ("CHECK_EXC_MATCH", "CHECK_EG_MATCH")
 _REMEMBERED = 1024  # functions whose handlers are kept
 _STEPS = {"async_generator_asend", "async_generator_athrow", "anext_awaitable", "coroutine_wrapper"}
-"""Types between a coroutine and what it waits for, which only the garbage collector can look into."""
+"""Types between a coroutine and its awaitable that only the garbage collector can look into."""
 _CLOSES = ("COPY", "POP_EXCEPT", "RERAISE")  # how the compiled code of each handler ends
 
 
@@ -59,7 +59,7 @@ def cleans_up(coroutine: object, *, handlers: bool = False) -> bool:
 
 
 def frames(awaitable: object, *, closing: bool = True) -> Iterator[FrameType]:
-    """The frames of all coroutines and generators of a chain, the outermost first.
+    """Return the frames of all coroutines and generators of a chain, the outermost first.
 
     Without `closing`, up to an async generator that is being closed: GeneratorExit does not leave its `aclose`.
     """
@@ -132,7 +132,7 @@ def _escapes(code: CodeType, offset: int) -> bool:
 
 
 def _reraised(code: CodeType, target: int) -> int:
-    """The offset at which clean-up that the compiler adds raises the exception again."""
+    """Return the offset at which clean-up added by the compiler raises the exception again."""
     return next(
         each.offset
         for each in dis.get_instructions(code)

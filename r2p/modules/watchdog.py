@@ -1,4 +1,4 @@
-"""The watchdog: logs which code blocks the event loop, while it blocks it.
+"""The watchdog: logs code that blocks the event loop, while it does so.
 
 A thread asks the loop for a sign of life four times in each LIMIT. When none comes for LIMIT seconds, it logs the stack
 in which the loop is stuck, and afterwards how long that took. A block of 100 ms is ten missed periods of a 100 Hz node.
@@ -27,7 +27,7 @@ from r2p.units import SECOND
 logger = logging.getLogger("r2p.watchdog")
 
 LIMIT = 0.1
-"""Seconds that the loop may be blocked."""
+"""Seconds for which the loop may be blocked."""
 
 _REPORTS = 1  # a second
 _REMEMBERED = 256  # stacks that were logged
@@ -37,7 +37,7 @@ _IDLE = 0.5  # of a processor: code that blocks by working uses more than that, 
 STOPPED = "this process did not run for %.1f s: it was stopped, or the computer slept or was busy"
 BLOCKED = "%s has blocked the event loop for over %.0f ms%s:\n%s"
 AGAIN = "%s has blocked the event loop for over %.0f ms%s, again in %s"
-NOT_RUNNING = "the event loop did not come round for over %.0f ms, and none of its code runs: is the computer busy?"
+NOT_RUNNING = "the event loop did not run for over %.0f ms, and no code blocks it: is the computer busy?"
 
 _LOOP_FILES = {each.__file__ for each in (asyncio.base_events, asyncio.events, asyncio.runners)} | {
     str(Path(__file__).with_name("supervisor.py"))
@@ -49,7 +49,7 @@ _lock = threading.Lock()
 
 
 def watch(loop: asyncio.AbstractEventLoop) -> "Watchdog":
-    """The watchdog of this thread's loop, which runs until each caller has closed it."""
+    """Return the watchdog of this thread's loop, which runs until each caller has closed it."""
     with _lock:
         watchdog = _watchdogs.get(loop)
         if watchdog is None:
@@ -61,7 +61,7 @@ def watch(loop: asyncio.AbstractEventLoop) -> "Watchdog":
 
 
 class Watchdog:
-    """Watches the loop of the thread that starts it, on behalf of so many `users`."""
+    """Watches the loop of the thread that starts it, for a number of `users`."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, limit: float = LIMIT) -> None:
         self.users = 1
@@ -117,7 +117,7 @@ class Watchdog:
                 logger.warning("the event loop runs again after %.0f ms", took)
 
     def _pause(self) -> bool:
-        """Wait until the next check. Returns True if the watchdog ends instead."""
+        """Wait until the next check. Return True if the watchdog ends instead."""
         start, used = self._clock.monotonic(), _used()
         if self._ended.wait(self._limit / 4):
             return True
@@ -126,12 +126,12 @@ class Watchdog:
         return False
 
     def _stopped_for(self, since: int, used: float, limit: float) -> float:
-        """The seconds since then, if this thread waited over `limit` too long while this process used no processor."""
+        """Return the seconds since then, if this thread waited over `limit` too long while the process did not run."""
         passed = (self._clock.monotonic() - since) / SECOND
         return passed if passed > 2 * limit and _used() - used < _IDLE * passed else 0.0
 
     def _report(self) -> bool:
-        """Log where the loop is stuck; False if there was a report less than a second ago."""
+        """Log where the loop is stuck; return False if the last report is less than a second old."""
         suffix = self._line_limit.suffix("", self._clock.monotonic())
         if suffix is None:
             return False
@@ -155,19 +155,19 @@ class Watchdog:
 
 
 def _used() -> float:
-    """The processor time that this process has used so far, in seconds."""
+    """Return the processor time of this process so far, in seconds."""
     return sum(os.times()[:2])
 
 
 def _runner() -> FrameType | None:
-    """The frame that called the one of the running task: of the event loop, or of what runs it."""
+    """Return the frame that called the running task's: of the event loop, or of its runner."""
     task = asyncio.current_task()
     frame = getattr(task.get_coro(), "cr_frame", None) if task is not None else None
     return frame.f_back if frame is not None else None
 
 
 def _own_part(frame: FrameType) -> list[traceback.FrameSummary]:
-    """The part of a stack that belongs to a node or a callback, without the event loop that called it; may be empty."""
+    """Return the part of a stack that belongs to a node or a callback, without the event loop's; may be empty."""
     stack = traceback.extract_stack(frame)
     begin = max((at for at, each in enumerate(stack, 1) if each.filename in _LOOP_FILES), default=0)
     own = stack[begin:]

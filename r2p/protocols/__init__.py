@@ -2,7 +2,7 @@
 
 - `discovery`: modules, topics and subscriptions on a link, by management messages; `liveliness`: the same on zenoh.
 - `rtcan`: the CAN protocol, with its cycle, its master and its slots.
-- `bridge`: how gateways agree on a tree, and which link a module with several of them uses.
+- `bridge`: the tree of gateways, and the choice of a module with several links.
 - `flow_control`, `time_left`, `timers`: parts that several links or protocols use.
-- `can_orders`: what RTCAN and the ports to CAN controllers exchange.
+- `can_orders`: orders and answers between RTCAN and the ports to CAN controllers.
 """

@@ -1,6 +1,6 @@
-"""The orders to a CAN controller, and its answers: all that a CAN port and the protocol that uses it have in common.
+"""The orders to a CAN controller, and its answers: the interface of CAN ports and protocols.
 
-They stand apart from both: a port (`r2p.transports.can`) knows no RTCAN, and RTCAN's engine no ports.
+They are separate, as a port (`r2p.transports.can`) does not know RTCAN, nor RTCAN's engine ports.
 """
 
 import enum

@@ -1,9 +1,9 @@
 """Credit-based flow control from end to end: a publisher never runs further ahead of a subscriber than its window.
 
-Everything that a session sends on a topic in one class has a serial number. A subscriber's session grants credit: it
-reports the last serial that its queues accepted, and its window says how many more may be on the way. A publisher waits
-for a subscriber that grants nothing, and skips it when it has waited long enough; the subscriber's next credit brings
-it back. Missing serials also show what was lost on the way.
+Each message of a session on a topic in one class has a serial number. A subscriber's session grants credit: it reports
+the last serial that its queues accepted, and its window says how many more may be on the way. A publisher waits for a
+subscriber that grants nothing, and skips it when it has waited long enough; the subscriber's next credit ends that.
+Missing serials also show losses on the way.
 """
 
 import msgspec
@@ -14,7 +14,7 @@ NO_LIMIT = 1 << 62
 """A serial that is never reached: no subscriber has a window."""
 
 SHARE = 1024
-"""Messages from one credit to the next where no window limits them. When a link breaks, this many messages at most are
+"""Messages from one credit to the next without a window. When a link breaks, this many messages at most are
 of unknown fate, beside those that were on the way.
 """
 
@@ -37,17 +37,17 @@ class SendWindow:
 
     def __init__(self) -> None:
         self.serial = 0
-        """The last serial that was sent. It has more than 32 bits, so that comparing needs no wrap."""
+        """The last serial sent. It has more than 32 bits, so that comparing needs no wrap."""
         self.limit = NO_LIMIT
-        """The last serial for which all subscribers that are waited for have room."""
+        """The last serial for which all subscribers have room, except skipped ones."""
         self.subscribers: dict[int, _SubscriberWindow] = {}
-        """By session."""
+        """Windows by session."""
 
     def add(self, session: int, window: int) -> None:
-        """Add a subscriber, or give it another window; 0: it is never waited for."""
+        """Add a subscriber, or change its window; 0: never wait for it."""
         known = self.subscribers.get(session)
         if known is None:
-            # What went out before it joined was not for it, so that counts as acknowledged.
+            # Earlier messages were not for this subscriber, so they count as acknowledged.
             self.subscribers[session] = _SubscriberWindow(window, self.serial, self.serial)
         elif known.window != window:  # it need not have granted anything for what went out before
             known.window = window
@@ -88,7 +88,7 @@ class SendWindow:
         return skipped
 
     def unacknowledged(self) -> list[int]:
-        """Return the sessions that were sent something, and have not answered since they joined."""
+        """Return the sessions that got messages, and have not answered since they joined."""
         return [
             session for session, each in self.subscribers.items() if not each.answered and self.serial > each.joined_at
         ]
@@ -105,14 +105,14 @@ class ReceiveWindow:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        """Messages that may be on the way; 0: any number."""
+        """Messages on the way, at most; 0: any number."""
         self.next_serial = -1
-        """The serial that is expected; -1: any."""
+        """The expected serial; -1: any."""
         self.until_credit = 1
         """Messages that the queues accept before credit is granted; the first message is answered at once."""
 
     def advance(self, serial: int) -> int:
-        """Expect what follows this serial; return how many are missing before it, or -1 for one that came before."""
+        """Expect the next serial; return how many are missing before this one, or -1 if it arrived before."""
         ahead = (serial - self.next_serial) & SERIAL_WRAP if self.next_serial >= 0 else 0
         if ahead >= _HALF:
             return -1
@@ -120,16 +120,16 @@ class ReceiveWindow:
         return ahead
 
     def resize(self, size: int) -> None:
-        """Change the window. The sender counts anew from when it learns this, and so does the receiver."""
+        """Change the window. Sender and receiver count anew from there."""
         self.size = size
         self.until_credit = min(self.until_credit, self._share)
 
     def restart(self) -> None:
-        """Answer the next message at once: a sender that is gone will know nothing of this one should it return."""
+        """Answer the next message at once: a sender that is gone will have forgotten this receiver if it returns."""
         self.until_credit = 1
 
     def skip(self, count: int) -> None:
-        """Count lost messages towards the next credit, so that it comes in time."""
+        """Count lost messages towards the next credit, so that it is in time."""
         self.until_credit = max(1, self.until_credit - count)
 
     def credit_sent(self) -> None:

@@ -2,9 +2,8 @@
 
 The clocks of two computers are not compared: they may differ by seconds. A message's delay, the instant of its arrival
 less its stamp, is the difference of the clocks plus the time on the way. The least delay of a publisher's messages is
-that of messages that nothing held up; so what is above it is how long a message was held up, by a stalled network or by
-a gateway that was stopped. What every message takes alike can't be told from the difference of the clocks, and is not
-counted.
+that of undisturbed messages; anything above it is time that a message was held up, by a stalled network or by a stopped
+gateway. A delay common to all messages can't be distinguished from the difference of the clocks, and is not counted.
 """
 
 from r2p.units import SECOND
@@ -30,7 +29,7 @@ class TimeLeft:
         self._doubted_until: int | None = None
 
     def left(self, now: int, stamp: int, deadline: int) -> int:
-        """Return what is left at `now` (monotonic, this computer) until `deadline`, at most all of the time after
+        """Return the time left at `now` (monotonic, this computer) until `deadline`, at most all of the time after
         `stamp` (both UTC, the publisher's clock); 0 or less: it is too late.
         """
         span, delay = deadline - stamp, now - stamp
@@ -58,7 +57,7 @@ class TimesLeft:
         self._known: dict[object, TimeLeft] = {}
 
     def of(self, publisher: object) -> TimeLeft:
-        """Return that of one publisher."""
+        """Return the `TimeLeft` of one publisher."""
         known = self._known.get(publisher)
         if known is None:
             if len(self._known) >= self.PUBLISHERS_MAX:

@@ -11,7 +11,7 @@ from r2p.units import NEVER
 
 
 class KeyedTimers:
-    """Keys that run out. Setting a key later costs nothing: its place in the heap is corrected when it comes up."""
+    """Keys that expire. Setting a key later costs nothing: its place in the heap is corrected when it comes up."""
 
     def __init__(self) -> None:
         self.due = NEVER
@@ -24,7 +24,7 @@ class KeyedTimers:
         return key in self._due
 
     def set(self, key: Hashable, due: int) -> None:
-        """Let a key run out at `due` (ns), earlier or later than before."""
+        """Let a key expire at `due` (ns), earlier or later than before."""
         before = self._due.get(key)
         self._due[key] = due
         if before is None or due < before:
@@ -40,19 +40,19 @@ class KeyedTimers:
         return self.due if self.due < NEVER else None
 
     def put_off(self, until: int) -> None:
-        """Let no key run out before `until` (ns)."""
+        """Let no key expire before `until` (ns)."""
         self._due = {key: max(due, until) for key, due in self._due.items()}
         self._update()
 
     def pop(self, now: int) -> Iterator[Hashable]:
-        """The keys that have run out; each is cleared."""
+        """Yield the expired keys, and clear each."""
         while self.due <= now:
             key = heapq.heappop(self._heap)[2]
             self.clear(key)
             yield key
 
     def _update(self) -> None:
-        """Correct the places in the heap up to the first one that is true."""
+        """Correct the places in the heap up to the first valid one."""
         while self._heap:
             self.due, _, key = self._heap[0]
             due = self._due.get(key)

@@ -1,6 +1,6 @@
 """Events about a module's links and its network, which programs and tools iterate over.
 
-A listener is a bounded queue that lives as long as its iterator: one that is not read is garbage-collected.
+A listener is a bounded queue that lives as long as its iterator: an abandoned one is garbage-collected.
 """
 
 import asyncio
@@ -18,7 +18,7 @@ EVENTS = 256
 
 
 class LinkUp(msgspec.Struct, frozen=True):
-    """A link is up: for the first time, or after `outage` seconds, in which `lost` messages found it down."""
+    """A link is up: for the first time, or after `outage` seconds, in which `lost` messages were lost."""
 
     link: str
     outage: float
@@ -81,7 +81,7 @@ class EventHub:
             listener.arrived.set()
 
     def close(self) -> None:
-        """Let each listener end when it has read what it holds."""
+        """Let each listener end when it has read all its events."""
         self._closed = True
         for listener in list(self._listeners.values()):
             listener.closed = True

@@ -1,4 +1,4 @@
-"""The three classes of publisher as values (thesis 5.3.6), and what they report to the callbacks given with them."""
+"""The three classes of publisher as values (thesis 5.3.6), and their reports to callbacks."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, Generic, Literal, TypeVar
@@ -14,7 +14,7 @@ M = TypeVar("M", bound=Message)
 
 
 class Missed(msgspec.Struct, frozen=True):
-    """A message that did not reach every subscriber in time, or the notice that messages may not from now on.
+    """A message that did not reach every subscriber in time, or a notice that messages may not from now on.
 
     Publishers log it, and give it to `on_missed`, `on_late` or `on_degraded` of their class. `where` names the node of
     the subscriber, or the link; `late` is in seconds (0: unknown); `count` is the number of messages.
@@ -38,8 +38,8 @@ Signal = Callable[[Missed], object]
 class NonRealTime(msgspec.Struct, frozen=True, kw_only=True):
     """The class of a publisher whose messages do not expire.
 
-    `publish()` waits for room up to `stall` seconds; after that it goes on without the subscribers that have none,
-    which is reported to `on_missed`. `on_degraded` is called when a link that carried the topic goes down.
+    `publish()` waits for room up to `stall` seconds; then it goes on without the subscribers that have none, and calls
+    `on_missed`. `on_degraded` is called when a link that carried the topic goes down.
     """
 
     publisher_class: ClassVar = PublisherClass.NON_REAL_TIME
@@ -54,7 +54,7 @@ class Sporadic(msgspec.Struct, frozen=True):
 
     At most `pending` messages wait for room, in order; one more drops the oldest of them. An overdue message is dropped
     (`late="drop"`) and reported to `on_missed`, or still sent (`late="send"`) and reported to `on_late`. `on_degraded`
-    is called when a link can no longer do what the class asks for.
+    is called when a link can no longer meet the class.
     """
 
     publisher_class: ClassVar = PublisherClass.SPORADIC
@@ -85,7 +85,7 @@ class Periodic(msgspec.Struct, Generic[M], frozen=True):
 
 
 def check_class(topic: str, klass: NonRealTime | Sporadic | Periodic[Any]) -> None:
-    """Raise MessageError for a class value that makes no sense."""
+    """Raise MessageError for an invalid class value."""
     match klass:
         case NonRealTime():
             check_seconds(f"topic {topic}: stall", klass.stall, least=0.0)
@@ -108,6 +108,6 @@ def check_class(topic: str, klass: NonRealTime | Sporadic | Periodic[Any]) -> No
 
 
 def check_count(topic: str, option: str, value: object) -> None:
-    """Raise MessageError for what is not a number of messages."""
+    """Raise MessageError unless the value is a number of messages."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise MessageError(f"topic {topic}: {option} is a number of messages, 1 or more, not {value!r}")

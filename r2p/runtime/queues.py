@@ -1,11 +1,11 @@
-"""The bounded queues of subscribers: where a full one drops its oldest message, and who is woken when one comes in.
+"""The bounded queues of subscribers: a full one drops its oldest message, and a new message wakes the reader.
 
     Topic.deliver   -> there is room: append the message
                     -> the queue is full: the publisher waits, where it may (`backpressure`)
                     -> ... or `SubscriberQueue.drop_oldest` makes room, counted in `lost`
 
 Waking is separate from queueing. The nodes of the highest priority are woken directly, the others one for each turn of
-the event loop: so an important node waits for a few steps of less important ones at most.
+the event loop: so an important node waits at most for a few steps of less important ones.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from r2p.runtime.sample import PublisherClass, Sample
 YIELD_EVERY = 16
 """Messages that publish() or an iteration handles before it lets the event loop run once.
 
-A turn of the loop takes as long as a few messages, so not after each; other tasks wait for so many at most.
+A turn of the loop takes as long as a few messages, so not after each one; other tasks wait for so many at most.
 """
 
 _NRT = PublisherClass.NON_REAL_TIME
@@ -74,10 +74,10 @@ class EndpointOwner(Protocol):
         """Return whether the node's callbacks must no longer be called."""
 
     def crash(self, error: Exception) -> None:
-        """End the node with an error of a function that it gave away."""
+        """End the node with an error of one of its callbacks."""
 
     def forget(self, endpoint: object) -> None:
-        """Drop a publisher or subscriber of the node that was closed."""
+        """Drop a closed publisher or subscriber of the node."""
 
 
 class WakeScheduler:
@@ -104,14 +104,14 @@ class WakeScheduler:
         self.top = max(self._priorities, default=0)
 
     def wake(self, priority: int, waiter: asyncio.Future[None]) -> None:
-        """Wake now what has the highest priority, anything else in its turn."""
+        """Wake a reader of the highest priority now, any other in its turn."""
         if priority < self.top:
             self.wake_later(priority, waiter)
         elif not waiter.done():
             waiter.set_result(None)
 
     def wake_later(self, priority: int, waiter: asyncio.Future[None]) -> None:
-        """Wake in its turn."""
+        """Wake the reader in its turn."""
         # The number keeps the order within a priority, and futures from being compared.
         heapq.heappush(self._readers, (-priority, next(self._order), waiter))
         if not self._running:
@@ -159,7 +159,7 @@ class SubscriberQueue(Sink):
         self.waiter: asyncio.Future[None] | None = None
         """The reader's future, while it waits for a message."""
         self.publisher_came = Pulse()
-        """Pulsed, never left set: what waits for a publisher is woken."""
+        """Pulsed, never left set: wakes tasks that wait for a publisher."""
         self.wait_queue: WaitQueue | None = None
         """Deliveries that wait for room; while there are any, each reader that pops a message has to call `refill`."""
 
@@ -184,7 +184,7 @@ class SubscriberQueue(Sink):
     def force(self, sample: Sample) -> None:
         if self.offer(sample):
             return
-        # What the same publisher published before, and still waits, goes in first: its messages keep their order.
+        # Earlier messages of the same publisher that still wait go in first: its messages keep their order.
         overtaken = [] if self.wait_queue is None or self.keep_oldest else self.wait_queue.pop_earlier(self, sample)
         for each in (*(delivery.sample for delivery in overtaken), sample):
             if self.drop_oldest():
@@ -195,8 +195,8 @@ class SubscriberQueue(Sink):
     def waits_for(self, sample: Sample) -> bool:
         """Return whether a full queue that became lossy still comes back to the sender of this sample.
 
-        It became lossy for what does not expire: events wait until their deadline as before. A publisher of this module
-        gets it back, too, and counts what is lost there.
+        It is lossy only for samples that do not expire: events wait until their deadline as before. A publisher of this
+        module gets its sample back, too, and counts the loss.
         """
         return not self.lossy and (sample.publisher_class != _NRT or not sample.source.link)
 
@@ -214,7 +214,7 @@ class SubscriberQueue(Sink):
                 self.wait_queue = None
 
     def publisher_joined(self) -> None:
-        """Wake those that wait for a publisher."""
+        """Wake the tasks that wait for a publisher."""
         self.publisher_came.emit()
 
     def _append(self, sample: Sample) -> None:

@@ -3,11 +3,11 @@
 It carries the message both as the object that was published and as packed bytes. A local subscriber gets the object, a
 link sends the bytes, and a gateway never needs the type.
 
-Samples that come again, after a repetition, by another link or by another gateway, are recognised by sequence number
-and stamp, as a publisher that has started again counts anew. `LastReceived` is for a publisher whose start is known, so
-its messages never go back: whatever is not newer than the last one is dropped, and order is kept. A gateway does not
-know the start, and the clock of a module without a battery may go back with it, so `DuplicateFilter` drops only what it
-has seen: else all messages of such a module would be lost behind the gateway.
+Duplicates, after a repetition, by another link or by another gateway, are recognised by sequence number and stamp, as a
+restarted publisher counts anew. `LastReceived` is for a publisher whose start is known, so its messages never go back:
+any that is not newer than the last one is dropped, and order is kept. A gateway does not know the start, and the clock
+of a module without a battery may go back with it, so `DuplicateFilter` drops only messages that it has seen: otherwise
+all messages of such a module would be lost behind the gateway.
 """
 
 from typing import TYPE_CHECKING, Generic
@@ -33,8 +33,7 @@ _PUBLISHERS_MAX = 1024  # of a topic; with one more all are forgotten
 class Source(msgspec.Struct, frozen=True):
     """The origin of a sample; names that the link does not carry are empty.
 
-    `link` names the link of this module by which it came in; it is empty for a sample that was published in this
-    module.
+    `link` names the link of this module that received the sample; it is empty for a sample of this module.
     """
 
     module: str = ""
@@ -46,20 +45,20 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Sample(msgspec.Struct, Generic[T], gc=False):
-    """One published message, with what is known of its publication.
+    """One published message, with its stamp, deadline and source.
 
     `data` are the packed bytes. `message` is None until a subscriber decodes a sample that came over a link: never in
     what `Subscriber.samples()` of a type yields, where `Sample[Led]` is a sample whose message is a `Led`.
 
-    `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none) by the clock of the computer that stamped it,
-    which may differ from this computer's. `expires` is the deadline by the clock here; 0: the same as `deadline`.
-    `stamped` says whether the stamp is the sender's; otherwise it is the time of reception.
+    `stamp` and `deadline` are UTC instants in ns (`deadline` 0: none) by the clock of the computer that stamped the
+    sample, which may differ from this computer's. `expires` is the deadline by the clock here; 0: the same as
+    `deadline`. `stamped` says whether the stamp is the sender's; otherwise it is the time of reception.
 
     `sequence` counts the messages of one publisher from 1; 0 where the link does not carry it. `drop_late`: a link that
-    could not send it by its deadline drops it instead of sending it late. `hops` counts the gateways that it crossed.
+    misses the deadline drops the sample instead of sending it late. `hops` counts the gateways on its way.
 
-    `clock` says how the time of the network where it was stamped translates to UTC, and how accurately:
-    `clock.utc(...)` is for such times in the payload, which no gateway changes.
+    `clock` translates the time of the network where the sample was stamped to UTC, and says how accurately:
+    `clock.utc(...)` is for such times in the payload, which gateways don't change.
     """
 
     data: bytes
@@ -82,13 +81,13 @@ class Sample(msgspec.Struct, Generic[T], gc=False):
 
 
 class LastReceived(msgspec.Struct, eq=False, weakref=True):
-    """The last message of a remote publisher, by whatever way it came."""
+    """The last message of a remote publisher, from any link."""
 
     sequence: int = 0
     stamp: int = 0
 
     def accept(self, sequence: int, stamp: int) -> bool:
-        """Enter a message; False if it, or a later one, was here before. Messages without a number are all new."""
+        """Enter a message; return False if it, or a later one, was here before. Without a number, all are new."""
         if sequence and sequence <= self.sequence and stamp <= self.stamp:
             return False
         self.sequence = sequence
@@ -103,7 +102,7 @@ class DuplicateFilter:
         self._stamps: dict[tuple[str, str], list[int]] = {}
 
     def accept(self, sample: Sample) -> bool:
-        """Enter a message that has a number; False if it was here before."""
+        """Enter a message with a number; return False if it was here before."""
         source = sample.source
         key = (source.module, source.node)
         stamps = self._stamps.get(key)

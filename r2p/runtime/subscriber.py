@@ -40,7 +40,7 @@ class SubscriberOptions(msgspec.Struct, frozen=True):
     on_timeout: Callable[[], object] | None
 
     def check(self, topic: str) -> None:
-        """Raise MessageError for options that make no sense."""
+        """Raise MessageError for invalid options."""
         check_count(topic, "queue", self.queue)
         if self.keep not in ("newest", "oldest"):
             raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {self.keep!r}")
@@ -56,7 +56,7 @@ class SubscriberOptions(msgspec.Struct, frozen=True):
 
 
 class _MonitoredQueue(deque[Sample]):
-    """A queue that notes when messages come in; only for subscribers with a time-out, as it costs time."""
+    """A queue that notes the arrival of messages; only for subscribers with a time-out, as it costs time."""
 
     def __init__(self, note: Callable[[Sample], None]) -> None:
         super().__init__()
@@ -85,13 +85,13 @@ class Subscriber(Generic[T]):
         self.topic = topic.name
         """The topic's name, after remapping."""
         self.callback: Callback[T] | None = options.callback
-        """The function that `Node.spin` calls with each message; None if they are read by iteration or `fetch`."""
+        """The function that `Node.spin` calls with each message; None for iteration or `fetch`."""
         self.undecodable = 0
         """Messages whose bytes don't decode as the type; skipped."""
         self.stale = 0
         """Messages older than `max_age` when their turn came; skipped."""
         self.timeouts = 0
-        """Times that nothing (fresh) came for `timeout` seconds."""
+        """Times that no fresh message arrived for `timeout` seconds."""
         self._sink = SubscriberQueue(
             space.wake_scheduler, node, options.queue, lossy=options.lossy, keep_oldest=options.keep == "oldest"
         )
@@ -112,7 +112,7 @@ class Subscriber(Generic[T]):
             self._sink.queue = _MonitoredQueue(self._note)
             self._alarm.set(self._last_message + self._timeout)
         self.queue = self._sink.queue
-        """The messages that wait to be read, oldest first."""
+        """Unread messages, oldest first."""
 
     @property
     def lost(self) -> int:
@@ -148,8 +148,8 @@ class Subscriber(Generic[T]):
         return self._iterate(whole=True)
 
     async def _iterate(self, *, whole: bool) -> AsyncIterator[Any]:  # noqa: C901 - see below
-        # One long function with everything in local variables, because this is where every message passes: calls would
-        # take as long as the work. `_next` and `_yield_sometimes` are the same for what is less frequent.
+        # One long function with everything in local variables, because every message passes here: calls would take as
+        # long as the work. `_next` and `_yield_sometimes` are the same for less frequent paths.
         sink, kind, create_future = self._sink, self._type, self._space.loop.create_future
         queue, wake_scheduler, ages = sink.queue, self._space.wake_scheduler, self._max_age is not None
         while not self._closed:
@@ -162,7 +162,7 @@ class Subscriber(Generic[T]):
                 finally:
                     if sink.waiter is waiter:
                         sink.waiter = None
-            # A node of low priority yields after each message, so that a more important one comes in between.
+            # A node of low priority yields after each message, so that a more important one runs in between.
             credit = YIELD_EVERY if sink.priority >= wake_scheduler.top else 1
             while queue:
                 sample = queue.popleft()
@@ -238,12 +238,12 @@ class Subscriber(Generic[T]):
     # Called by the node
 
     def open(self) -> None:
-        """Join the topic. A latched value is there at once."""
+        """Join the topic. A latched value is available at once."""
         self._topic.join(self._sink)
         self._space.changed(self._topic)
 
     async def serve(self) -> bool:
-        """Call the callback with each message that waits now; returns whether there was any. For `Node.spin`."""
+        """Call the callback with each waiting message; return whether there was any. For `Node.spin`."""
         served = False
         for _ in range(len(self.queue)):
             message = self._next()
@@ -267,7 +267,7 @@ class Subscriber(Generic[T]):
             self._sink.waiter = None
 
     def _next(self) -> T | None:
-        """Pop messages up to the next one that is fresh and decodes; returns None if there is no such message."""
+        """Pop messages up to the next one that is fresh and decodes; return None if there is no such message."""
         sink, queue = self._sink, self.queue
         while queue:
             sample = queue.popleft()
@@ -279,7 +279,7 @@ class Subscriber(Generic[T]):
         return None
 
     def _examine(self, sample: Sample) -> Any:
-        """The sample's message as this subscriber's type. None, counted: it is too old, or does not decode."""
+        """Return the sample's message as this subscriber's type; None, counted, if it is too old or does not decode."""
         if self._max_age is not None and self._space.clock.now() - sample.stamp > self._max_age:
             self.stale += 1
             return None

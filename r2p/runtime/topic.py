@@ -1,7 +1,7 @@
-"""A topic: what joins the publishers and subscribers of one module, and the links that carry it.
+"""A topic: joins the publishers and subscribers of one module, and the links that carry it.
 
 `Topic.deliver` is one loop over the queues, highest priority first, and one over the links that send it on. It never
-waits: the sinks that are full, and worth waiting for, come back to the publisher, whose class decides what that means.
+waits: full sinks worth waiting for are returned to the publisher, whose class decides what to do.
 """
 
 import abc
@@ -27,7 +27,7 @@ class RemoteSubscriber(Sink):
         super().__init__()
         self.link_name = link_name
         self.link = link
-        """The link itself; topics only compare it."""
+        """The link; topics only compare it."""
         self.wait_queue = wait_queue
 
     @property
@@ -59,12 +59,12 @@ class PublisherHandle(Protocol):
 
 
 class SlotPublisher(abc.ABC):
-    """Fills slots that a bus reserves for a topic: a periodic publisher of this module, or what a gateway relays."""
+    """Fills slots that a bus reserves for a topic: a periodic publisher of this module, or a gateway's relay."""
 
     period: float
     """Seconds."""
     lead: float
-    """Seconds before its slot in which a message is made."""
+    """Seconds before its slot at which a message is made."""
 
     @property
     @abc.abstractmethod
@@ -73,9 +73,9 @@ class SlotPublisher(abc.ABC):
 
     @abc.abstractmethod
     def use_slot_clock(self, slot_link: object, period: float) -> bool:
-        """Let a link call `tick` at its slots, each `period` seconds, instead of the clock; again: another period.
+        """Let a link call `tick` at its slots, each `period` seconds, instead of the clock; again: other slots.
 
-        False if the slots of another link are the clock, or the publisher is closed.
+        Return False if the slots of another link are the clock, or the publisher is closed.
         """
 
     @abc.abstractmethod
@@ -109,8 +109,8 @@ class Topic:
         self.name = name
         self.layout: Layout[Any] | None = None
         self.publishers: list[PublisherHandle] = []
-        # Both lists are replaced at a change, never changed in place: a sink may call the user's code, as where a line
-        # breaks when it is written to, and that may close what is in them while a sample is on its way through them.
+        # Both lists are replaced at a change, never changed in place: a sink may call the user's code, such as when a
+        # write breaks a line, and that code may close entries while a sample is on its way through them.
         self.queues: list[SubscriberQueue] = []
         """Queues of this module's subscribers, by descending priority."""
         self.remote_subscribers: list[RemoteSubscriber] = []
@@ -123,9 +123,9 @@ class Topic:
         self._last_received: WeakValueDictionary[Hashable, LastReceived] = WeakValueDictionary()
 
     def last_received(self, publisher: Hashable) -> LastReceived:
-        """The record that all links share by which a remote publisher's messages come in, to recognise duplicates.
+        """Return the record that all links with a remote publisher share, to recognise duplicates.
 
-        It lasts as long as one of them keeps it.
+        The record lasts as long as one of them keeps it.
         """
         last = self._last_received.get(publisher)
         if last is None:
@@ -135,11 +135,10 @@ class Topic:
     def deliver(  # noqa: C901 - see below
         self, sample: Sample, own: object = None, slot_link: object = None
     ) -> list[Sink] | None:
-        """Queue the sample wherever there is room; returns the sinks that are full, and worth waiting for.
+        """Queue the sample wherever there is room; return the full sinks that are worth waiting for.
 
-        For a sample of this module that includes those that became lossy: its publisher counts what they lose.
-        `own` is the publishing node: its own queues never make it wait. `slot_link` sends the sample in a slot: it is
-        passed over.
+        For a sample of this module these include sinks that became lossy: its publisher counts their losses. `own` is
+        the publishing node: its own queues never make it wait. `slot_link` sends in a slot, and is left out.
         """
         if self.drop_filter is not None and self.drop_filter(sample.source.link):
             return None
@@ -170,15 +169,15 @@ class Topic:
         return blocked if blocked is None else self._remaining(blocked)
 
     def _remaining(self, sinks: list[Sink]) -> list[Sink] | None:
-        """Leave out sinks that left while a sample was on its way: nothing would ever make room in them."""
+        """Leave out sinks that left meanwhile: they would never have room."""
         return [sink for sink in sinks if sink in self.queues or sink in self.remote_subscribers] or None
 
     def _send(
         self, subscribers: list[RemoteSubscriber], sample: Sample, blocked: list[Sink] | None, slot_link: object
     ) -> list[Sink] | None:
-        """Offer the sample to links; returns `blocked`, and those that have no room."""
+        """Offer the sample to links; return `blocked`, and those without room."""
         for remote in subscribers:
-            # Behind what waits in the same line: nothing overtakes. Two look-ups, as lines are mostly empty.
+            # Behind others in the same line: nothing overtakes. Two look-ups, as lines are mostly empty.
             queue = remote.wait_queue
             in_line = (queue.real_time or queue.non_real_time) and queue.line_of(sample)
             if remote.link is slot_link or (not in_line and remote.offer(sample)):
@@ -190,7 +189,7 @@ class Topic:
         return blocked
 
     def join(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
-        """Add a subscriber or a link; publishers that latch send it their last value."""
+        """Add a subscriber or a link; latching publishers send it their last value."""
         if isinstance(sink, SubscriberQueue):
             self.queues = sorted([*self.queues, sink], key=lambda queue: -queue.priority)
             for value in self.latched_values():
@@ -200,11 +199,11 @@ class Topic:
         self.resend_latched(sink)
 
     def latched_values(self) -> list[Sample]:
-        """The last messages of remote publishers that latch them."""
+        """Return the latched values of remote publishers."""
         return [value for source in self.latched_sources if (value := source.latched_value(self)) is not None]
 
     def resend_latched(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
-        """Let publishers send what they latch: for a subscriber that joins behind a link, or is back after a reboot."""
+        """Let publishers resend latched values to a subscriber that joins behind a link, or is back after a reboot."""
         for publisher in list(self.publishers):  # one may be closed by what its message brings about
             publisher.subscriber_joined(sink)
 
@@ -217,7 +216,7 @@ class Topic:
         sink.get_wait_queue().drop_sink(sink)
 
     def publisher_of(self, sample: Sample) -> PublisherHandle | None:
-        """The publisher of this module to which a link reports the fate of the sample; None if it came by a link."""
+        """Return this module's publisher, to which links report the sample's fate; None for a sample from a link."""
         if sample.source.link:
             return None
         for publisher in self.publishers:
@@ -265,7 +264,7 @@ class LinkView(Protocol):
         """Return the reason why slots for `size` bytes each `period` seconds are impossible, if there is one."""
 
     def network_time(self) -> int | None:
-        """The time (ns) that all nodes of the link's network share; None if it has no such time, or it is not known."""
+        """Return the time (ns) that all nodes of the link's network share; None without one, or if it is unknown."""
 
     async def admission(self, topic: str) -> None:
         """Wait until the link has admitted the topic."""
@@ -282,12 +281,12 @@ class TopicSpace:
         self.topics: dict[str, Topic] = {}
         self.links: list[LinkView] = []
         self.make_topic: Callable[[str, WakeScheduler], Topic] = Topic
-        """Makes the topics; a gateway has a class of its own."""
+        """The class of the topics; a gateway has its own."""
         self.changed: Callable[[Topic], None] = lambda _topic: None
-        """Called after a publisher or a subscriber of this module has come or gone."""
+        """Callback after a publisher or a subscriber of this module was added or removed."""
 
     def open(self, name: str, layout: Layout[Any] | None) -> Topic:
-        """The topic of that name, for a new user. Raises TypeMismatch if it has another layout (`None` fits any)."""
+        """Return the topic for a new user. Raises TypeMismatch if it has another layout (`None` fits any)."""
         topic = self.topics.get(name)
         if topic is None:
             topic = self.topics[name] = self.make_topic(name, self.wake_scheduler)

@@ -292,7 +292,7 @@ def _share(text: str) -> float:
 
 def _flag(text: str) -> bool:
     if text not in ("0", "1"):
-        raise ValueError("it must be 0 or 1")
+        raise ValueError("use 0 or 1")
     return text == "1"
 
 

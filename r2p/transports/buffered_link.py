@@ -1,9 +1,9 @@
 """A link with one send buffer and one way in for all its topics: the debug line, the memory network and RTCAN.
 
     publisher  ->  BufferedSubscriber.offer  ->  write     while there is room, else the sample waits in `wait_queue`
-    wire       ->  receive  ->  sample  ->  Topic.deliver  what does not fit is left to `LinkBackpressure`
+    wire       ->  receive  ->  sample  ->  Topic.deliver  full queues are left to `LinkBackpressure`
 
-A subclass implements `full`, `write`, `write_management` and `sample`, calls `receive` with what came in, and
+A subclass implements `full`, `write`, `write_management` and `sample`, calls `receive` with each received message, and
 `made_room` when it accepts again what it had rejected.
 """
 
@@ -44,7 +44,7 @@ class Arrival(Protocol):
 class _ReceivedTopic(msgspec.Struct):
     """A topic that is received. `sizes`: bytes of the messages of each publisher, by its address; 0: any.
 
-    The last message is kept for subscribers that come later, as it may be announced after it came that it is latched.
+    The last message is kept for later subscribers, as its publisher may only afterwards announce that it is latched.
     """
 
     topic: Topic
@@ -53,7 +53,7 @@ class _ReceivedTopic(msgspec.Struct):
 
 
 class BufferedLink(Link):
-    """A link that buffers what it sends, and delivers what it receives in the order in which that came."""
+    """A link with a send buffer, which delivers received messages in the order of their arrival."""
 
     in_order: ClassVar[bool] = True
     """True if the link keeps the order; else a message may overtake the answer that announces it."""
@@ -72,7 +72,7 @@ class BufferedLink(Link):
             self._space.loop, self.stats.lost, self._deliver_rest, lambda: self.flow_controlled
         )
         self._early: dict[tuple[bytes, Hashable], tuple[Arrival, int]] = {}
-        """The last message of each publisher that is not announced yet, and when it came (ns)."""
+        """The last message of each publisher that is not announced yet, and its arrival (ns)."""
 
     # For subclasses to implement
 
@@ -87,7 +87,7 @@ class BufferedLink(Link):
 
     @abc.abstractmethod
     def sample(self, topic: str, arrival: Any) -> Sample:
-        """Make a sample of what came in."""
+        """Make a sample of a received message."""
 
     def has_room_for(self, sample: Sample) -> bool:
         """Return whether there is room for this very sample now; called before each `write`."""
@@ -97,7 +97,7 @@ class BufferedLink(Link):
         return 0
 
     def sender(self, arrival: Any) -> Hashable:
-        """The sender's address on a bus; None on a line with one other end."""
+        """Return the sender's address on a bus; None on a line with one other end."""
         return None
 
     @property
@@ -106,7 +106,7 @@ class BufferedLink(Link):
         return False
 
     def pause(self) -> None:
-        """Stop reading, if possible: what came in is still being delivered."""
+        """Stop reading, if possible: received messages are still being delivered."""
 
     def resume(self) -> None:
         """Go on reading."""
@@ -114,7 +114,7 @@ class BufferedLink(Link):
     # Out
 
     def made_room(self) -> None:
-        """Send samples that wait, in order, while there is room. Call it when `has_room_for` may answer differently."""
+        """Send waiting samples, in order, while there is room. Call it when the answer of `has_room_for` may change."""
         while not self.stats.lost.guard(self.wait_queue.serve):
             pass  # the sample that raised is out of the queue: go on with the others
         if not self.full:
@@ -185,7 +185,7 @@ class BufferedLink(Link):
     # In: messages
 
     def receive(self, arrivals: Iterable[Arrival]) -> None:
-        """Deliver what came in, at most MESSAGES_PER_TURN messages in one turn of the loop."""
+        """Deliver received messages, at most MESSAGES_PER_TURN in one turn of the loop."""
         if self._closed:
             return
         self._arrivals.extend(arrivals)
@@ -195,7 +195,7 @@ class BufferedLink(Link):
             self.pause()  # the connection is a new one, which still reads
 
     def receive_other(self, arrival: Any) -> None:
-        """Handle what is of no topic that is received: management, or something unexpected."""
+        """Handle a message of any other topic: management, or something unexpected."""
         if arrival.topic == _MANAGEMENT:
             self.manage(arrival.data, self.sender(arrival))
         else:
@@ -244,7 +244,7 @@ class BufferedLink(Link):
             self.resume()
 
     def _deliver_rest(self) -> None:
-        """Go on behind the message that had no room: it has been delivered, or given up."""
+        """Go on after the blocked message, which has been delivered or given up."""
         if not self._closed:
             self._deliver()
 
@@ -304,11 +304,11 @@ class BufferedSubscriber(LinkSubscriber):
 
 
 class SenderLookup:
-    """The source of messages by topic and address, looked up anew when discovery has learnt something.
+    """The source of messages by topic and address, looked up anew after changes in discovery.
 
-    Lines and CAN frames do not say who sent them, so that follows from what discovery knows: r2p modules announce which
-    of their nodes publish a topic. A topic that none has announced comes from the only module that can have sent it, if
-    there is only one. `shared` are the addresses that several modules may have.
+    Lines and CAN frames do not name their sender, so it follows from discovery: r2p modules announce which of their
+    nodes publish a topic. A topic that no module has announced comes from the only possible sender, if there is only
+    one. `shared` are addresses that several modules may have.
     """
 
     def __init__(self, discovery: DiscoveryProtocol, link: str, shared: tuple[PeerAddress, ...] = ()) -> None:
@@ -319,7 +319,7 @@ class SenderLookup:
         self._generation = -1
 
     def source(self, topic: str, address: PeerAddress = None) -> Source:
-        """The source of a message from this address. Without an address it may be any module at the other end.
+        """Return the source of a message from this address. Without an address it may be any module at the other end.
 
         A name is empty if it is unknown or ambiguous.
         """

@@ -1,8 +1,8 @@
-"""The debug line: one other end that speaks in lines of ASCII (PROTOCOL.md 3), whatever carries the bytes.
+"""The debug line: lines of ASCII (PROTOCOL.md 3) to and from one other end, over any carrier of bytes.
 
-The first line that is written in a turn of the event loop is sent at once, the others of that turn in one piece. While
-the carrier (TCP connection, serial port) takes no more, lines wait here, where management can overtake samples. Those
-of real-time publishers never wait: each is sent at once, before all that wait, or its publisher keeps it and watches
+The first line written in a turn of the event loop is sent at once, the others of that turn in one piece. While the
+carrier (TCP connection, serial port) takes no more, lines wait here, where management can overtake samples. Those of
+real-time publishers never wait: each is sent at once, before all waiting ones, or its publisher keeps it and watches
 the time. A carrier is attached while it lives. The link outlasts it, and so do its subscriptions and counters.
 
 `UnconfirmedBytes` finds out how many messages a broken connection may have lost.
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 BUFFER = 64 * 1024
-"""Bytes that wait for a connection that takes no more, before its publishers have to wait or lose."""
+"""Bytes that wait for a busy connection before its publishers have to wait or lose messages."""
 
 _MANAGEMENT_BUFFER = 8 * 1024  # bytes more, for management only
 _URGENT_MAX = 96  # urgent messages that wait, whatever else does: another 8 KiB
@@ -46,19 +46,19 @@ _NRT = PublisherClass.NON_REAL_TIME
 class Carrier(abc.ABC):
     """A connection that carries the bytes of a line link.
 
-    It calls `carrier_full()` of its link when it holds bytes that could not be sent at once, and `carrier_ready()` when
-    it has none left; in between it is given nothing, except the last lines before `close()`.
+    A carrier calls `carrier_full()` of its link when it holds bytes that could not be sent at once, and
+    `carrier_ready()` when it has none left; in between it gets nothing but the last lines before `close()`.
     """
 
     flow_controlled: ClassVar[bool] = False
     """True if the other end waits while nothing is read, and nothing is lost by that."""
 
     unconfirmed = 0
-    """Bytes that it was given and that the other end has not confirmed, as far as that is known when it breaks."""
+    """Return the number of bytes sent that the other end has not confirmed, as far as known when the carrier breaks."""
 
     @abc.abstractmethod
     def send(self, data: bytes) -> None:
-        """Send, or hold what can't be sent at once."""
+        """Send the bytes, and hold those that can't be sent at once."""
 
     @abc.abstractmethod
     def pause(self) -> None:
@@ -70,11 +70,11 @@ class Carrier(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Send what is held, as far as the other end reads it, and close."""
+        """Send held bytes, as far as the other end reads them, and close."""
 
 
 class Connection(Carrier):
-    """A carrier that can break. Its transport waits until it has ended, and closes it."""
+    """A carrier that can break. Its transport waits for its end, and closes it."""
 
     def __init__(self) -> None:
         self.ended = asyncio.Event()
@@ -82,10 +82,10 @@ class Connection(Carrier):
 
     @abc.abstractmethod
     def abort(self) -> None:
-        """Close at once; does nothing when it is closed."""
+        """Close at once; do nothing if it is closed."""
 
     async def aclose(self) -> None:
-        """Close, and wait until it has ended; what the other end does not read soon is not sent."""
+        """Close, and wait for the end; bytes that the other end does not read soon are not sent."""
         self.close()
         try:
             with contextlib.suppress(TimeoutError):
@@ -97,9 +97,9 @@ class Connection(Carrier):
 
 
 class _NewStamp(msgspec.Struct, frozen=True, gc=False):
-    """Stands among the lines that wait to be delivered: those behind it came in at `received_at` (UTC, ns).
+    """A mark among lines that wait for delivery: the lines behind it arrived at `received_at` (UTC, ns).
 
-    Bytes hardly ever come while lines wait, so a mark before them is cheaper than a stamp on each line.
+    Bytes hardly ever arrive while lines wait, so a mark is cheaper than a stamp on each line.
     """
 
     received_at: int
@@ -110,8 +110,8 @@ class _NewStamp(msgspec.Struct, frozen=True, gc=False):
 class LineLink(BufferedLink):
     """A link over the debug line.
 
-    `buffer` bytes may wait for the carrier. With `piecemeal` the carrier is given one line at a time, so that no more
-    than one line is past being overtaken or discarded.
+    `buffer` bytes may wait for the carrier. With `piecemeal` the carrier gets one line at a time, so that at most one
+    line can no longer be overtaken or discarded.
     """
 
     max_payload: ClassVar[int] = debug.PAYLOAD_MAX
@@ -167,7 +167,7 @@ class LineLink(BufferedLink):
         self._lose_unsent()  # after `on_down`, so that it counts as lost in this outage
 
     def feed(self, data: bytes | memoryview) -> None:
-        """Deliver the messages in bytes that came in."""
+        """Deliver the messages in received bytes."""
         self.stats.bytes_received += len(data)
         received_at = self._clock.now()
         try:
@@ -182,7 +182,7 @@ class LineLink(BufferedLink):
         self.receive(lines)
 
     def _readable_lines(self, data: bytes) -> list[debug.Line]:
-        """All lines but the one whose reading raised, each read separately."""
+        """Return all lines but the one whose reading raised, each read separately."""
         lines: list[debug.Line] = []
         self._reader.drops = {}  # up to what raised they are counted already
         for piece in data.splitlines(keepends=True):
@@ -198,7 +198,7 @@ class LineLink(BufferedLink):
         self._blocked = True
 
     def carrier_ready(self) -> None:
-        """Go on with what waits: the carrier has sent all that it held."""
+        """Go on with waiting lines: the carrier has sent all its bytes."""
         self._blocked = False
         self.stats.lost.guard(self._report_late)
         self.made_room()  # before the bytes that wait fill the carrier again
@@ -306,8 +306,8 @@ class LineLink(BufferedLink):
         super()._remove_subscriber(name)
         self._encoders.pop(name, None)
 
-    # Firmware drops what comes too soon after a new connection (PROTOCOL.md 4). Its subscriptions outlast the old one,
-    # so samples wait for as long.
+    # Firmware drops messages too soon after a new connection (PROTOCOL.md 4). Its subscriptions outlast the old one, so
+    # samples wait for as long.
 
     def _begin_grace(self) -> None:
         if self._subscribers.keys() - self._lapsed:
@@ -366,7 +366,7 @@ class LineLink(BufferedLink):
             self._carrier.send(data)
 
     def _count_unknown(self) -> None:
-        """Count what the connection had been given, and the other end may not have received."""
+        """Count messages that the connection had accepted, and the other end may not have received."""
         if self._carrier is not None and not self._closed:
             lost = self._unsent is not None  # that one certainly is, and is counted as such
             unknown = self._unconfirmed.messages_in(self._carrier.unconfirmed, self._messages_given) - lost
@@ -438,10 +438,10 @@ _LONG_STEP = 16 * _STEP  # bytes between two marks before those: 8 MB, more than
 
 
 class UnconfirmedBytes:
-    """The number of messages that the last bytes of a connection were: what may be lost when it breaks.
+    """The number of messages in the last bytes of a connection, which may be lost when it breaks.
 
-    The longer ago bytes were sent, the fewer of their positions are known, so memory stays small; where the position
-    that is asked for is not known the answer is the count as of the known one before it.
+    The longer ago bytes were sent, the fewer of their positions are known, so memory stays small; for an unknown
+    position the answer is the count as of the known one before it.
     """
 
     def __init__(self) -> None:
@@ -461,7 +461,7 @@ class UnconfirmedBytes:
         self._bytes = position + size
 
     def messages_in(self, last: int, messages: int) -> int:
-        """Return how many messages the `last` bytes were, at most; `messages` have been sent by now."""
+        """Return how many messages are in the `last` bytes, at most; `messages` have been sent by now."""
         if not last or not self._recent:
             return 0
         begin = self._bytes - last
@@ -481,7 +481,7 @@ class _Marks:
     def __init__(self, step: int) -> None:
         self._step = step
         self.next = 0
-        """The position from which on the next mark is due."""
+        """The position of the next mark."""
         self.positions = array("Q")
         self.messages = array("Q")
 

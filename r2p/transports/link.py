@@ -1,9 +1,9 @@
-"""A link: one line, connection or bus as a module sees it, and the discovery that runs on it.
+"""A link: one line, connection or bus as a module sees it, with its discovery.
 
-A transport, which a URL names, opens links and keeps them up. The link's discovery decides what flows: nothing is sent
-that no module at the other end subscribes to, and nothing is received that no node here subscribes to. `Link` holds
-what all links share: discovery, announcements, state and counters. How messages are sent and received is up to its two
-kinds: `BufferedLink`, with one send buffer for all topics, and zenoh's, with a stream for each topic.
+A transport, which a URL names, opens links and keeps them up. The link's discovery decides what flows: only topics with
+subscribers at the other end are sent, and only those with subscribers here are received. `Link` has the common part:
+discovery, announcements, state and counters. Its two kinds send and receive messages: `BufferedLink`, with one send
+buffer for all topics, and zenoh's, with a stream for each topic.
 """
 
 import abc
@@ -54,8 +54,8 @@ MESSAGES_PER_TURN = 64
 class Announcement(msgspec.Struct, frozen=True):
     """The other ends' view of a topic of this module; `asked` is the type in which it subscribes to the topic.
 
-    `queue`: how many messages a publisher keeps, or has on the way, for this module; that has nothing to do with the
-    queues of its own subscribers.
+    `queue`: how many messages a publisher keeps, or has on the way, for this module; independent of its subscribers'
+    queues.
     """
 
     publishes: bool = False
@@ -111,7 +111,7 @@ class Hub(Protocol):
 
     @property
     def random(self) -> random.Random:
-        """For jitter; seeded under virtual time."""
+        """Random numbers for jitter; seeded under virtual time."""
 
     def attach(self, link: "Link") -> None:
         """Add a link to the module."""
@@ -145,7 +145,7 @@ class GatewayHooks(Protocol):
         """Handle a management message before discovery does; return True if it concerns gateways only."""
 
     def desired_state(self, topic: Topic, own: Announcement) -> Announcement:
-        """Return what the other ends should know of a topic: `own`, and what is wanted for other links."""
+        """Return what the other ends should know of a topic: `own`, and the demand of other links."""
 
     @property
     def may_announce(self) -> bool:
@@ -156,10 +156,10 @@ class GatewayHooks(Protocol):
         """Return whether there are other gateways on the link's network."""
 
     def source_name(self, source: Source) -> str:
-        """The name of the module that published a message, as it is on the link's network."""
+        """Return the name of a message's module, as it is on the link's network."""
 
     def discovery_changed(self) -> None:
-        """Adapt to what discovery knows: it may have changed."""
+        """Adapt to changes in discovery."""
 
 
 class Transport(abc.ABC):
@@ -169,13 +169,13 @@ class Transport(abc.ABC):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         """Attach links and keep them alive for ever; on cancellation close and detach them.
 
-        Calls `opened()` once it works, or works on its way by itself: the module's `async with` waits for that. Raises
-        TransportError for what waiting can't mend, such as an address in use; Broken if it had worked before.
+        Calls `opened()` as soon as the transport works, or will work without further action: the module's `async with`
+        waits for that. Raises TransportError for permanent faults, such as an address in use; Broken if it has worked.
         """
 
 
 class Link(abc.ABC):
-    """The part that all links share: discovery, announcements, state and counters."""
+    """The base of all links: discovery, announcements, state and counters."""
 
     max_payload: ClassVar[int] = 255
     """Bytes of the longest message."""
@@ -191,10 +191,10 @@ class Link(abc.ABC):
     def __init__(
         self, name: str, hub: Hub, *, management_rate: float = 250.0, discovery: DiscoveryProtocol | None = None
     ) -> None:
-        """`management_rate`: management messages a second that its discovery sends at most, without one of its own."""
+        """`management_rate`: management messages a second at most, for a link without a discovery of its own."""
         self.name = name = unique_name(name, hub)
         self.title = self.name.removesuffix(":")
-        """The name as it stands in texts."""
+        """The name for texts."""
         self.up = False
         self.unreachable_reason = ""
         """Why its other end can't be reached, once that has been reported; empty while it is up."""
@@ -215,7 +215,7 @@ class Link(abc.ABC):
         self._clock = hub.space.clock
         self._alarm = Alarm(hub.space.loop, self._poll, background=True)  # announcements keep no program going
         self._subscribers: dict[str, LinkSubscriber] = {}
-        """By topic: those at the other end, as publishers here see them."""
+        """Subscribers at the other end as publishers here see them, by topic."""
         self._announced: dict[str, Announcement] = {}
         self._lapsed: set[str] = set()  # topics that lost their subscribers while the link was down
         self._events: deque[Event] = deque()
@@ -227,7 +227,7 @@ class Link(abc.ABC):
     # For the transport that owns the link
 
     def on_up(self) -> None:
-        """Begin to send, and announce everything: the other end can be reached."""
+        """Begin to send, and announce everything, as the other end can be reached."""
         outage = (self._clock.monotonic() - self._down_at) / SECOND
         lost = self.stats.lost[LINK_DOWN] - self._lost_at_down
         self.up = True
@@ -246,7 +246,7 @@ class Link(abc.ABC):
             self._hub.link_waits(self, reason)
 
     def on_down(self, reason: str) -> None:
-        """Stop sending, and discard and count what waits: no stale command ever arrives late. The other end is gone."""
+        """Stop sending, as the other end is gone; discard and count what waits: no stale command arrives late."""
         if not self.up:
             return
         self.up = False
@@ -255,7 +255,7 @@ class Link(abc.ABC):
         lost = self.discard()  # which may count some itself
         self.stats.lost[LINK_DOWN] += lost
         self._hub.link_changed(self, reason, 0.0, 0)
-        # Before discovery forgets who subscribed, and so which topics the link carried.
+        # Before discovery forgets the subscribers, and so which topics the link carried.
         carried = [publisher for each in self._subscribers.values() for publisher in each.topic.publishers]
         self._apply(self.discovery.link_down(self._down_at))
         for publisher in carried:
@@ -280,11 +280,11 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
-        """Send a management message before the samples that wait, `urgent` ones before all; lost if nothing moves."""
+        """Send a management message before waiting samples, `urgent` ones before all; lost if nothing moves."""
 
     @abc.abstractmethod
     def discard(self) -> int:
-        """Empty the send buffer; return how many samples are lost by that."""
+        """Empty the send buffer; return how many samples are lost."""
 
     @abc.abstractmethod
     def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
@@ -300,7 +300,7 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def _subscriber_joined(self, event: SubscriberJoined) -> None:
-        """Send the topic from now on, and what is latched."""
+        """Send the topic from now on, and its latched values."""
 
     def _release_topics(self) -> None:
         for name in list(self._subscribers):
@@ -312,13 +312,13 @@ class Link(abc.ABC):
         return False
 
     def module_changed(self, module: str) -> None:
-        """Adapt to a module at the other end that came, went, or changed its state."""
+        """Adapt to a module at the other end that joined, left, or changed its state."""
 
     # For publishers and the module
 
     @property
     def losses(self) -> Counter[str]:
-        """All that was dropped since the link was opened, in both directions, by reason."""
+        """All losses since the link was opened, in both directions, by reason."""
         return self.stats.lost + self.discovery.counts
 
     def latched(self, topic: str) -> bool:
@@ -326,7 +326,7 @@ class Link(abc.ABC):
         return any(each.latches(topic) for each in self.discovery.endpoints.values())
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
-        """Describe what the class means here for this topic."""
+        """Describe what the class means for this topic on this link."""
         return "best effort, in order" + (", waits for room" if publisher_class == PublisherClass.NON_REAL_TIME else "")
 
     def best_effort(self, publisher_class: PublisherClass) -> bool:
@@ -343,11 +343,11 @@ class Link(abc.ABC):
         return None
 
     def network_time(self) -> int | None:
-        """The time (ns) that all nodes of the network share; None if it has no such time, or it is not known."""
+        """Return the time (ns) that all nodes of the network share; None without one, or if it is unknown."""
         return None
 
     def translation(self) -> ClockOffset | None:
-        """Return how network time translates to UTC here, and how accurately; None if that is not known."""
+        """Return the translation of network time to UTC, and its accuracy; None if unknown."""
         return None
 
     def params(self, topic: str) -> bytes | None:
@@ -362,7 +362,7 @@ class Link(abc.ABC):
         """Wait until the link has admitted the topic; best effort is admitted at once."""
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
-        """A message class of this layout, from a module on the link that has it; where types can be asked for."""
+        """Return a message class of this layout from a module on the link, where types can be requested."""
         return None
 
     def command(self, command: Command, module: str) -> None:
@@ -370,15 +370,15 @@ class Link(abc.ABC):
         self._apply(self.discovery.command(self._clock.monotonic(), command, module))
 
     def report_conflict(self, module: str, instance_a: int, instance_b: int) -> None:
-        """Tell two modules that they have the same name."""
+        """Inform two modules that they have the same name."""
         self._apply(self.discovery.report_conflict(self._clock.monotonic(), module, instance_a, instance_b))
 
     def relay(self, message: Relayed) -> None:
-        """Pass on what a module on another link has announced."""
+        """Pass on the announcement of a module on another link."""
         self._apply(self.discovery.relay(self._clock.monotonic(), message))
 
     def query(self) -> None:
-        """Ask all modules to repeat what they publish and subscribe."""
+        """Ask all modules to repeat what they publish and subscribe to."""
         self._apply(self.discovery.query(self._clock.monotonic()))
 
     def set_flags(self, flags: int) -> None:
@@ -386,7 +386,7 @@ class Link(abc.ABC):
         self._apply(self.discovery.set_flags(self._clock.monotonic(), flags))
 
     def topic_changed(self, topic: Topic) -> None:
-        """Announce what this module publishes and subscribes of a topic: it may have changed."""
+        """Announce a topic that this module publishes or subscribes to, after a possible change."""
         known = self._announced.pop(topic.name, NOTHING)
         desired = _announcement_of(topic)
         if self.gateway_hooks is not None:
@@ -400,7 +400,7 @@ class Link(abc.ABC):
         )
         if desired != known:
             self._apply(self._announce_changes(topic.name, known, desired))
-        # Discovery reports nothing of what this module has withdrawn itself.
+        # Discovery reports nothing that this module has withdrawn itself.
         if not desired.publishes:
             self._remove_subscriber(topic.name)
         if not desired.subscribes:
@@ -409,7 +409,7 @@ class Link(abc.ABC):
             self._announced[topic.name] = desired
 
     def _announce_changes(self, topic: str, known: Announcement, desired: Announcement) -> list[Event]:
-        """Bring the other ends from what they know of a topic to what they should know; return what follows from it."""
+        """Announce the difference between what the other ends know of a topic and should know; return the events."""
         discovery, now = self.discovery, self._clock.monotonic()
         events: list[Event] = []
         retyped = (desired.size, desired.fingerprint) != (known.size, known.fingerprint)
@@ -490,7 +490,7 @@ class Link(abc.ABC):
 class LinkSubscriber(RemoteSubscriber):
     """One topic on its way out by one link, for all modules at the other end that subscribe to it.
 
-    Publishers do not wait for a link that is down: what it is given then is lost and counted.
+    Publishers do not wait for a link that is down: its messages are lost and counted.
     """
 
     __slots__ = ("topic",)
@@ -527,14 +527,14 @@ def is_booting(link: Link, module: str) -> bool:
 
 
 def unique_name(name: str, hub: Hub) -> str:
-    """A name that no other link has, though it may lead to the same place; all parts of the link use this one."""
+    """Return a name that no other link has, even one to the same place; all parts of the link use this one."""
     used = {each.name for each in hub.space.links}
     names = itertools.chain((name,), (f"{name}#{n}" for n in itertools.count(2)))
     return next(each for each in names if each not in used)
 
 
 def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
-    """Make the discovery of a line or a bus; `rate` is in messages/s."""
+    """Make the discovery of a line or a bus; `rate` is in messages per second."""
     counts = LoggedCounter(link, hub.space.clock)
     burst = max(4, int(rate / 4))  # what a quarter of a second carries
     return Discovery(hub.space.module, hub.instance, rate=rate, burst=burst, observer=hub.observer, counts=counts)

@@ -1,8 +1,7 @@
 """The in-memory network: modules of one process on a bus that loses, delays, duplicates and reorders on request.
 
 All modules that open `memory:NAME` in one event loop share the network NAME; `MemoryNetwork.transport()` joins one
-without a name. What happens to a message is drawn from one seeded generator, so under virtual time a run with the same
-seed goes the same way.
+without a name. The faults come from one seeded generator, so under virtual time, runs with the same seed are identical.
 """
 
 import asyncio
@@ -25,7 +24,7 @@ from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url, duration
 
 IN_FLIGHT = 1024
-"""Messages that may be on their way before senders find the network full."""
+"""Messages on their way at which the network is full for senders."""
 
 
 class Datagram(msgspec.Struct, frozen=True, gc=False):
@@ -46,7 +45,7 @@ class Datagram(msgspec.Struct, frozen=True, gc=False):
 
 
 class MemoryPort:
-    """A socket on a network. While its reader has paused it holds what comes: that is still on its way.
+    """A socket on a network. While its reader pauses, it holds messages: they are still on their way.
 
     `made_room` is called when the network is no longer full.
     """
@@ -61,7 +60,7 @@ class MemoryPort:
         self.paused = False
 
     def resume(self) -> None:
-        """Hand on what was held."""
+        """Hand on held messages."""
         self.paused = False
         while self.held and not self.paused:
             self.network.release()
@@ -72,8 +71,8 @@ class MemoryNetwork:
     """A network of this process, and its faults: probabilities 0..1, `delay` and `jitter` in seconds.
 
     `reorder` is the probability that a message is held back long enough for the next ones to overtake it. Faults can be
-    changed while it runs; `counts` shows what happened. Without a `seed` the event loop that runs at its first fault
-    gives one (under virtual time that of the test).
+    changed at any time; `counts` shows what happened. Without a `seed`, the event loop provides one at the first fault
+    (under virtual time that of the test).
     """
 
     def __init__(
@@ -101,7 +100,7 @@ class MemoryNetwork:
         self._in_flight = 0
 
     def transport(self, name: str = "") -> "MemoryTransport":
-        """A place on this network, for `Module(via=...)` of one module."""
+        """Return a place on this network, for `Module(via=...)` of one module."""
         return MemoryTransport(name, self)
 
     @property
@@ -185,13 +184,13 @@ _networks: "weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, Memor
 
 
 def network(name: str) -> MemoryNetwork:
-    """The running loop's network of that name, made at first use: to change its faults, or to watch its counts."""
+    """Return the running loop's network of that name, made at first use: to set its faults, or to read its counts."""
     networks = _networks.setdefault(asyncio.get_running_loop(), {})
     return networks.setdefault(name, MemoryNetwork())
 
 
 class MemoryLink(BufferedLink):
-    """One module's place on a memory network; it can be unplugged, and plugged in again."""
+    """One module's link to a memory network, which can be unplugged and plugged in again."""
 
     max_payload: ClassVar[int] = 1024
     in_order: ClassVar[bool] = False
@@ -204,12 +203,12 @@ class MemoryLink(BufferedLink):
         self._times_left = TimesLeft()
 
     def connect(self) -> None:
-        """Plug it in."""
+        """Plug the link in."""
         self.network.plug_in(self._address, self._port)
         self.on_up()
 
     def disconnect(self, reason: str = "unplugged") -> None:
-        """Unplug it."""
+        """Unplug the link."""
         self.network.unplug(self._address)
         self.on_down(reason)
 
@@ -257,7 +256,7 @@ class MemoryLink(BufferedLink):
         )
 
     def _expiry(self, arrival: Datagram) -> int:
-        """The deadline by the clock of this computer."""
+        """Return the deadline by the clock of this computer."""
         publisher = (arrival.port, arrival.module, arrival.node)
         left = self._times_left.of(publisher).left(self._clock.monotonic(), arrival.stamp, arrival.deadline)
         return self._clock.now() + left

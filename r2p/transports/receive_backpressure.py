@@ -1,16 +1,15 @@
 """Let a message from a link wait for room in a full queue.
 
 A `BlockedMessage` waits FULL_QUEUE_TURNS turns of the event loop: most readers make room within them. Then its owner
-decides. There are two, as a slow reader must not stop what others receive, and a fast one should lose nothing:
+decides. There are two owners, as a slow reader must not stop others, and a fast one should lose nothing:
 
 `LinkBackpressure`, on a link whose topics share one way in. A queue that made no room is treated as lossy (it gets
 messages by force, which drops older ones) until it has plenty of room again. Where a gateway passes messages on to a
 link without room, and the sender waits while nothing is read, the link stops reading instead, for STALL_MAX_S seconds
-at most: so backpressure reaches from end to end.
+at most: so backpressure is end to end.
 
 `Backlog`, for one topic on zenoh, whose packets wait apart from those of other topics. A message that does not expire
-waits for as long as it takes: its publisher learns that from the credit that does not come. An event or a periodic
-message replaces an older one.
+waits without a limit, and its publisher gets no credit meanwhile. An event or a periodic message replaces an older one.
 """
 
 import abc
@@ -28,13 +27,13 @@ from r2p.transports.stats import LoggedCounter
 P = TypeVar("P")  # what is known of a message's publisher; it is only passed on
 
 FULL_QUEUE_TURNS = 4
-"""Turns of the event loop that a link waits for a full queue before it goes on without it."""
+"""Turns of the event loop for which a link waits for a full queue."""
 
 STALL_MAX_S = 1.0
-"""Seconds that a link reads nothing, at most, while another link has no room."""
+"""Seconds for which a link reads nothing, at most, while another link has no room."""
 
 STALL_MIN_S = 0.05
-"""Seconds that it reads nothing, at most, right after a stall that has not helped.
+"""Seconds for which it reads nothing, at most, right after a stall that has not helped.
 
 Where many topics have no room, the link would otherwise stall for STALL_MAX_S once for each of them. The limit grows
 with the time since that stall, up to STALL_MAX_S. 0.05 is a choice: 20 blocked topics cost a second.
@@ -45,7 +44,7 @@ BACKLOG_MAX = 16_384
 
 
 class ReceiveBackpressure(abc.ABC):
-    """The owner of a `BlockedMessage`: delivers what comes by a link in order, and decides how long a message waits."""
+    """The owner of a `BlockedMessage`: delivers a link's messages in order, and decides how long each waits."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, lost: LoggedCounter) -> None:
         self.loop = loop
@@ -74,7 +73,7 @@ class BlockedMessage(PendingDelivery):
         owner.loop.call_soon(self._retry)
 
     def hold(self) -> None:
-        """Wait on, without a limit."""
+        """Keep waiting, without a limit."""
         self._holds = True
 
     def leave(self, sink: Sink) -> None:
@@ -93,7 +92,7 @@ class BlockedMessage(PendingDelivery):
         self._check_remaining()
 
     def _offer(self, sink: Sink) -> bool:
-        """Offer the message to a sink. Returns True if its wait is over: it has the message, or has raised."""
+        """Offer the message to a sink. Return True if the wait is over: the sink has the message, or raised."""
         try:
             return sink.offer(self.sample)
         except Exception as error:  # noqa: BLE001 - counted and logged; the others follow
@@ -134,7 +133,7 @@ class LinkBackpressure(ReceiveBackpressure):
         self._closed = False
 
     def wait(self, sample: Sample, blocked: list[Sink]) -> bool:
-        """Wait for room in these sinks: `resume` is called later. Returns False if none of them is worth a wait."""
+        """Wait for room in these sinks: `resume` is called later. Return False if none of them is worth a wait."""
         for sink in self._lossy.intersection(blocked):
             self.lost.guard(sink.force, sample)
         worth_a_wait = [sink for sink in blocked if sink not in self._lossy]
@@ -157,7 +156,8 @@ class LinkBackpressure(ReceiveBackpressure):
         # Only other links stall this one: a slow reader in this module loses messages, so that other topics go on.
         may_stall = self._flow_controlled() and not self._closed
         slow = [sink for sink in message.remaining if not (may_stall and isinstance(sink, RemoteSubscriber))]
-        # Events and periodic messages stall nothing: they would be stale. The other link is no less waited for later.
+        # Events and periodic messages stall nothing: they would be stale. The other link is waited for all the same
+        # later.
         stalls = message.sample.publisher_class == PublisherClass.NON_REAL_TIME
         rest = slow if stalls else list(message.remaining)
         for sink in rest:
@@ -172,7 +172,7 @@ class LinkBackpressure(ReceiveBackpressure):
         else:
             self._resume()
 
-    # Stall: nothing is read until there is room on the links that the message goes out by, or the time is over
+    # Stall: nothing is read until there is room on the message's outgoing links, or the time is over
 
     def _begin_stall(self, message: BlockedMessage) -> None:
         message.hold()
@@ -201,8 +201,8 @@ class LinkBackpressure(ReceiveBackpressure):
 class Backlog(ReceiveBackpressure, Generic[P]):
     """Messages that wait for room on one topic: the blocked one, and those behind it.
 
-    `deliver` gets each message when it has its turn, and None for the blocked one when every sink has it; `resume` is
-    called when reading may go on.
+    `deliver` gets each message in its turn, and None for the blocked one when every sink has it; `resume` is called
+    when reading may go on.
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class Backlog(ReceiveBackpressure, Generic[P]):
         self.blocked = BlockedMessage(sample, sinks, self)
 
     def append(self, publisher: P, serial: int, sample: Sample | None) -> bool:
-        """Put a message behind the others, or None in place of one that is only acknowledged. False if it is full."""
+        """Append a message, or None in place of one that is only acknowledged; return False if there is no room."""
         if len(self._queue) >= BACKLOG_MAX:
             return False
         self._queue.append((publisher, serial, sample))

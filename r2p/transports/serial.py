@@ -1,8 +1,8 @@
-"""The debug line over a serial port; where the device vanishes, the transport waits until it is back.
+"""The debug line over a serial port; if the device vanishes, the transport waits until it is back.
 
 pyserial configures the port; reading and writing go straight to its file descriptor in the event loop. A slow line must
 not have its queue in the kernel, where nothing can be overtaken or discarded, so the kernel gets only IN_KERNEL seconds
-of it. What real-time publishers send waits with them until there is room.
+of it. Messages of real-time publishers wait with these until there is room.
 """
 
 import asyncio
@@ -75,7 +75,7 @@ class SerialTransport(Transport):
             hub.detach(link)
 
     async def _connect(self, link: LineLink, bytes_a_second: float) -> bool:
-        """Use the device until it is gone; returns False if it can't be opened."""
+        """Use the device until it is gone; return False if it can't be opened."""
         try:
             device = self._open()
         except (OSError, ValueError, termios.error) as error:
@@ -176,7 +176,7 @@ class _SerialConnection(Connection):
             while self._unsent:
                 queued = _queued(self._fd)
                 if queued >= self._window:
-                    # Half of the time that it takes to empty, so that the line never runs dry.
+                    # Half of the time to empty it, so that the line never runs dry.
                     self._timer = self._loop.call_later(queued / self._bytes_a_second / 2, self._write)
                     return
                 del self._unsent[: os.write(self._fd, self._unsent[: self._window - queued])]
@@ -233,7 +233,7 @@ def _end_differs_from_silence(fd: int) -> None:
 
 
 def _queued(fd: int) -> int:
-    """Bytes that the kernel has not sent yet; 0 where the driver can't say, or its device is gone."""
+    """Return the bytes that the kernel has not sent yet; 0 if the driver can't say, or the device is gone."""
     try:
         return int.from_bytes(fcntl.ioctl(fd, termios.TIOCOUTQ, bytes(4)), "little")
     except OSError:

@@ -1,7 +1,7 @@
 """The counters of a link: messages, bytes and connections, and by reason what it dropped.
 
-All who drop something count it in the link's `LoggedCounter`. That one logs, too, within limits: so no place that drops
-needs a logger, and a flood of bad messages can't fill the log.
+All losses are counted in the link's `LoggedCounter`, which also logs them within limits: so code that drops messages
+needs no logger, and a flood of bad messages can't fill the log.
 """
 
 import logging
@@ -18,7 +18,7 @@ from r2p.runtime.backpressure import INTERNAL_ERROR
 logger = get_logger("r2p.link")
 
 RETRY_AFTER_ERROR = 100_000_000
-"""Ns until a timer whose work raised goes off again: a deadline that is over would otherwise be tried without end."""
+"""Ns until a timer whose work raised goes off again: otherwise a past deadline would be tried without end."""
 
 _LINES = 1  # lines of the log in a second about one reason
 
@@ -55,7 +55,7 @@ class LoggedCounter(Counter[str]):
             logger.error(text, self._link, self[INTERNAL_ERROR], more, exc_info=error)
 
     def guard(self, call: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> bool:
-        """Call it; return False if it raised."""
+        """Call the function; return False if it raised."""
         try:
             call(*args, **kwargs)
         except Exception as error:  # noqa: BLE001 - counted and logged
@@ -64,7 +64,7 @@ class LoggedCounter(Counter[str]):
         return True
 
     def drain(self, items: deque[T], handle: Callable[[T], Any], most: int) -> None:
-        """Pop items and handle them, in order, at most `most`: those that are there now, none that `handle` adds."""
+        """Pop and handle at most `most` of the present items, in order, but none that `handle` adds."""
         for _ in range(min(len(items), most)):
             item = items.popleft()
             try:
@@ -74,16 +74,16 @@ class LoggedCounter(Counter[str]):
 
 
 def count_internal_error(all_losses: Iterable[LoggedCounter], error: Exception) -> None:
-    """Count an error that concerns several links at each of them, as each may lack what was to be done."""
+    """Count an error that concerns several links at each of them."""
     for losses in all_losses:
         losses.internal_error(error)
 
 
 class LinkStats(msgspec.Struct):
-    """Counters of one link since it was opened. `lost` counts by reason what was dropped, in both directions; `faults`
-    what went wrong on the line or the bus, by kind, whether anything was lost by it or not.
+    """Counters of one link since it was opened. `lost` counts losses in both directions, by reason; `faults` counts
+    what went wrong on the line or the bus, by kind, even if nothing was lost.
 
-    `sent` are samples that were given to the line, the bus or its buffer, and not discarded there since.
+    `sent` are samples accepted by the line, the bus or its buffer, and not discarded there since.
     """
 
     sent: int = 0

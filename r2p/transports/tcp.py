@@ -1,7 +1,7 @@
 """The debug line over TCP: a client that reconnects, and a server for many clients, each on a link of its own.
 
 Lines must not wait where nothing can be overtaken or discarded: asyncio's buffer holds only what the socket did not
-take of the last piece, and the others wait in the link. A client for which the server has no place is sent the reason.
+take of the last piece, and the others wait in the link. A client for whom the server has no place gets the reason.
 """
 
 import abc
@@ -56,7 +56,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
 
     @abc.abstractmethod
     def open_link(self, transport: asyncio.Transport, peer: str) -> LineLink | None:
-        """Return the link that the connection carries, now that its other end is there; None: it is refused."""
+        """Return the link of the new connection; None: the connection is refused."""
 
     # Carrier
 
@@ -87,7 +87,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
             self.ended.set()
 
     def mark_ended(self) -> None:
-        """Count it as ended: it was given up while it was made. The event loop closes it, and uvloop reports no end."""
+        """Count the connection as ended: it was given up early. The event loop closes it, and uvloop reports no end."""
         self._transport = None
         self.ended.set()
 
@@ -130,7 +130,7 @@ class _TcpConnection(asyncio.BufferedProtocol, Connection):
 
 
 def _unacknowledged(transport: asyncio.Transport) -> int:
-    """Bytes that the kernel has taken, and the other end's has not; 0 where that can't be asked."""
+    """Return the bytes that this kernel has accepted, and the other end's has not; 0 if it can't say."""
     if sys.platform != "linux":
         return 0
     answer = array.array("i", [0])
@@ -178,7 +178,7 @@ class TcpTransport(Transport):
             hub.detach(link)
 
     async def _connect(self, link: LineLink) -> float:
-        """Run one connection from beginning to end; returns how many seconds it lasted."""
+        """Run one connection from beginning to end; return how many seconds it lasted."""
         loop = asyncio.get_running_loop()
         connection = _ClientConnection(link)
         try:
@@ -215,8 +215,7 @@ class _ClientConnection(_TcpConnection):
 class TcpListenTransport(Transport):
     """`tcp-listen:HOST:PORT`: serves up to `max_clients` clients at once; on loopback unless an address is given.
 
-    With `gateways=yes` gateways among them take part in the mesh of this one, where it is a gateway; else they are
-    refused.
+    With `gateways=yes`, gateways among them join the mesh of this gateway; otherwise they are refused.
     """
 
     def __init__(self, url: Url) -> None:
@@ -231,7 +230,7 @@ class TcpListenTransport(Transport):
         host, self._port = _host_port(url)
         self._host = host or "127.0.0.1"
         self.port: int | None = None
-        """The port that it listens on, once it does (port 0 in the URL: any free one)."""
+        """The port, once the transport listens (port 0 in the URL: any free one)."""
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         loop = asyncio.get_running_loop()
@@ -286,7 +285,7 @@ class _ServerConnection(_TcpConnection):
             self.link = None
 
     def _refuse(self, transport: asyncio.Transport) -> None:
-        """Send an r2p client the reason (PROTOCOL.md 9): when it has read that, it closes."""
+        """Send an r2p client the reason (PROTOCOL.md 9), which then closes the connection."""
         server, name = self._server, self._hub.space.module
         self._hub.connection_refused(
             str(server.url), f"all {server.max_clients} connections are in use: see max_clients="
@@ -308,7 +307,7 @@ class _ServerConnection(_TcpConnection):
 
 
 def _explain(error: Exception) -> str:
-    """Return what went wrong, and what to do where that is known."""
+    """Return what went wrong, and a remedy if there is a known one."""
     if isinstance(error, TimeoutError) and not error.errno:
         return "no answer"
     if isinstance(error, socket.gaierror):
@@ -337,7 +336,7 @@ def _client_count(text: str) -> int:
 
 
 def _address(host: str, port: int) -> str:
-    """The address as URLs write it."""
+    """Return the address as in URLs."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -346,7 +345,7 @@ _NAME = re.compile(rb"[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
 
 
 def _host_port(url: Url) -> tuple[str, int]:
-    """The host (may be empty) and the port of an address."""
+    """Return the host (may be empty) and the port of an address."""
     if url.address.startswith("//"):
         raise TransportError(f"{url}: leave out the //: {url.scheme}:{url.address.lstrip('/')}")
     if url.address.isdecimal():

@@ -39,7 +39,7 @@ _CLOSE = 0.65  # how alike a name must be to be suggested (difflib): can and rtc
 
 
 class Url(msgspec.Struct, frozen=True):
-    """A transport's URL in its parts."""
+    """The parts of a transport's URL."""
 
     scheme: str
     address: str
@@ -80,7 +80,7 @@ def parse(text: str) -> Url:
 
 
 def open_transport(text: str) -> Transport:
-    """The transport that a URL names, not running yet.
+    """Return the transport of a URL, not running yet.
 
     Raises TransportError for an unknown scheme or option, and for an extra that is not installed.
     """
@@ -93,7 +93,7 @@ def open_transport(text: str) -> Transport:
 
 
 def schemes() -> list[str]:
-    """All schemes that can be used, the ones of other packages included."""
+    """Return all available schemes, those of other packages included."""
     return sorted({*BUILT_IN, *(entry.name for entry in _entry_points())})
 
 

@@ -354,7 +354,7 @@ async def test_control_from_ip_links_needs_permission(monkeypatch: pytest.Monkey
     ("options", "command", "missing"),
     [
         (BridgeOptions(), Command.REBOOT, "it lacks --allow-control"),
-        (BridgeOptions(read_only=("memory:a",)), Command.STOP, "it is read-only there"),
+        (BridgeOptions(read_only=("memory:a",)), Command.STOP, "the link there is read-only"),
     ],
 )
 async def test_who_gives_an_order_that_does_not_pass_is_told(

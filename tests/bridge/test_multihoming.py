@@ -103,7 +103,7 @@ async def test_the_log_says_which_link_stands_by_and_why(caplog: pytest.LogCaptu
     notices = [(event.link, event.kind) async for event in events if isinstance(event, LinkNotice)]
     assert notices == [("memory:b", "stands by"), ("memory:b", "used")]
     assert "two modules carry the name" not in caplog.text
-    assert "gives back what we say" not in caplog.text
+    assert "returns this module's own messages" not in caplog.text
 
 
 async def test_two_links_to_one_network_are_reported(caplog: pytest.LogCaptureFixture) -> None:
@@ -115,7 +115,7 @@ async def test_two_links_to_one_network_are_reported(caplog: pytest.LogCaptureFi
                 "stands by: it leads to the same network as memory:a",
             ]
     assert "two modules carry the name" not in caplog.text
-    assert "gives back what we say" not in caplog.text
+    assert "returns this module's own messages" not in caplog.text
 
 
 @pytest.mark.parametrize("seed", [1, 2])

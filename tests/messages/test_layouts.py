@@ -125,7 +125,7 @@ def test_annotations_that_are_text() -> None:
 
 @pytest.mark.parametrize("build", [text_annotations.names_a_local, text_annotations.names_a_type_checking_import])
 def test_text_that_names_nothing_at_run_time(build: Callable[[], type[Message]]) -> None:
-    with pytest.raises(MessageError, match="is not defined: import what its annotations name at run time"):
+    with pytest.raises(MessageError, match="is not defined: import the names in its annotations at run time"):
         layout(build())
 
 

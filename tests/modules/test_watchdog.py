@@ -112,7 +112,7 @@ async def test_a_loop_that_only_waits_is_not_blamed(reports: Reports) -> None:
                 return
 
     await asyncio.to_thread(look)
-    assert reports.texts[-1].startswith("the event loop did not come round for over 100 ms, and none")
+    assert reports.texts[-1].startswith("the event loop did not run for over 100 ms, and no code")
 
 
 class Jumping:

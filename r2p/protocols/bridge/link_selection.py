@@ -1,12 +1,12 @@
 """Choose which of its links a module uses, so that it sends and receives nothing twice.
 
-Where gateways join the networks of two links, what is sent by both arrives twice: so only one of them is used, the one
-that comes first, and the others stand by. A module learns of gateways by their BRIDGE, of two links to one network by
-what it hears of itself, and of loops through firmware by probes. It may use several links with gateways only while
-these consent: each has acknowledged its LEAF within a lease, so it waits for this module before it joins their meshes.
+Where gateways join the networks of two links, messages sent by both arrive twice: so only the first link is used, and
+the others stand by. A module learns of gateways by their BRIDGE, of two links to one network by its own messages, and
+of loops through firmware by probes. It may use several links with gateways only while these consent: each has
+acknowledged its LEAF within a lease, so it waits for this module before it joins their meshes.
 
-`CandidateLink` is what is known of one link, `LinkChoice` chooses among those that can carry a topic, `LinkSelection`
-does so for a whole module.
+`CandidateLink` is one link, `LinkChoice` chooses among those that can carry a topic, `LinkSelection` does so for a
+whole module.
 """
 
 from collections import Counter
@@ -68,7 +68,7 @@ class CandidateLink(msgspec.Struct, eq=False):
 
     @property
     def consent_until(self) -> int:
-        """Until when all gateways there have consented to the use of the link beside others."""
+        """Return until when all gateways there have consented to use the link together with others."""
         return min((each.acked_at for each in self.gateways.values()), default=NEVER) + LEASE
 
     def is_contested(self, now: int) -> bool:
@@ -87,7 +87,7 @@ class LinkChoice:
         self.without = without
         self.used: frozenset[int] = frozenset()
         self.consent_until = NEVER
-        """Until when the gateways have consented to the use of more than one contested link."""
+        """End of the gateways' consent to use more than one contested link."""
         self._contested: frozenset[int] = frozenset()
         self._barred: dict[int, int] = {}  # number -> until when another link, or a lack of consent, barred its use
         self._closed_at = LONG_AGO  # when a contested link was given up
@@ -97,14 +97,14 @@ class LinkChoice:
         self._barred.pop(number, None)
 
     def add(self, number: int) -> bool:
-        """Use a link at once that is new and leads where no other one does; return whether that changes anything."""
+        """Use a new link at once if no other one leads to its network; return whether that changes anything."""
         if number in self.without or number in self.used:
             return False
         self.used |= {number}
         return True
 
     def remove(self, number: int) -> bool:
-        """Give up such a link that is down; return whether that changes anything."""
+        """Give up such a link when it is down; return whether that changes anything."""
         if number not in self.used:
             return False
         self.used -= {number}
@@ -151,7 +151,7 @@ class LinkChoice:
                 barred.append(link)
                 continue
             if link.is_contested(now):
-                # One of which not all is known is used alone, and only as long as no other one is known better.
+                # A link that is not fully known is used alone, and only while no other one is known better.
                 if now < link.known_at:
                     fits = not contested and (link.number in self.used or not settled)
                 else:
@@ -176,8 +176,8 @@ class LinkChoice:
 class LinkSelection:
     """The links of one module; links have numbers, in the order in which they are preferred.
 
-    Every method takes `now` (monotonic ns). `pop_messages` gives what to send, as number and LEAF (None: a probe, which
-    gateways of firmware pass on); `changes` counts how often other links were chosen.
+    Every method takes `now` (monotonic ns). `pop_messages` returns messages to send, as number and LEAF (None: a probe,
+    which gateways of firmware pass on); `changes` counts changes of the choice.
     """
 
     def __init__(self, instance: int) -> None:
@@ -192,7 +192,7 @@ class LinkSelection:
         self._updated_at = 0
         self._messages: list[tuple[int, Leaf | None]] = []
         self._busy: list[CandidateLink] = []
-        """Links of which something was heard, or may yet be: all others need no time."""
+        """Links with received messages, or that expect some: all others need no timer."""
         self._links_to: Counter[int] = Counter()
         """Number of links that lead to each module."""
 
@@ -238,10 +238,10 @@ class LinkSelection:
         """Forget a link that is removed for good."""
         self._choices = {key: choice for key, choice in self._choices.items() if number not in key}
 
-    # What follows
+    # Consequences
 
     def used(self, now: int, without: frozenset[int]) -> frozenset[int]:
-        """The links to use for what all can carry but those in `without`."""
+        """The links to use for topics that all can carry but those in `without`."""
         choice = self._choices.get(without)
         if choice is None:
             choice = self._choices[without] = LinkChoice(without)
@@ -254,7 +254,7 @@ class LinkSelection:
         return link is not None and any(other < number for other in link.twins)
 
     def stands_by_for(self, number: int) -> int | None:
-        """The link that leads to the same modules and is preferred."""
+        """Return the preferred link to the same modules."""
         link = self.by_number.get(number)
         if link is None:
             return None
@@ -262,12 +262,12 @@ class LinkSelection:
         return min((each.number for each in others if each.number < number), default=None)
 
     def pop_messages(self) -> list[tuple[int, Leaf | None]]:
-        """Return what to send, and forget it."""
+        """Return and forget the messages to send."""
         messages, self._messages = self._messages, []
         return messages
 
     def poll(self, now: int) -> None:
-        """Forget the gateways that have been silent, and send what is due."""
+        """Forget silent gateways, and send due messages."""
         self._update(now)
         for link in self._busy:
             if self._due(link) <= now:
@@ -286,7 +286,7 @@ class LinkSelection:
         due = min(dues, default=NEVER)
         return due if due < NEVER // 2 else None  # half: some dues are a little less or more than NEVER
 
-    # What comes in
+    # Received
 
     def receive_bridge(self, now: int, number: int, message: Bridge) -> None:
         """Handle a BRIDGE: there is a gateway on the link's network."""
@@ -324,7 +324,7 @@ class LinkSelection:
             self._update(now)
 
     def receive_own(self, now: int, number: int) -> bool:
-        """Handle what this module sent, or another one of its name, and what came in by this link.
+        """Handle a message of this module, or of another one of its name, from this link.
 
         True: another link may have sent it, which LEAF or a probe will show. False: it is an echo, or a namesake.
         """
@@ -382,7 +382,7 @@ class LinkSelection:
         return alone and link not in self._busy and not any(each.twins or each.loops for each in self._busy)
 
     def _expire(self, now: int, link: CandidateLink) -> None:
-        """Gateways that were silent for so long are gone, or not heard: listen again before that is believed."""
+        """Listen again before gateways that were silent for so long count as gone."""
         if any(now - each.heard_at >= DEAD for each in link.gateways.values()):
             link.gateways = {sender: each for sender, each in link.gateways.items() if now - each.heard_at < DEAD}
             if not link.gateways:

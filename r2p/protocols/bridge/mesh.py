@@ -1,8 +1,8 @@
-"""The mesh of gateways and the spanning tree in it, worked out from who hears whom.
+"""The mesh of gateways and its spanning tree, from the records of which gateway hears which.
 
-A network (bus, zenoh network, line) has no name of its own: it is the set of gateway ports that hear each other. Only
-what both sides say counts. The functions here are pure; `MeshMap` keeps what one gateway knows from the MESH of others,
-and what follows from that.
+A network (bus, zenoh network, line) has no name of its own: it is the set of gateway ports that hear each other. An
+edge counts only if both sides report it. The functions here are pure; `MeshMap` keeps one gateway's knowledge from the
+MESH of others, and its consequences.
 """
 
 from collections import defaultdict, deque
@@ -38,7 +38,7 @@ HEARD_MAX = MESH_HEARD * PARTS_MAX
 """Adjacencies that a gateway can announce. One with more could not agree with any other, and would not forward."""
 
 RECORDS_MAX = 256
-"""Gateways of which a record is kept: whom each one hears."""
+"""Gateways with a record of their neighbours, at most."""
 CHANGES = 100
 """Changes that one gateway may announce in a row ..."""
 CHANGE_FORGIVEN = 5 * SECOND
@@ -51,7 +51,7 @@ _KEPT = 5 * SECOND  # ns for which the record of a gateway outside the mesh is k
 
 
 def mesh_messages(gateway: int, serial: int, heard: Iterable[Adjacency]) -> list[Mesh]:
-    """Make the messages that announce whom a gateway hears."""
+    """Make the messages that announce a gateway's neighbours."""
     adjacencies = sorted(heard)[:HEARD_MAX]
     pieces = [adjacencies[at : at + MESH_HEARD] for at in range(0, len(adjacencies), MESH_HEARD)] or [[]]
     last = len(pieces) - 1
@@ -65,7 +65,7 @@ class MeshAssembler:
         self._pieces: dict[tuple[int, int], dict[int, frozenset[Adjacency]]] = {}
 
     def add(self, message: Mesh) -> frozenset[Adjacency] | None:
-        """Enter a part; return whom the gateway hears once all parts with this serial are there."""
+        """Enter a part; return the gateway's neighbours once all parts with this serial are there."""
         key = (message.gateway, message.serial)
         pieces = self._pieces.setdefault(key, {})
         number, last = split_part(message.part)
@@ -172,7 +172,7 @@ class MeshMap:
         self._expire_at = 0
 
     def others(self, turn: int, most: int) -> list[int]:
-        """Up to `most` gateways of the mesh that have announced whom they hear; other ones each `turn`."""
+        """Return up to `most` gateways of the mesh with a record; other ones each `turn`."""
         known = [gateway for gateway in self._records if self.concerns(gateway)]
         start = turn * most % len(known) if len(known) > most else 0
         return [*known[start:], *known[:start]][:most]
@@ -186,7 +186,7 @@ class MeshMap:
         return (self.gateway, number) in self._forwarding
 
     def set_heard(self, now: int, heard: frozenset[Adjacency]) -> bool:
-        """Enter whom this gateway hears now; return whether that has changed."""
+        """Enter this gateway's neighbours; return whether they have changed."""
         if heard == self._heard:
             return False
         self._heard = heard
@@ -195,7 +195,7 @@ class MeshMap:
         return True
 
     def receive(self, now: int, message: Mesh) -> bool:
-        """Enter what another gateway announces; return whether it is new, and complete."""
+        """Enter another gateway's announcement; return whether it is new, and complete."""
         known = self._records.get(message.gateway)
         if known is not None and not is_newer_serial(message.serial, known.serial):
             known.updated_at = now
@@ -212,7 +212,7 @@ class MeshMap:
         return True
 
     def _record(self, now: int, gateway: int, known: _GatewayRecord | None) -> _GatewayRecord | None:
-        """Return the record of a gateway that announces a change; None if there is no room, or it changes too often."""
+        """Return the record of a gateway that announces a change; None without room, or if it changes too often."""
         if known is None:
             if len(self._records) >= RECORDS_MAX and not self._make_room(gateway):
                 return None
@@ -223,7 +223,7 @@ class MeshMap:
         return known if known.changes < CHANGES else None
 
     def _make_room(self, gateway: int) -> bool:
-        """Make room for a gateway that concerns this one, by forgetting one that does not; False: there is no room."""
+        """Make room for a relevant gateway by forgetting an irrelevant one; return False if there is no room."""
         if not self.concerns(gateway):
             return False
         idle = next((each for each in self._records if not self.concerns(each)), None)
@@ -240,7 +240,7 @@ class MeshMap:
                     del self._records[gateway]
 
     def messages(self, gateway: int) -> list[Mesh]:
-        """Make the messages that announce whom this gateway hears, or another one of which there is a record."""
+        """Make the messages that announce the neighbours of this gateway, or of another one with a record."""
         if gateway == self.gateway:
             return mesh_messages(gateway, self._serial, self._heard)
         record = self._records[gateway]

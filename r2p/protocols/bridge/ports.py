@@ -1,6 +1,6 @@
-"""One port of a gateway: what was heard there, and until when the port may forward because of it.
+"""One port of a gateway: the neighbours there, and until when they let the port forward.
 
-A port's state follows from what is known now, not from the state before. Of these the first one that applies counts:
+A port's state depends on present knowledge, not on the previous state. The first of these that applies counts:
 
     LOOP         a probe shows a loop through a gateway that sends no BRIDGE, and this port is the one that yields
     LISTENING    the port is open for less than LISTEN: other gateways may be there that were not heard yet
@@ -12,12 +12,12 @@ A port's state follows from what is known now, not from the state before. Of the
     FORWARDING   they have, the tree contains the port, for SETTLE or longer          forwards until a lease runs out
 
 So nearly any state can follow any other: a port that hears its first gateway goes from ALONE to CONVERGING, and back
-when the last one is silent. After a time in which the program stood still, ports are LISTENING again. REFUSED is set by
-the owner of the ports, for those beyond PORTS_MAX and for clients that turn out to be gateways.
+when the last one is silent. After a time in which the program stood still, ports are LISTENING again. The owner of the
+ports sets REFUSED, for ports beyond PORTS_MAX and for clients that turn out to be gateways.
 
-Modules with several links (`link_selection`) share the timings with gateways, and the acknowledgements. One of these
-names a sender and the number of its last message. It proves that the link works in both directions, and that the other
-end knows what that message said.
+Modules with several links (`link_selection`) share the timings with gateways, and the acknowledgements. An
+acknowledgement names a sender and the number of its last message. It proves that the link works in both directions, and
+that the other end has received that message.
 """
 
 import enum
@@ -32,15 +32,15 @@ from r2p.protocols.bridge.mesh import MeshMap, PortId, digest
 from r2p.units import LONG_AGO, MILLISECOND, NEVER, SECOND
 
 TICK = 80 * MILLISECOND
-"""Ns between two BRIDGE where there are other gateways: seven fit into a lease, so some may be lost."""
+"""Ns between two BRIDGE with other gateways present: seven fit into a lease, so some may be lost."""
 TICK_ALONE = 200 * MILLISECOND
-"""The same where there are none: three fit into a lease."""
+"""The same without other gateways: three fit into a lease."""
 TICK_LISTENING = 50 * MILLISECOND
 """The same at a new port, so that several are sent, and answered, before it may forward."""
 LEASE = 600 * MILLISECOND
 """Validity of an acknowledgement, from the instant at which the acknowledged message was sent."""
 DEAD = 650 * MILLISECOND
-"""A gateway that is silent for this long is gone. More than a lease: what it was granted has run out by then."""
+"""A gateway that is silent for this long is gone. More than a lease: its permissions have expired by then."""
 LISTEN = 800 * MILLISECOND
 """A new port forwards nothing for this long. More than a lease: an old gateway that is stuck has stopped by then."""
 SETTLE = 300 * MILLISECOND
@@ -48,9 +48,9 @@ SETTLE = 300 * MILLISECOND
 PROBE = 2 * SECOND
 """Between two probes for loops through gateways that do not know this protocol."""
 PROBE_MEMORY = 7 * SECOND
-"""A loop is believed in for this long after a probe showed it: two of three probes may be lost."""
+"""Duration of a loop after a probe showed it: two of three probes may be lost."""
 PROBE_PROVEN = 300 * MILLISECOND
-"""A gateway of which only a probe was heard for this long, and no BRIDGE, is not on this network itself."""
+"""A gateway that sends probes for this long, but no BRIDGE, is not on this network itself."""
 STRANGE_PROBES_MAX = 256
 """Probes of gateways outside the mesh that are kept for each port: they may be forged."""
 
@@ -60,12 +60,12 @@ PORTS_MAX = 250
 FLAPS_MAX = 8
 """Neighbours that may go before newcomers have to wait."""
 FLAP_FORGIVEN = 10 * SECOND
-"""Ns after which one of those is forgotten."""
+"""Ns after which one of these departures is forgotten."""
 
 APART = 10 * MILLISECOND
 """Ns between two messages out of turn at least."""
 LEAVES_MAX = 32
-"""Modules with several links on one network; all beyond these use one link only."""
+"""Modules with several links on one network, at most; any more use one link only."""
 
 
 class PortState(enum.Enum):
@@ -80,7 +80,7 @@ class PortState(enum.Enum):
     REFUSED = "refused"
 
 
-# What the owner of the ports is to do
+# Actions for the owner of the ports
 
 
 class SendToPort(msgspec.Struct, frozen=True):
@@ -97,7 +97,7 @@ class SendToClients(msgspec.Struct, frozen=True):
 
 
 class SendProbe(msgspec.Struct, frozen=True):
-    """Send a probe at the port: something that any gateway passes on."""
+    """Send a probe at the port, which any gateway passes on."""
 
     port: int
 
@@ -117,7 +117,7 @@ Action = SendToPort | SendToClients | SendProbe | PortChanged
 class Neighbour(msgspec.Struct):
     """A port or a module that was heard on the same network; instants in monotonic ns.
 
-    `acked_at`: when the newest message of this program was sent that it has acknowledged.
+    `acked_at`: when the newest message that it has acknowledged was sent.
     """
 
     heard_at: int
@@ -128,7 +128,7 @@ class Neighbour(msgspec.Struct):
 
 
 class SentMessages:
-    """The messages of one sender: gives each a number, and remembers for a lease when it was sent."""
+    """The messages of one sender: numbers them, and keeps the time of sending for a lease."""
 
     def __init__(self, sender: int) -> None:
         self._count = 0
@@ -168,12 +168,12 @@ def pack_acks(heard: Mapping[PortId, Neighbour], places: int) -> list[bytes]:
 
 
 class TreePort(msgspec.Struct, eq=False):
-    """A port of this gateway: what was heard at it, and what follows.
+    """A port of this gateway: its neighbours, and its state.
 
     `forwards_until`: data may pass before this instant (monotonic ns). `in_tree`: whether data passes, has passed until
     the gateways began to converge, or will pass when they agree for SETTLE; demand travels where it is True.
     `neighbours` and `leaves` are the gateways and the modules with several links that were heard on its network.
-    `echoes`: its link gives back what this gateway sends. `leaves_ready_since`: since when all `leaves` know the root.
+    `echoes`: its link returns this gateway's own messages. `leaves_ready_since`: since when all `leaves` know the root.
     `private`: a connection whose other end stays the same while it is up. No gateway can join it unheard, so it needs
     no lease while there is none. `resumes`: it was ALONE, and listens anew only because this program stood still.
     `flaps`: how many neighbours have gone, `flapped_at`: when that was counted. `lost` counts messages of other
@@ -227,12 +227,12 @@ class TreePort(msgspec.Struct, eq=False):
             self.flapped_at += forgiven * FLAP_FORGIVEN
 
     def receive_bridge(self, now: int, message: Bridge, acked_at: int) -> bool:
-        """Enter a BRIDGE of a neighbour, old or new; False: it is late. `acked_at`: see `Neighbour`."""
+        """Enter a BRIDGE of a neighbour, old or new; return False if it is late. `acked_at`: see `Neighbour`."""
         sender = (message.gateway, message.port)
         neighbour = self.neighbours.get(sender)
         if neighbour is None:
             neighbour = Neighbour(now, message.count, agreement=message.agreement)
-            # It is on this network itself: its probes came straight, not through a loop of firmware.
+            # The gateway is on this network itself: its probes came directly, not through a loop of firmware.
             self.probes = {each: at for each, at in self.probes.items() if each[0] != message.gateway}
             self.neighbours = self.neighbours | {sender: neighbour}
         elif is_late(message.count, neighbour.count):
@@ -245,7 +245,7 @@ class TreePort(msgspec.Struct, eq=False):
         return True
 
     def receive_leaf(self, now: int, message: Leaf, mesh: MeshMap, acked_at: int) -> bool:
-        """Enter a LEAF; False: nothing changes. `acked_at` is when the message was sent that it acknowledges.
+        """Enter a LEAF; return False if nothing changes. `acked_at` is when the acknowledged message was sent.
 
         The module is entered once it knows this root. It is answered at once: it waits for the gateway's consent.
         """
@@ -298,7 +298,7 @@ class TreePort(msgspec.Struct, eq=False):
             self.leaves = _fresh(now, self.leaves)
 
     def extend_leaves(self, now: int) -> None:
-        """Keep the modules for longer: what they sent while this program stood still is yet to be read."""
+        """Keep the modules for longer: their messages while this program stood still are yet to be read."""
         for leaf in self.leaves.values():
             leaf.heard_at = now
 
@@ -314,14 +314,14 @@ class TreePort(msgspec.Struct, eq=False):
         self.leaves = {}
         self.agreed_since = None
 
-    # What goes out
+    # Sent
 
     def hurry(self, now: int) -> None:
         """Send the next BRIDGE out of turn."""
         self.send_at = min(self.send_at, max(now, self.sent_at + APART))
 
     def note_sent(self, now: int, mesh: MeshMap) -> None:
-        """Note that BRIDGE was sent: plan the next one, and forward for longer where that needs no consent."""
+        """Note that BRIDGE was sent: plan the next one, and forward for longer if no consent is needed."""
         listening, others = self.state is PortState.LISTENING, self.neighbours or self.leaves
         self.sent_at = now
         self.send_at = now + (TICK_LISTENING if listening else TICK if others else TICK_ALONE)
@@ -352,7 +352,7 @@ class TreePort(msgspec.Struct, eq=False):
         return self.update_state(now, mesh)
 
     def update_state(self, now: int, mesh: MeshMap) -> bool:
-        """Do the same for a port at which there can be no other gateway."""
+        """Do the same for a port that can't have another gateway."""
         if self.leaves_ready_since is None and all(each.acked_at >= mesh.rooted_at for each in self.leaves.values()):
             self.leaves_ready_since = now
         before = self.state, self.in_tree
@@ -364,7 +364,7 @@ class TreePort(msgspec.Struct, eq=False):
         return (self.state, self.in_tree) != before
 
     def is_agreed(self, now: int, mesh: MeshMap) -> bool:
-        """Return whether all gateways there have acknowledged the very same mesh within a lease."""
+        """Return whether all gateways there have acknowledged this very mesh within a lease."""
         return all(  # other ports of this gateway agree anyway
             each.agreement == self.agreement and now < each.acked_at + LEASE
             for (gateway, _), each in self.neighbours.items()
@@ -409,7 +409,7 @@ class TreePort(msgspec.Struct, eq=False):
     def _loops(self, now: int, mesh: MeshMap) -> bool:
         """Return whether the port is in a loop through a gateway that sends no BRIDGE, and is the end that yields.
 
-        A probe that came in proves the loop. Of two ports of one gateway the one with the higher number (modulo
+        A received probe proves the loop. Of two ports of one gateway the one with the higher number (modulo
         PORT_MODULUS) yields, of two gateways the one with the higher number.
         """
         for (gateway, its_port), (first, _) in self.probes.items():

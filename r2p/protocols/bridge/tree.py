@@ -1,10 +1,10 @@
-"""One gateway's part in the spanning tree: which of its ports may forward, and until when.
+"""One gateway's part in the spanning tree: its ports, and until when each may forward.
 
 `SpanningTree` receives BRIDGE, MESH and LEAF at each port and sends its own; `TreePort.forwards_until` is the instant
 before which data may pass. A gateway that was stopped for a while finds it in the past before it does anything else.
 `ClientPorts` are those of clients, which take part in no tree.
 
-The timings fit together: a gateway counts as dead (`DEAD`) only after what it was granted has run out (`LEASE`); a new
+The timings fit together: a gateway counts as dead (`DEAD`) only after its permissions have expired (`LEASE`); a new
 one listens (`LISTEN`) for longer than an old one can be stuck and still forward.
 
 Modules that are not gateways may have several links, too (`link_selection`). Those that use links of several meshes say
@@ -48,9 +48,9 @@ _NO_ACKS = encode_acks((), BRIDGE_ACKS)
 
 
 class SpanningTree:
-    """The tree as one gateway knows it. Methods take `now` (monotonic ns); `pop_actions` returns what to do.
+    """The tree as one gateway knows it. Methods take `now` (monotonic ns); `pop_actions` returns the actions.
 
-    `gateway` is the number of this start of it; 0 is not a valid one.
+    `gateway` is the random number of its start, not 0.
     """
 
     def __init__(self, gateway: int) -> None:
@@ -61,7 +61,7 @@ class SpanningTree:
         self._sent = SentMessages(self.gateway)
         self._updated_at = 0
         self._root = self.gateway
-        """The root that the ports know of."""
+        """The root known to the ports."""
         self._actions: list[Action] = []
 
     # Ports
@@ -80,7 +80,7 @@ class SpanningTree:
         self._update(now)
 
     def pop_actions(self) -> list[Action]:
-        """Return what is to be done, and forget it."""
+        """Return and forget the actions."""
         actions = self._actions + self.clients.actions
         self._actions, self.clients.actions = [], []
         return actions
@@ -92,7 +92,7 @@ class SpanningTree:
         return due if due < NEVER else None
 
     def poll(self, now: int) -> None:
-        """Send what is due, and forget neighbours that were silent for DEAD."""
+        """Send due messages, and forget neighbours that were silent for DEAD."""
         self._update(now)
         for port in self.ports.values():
             if port.send_at <= now:
@@ -104,7 +104,7 @@ class SpanningTree:
     # What comes in
 
     def receive_bridge(self, now: int, number: int, message: Bridge) -> None:
-        """Enter a BRIDGE that came in at a port: its sender is a gateway on the port's network."""
+        """Enter a BRIDGE from a port: its sender is a gateway on the port's network."""
         port = self.ports.get(number)
         sender = (message.gateway, message.port)
         if port is None or not message.gateway:
@@ -121,8 +121,8 @@ class SpanningTree:
     def _admit_neighbour(self, now: int, port: TreePort) -> bool:
         """Decide whether to enter one more gateway as a neighbour; if not, count it as lost.
 
-        A gateway that is not entered forwards nothing: it hears this one, which does not acknowledge it. Were each one
-        entered at once, gateways that come and go would keep all others from agreeing, and so from forwarding.
+        A gateway that is not entered forwards nothing: it hears this one, which does not acknowledge it. If each were
+        entered at once, gateways that keep joining and leaving would stop all others.
         """
         if sum(len(each.neighbours) for each in self.ports.values()) >= HEARD_MAX:
             port.lost["too many gateways"] += 1
@@ -134,7 +134,7 @@ class SpanningTree:
         return True
 
     def receive_leaf(self, now: int, number: int, message: Leaf) -> None:
-        """Enter a LEAF that came in at a port: its sender is a module with several links."""
+        """Enter a LEAF from a port: its sender is a module with several links."""
         port = self.ports.get(number)
         if port is None or not message.module:
             return
@@ -142,7 +142,7 @@ class SpanningTree:
             self._update(now, port)
 
     def receive_mesh(self, now: int, number: int, message: Mesh) -> None:
-        """Enter a MESH that came in at a port, and pass it on at the other ports if it is new."""
+        """Enter a MESH from a port, and pass it on at the other ports if it is new."""
         if message.gateway in (0, self.gateway) or number not in self.ports:
             return
         if not self.mesh.receive(now, message):
@@ -153,7 +153,7 @@ class SpanningTree:
         self._update(now)
 
     def receive_probe(self, now: int, number: int, gateway: int, its_port: int) -> None:
-        """Enter a probe that came in at a port; `gateway` sent it at its port `its_port` (modulo PORT_MODULUS)."""
+        """Enter a probe from a port; `gateway` sent it at its port `its_port` (modulo PORT_MODULUS)."""
         port = self.ports.get(number)
         sender = gateway, its_port
         if port is None or sender == (self.gateway, number % PORT_MODULUS) or gateway in port.gateways:
@@ -164,7 +164,7 @@ class SpanningTree:
     # What follows
 
     def _update(self, now: int, changed: TreePort | None = None) -> None:
-        """Work out all that follows from what was heard, and from the time.
+        """Work out the consequences of messages and time.
 
         With `changed`, only for this port, unless the mesh changes, too.
         """
@@ -229,8 +229,8 @@ class ClientPorts:
     that before its port forwards. Modules with several links send LEAF here, too: each is waited for on its own
     connection.
 
-    Every method takes `now` (monotonic ns); what is to be done goes to `actions`. The work that the time brings does
-    not grow with the number of clients, apart from what is sent to all of them.
+    Every method takes `now` (monotonic ns) and appends to `actions`. Periodic work does not grow with the number of
+    clients, except for messages to all of them.
     """
 
     def __init__(self, mesh: MeshMap) -> None:
@@ -272,7 +272,7 @@ class ClientPorts:
             self.actions.append(PortChanged(port.number))
 
     def receive_leaf(self, now: int, port: TreePort, message: Leaf) -> None:
-        """Enter a LEAF that came in from a client."""
+        """Enter a LEAF from a client."""
         if not message.module or port.state in _REFUSED:
             return
         self._with_leaves[port.number] = port
@@ -286,7 +286,7 @@ class ClientPorts:
             self._update(self._mesh.rooted_at, port)
 
     def poll(self, now: int) -> None:
-        """Send what is due, and forget modules that were silent for DEAD."""
+        """Send due messages, and forget modules that were silent for DEAD."""
         stood_still = now - self._polled_at > LEASE
         self._polled_at = now
         while self._listening and now >= self._listening[0].opened_at + LISTEN:

@@ -1,6 +1,6 @@
 """Announce on one link what this module publishes and subscribes to, and which of its nodes do so.
 
-The schedule holds keys only. The announcer makes the messages of a key when its turn has come, from what is true then.
+The schedule holds keys only. The announcer makes the messages of a key in its turn, from the present state.
 """
 
 from collections import Counter
@@ -57,7 +57,7 @@ class Announcer:
         self.publisher_counts: Counter[str] = Counter()
         """Number of peers that publish each subscribed topic to this module; topics without one are missing."""
         self.subscriber_counts: Counter[str] = Counter()
-        """The same of published topics, and of peers that subscribe to them."""
+        """The same for published topics, and peers that subscribe to them."""
         self._observer = observer
         self.outbox = outbox
         self._directory = directory
@@ -65,7 +65,7 @@ class Announcer:
         self._endpoints: dict[tuple[str, str, int], int] = {}
         self._relayed: dict[tuple[str | int, ...], Relayed] = {}
 
-    # What the module has
+    # The module's topics
 
     def set_topic(self, topic: str, role: int, own: LocalTopic) -> bool:
         """Announce that the module publishes or subscribes to a topic; return whether that is new, or has changed."""
@@ -76,7 +76,7 @@ class Announcer:
         return True
 
     def remove_topic(self, topic: str, role: int) -> bool:
-        """Stop announcing that; return whether it was announced."""
+        """Stop announcing the topic in this role; return whether it was announced."""
         if self.topics[role].pop(topic, None) is None:
             return False
         self._drop(_KIND_OF_ROLE[role], topic)
@@ -100,7 +100,7 @@ class Announcer:
     # When to announce it
 
     def announce_once(self, kind: ItemKind, *key: str | int) -> None:
-        """Announce something once, as soon as the rate allows and if the link is up; not twice if it waits already."""
+        """Announce an item once, as soon as the rate allows, if the link is up and it is not waiting already."""
         if self.outbox.up:
             self._schedule.add(Item(kind, key, once=True))
 
@@ -110,11 +110,11 @@ class Announcer:
             self._add(ItemKind.PUBLISHER, topic)
 
     def repeat_all(self, now: int, *, tool: bool) -> None:
-        """Repeat everything soon: a module on the link is new, or asks for it; `tool`: one that shows it to a user."""
+        """Repeat everything soon, as a module on the link is new, or asks for it; `tool`: it shows all to a user."""
         self._schedule.repeat(now, self._directory.r2p_modules, tool=tool)
 
     def relay(self, message: Relayed) -> None:
-        """Pass on what another module has said on another link, as soon as the rate allows."""
+        """Pass on a message of another module from another link, as soon as the rate allows."""
         if not self.outbox.up:
             return
         match message:
@@ -123,7 +123,7 @@ class Announcer:
             case management.Endpoint(role, instance, node, topic):
                 key = (instance, node, topic, role & ~ROLE_GONE)
         if isinstance(message, management.Hello):
-            # On a slow link the next one comes late: its module must not seem gone until then.
+            # On a slow link the next one is late: its module must not seem gone until then.
             lease = max(message.lease_ms, 3 * self._schedule.relay_time // MILLISECOND)
             message = msgspec.structs.replace(message, lease_ms=min(lease, management.LEASE_MS_MAX))
         self._relayed[key] = message
@@ -142,7 +142,7 @@ class Announcer:
                 self._drop(ItemKind.ENDPOINT, *key)
 
     def flush(self, now: int) -> None:
-        """Send what is due."""
+        """Send due announcements."""
         while self.outbox.up and (item := self._schedule.pop(now)) is not None:
             messages = self._messages(item)
             if messages:
@@ -159,7 +159,7 @@ class Announcer:
         return management.Hello(self.module, self.instance, flags | tool, 0, lease, management.WIRE_VERSION, release)
 
     def requests(self, topic: str, own: LocalTopic, size: int = 0) -> list[management.Management]:
-        """The request for a topic, of which a publisher said this `size` (0: unknown), if it may be sent.
+        """Return the request for a topic with this announced `size` (0: unknown), if it may be sent.
 
         While the size is unknown, it may not: a request of size 0 makes gateways of firmware overrun their buffers.
         """
@@ -170,7 +170,7 @@ class Announcer:
         return [management.SubscribeRequest(topic, size, management.queue_length(size, own.queue), params)]
 
     def _advertisement(self, topic: str, own: LocalTopic) -> management.Advertise:
-        """The advertisement of a topic; r2p modules see in it whether the topic has a subscriber yet."""
+        """Return the advertisement of a topic, which shows r2p modules whether the topic has a subscriber yet."""
         unanswered = self.r2p and topic not in self.subscriber_counts
         params = management.with_unanswered(own.params) if unanswered else own.params
         return management.Advertise(topic, own.type.size, 0, params)
@@ -216,7 +216,7 @@ class Announcer:
 
 
 def _with_alias(message: Relayed) -> list[management.Management]:
-    """A message, where its module's name is too long with the alias in its place and behind what that stands for."""
+    """Return a message; a module's name that is too long is replaced by its alias, after a NAME."""
     if isinstance(message, management.Endpoint):
         return [message]
     names = management.alias_messages(message.module)

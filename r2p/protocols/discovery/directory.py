@@ -1,9 +1,8 @@
 """The announcements of the modules on one link: names, topics and endpoints. Nothing here decides what flows.
 
-`Directory` has it for one link. `Demand` is for gateways only: which topics the others publish and subscribe to,
-whether this module has them or not.
+`Directory` has those of one link. `Demand` is for gateways only: the topics of others, used by this module or not.
 
-Every table is bounded. When it is full, the entry that was not repeated for longest is forgotten: a flood of made-up
+Every table is bounded. A full one forgets the entry that was not repeated for longest: a flood of made-up
 messages pushes out true entries only until they are repeated.
 """
 
@@ -25,13 +24,13 @@ TABLE_MAX = 4096
 """Entries in each table."""
 
 LEASE = 5 * SECOND
-"""Ns that an r2p module may be silent at least, whatever its HELLO says: three rounds of repetition, and some more."""
+"""Shortest lease of an r2p module (ns), whatever its HELLO says: some more than three rounds of repetition."""
 
 FOR_EVER = management.LEASE_MS_MAX * MILLISECOND
 """The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
 
 _UNFINISHED_MAX = 256
-"""Aliases of which some parts were received, and not all."""
+"""Incomplete aliases, of which some parts were received."""
 
 _TopicRole = tuple[str, int]
 K = TypeVar("K")
@@ -41,8 +40,8 @@ V = TypeVar("V")
 class TopicInfo(msgspec.Struct):
     """A topic on the link. Instants are in monotonic ns, None: never; `size` is in bytes, 0: unknown.
 
-    `types` has what the peers in each role (ROLE_...) say, and `typed_at` when they said it last. `size` and
-    `fingerprint` are those of the publishers, or of the subscribers while publishers have said nothing.
+    `types` has the type that the peers in each role (ROLE_...) announce, and `typed_at` the time of the last one.
+    `size` and `fingerprint` are those of the publishers, or of the subscribers while publishers have said nothing.
     """
 
     name: str
@@ -55,14 +54,14 @@ class TopicInfo(msgspec.Struct):
     typed_at: dict[int, int] = {}
 
     def set_heard(self, role: int, at: int | None) -> None:
-        """Set when a peer in this role was heard last."""
+        """Set the time of the last message from a peer in this role."""
         if role == ROLE_PUBLISHES:
             self.advertised_at = at
         else:
             self.requested_at = at
 
     def set_type(self, role: int, known: TopicType | None) -> None:
-        """Set what the peers in this role say; None removes it."""
+        """Set the type that the peers in this role announce; None removes it."""
         if known is None:
             self.types.pop(role, None)
         else:
@@ -95,7 +94,7 @@ EndpointKey = tuple[int, str, str, int]
 
 
 class _Starts(msgspec.Struct):
-    """The recent starts under one module name, to tell two modules from one that restarts."""
+    """The recent starts under one module name, to distinguish two modules from a restart."""
 
     previous: int
     at: int
@@ -135,7 +134,7 @@ class Directory:
         return self._names.get(instance, "")
 
     def lease_of(self, source: PeerAddress) -> int | None:
-        """The longest lease of the r2p modules directly at an address; None where there are none, or it never ends."""
+        """Return the longest lease of the r2p modules directly at an address; None without any, or if it never ends."""
         lease = max(self._leases.get(source, ()), default=FOR_EVER)
         return lease if lease < FOR_EVER else None
 
@@ -146,7 +145,7 @@ class Directory:
     def read_alive(
         self, now: int, message: management.Alive, source: PeerAddress
     ) -> tuple[ModuleInfo | None, ModuleInfo]:
-        """Read a module's state; returns what was known before (it is not entered yet), and what is known now."""
+        """Read a module's state; return the previous information and the new one, which is not entered yet."""
         before = self.modules.get(message.module)
         if before is None:
             info = ModuleInfo(message.module, message.flags, now, source=source)
@@ -157,7 +156,7 @@ class Directory:
     def read_hello(
         self, now: int, message: management.Hello, source: PeerAddress
     ) -> tuple[ModuleInfo | None, ModuleInfo]:
-        """Read an r2p module's HELLO; returns what was known before (it is not entered yet), and what is known now."""
+        """Read an r2p module's HELLO; return the previous information and the new one, which is not entered yet."""
         before = self.modules.get(message.module)
         return before, ModuleInfo(
             name=message.module,
@@ -173,7 +172,7 @@ class Directory:
         )
 
     def enter(self, info: ModuleInfo) -> ModuleInfo | None:
-        """Enter a module; returns the one that was forgotten for it, if the table was full."""
+        """Enter a module; return the one that was forgotten for it, if the table was full."""
         before = self.modules.get(info.name)
         if before is not None and before.instance is not None and before.instance != info.instance:
             self._forget_instance(before.instance)  # the endpoints of its last start are gone
@@ -220,13 +219,13 @@ class Directory:
         return 0 if info is None else info.size
 
     def touch_topic(self, name: str) -> TopicInfo:
-        """The entry of a topic that a message has just named."""
+        """Return the entry of a topic that a message has just named."""
         info = self.topics.get(name) or TopicInfo(name)
         self._put(self.topics, name, info, "topics forgotten")
         return info
 
     def add_type(self, now: int, topic: str, role: int, said: TopicType) -> TopicInfo:
-        """Enter the type that a peer says. Of several that differ the first one stays, as long as it is repeated."""
+        """Enter the type from a peer. Of several different ones the first stays, as long as it is repeated."""
         info = self.touch_topic(topic)
         for each, at in list(info.typed_at.items()):
             if now > at + LEASE:
@@ -267,7 +266,7 @@ class Directory:
             self._drop_endpoint(key)
 
     def _drop_endpoint(self, key: EndpointKey) -> None:
-        """Forget what belongs to an endpoint that has left the table."""
+        """Forget everything of an endpoint that has left the table."""
         self.timers.clear(("endpoint", key))
         keys = self._endpoints_of[key[0]]
         del keys[key]
@@ -275,7 +274,7 @@ class Directory:
             del self._endpoints_of[key[0]]
 
     def _put(self, table: dict[K, V], key: K, value: V, reason: str) -> V | None:
-        """Enter a value as the latest one; returns the one that was forgotten for it. A dict keeps the order."""
+        """Enter a value as the latest one; return the one that was forgotten for it. A dict keeps the order."""
         table.pop(key, None)  # to enter it as the last one again
         forgotten = None
         if len(table) >= TABLE_MAX:
@@ -314,18 +313,18 @@ class Directory:
 
 
 class Aliases:
-    """The names of modules that are too long for a message: an alias travels, and NAME says what it stands for."""
+    """The names of modules that are too long for a message: an alias travels, which NAME explains."""
 
     def __init__(self) -> None:
         self._names: dict[str, str] = {}
         self._parts: dict[str, dict[int, str]] = {}
 
     def name_of(self, alias: str) -> str:
-        """The name; the alias itself where none is known, or where it is a name."""
+        """Return the name; the alias itself if it is a name, or its name is unknown."""
         return self._names.get(alias, alias)
 
     def receive(self, message: management.Name) -> str | None:
-        """Read a part of a name; returns the name if it is complete now, and new."""
+        """Read a part of a name; return the name if it is complete now, and new."""
         parts = self._parts.setdefault(message.alias, {})
         number, last = management.split_part(message.part)
         parts[number] = message.piece
@@ -352,7 +351,7 @@ def counterpart(role: int) -> int:
 
 
 def decrement(counter: Counter[K], key: K) -> bool:
-    """Count one less of a key, which goes with the last one; return whether this was the last one."""
+    """Count one less of a key, and remove it with the last one; return whether this was the last one."""
     counter[key] -= 1
     if counter[key]:
         return False
@@ -387,12 +386,12 @@ class Demand:
         return [entry for entry, sources in self._sources.items() if source in sources]
 
     def pop_changed(self) -> set[str]:
-        """The topics that got their first source in a role, or lost the last one, since the last call."""
+        """Return the topics that got their first source in a role, or lost the last one, since the last call."""
         changed, self._changed = self._changed, set()
         return changed
 
     def add(self, topic: str, role: int, source: Hashable) -> bool:
-        """Enter a source; False if the table is full."""
+        """Enter a source; return False if the table is full."""
         sources = self._sources.get((topic, role))
         if sources is None:
             if len(self._sources) >= TABLE_MAX:
@@ -415,7 +414,7 @@ class Demand:
 
 
 class LeasedDemand(Demand):
-    """Demand by management messages: what r2p modules say holds for a lease, what firmware says for good.
+    """Demand by management messages: of r2p modules for a lease, of firmware for good.
 
     It uses the timers of its discovery, with keys that begin with "demand".
     """
@@ -460,7 +459,7 @@ class LeasedDemand(Demand):
                     self.expired(topic, role, source)
 
     def _enter(self, now: int, topic: str, role: int, source: PeerAddress) -> None:
-        # None also while the HELLO of an r2p module has not come: see `_start_leases`.
+        # None also before the HELLO of an r2p module: see `_start_leases`.
         lease = self._directory.lease_of(source)
         if not self.add(topic, role, source):
             return
@@ -471,7 +470,7 @@ class LeasedDemand(Demand):
             self._permanent.setdefault(source, {})[topic, role] = None
 
     def _start_leases(self, now: int, source: PeerAddress) -> None:
-        """Make a lease of what a module said before its first HELLO, too."""
+        """Make leases of a module's entries before its first HELLO, too."""
         lease = self._directory.lease_of(source) if source in self._permanent else None
         if lease is not None:
             for topic, role in self._permanent.pop(source):

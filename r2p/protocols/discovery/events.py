@@ -56,7 +56,7 @@ class ModuleInfo(msgspec.Struct, frozen=True):
     """A module on the link.
 
     `flags` are those of its ALIVE, `last_heard` is in monotonic ns. Only an r2p module has an `instance` (the random
-    number of its start), a `lease` (ns that it may be silent), and can be an `observer`, a tool that sends no ALIVE.
+    number of its start), a `lease` (ns that it may be silent), and may be an `observer`, a tool that sends no ALIVE.
     `hops` is the number of gateways in between. `wire` and `release` are those of its HELLO (0 and empty: not known).
     """
 
@@ -108,7 +108,7 @@ class SubscribersGone(msgspec.Struct, frozen=True):
 class SubscriberLeft(msgspec.Struct, frozen=True):
     """One remote subscriber of a topic has left; `SubscribersGone` follows the last. Only where links tell them apart.
 
-    `gone`: the subscriber has ended; else it still subscribes, and this module publishes it no longer, or otherwise.
+    `gone`: the subscriber has ended; else it still subscribes, and this module's publication has ended or changed.
     """
 
     topic: str
@@ -166,8 +166,8 @@ class CommandDenied(msgspec.Struct, frozen=True):
 
 
 class ConnectionDenied(msgspec.Struct, frozen=True):
-    """The server at the other end does not accept this connection: it serves as many clients as it may, or this module
-    is a `gateway` and the server accepts none.
+    """The server at the other end does not accept this connection: it has its maximum of clients, or this module is a
+    `gateway` and the server accepts none.
     """
 
     server: str
@@ -175,17 +175,17 @@ class ConnectionDenied(msgspec.Struct, frozen=True):
 
 
 class EchoDetected(msgspec.Struct, frozen=True):
-    """The line echoes what this module sends."""
+    """The line echoes this module's own messages."""
 
 
 class ModuleChanged(msgspec.Struct, frozen=True):
-    """A module is new, or anything but the time it was last heard has changed."""
+    """A module is new, or anything but the time of its last message has changed."""
 
     info: ModuleInfo
 
 
 class ModuleGone(msgspec.Struct, frozen=True):
-    """An r2p module said good-bye, or was `silent` for its lease. On zenoh the two can't be told apart."""
+    """An r2p module said good-bye, or was `silent` for its lease. On zenoh the two can't be distinguished."""
 
     info: ModuleInfo
     silent: bool = False
@@ -204,7 +204,7 @@ class Undeclare(msgspec.Struct, frozen=True):
 
 
 class QueryTokens(msgspec.Struct, frozen=True):
-    """Query the network for all tokens; `appeared` takes each of them, and `query_ended` the end."""
+    """Query the network for all tokens; `appeared` gets each of them, and `query_ended` the end."""
 
 
 Event = (
@@ -228,7 +228,7 @@ Event = (
 )
 
 _SENT_MAX = 256
-"""Messages that are recognised when a line echoes them: more than are on the way at a time."""
+"""Messages to recognise when a line echoes them: more than are on the way at a time."""
 
 
 class Outbox:

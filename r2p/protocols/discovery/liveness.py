@@ -1,7 +1,7 @@
 """Track the modules on one link: those that come, go and restart, two with one name, and echoes of this module.
 
 Firmware is known by its ALIVE only. It never says good-bye, and is remembered for good. An r2p module also says HELLO
-with the random number of its start (its instance), which tells a restart from a second module with the same name.
+with the random number of its start (its instance), which distinguishes a restart from a second module of the same name.
 """
 
 from typing import TypeVar
@@ -25,7 +25,7 @@ from r2p.units import SECOND
 _REPORT_INTERVAL = 5 * SECOND
 """Ns between two reports of one conflict, or of an echo."""
 _REPORTED_MAX = 64
-"""Names with a conflict that are remembered; further ones are counted only."""
+"""Remembered names with a conflict; further ones are only counted."""
 _ECHO_INTERVAL = 10 * SECOND
 """Ns after an echo in which the line is expected to echo again."""
 _SWAPS_OF_TWO = 3
@@ -53,7 +53,7 @@ class PeerLiveness:
     # Messages
 
     def name(self, now: int, message: management.Name, source: PeerAddress) -> None:
-        """NAME: a module that is known by its alias gets its name."""
+        """Handle NAME: a module known by its alias gets its name."""
         name = self._aliases.receive(message)
         info = self._directory.modules.get(message.alias)
         if name is not None and info is not None and (info.hops or not info.r2p):
@@ -61,7 +61,7 @@ class PeerLiveness:
             self._enter(now, None, msgspec.structs.replace(info, name=name))
 
     def alive(self, now: int, message: management.Alive, source: PeerAddress) -> None:
-        """ALIVE: the state of any module."""
+        """Handle ALIVE: the state of any module."""
         if not self._is_possible(message.module):
             return
         message = self._with_name(message)
@@ -76,7 +76,7 @@ class PeerLiveness:
         self._enter(now, before, info)
 
     def hello(self, now: int, message: management.Hello, source: PeerAddress) -> None:
-        """HELLO: an r2p module, maybe this one."""
+        """Handle HELLO: an r2p module, maybe this one."""
         if not self._is_possible(message.module):
             return
         message = self._with_name(message)
@@ -91,12 +91,12 @@ class PeerLiveness:
             self._present(now, message, source)
 
     def endpoint(self, now: int, message: management.Endpoint, source: PeerAddress) -> None:
-        """ENDPOINT: a publisher or subscriber of a remote node."""
+        """Handle ENDPOINT: a publisher or subscriber of a remote node."""
         if message.instance != self._instance:
             self._directory.enter_endpoint(now, message)
 
     def conflict(self, now: int, message: management.Conflict, source: PeerAddress) -> None:
-        """CONFLICT: a peer, which hears more modules than this one does, found another one of this module's name."""
+        """Handle CONFLICT: a peer that hears more modules found another one of this module's name."""
         instances = (message.instance_a, message.instance_b)
         if message.module == self._module and self._instance in instances:
             self._report_conflict(now, message.module, *instances)
@@ -104,9 +104,9 @@ class PeerLiveness:
     # Time and the link
 
     def drop_echo(self, now: int, data: bytes) -> bool:
-        """Count a message of this module that the line gave back; False for any other.
+        """Count a message of this module that the line returned; return False for any other.
 
-        That the line does so is known from the HELLO of this module.
+        The HELLO of this module shows that the line does so.
         """
         if now >= self._echoing_until or not self._outbox.pop_echo(data):
             return False
@@ -160,18 +160,18 @@ class PeerLiveness:
 
     def _present(self, now: int, message: management.Hello, source: PeerAddress) -> None:
         """Enter an r2p module that introduces itself, for the first time or again."""
-        # What was known before has to be looked at first: `_enter` replaces it.
+        # The previous information has to be read first: `_enter` replaces it.
         known_start = self._directory.was_before(message.module, message.instance)
         before, info = self._directory.read_hello(now, message, source)
         self._look_for_namesakes(now, before, message)
         is_new = not known_start and (before is None or before.instance != info.instance)
-        # Before `module_found`: what it had at its old address must not end what it gets at the new one.
+        # Before `module_found`: the end at its old address must not affect the new one.
         if before is not None and (before.source, before.hops) != (info.source, info.hops):
             self._negotiation.module_gone(now, before)
         if message.hops == 0:
             self._negotiation.module_found(now, info, is_new=is_new)
         self._enter(now, before, info)
-        # After `_enter`: how often everything is repeated depends on the number of modules.
+        # After `_enter`: the rate of repetition depends on the number of modules.
         if is_new or message.flags & management.HELLO_QUERY:
             self._announcer.repeat_all(now, tool=bool(message.flags & management.HELLO_TOOL))
 
@@ -190,7 +190,7 @@ class PeerLiveness:
             self._negotiation.unknown_left(now, source)
 
     def _enter(self, now: int, before: ModuleInfo | None, info: ModuleInfo) -> None:
-        """Enter what a module says, and report it unless it only shows that the module lives."""
+        """Enter a module's information, and report it unless it only shows that the module lives."""
         forgotten = self._directory.enter(info)  # made room for this one: as good as gone
         if info.r2p:
             self._timers.set(("module", info.name), now + info.lease)
@@ -220,7 +220,7 @@ class PeerLiveness:
             self._outbox.emit(NameConflict(module, instance_a, instance_b))
 
     def _admit_report(self, now: int, subject: str) -> bool:
-        """Decide whether to report a conflict now, and note that; '': an echo."""
+        """Decide whether to report a conflict now, and note the report; '': an echo."""
         if now < self._next_report.get(subject, now):
             return False
         if len(self._next_report) >= _REPORTED_MAX:

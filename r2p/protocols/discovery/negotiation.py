@@ -3,11 +3,11 @@
 Firmware is answered every time. Between r2p modules a repetition brings no more than a response, as both sides repeat;
 and where many of them ask at once, they share an answer (`SharedAnswers`). Only a change becomes an event.
 
-A type that does not fit is refused by both sides, because each sends its own with every repetition and as the answer to
-what it refuses. A TYPE is never answered, so two modules that disagree don't argue for ever.
+Both sides refuse a type that does not fit, because each sends its own with every repetition and as its refusal. A TYPE
+is never answered, so two modules that disagree don't argue for ever.
 
 A subscription of firmware lasts for ever. That of an r2p peer (its HELLO came without a gateway in between) is a lease.
-After a good-bye a peer counts as r2p until its lease would be over, because what it sent before may still arrive.
+After a good-bye a peer counts as r2p until its lease would be over, because earlier messages may still arrive.
 """
 
 from typing import Generic, TypeVar
@@ -55,7 +55,7 @@ class Peer(msgspec.Struct, eq=False):
     with params and size.
 
     `subscriptions` are the topics that the peer subscribes to, and whether it may have restarted since: then its next
-    request is as good as new. `permanent` are those that are no leases, `joined_at` (ns) is when `SubscriberJoined` was
+    request counts as new. `permanent` are those without a lease, `joined_at` (ns) is when `SubscriberJoined` was
     emitted last, and `waiting` are those that get no messages yet. The keys of `types` and `mismatched` are topic and
     role.
     """
@@ -106,25 +106,25 @@ class SubscriptionNegotiation:
         self._offers = SharedAnswers[management.Advertise](directory, ROLE_PUBLISHES)
         self._requests = SharedAnswers[management.SubscribeRequest](directory, ROLE_SUBSCRIBES)
         self._attached: set[str] = set()
-        """The topics for which `SubscriberJoined` was emitted, and no `SubscribersGone` since."""
+        """Topics with a `SubscriberJoined`, and no `SubscribersGone` since."""
 
     # Messages
 
     def advertised(self, now: int, message: management.Advertise, source: PeerAddress) -> None:
-        """ADVERTISE, of a publisher: request its messages if this module subscribes to the topic."""
+        """Handle ADVERTISE of a publisher: request its messages if this module subscribes to the topic."""
         topic = message.topic
         self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
         own = self._own.topics[ROLE_SUBSCRIBES].get(topic)
         peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
             return
-        # Firmware is asked at once and every time: it may have restarted, which it does not say.
+        # Firmware is asked at once and every time: it may have restarted without notice.
         if peer.is_r2p(now) and (_receives(peer, message) or self._offers.defer(now, topic, source, message)):
             return
         self._send_request(now, topic, own, [(peer, message)])
 
     def requested(self, now: int, message: management.SubscribeRequest, source: PeerAddress) -> None:
-        """SUBSCRIBE_REQUEST, of a subscriber: respond, and attach it if it is new. The size in it decides nothing."""
+        """Handle SUBSCRIBE_REQUEST of a subscriber: respond, and attach it if it is new. Its size is ignored."""
         topic = message.topic
         self._directory.add_type(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
         own = self._own.topics[ROLE_PUBLISHES].get(topic)
@@ -136,20 +136,20 @@ class SubscriptionNegotiation:
             self._send_response(now, topic, own, [(peer, message)])
 
     def responded(self, now: int, message: management.SubscribeResponse, source: PeerAddress) -> None:
-        """SUBSCRIBE_RESPONSE, of a publisher that will send: accept its messages."""
+        """Handle SUBSCRIBE_RESPONSE of a publisher that will send: accept its messages."""
         topic = message.topic
         peer = self._get_or_create(source) if topic in self._own.topics[ROLE_SUBSCRIBES] else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, message)):
             return
         self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size))
-        # Every response to a repeated request comes here; only new params, as after a restart, are an event.
+        # Every response to a repeated request arrives here; only new params, as after a restart, are an event.
         if peer.publishers.get(topic) != (message.params, message.size):
             self._own.publisher_counts[topic] += topic not in peer.publishers
             peer.publishers[topic] = (message.params, message.size)
             self._outbox.emit(PublisherFound(topic, source, message.params, message.size))
 
     def typed(self, now: int, message: management.TypeInfo, source: PeerAddress) -> None:
-        """TYPE: compare a peer's type of a topic with this module's, if it has the topic."""
+        """Handle TYPE: compare a peer's type of a topic with this module's, if it has the topic."""
         self._directory.add_type(now, message.topic, message.role, TopicType(message.size, message.fingerprint))
         own = self._counterpart(message.role).get(message.topic)
         peer = self._get_or_create(source) if own is not None else None
@@ -158,8 +158,8 @@ class SubscriptionNegotiation:
             self._fits(peer, message.topic, message.role, theirs)
 
     def unsubscribed(self, now: int, message: management.Unsubscribe, source: PeerAddress) -> None:
-        """UNSUBSCRIBE: end a subscription. Where several modules share an address, only the lease can end it, as the
-        others may still subscribe.
+        """Handle UNSUBSCRIBE: end a subscription. If several modules share an address, only the lease can end it, as
+        the others may still subscribe.
         """
         peer = self._peers.get(source)
         if peer is not None and peer.direct == {self._directory.name_of(message.instance)}:
@@ -232,7 +232,7 @@ class SubscriptionNegotiation:
                 self._fits(peer, topic, role, theirs)
 
     def topic_removed(self, topic: str, role: int) -> None:
-        """End what flowed of a topic that this module no longer publishes or subscribes to."""
+        """End the flow of a topic that this module no longer publishes or subscribes to."""
         theirs = counterpart(role)
         (self._requests if theirs == ROLE_SUBSCRIBES else self._offers).forget(topic)
         for peer in list(self._peers.values()):
@@ -242,7 +242,7 @@ class SubscriptionNegotiation:
     # Changes of the peers
 
     def module_found(self, now: int, info: ModuleInfo, *, is_new: bool) -> None:
-        """An r2p module is directly at an address: from now on, subscriptions from there are leases."""
+        """Note an r2p module directly at an address: from now on, subscriptions from there are leases."""
         peer = self._get_or_create(info.source)
         if peer is None:
             return
@@ -256,13 +256,13 @@ class SubscriptionNegotiation:
             self._renew(now, peer, topic)
 
     def restarted(self, source: PeerAddress) -> None:
-        """A module at an address has restarted, and forgot its subscriptions: its next requests are as good as new."""
+        """Note that a module at an address has restarted without its subscriptions: its next requests count as new."""
         peer = self._peers.get(source)
         if peer is not None:
             peer.mark_restarted()
 
     def module_gone(self, now: int, info: ModuleInfo) -> None:
-        """A module has left its address. With the last r2p module there, all subscriptions and publishers end."""
+        """Note that a module left its address. With the last r2p module there, all subscriptions and publishers end."""
         peer = self._peers.get(info.source)
         if peer is not None and info.name in peer.direct:
             peer.direct.discard(info.name)
@@ -270,7 +270,7 @@ class SubscriptionNegotiation:
                 self._forget_peer(now, peer)
 
     def unknown_left(self, now: int, source: PeerAddress) -> None:
-        """A module said good-bye whose other HELLOs were all lost."""
+        """Handle the good-bye of a module whose other HELLOs were all lost."""
         peer = self._peers.get(source)
         if peer is not None and not peer.direct:
             self._forget_peer(now, peer)
@@ -292,7 +292,7 @@ class SubscriptionNegotiation:
             self._remove_subscriber(peer, topic)
 
     def grace_over(self, source: PeerAddress, topic: str) -> None:
-        """Firmware has handled the response by now: attach it.
+        """Attach firmware, which has handled the response by now.
 
         On a line advertise once more: the other end may be a gateway of firmware, which passes messages on only after a
         second round of request and response.
@@ -305,7 +305,7 @@ class SubscriptionNegotiation:
                 self._own.advertise_again(topic)
 
     def linger_over(self, source: PeerAddress) -> None:
-        """Forget a peer: what it sent before it left has arrived by now."""
+        """Forget a peer: its last messages have arrived by now."""
         peer = self._peers.get(source)
         if peer is not None:
             self._prune(peer)
@@ -323,7 +323,7 @@ class SubscriptionNegotiation:
         self._timers.set(("peer", peer.source), peer.r2p_until)
 
     def _get_or_create(self, source: PeerAddress) -> Peer | None:
-        """Return the peer at this address; None, and counted, where there are too many."""
+        """Return the peer at this address; None, and counted, if there are too many."""
         peer = self._peers.get(source)
         if peer is None:
             if len(self._peers) >= PEERS_MAX:
@@ -356,10 +356,10 @@ class SubscriptionNegotiation:
         return False
 
     def _add_subscriber(self, now: int, peer: Peer, topic: str, *, unanswered: bool) -> bool:
-        """Enter a subscription; return whether it is new, or as good as new.
+        """Enter a subscription; return whether it is new, or counts as new.
 
-        It is as good as new after a restart. So it is where the peer is still `unanswered` a while after it joined: the
-        response was lost, and with it what was sent before the peer accepted anything.
+        It counts as new after a restart, and if the peer is still `unanswered` a while after it joined: the response
+        was lost, and with it all messages since, which the peer did not accept.
         """
         restarted = peer.subscriptions.get(topic)
         peer.subscriptions[topic] = False
@@ -394,7 +394,7 @@ class SubscriptionNegotiation:
             self._timers.set(key, now + peer.lease)
 
     def _end(self, peer: Peer, topic: str, role: int) -> None:
-        """End what flows to or from a peer in this role."""
+        """End the flow to or from a peer in this role."""
         if role == ROLE_SUBSCRIBES:
             self._remove_subscriber(peer, topic)
         else:
@@ -432,18 +432,18 @@ def _needs_type(now: int, peer: Peer, message: management.SubscribeRequest) -> b
 
 
 def _implied_type(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> TopicType:
-    """The type that a publisher's message implies: that of the TYPE before it, if the sizes agree."""
+    """Return the type that a publisher's message implies: that of the TYPE before it, if the sizes agree."""
     typed = peer.types.get((message.topic, ROLE_PUBLISHES))
     return typed if typed is not None and typed.size == message.size else TopicType(message.size)
 
 
 class SharedAnswers(Generic[M]):
-    """The answers to r2p modules in one role, by topic: which go at once, and which wait to serve several modules.
+    """The answers to r2p modules in one role, by topic: some go at once, others wait to serve several modules.
 
-    An answer is heard by all modules on the link, so it serves everyone who asked before it. About each topic the first
-    few answers go at once; then there is one for each `_SHARED_GAP` and module. Without that, when n modules start
-    together, each would answer each of the others, and each of these answers would be answered. The timers have keys
-    that begin with "answer".
+    All modules on the link hear an answer, so it serves all earlier requests. For each topic the first few answers go
+    at once; then there is one for each `_SHARED_GAP` and module. Without that, when n modules start together, each
+    would answer each of the others, and each of these answers would be answered. The timers have keys that begin with
+    "answer".
     """
 
     def __init__(self, directory: Directory, role: int) -> None:
@@ -468,7 +468,7 @@ class SharedAnswers(Generic[M]):
         return True
 
     def pop(self, now: int, topic: str) -> list[tuple[PeerAddress, M]]:
-        """The peers to answer now that the timer has run out, and what each of them said last."""
+        """Return the peers to answer, as the timer has expired, each with its last message."""
         self._count(now, topic)
         return list(self._deferred.pop(topic, {}).items())
 

@@ -1,8 +1,8 @@
 """The schedule of announcements: a ring of everything to repeat, step by step, never faster than the link's rate.
 
-New items go first (`_fresh`), then join the ring. A request to hear everything again only raises the number of steps
-that don't wait (`_eager`) to one full turn, so that fifty requests at once cost one turn. Items that only describe,
-those of endpoints, leave the ring after two turns for one that turns more slowly (`_slow`), until a module is new.
+New items go first (`_fresh`), then join the ring. A request for everything only raises the number of steps that don't
+wait (`_eager`) to one full turn, so that fifty requests at once cost one turn. Items that only describe, those of
+endpoints, leave the ring after two turns for one that turns more slowly (`_slow`), until a module is new.
 """
 
 from collections import OrderedDict
@@ -13,13 +13,13 @@ import msgspec
 from r2p.units import SECOND
 
 _STEP = SECOND // 2
-"""Ns between two steps at most, when there is little to repeat."""
+"""Ns between two steps, at most, when there is little to repeat."""
 _ROUND = 3 * SECOND // 2
 """Ns in which the ring turns once, if the rate allows. The shortest lease is three turns, so two may be lost."""
 SLOW_ROUNDS = 4
 """Turns of the ring in which the slow ring turns once."""
 _PRESENCE_INTERVAL = SECOND // 10
-"""Ns between two presences (HELLO and ALIVE) at least, however many modules ask."""
+"""Ns between two presences (HELLO and ALIVE), at least, however many modules ask."""
 _PRESENCE_EACH = SECOND // 100
 """The same, for each module on the link."""
 _PRESENCE_SHARE = 8
@@ -32,7 +32,7 @@ _NEWCOMER_EACH = SECOND // 20
 """Ns for each module on the link between two full repetitions for new modules. Those that start meanwhile share one, so
 that the start of n modules costs each a few repetitions, not n."""
 _TOOL_INTERVAL = SECOND // 5
-"""Ns between two full repetitions for a tool, which shows what it hears to a user."""
+"""Ns between two full repetitions for a tool, whose user is waiting."""
 
 
 class ItemKind(Enum):
@@ -50,7 +50,7 @@ class ItemKind(Enum):
 
 
 class Item(msgspec.Struct, frozen=True):
-    """One thing to announce: again and again, or `once`. The message is made when its turn comes."""
+    """One item to announce: again and again, or `once`. The message is made in its turn."""
 
     kind: ItemKind
     key: tuple[str | int, ...] = ()
@@ -101,7 +101,7 @@ class Schedule:
         self._quiet = quiet
 
     def add(self, item: Item) -> None:
-        """Announce an item as soon as the rate allows, and unless `once` for ever. One that waits keeps its turn."""
+        """Announce an item as soon as the rate allows, and unless `once` for ever. A waiting one keeps its turn."""
         if item in self._fresh:
             return
         self.drop(item)  # it is announced now, so its place in a ring would announce it twice
@@ -109,7 +109,7 @@ class Schedule:
         self._count += not item.once
 
     def relay(self, item: Item) -> None:
-        """Announce once what another module said, in turn with this module's items. One that waits keeps its turn."""
+        """Announce another module's item once, in turn with this module's own. A waiting one keeps its turn."""
         self._relayed[item] = None
 
     def drop(self, item: Item) -> None:
@@ -137,7 +137,7 @@ class Schedule:
         self._repeated_at, self._repeat_at, self._tool_waits = -_ROUND, None, False
 
     def repeat(self, now: int, modules: int = 1, *, tool: bool = False) -> None:
-        """Announce everything once more, presence first: one of `modules` on the link is new, or a `tool` asks."""
+        """Announce everything once more, presence first, as one of `modules` on the link is new, or a `tool` asks."""
         apart = max(_PRESENCE_INTERVAL, _PRESENCE_SHARE * self._bucket.gap, modules * _PRESENCE_EACH)
         self._presence_at = min(self._presence_at, max(now, self._presence_sent + apart))
         apart = modules * _NEWCOMER_EACH
@@ -155,11 +155,11 @@ class Schedule:
 
     def due(self) -> int:
         """Return when to call `pop` (ns)."""
-        # What an item costs is known when its messages are made: there must be room for the most that it may cost.
+        # The cost of an item is known only when its messages are made: there must be room for the most possible.
         return max(0 if self._fresh or self._relayed else self._turn_at(), self._bucket.ready_at(_ITEM_MESSAGES))
 
     def pop(self, now: int) -> Item | None:
-        """The item to announce now, if any; `sent` takes what it cost."""
+        """Return the item to announce now, if any; `sent` takes its cost."""
         if self.due() > now:
             return None
         if self._repeat_at is not None and self._repeat_at <= now:
@@ -172,7 +172,7 @@ class Schedule:
                 self._ring[item] = None
                 self._lap = max(self._lap, len(self._ring))
             return item
-        # By turns: neither may the other links' modules starve this one, nor the other way round.
+        # In turn, so that neither this module nor those of other links starve.
         if self._relayed and (self._relay_next or self._turn_at() > now):
             self._relay_next = False
             return self._relayed.popitem(last=False)[0]
@@ -189,13 +189,13 @@ class Schedule:
 
     @property
     def round_time(self) -> int:
-        """Ns that it takes to repeat everything."""
+        """Ns to repeat everything."""
         slot = max(self._interval, _ITEM_MESSAGES * self._bucket.gap, self._quiet)
         return max(_ROUND, (self._places + 1) * slot)
 
     @property
     def relay_time(self) -> int:
-        """Ns that it takes until all that waits to be relayed has had its turn."""
+        """Ns until all items that wait to be relayed have had their turn."""
         return 2 * _ITEM_MESSAGES * self._bucket.gap * len(self._relayed)
 
     @property

@@ -1,14 +1,14 @@
-"""The interface that a link has to its discovery, and `Discovery` by management messages (PROTOCOL.md 4 and 9).
+"""The interface of discovery to its link, and `Discovery` by management messages (PROTOCOL.md 4 and 9).
 
 `Discovery` finds peers by messages that it repeats, `r2p.protocols.liveliness.session.LivelinessDiscovery` by the
-liveliness tokens of a zenoh network. A link drives both alike: it hands over what its module has and what it receives,
-and acts on the events that come back.
+liveliness tokens of a zenoh network. A link drives both alike: it hands over its module's topics and received messages,
+and acts on the returned events.
 
 The protocol of management messages keeps no connections: everything is announced again and again, every request is
-answered every time, and no single message matters. `Announcer` says what this module has, `SubscriptionNegotiation`
-answers what peers offer and request, `PeerLiveness` reports which modules come and go, and `Directory` remembers what
-they said. `Discovery` gives each received message to the part that handles it, and calls the parts when their time has
-come.
+answered every time, and no single message matters. `Announcer` announces this module's topics,
+`SubscriptionNegotiation` answers offers and requests of peers, `PeerLiveness` reports modules that join and leave, and
+`Directory` remembers their announcements. `Discovery` gives each received message to the part that handles it, and
+calls the parts at their deadlines.
 """
 
 from abc import ABC, abstractmethod
@@ -62,8 +62,8 @@ class DiscoveryProtocol(ABC):
     """The modules, topics and subscriptions of one link.
 
     Every method that takes `now` (monotonic ns) returns the events to act on, in order. Call `poll` at
-    `next_deadline()`, which may have changed after each call. `counts` is the counter to use, where its owner
-    wants to see it grow.
+    `next_deadline()`, which may have changed after each call. `counts` is the counter to use, for an owner that watches
+    it.
     """
 
     flags: int
@@ -71,7 +71,7 @@ class DiscoveryProtocol(ABC):
     counts: Counter[str]
     """Received messages that were dropped, by reason."""
     modules: dict[str, ModuleInfo]
-    """The other modules by name. One of this module's own name is another module that has it too."""
+    """The other modules by name. One of this module's own name is another module with the same name."""
     topics: dict[str, TopicInfo]
     """The topics of the other modules, by name."""
     endpoints: dict[EndpointKey, EndpointInfo]
@@ -92,7 +92,7 @@ class DiscoveryProtocol(ABC):
     @property
     @abstractmethod
     def generation(self) -> int:
-        """A number that changes when `modules` or `endpoints` change, their `last_heard` aside."""
+        """A number that changes with `modules` and `endpoints`, except for their `last_heard`."""
 
     @abstractmethod
     def demand(self) -> Demand:

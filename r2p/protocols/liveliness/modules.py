@@ -1,4 +1,4 @@
-"""The modules on a network with liveliness tokens, and their nodes, worked out from the tokens there are."""
+"""The modules on a network with liveliness tokens, and their nodes, worked out from the tokens."""
 
 from collections import Counter
 
@@ -10,13 +10,12 @@ from r2p.protocols.discovery.events import ModuleChanged, ModuleGone, ModuleInfo
 from r2p.units import SECOND
 
 _CONFLICT_AFTER = 3 * SECOND // 2
-"""Ns for which two modules of one name must be there: the token of one that hangs may live for a second."""
+"""Ns for which two modules must share a name: the token of a hanging one may live for a second."""
 
 
 class ModuleRegistry:
-    """The other modules on the network of module `module`, run `instance`. What has changed goes to `outbox`.
-
-    It keeps TABLE_MAX modules; of others only the name, so that they are shown as soon as another module is gone.
+    """The other modules on the network of module `module`, run `instance`. Changes go to `outbox`. It keeps TABLE_MAX
+    modules; of others only the name, to show them when there is room.
     """
 
     def __init__(self, module: str, instance: int, outbox: Outbox, counts: Counter[str]) -> None:
@@ -71,7 +70,7 @@ class ModuleRegistry:
         self.generation += 1
 
     def endpoint_disappeared(self, token: TopicToken) -> None:
-        """Remove it, unless another token declares it as well, as when its class has changed."""
+        """Remove the token's endpoint, unless another token declares it as well, such as after a change of class."""
         key = _endpoint_key(token)
         if key is not None and key in self._endpoint_tokens and decrement(self._endpoint_tokens, key):
             del self.endpoints[key]
@@ -81,12 +80,12 @@ class ModuleRegistry:
     # Without tokens
 
     def add_firmware(self, info: ModuleInfo) -> None:
-        """Enter a module that has no token of its own, as a gateway announces it."""
+        """Enter a module without a token of its own, which a gateway announces."""
         if info.name != self._module and info.name not in self._tokens:
             self._keep(self.modules.get(info.name), info)
 
     def mark_heard(self, now: int) -> None:
-        """Mark what has a token as heard now."""
+        """Mark everything with a token as heard now."""
         for name in self._tokens:
             info = self.modules.get(name)
             if info is not None and info.r2p:
@@ -106,7 +105,7 @@ class ModuleRegistry:
         return min(self._conflict_at.values(), default=None)
 
     def poll(self, now: int) -> None:
-        """Show modules that have room now, and report two modules that have had the same name for long enough."""
+        """Show modules with room now, and report two modules that have shared a name for long enough."""
         while self._without_room and len(self.modules) < TABLE_MAX:
             self._update(now, next(iter(self._without_room)))
         for name in [name for name, due in self._conflict_at.items() if due <= now]:
@@ -118,7 +117,7 @@ class ModuleRegistry:
             self._outbox.emit(NameConflict(name, one, other))
 
     def _update(self, now: int, name: str) -> None:
-        """The tokens of a name have changed: the nearest and latest of them becomes the module."""
+        """Make the nearest and latest of a name's tokens the module, as they have changed."""
         tokens = [each for each in self._tokens.get(name, {}).values() if each.instance != self._instance]
         before = self.modules.get(name)
         self._without_room.pop(name, None)

@@ -1,9 +1,9 @@
-"""Discovery on a network that reports by itself what its modules have: zenoh's liveliness tokens (PROTOCOL.md 10).
+"""Discovery on a network that itself reports changes: zenoh's liveliness tokens (PROTOCOL.md 10).
 
-Links use it as they use `Discovery`, and get the same events; but nothing is repeated, asked for, or leased. What this
-module has becomes tokens (`Declare`, `Undeclare`); the tokens of other modules come in with `appeared` and
-`disappeared`, also those that were there before. What has no place in a token travels as a management message on the
-network's control key: commands, CONFLICT, and what gateways have to say of firmware.
+Links use it like `Discovery`, and get the same events; but nothing is repeated, requested, or leased. This module's
+topics become tokens (`Declare`, `Undeclare`); `appeared` and `disappeared` report those of other modules, earlier ones
+included. Everything else travels as a management message on the network's control key: commands, CONFLICT, and
+gateways' messages about firmware.
 """
 
 from collections import Counter
@@ -28,10 +28,10 @@ from r2p.protocols.liveliness.tokens import Matching, TokenSet
 from r2p.units import SECOND
 
 TOKENS_MAX = 4 * TABLE_MAX
-"""Tokens of other modules that are kept."""
+"""Tokens of other modules, at most."""
 
 _MARK_EVERY = SECOND // 2
-"""Ns after which what has a token is marked as heard once more."""
+"""Ns after which everything with a token is marked as heard once more."""
 
 _PAUSE_MIN = 5 * SECOND
 """Ns from when there is room for refused tokens until they are queried; twice as long each time."""
@@ -124,7 +124,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     # What users ask for
 
     def query(self, now: int) -> list[Event]:
-        """Do nothing: what r2p modules have is known."""
+        """Do nothing: all topics of r2p modules are known."""
         return self._outbox.drain()
 
     def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
@@ -140,7 +140,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._outbox.drain()
 
     def link_down(self, now: int) -> list[Event]:
-        """Forget all tokens, which will appear again. This module's own are declared anew then."""
+        """Forget all tokens, which will appear again; then this module declares its own anew."""
         self._outbox.up = False
         self._outbox.emit(*self._own.withdraw_all())
         for key in list(self._tokens):
@@ -150,7 +150,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._outbox.drain()
 
     def leave(self, now: int) -> list[Event]:
-        """Stop; the tokens go with the session."""
+        """Stop; the tokens end with the session."""
         self._outbox.up = False
         self._refused.clear()
         return self._outbox.drain()
@@ -162,7 +162,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return min((each for each in due if each is not None), default=None)
 
     def poll(self, now: int) -> list[Event]:
-        """Declare what has changed here; mark as heard what has a token; query tokens that were refused."""
+        """Declare changes of this module; mark everything with a token as heard; query refused tokens."""
         if self._outbox.up:
             self._outbox.emit(*self._own.pop_changes())
         if self._mark_at is not None and self._mark_at <= now:
@@ -181,7 +181,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     # Tokens of other modules
 
     def appeared(self, now: int, key: str) -> list[Event]:
-        """Handle a token that is there; one that is known already is ignored."""
+        """Handle a token that exists; ignore a known one."""
         token = None if key in self._tokens else self._decode(liveliness.decode, key)
         if token is None or token.session == self._instance:
             return self._outbox.drain()
@@ -201,7 +201,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._outbox.drain()
 
     def disappeared(self, now: int, key: str) -> list[Event]:
-        """Handle a token that is gone."""
+        """Handle the end of a token."""
         if key in self._tokens:
             self._remove_token(now, key)
         else:
@@ -215,7 +215,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self.missed(now, 1)
 
     def missed(self, now: int, count: int) -> list[Event]:
-        """Note that so many tokens may be there that were not reported, which are queried when there is room."""
+        """Note that so many tokens may be unreported, which are queried when there is room."""
         self._refused.add(count)
         self._review_refused(now)
         return self._outbox.drain()
@@ -297,19 +297,19 @@ class RefusedTokens:
         self._spread = spread % 256
         self._any = False
         self._count = 0
-        """An estimate: a token that went may have been one of those that were refused."""
+        """An estimate: a token that ended may have been a refused one."""
         self._query_at: int | None = None
         self._querying = False
         self._pause = _PAUSE_MIN
         self._last_query: int | None = None
 
     def add(self, count: int = 1) -> None:
-        """Count tokens that were refused."""
+        """Count refused tokens."""
         self._any = True
         self._count += count
 
     def remove_one(self) -> None:
-        """Note that a token is gone that was not kept."""
+        """Note the end of a token that was not kept."""
         self._count = max(0, self._count - 1)
 
     def clear(self) -> None:

@@ -1,6 +1,6 @@
 """Liveliness tokens of this module, and which topics flow between it and each other session because of them.
 
-`TokenSet` says which tokens to declare, and which to undeclare. Changes are collected, and become events all at once:
+`TokenSet` decides which tokens to declare and undeclare. Changes are collected, and become events all at once:
 so a publisher that is announced first and gets the name of its node a moment later is one token, and a change declares
 the new token before it undeclares the old one.
 
@@ -72,7 +72,7 @@ class TokenSet:
         self._dirty.add((topic, role))
 
     def remove_topic(self, topic: str, role: int) -> None:
-        """Undeclare that."""
+        """Undeclare the topic in this role."""
         self._topics.pop((topic, role), None)
         self._dirty.add((topic, role))
 
@@ -89,7 +89,7 @@ class TokenSet:
         self._dirty.add((topic, role))
 
     def set_relayed(self, key: tuple[str | int, ...], token: liveliness.Token | None) -> None:
-        """Declare something behind this module, which is a gateway; None undeclares it."""
+        """Declare a token of a module behind this gateway; None undeclares it."""
         if token is None:
             self._relayed.pop(key, None)
         else:
@@ -100,7 +100,7 @@ class TokenSet:
         return self._relayed.get(key)
 
     def pop_changes(self) -> list[Declare | Undeclare]:
-        """Return what to declare and undeclare since the last call."""
+        """Return the declarations and their ends since the last call."""
         events: list[Declare | Undeclare] = []
         dirty, self._dirty = self._dirty, set()
         for key in dirty:
@@ -148,7 +148,7 @@ class TokenSet:
 
 
 class _PeerSession(msgspec.Struct):
-    """The topics of another module on the network: its tokens, what of them flows, and the types that don't fit."""
+    """The topics of another module on the network: its tokens, those that flow, and the types that don't fit."""
 
     tokens: dict[TopicRole, dict[str, TopicToken]] = msgspec.field(default_factory=dict)
     matched: dict[TopicRole, int] = msgspec.field(default_factory=dict)
@@ -202,7 +202,7 @@ class Matching:
             self._remove_role(*topic_role)
 
     def changed(self, topic: str, role: int) -> None:
-        """Match a topic anew that this module begins or ceases to have in this role, or has with another type."""
+        """Match a topic again after this module begins or ends it in this role, or changes its type."""
         theirs = topic, counterpart(role)
         for number, session in list(self._sessions_of.get(theirs, {}).items()):
             self._clear_mismatch(session, theirs)
@@ -262,13 +262,13 @@ class Matching:
             self._outbox.emit(SubscribersGone(topic))
 
     def _update_type(self, info: TopicInfo, role: int) -> None:
-        """A topic has the type of the first session that declares one."""
+        """Give a topic the type of the first session that declares one."""
         sessions = self._sessions_of.get((info.name, role), {}).values()
         types = (_type_of(session.tokens[info.name, role]) for session in sessions)
         info.set_type(role, next((each for each in types if each != TopicType()), None))
 
     def _remove_role(self, topic: str, role: int) -> None:
-        """Forget the role of a topic that has lost its last token, and the topic without the other role."""
+        """Forget the role of a topic that has lost its last token; without the other role, the topic too."""
         if (topic, counterpart(role)) not in self._sessions_of:
             del self.topics[topic]
         else:

@@ -1,4 +1,4 @@
-"""The calendar of reserved slots at the master: which message gets which (PROTOCOL.md 6, thesis 4.3.4).
+"""The calendar of reserved slots at the master (PROTOCOL.md 6, thesis 4.3.4).
 
 Slots are counted through: slot s of cycle c is number c * slots + s. A reservation of period p, phase f and k fragments
 owns the numbers f .. f + k - 1 and all that differ from them by a multiple of p. Of every two reservations, the sync's
@@ -29,7 +29,7 @@ class Reservation(msgspec.Struct, frozen=True):
     fragments: int = 1
 
     def first_from(self, number: int) -> int:
-        """The first slot number from this one on where an occurrence begins."""
+        """Return the first slot number from this one on where an occurrence begins."""
         return number + (self.phase - number) % self.period
 
 
@@ -121,7 +121,7 @@ class Calendar:
         return self._entries.pop(message, None) is not None
 
     def free(self, period: int) -> int:
-        """Bit i: no reservation owns slot number i, nor any number that differs from it by a multiple of the period."""
+        """Return a mask; bit i: no reservation owns slot i, or one that differs from it by a multiple of the period."""
         free = (1 << period) - 1 & ~_comb(self.slots, 0, 1, period)
         for each in self._entries.values():
             free &= ~_comb(each.period, each.phase, each.fragments, period)
@@ -140,7 +140,7 @@ class Calendar:
         return reservation
 
     def _wanted(self, message: int, period: int, round_down: bool) -> int:
-        """The period, or the longest up to it that is harmonic with all others; the period itself if there is none."""
+        """Return the longest period up to this one that is harmonic with all others; this one if there is none."""
         if not round_down or not 1 < period <= PERIOD_MAX:
             return period
         others = {each.period for each in self._entries.values() if each.message != message} | {self.slots}
@@ -163,7 +163,7 @@ class Calendar:
 
 
 def occupied(reservation: Reservation, start: int, slots: int) -> int:
-    """The slots of the reservation in a cycle that begins with number `start`, as a mask."""
+    """Return the slots of the reservation in a cycle that begins with number `start`, as a mask."""
     period, train = reservation.period, (1 << reservation.fragments) - 1
     offset = (reservation.phase - start) % period
     if period >= slots:  # at most one occurrence, and a whole one: none spans two cycles
@@ -176,7 +176,7 @@ def _harmonic(a: int, b: int) -> bool:
 
 
 def _candidates(period: int, slots: int) -> Iterator[int]:
-    """Periods up to this one that are harmonic with the cycle, the longest first."""
+    """Yield the periods up to this one that are harmonic with the cycle, the longest first."""
     yield from range(period - period % slots, 0, -slots)
     yield from (divisor for divisor in range(min(period, slots - 1), 1, -1) if slots % divisor == 0)
 

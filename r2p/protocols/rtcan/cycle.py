@@ -1,11 +1,11 @@
-"""Slots and cycles: where this node is in which cycle, by its own clock (PROTOCOL.md 6, thesis 4.3.3).
+"""Slots and cycles: this node's place in the cycle, by its own clock (PROTOCOL.md 6, thesis 4.3.3).
 
 The reference is the start of frame of the sync in slot 0. The master plans it on a grid of its own clock; if the
 confirmation of its own frame shows that it left later than latencies vary, that start counts. A slave has it from each
 sync that it receives: the reception's stamp, less the exact length of the frame with its stuff bits, less its own
-calibrated latency. The slave's own clock bridges syncs that do not come, for at most three cycles.
+calibrated latency. The slave's own clock bridges missing syncs, for at most three cycles.
 
-The first sync of a master that goes on with a network may leave late: then its grid begins where that sync did, and
+The first sync of a master that continues a network may leave late: then its grid begins with that sync, and
 moves back from cycle to cycle, so that network time catches up.
 """
 
@@ -45,7 +45,7 @@ class Timing(msgspec.Struct, frozen=True):
 
 
 def timing(slots: int = 60, nominal: int = 10_000_000, bit_rate: int = 1_000_000) -> Timing:
-    """The slots of a nominal cycle (ns): whole microseconds each. Raises ValueError when no frame fits in."""
+    """Return the slots of a nominal cycle (ns): whole microseconds each. Raises ValueError if no frame fits in."""
     slot = nominal // slots // _MICROSECOND * _MICROSECOND
     bit = SECOND // bit_rate
     longest = (frame_bits_max(FRAME_MAX) + INTERMISSION) * bit
@@ -78,10 +78,10 @@ class Alignment(enum.Enum):
 
 
 class Cycle:
-    """The cycle of one node. `mask` None: it is not known which slots of this cycle are free.
+    """The cycle of one node. `mask` None: the free slots of this cycle are unknown.
 
-    `free` are the slots that surely are; `next_free` has for each slot the first of them after it. `counter` is the
-    whole cycle counter once `anchored`; before, only its low 8 bits mean something.
+    `free` are the slots that are surely free; `next_free` has for each slot the first of them after it. `counter` is
+    the whole cycle counter once `anchored`; before, only its low 8 bits are valid.
     """
 
     def __init__(self, timing: Timing, receive_latency: int = 0) -> None:
@@ -107,7 +107,7 @@ class Cycle:
         return self.state is not _NONE
 
     def slot_at(self, now: int) -> int:
-        """The slot at this instant, counted from the start of this cycle; not limited to it."""
+        """Return the slot at this instant, counted from the start of this cycle; not limited to it."""
         return (now - self.reference) // self._slot
 
     def start_of(self, slot: int) -> int:
@@ -115,11 +115,11 @@ class Cycle:
         return self.reference + slot * self._slot
 
     def number_of(self, slot: int) -> int:
-        """The number of a slot of this cycle, counted from the start of cycle 0."""
+        """Return the number of a slot of this cycle, counted from the start of cycle 0."""
         return self.counter * self.timing.slots + slot
 
     def network_time(self, now: int) -> int | None:
-        """The time that all nodes share (ns): since the start of cycle 0. None: not known."""
+        """Return the time that all nodes share (ns): since the start of cycle 0. None: unknown."""
         if not self.anchored or not self.running:
             return None
         return self.counter * self.timing.cycle + now - self.reference
@@ -145,11 +145,11 @@ class Cycle:
         return Alignment.ALIGNED if cycles else Alignment.LATE
 
     def doubt(self) -> None:
-        """Distrust the mask of this cycle: which slots are free is not known, unless another sync tells."""
+        """Distrust the mask of this cycle: the free slots are unknown, unless there is another sync."""
         self._set_mask(None)
 
     def measured(self) -> tuple[int, int] | None:
-        """The length of a cycle by the syncs since it started, and how far off that may be as they jitter (ns).
+        """Return the length of a cycle by the syncs since its start, and its possible error by their jitter (ns).
 
         None before there are two.
         """
@@ -171,7 +171,7 @@ class Cycle:
         return True
 
     def anchor(self, counter: int) -> bool:
-        """Use the whole counter of a NETWORK of this cycle or a bit earlier; return whether ours was another one."""
+        """Use the whole counter of a NETWORK of this cycle or a bit earlier; return whether it changes this node's."""
         whole = _nearest(counter, self.counter, _DELAYED)
         changed = self.anchored and whole != self.counter
         self._first += whole - self.counter
@@ -190,29 +190,29 @@ class Cycle:
     def first_sync(self, now: int, mask: Callable[[int], int], *, inherits: bool) -> tuple[Frame, int, int]:
         """The first sync of a new master, its start and its count; `mask(count)` gives the slots that it reserves.
 
-        If the master `inherits` a network, the grid and the count of before go on.
+        If the master `inherits` a network, its grid and count go on.
         """
         self.anchored = inherits
         start, counter = self.upcoming(now)
         return rtcan.encode_sync(counter, mask(counter)), start, counter
 
     def upcoming(self, now: int) -> tuple[int, int]:
-        """Start and count of the next cycle: by the grid and the counter of before, if there were any."""
+        """Return start and count of the next cycle: by the previous grid and counter, if any."""
         if not self.anchored:
             return now, 1
         cycles = -(-(now - self._grid) // self.timing.cycle)
         return self._grid + cycles * self.timing.cycle, self.counter + cycles
 
     def delay(self, by: int) -> bool:
-        """Take into account that the first sync of a network that goes on left `by` ns late.
+        """Take into account that the first sync of a continued network left `by` ns late.
 
-        Return False when it was too late for its count: network time can no longer catch up, and a new network begins.
+        Return False if it was too late for its count: network time can no longer catch up, and a new network begins.
         """
         self._behind += by
         return 2 * self._behind < self.timing.cycle
 
     def lead(self, start: int, counter: int, mask: int | None, *, anew: bool = False) -> None:
-        """Lead from the cycle on that began at `start`; `anew`: a network that was not there before."""
+        """Lead from the cycle that began at `start`; `anew`: a new network."""
         self._begin(CycleState.LEADING, start, mask)
         if anew:
             self._behind = 0
@@ -236,7 +236,7 @@ class Cycle:
     def on_sync_sent(self, frame: Frame, at: int) -> None:
         """Correct the reference if the master's sync, on the bus until `at`, left late: its slaves are late with it.
 
-        What the jitter of latencies explains moves nothing: the plan is as good a guess as the stamp, and keeps the
+        Delays within the jitter of latencies change nothing: the plan is as good a guess as the stamp, and keeps the
         slots of the next cycle exactly one cycle later.
         """
         start = start_of_frame(frame, at, self.timing.bit)
@@ -275,7 +275,7 @@ class Cycle:
 
 
 def following(chosen: Container[int], slots: int) -> list[int]:
-    """For each slot from 0 to `slots`: the first one after it that is chosen, up to `slots`; else NO_SLOT."""
+    """Return for each slot from 0 to `slots` the first chosen one after it, up to `slots`; else NO_SLOT."""
     after = [NO_SLOT]
     for slot in range(slots, 0, -1):
         after.append(slot if slot in chosen else after[-1])
@@ -284,7 +284,7 @@ def following(chosen: Container[int], slots: int) -> list[int]:
 
 @lru_cache(maxsize=64)  # few masks come, again and again
 def _free(mask: int | None, slots: int) -> tuple[frozenset[int], list[int]]:
-    """The slots that this mask leaves free, and which one is next after each slot."""
+    """Return the free slots of this mask, and the next one after each slot."""
     free = frozenset() if mask is None else frozenset(slot for slot in range(1, slots) if not mask >> slot & 1)
     return free, following(free, slots)
 

@@ -9,11 +9,11 @@ a transport does this:
    `transmit_latency`: a call that is late enough misses the slot.
 3. `Transmit`: put the frame into that mailbox, so that its start of frame is not before `not_before`, and not after
    `not_after`: by then a frame that has not started is aborted. Mailboxes hold one frame and never get a second one.
-   `Withdraw`: abort it if it has not started. For each `Transmit` call `confirm` exactly once, with what became of
-   the frame and when it was over: SENT when its own frame was seen on the bus; LOST in arbitration, on a one-shot
-   controller only; LATE when aborted, or not handed over in time; ERROR when given up after a bus error; UNKNOWN when
-   there was no confirmation, and it may have been sent. One-shot controllers give every try a fresh laxity. On others
-   the laxity is that of the hand-over, until the frame is sent or aborted: say so in `guarantees`.
+   `Withdraw`: abort it if it has not started. For each `Transmit` call `confirm` exactly once, with its outcome and its
+   end: SENT when its own frame was seen on the bus; LOST in arbitration, on a one-shot controller only; LATE when
+   aborted, or not handed over in time; ERROR when given up after a bus error; UNKNOWN when there was no confirmation,
+   and it may have been sent. One-shot controllers give every try a fresh laxity. On others the laxity is that of the
+   hand-over, until the frame is sent or aborted: say so in `guarantees`.
 4. `receive` every frame of others, never the own ones, with the instant (by the same clock) of the reception interrupt,
    that is the end of the frame plus `receive_latency`. Sync frames must not wait behind a long queue. `filters` says
    which frames are needed; it changes with `Ready`, `IdConflict`, and subscriptions.
@@ -45,7 +45,7 @@ from r2p.protocols.rtcan.transmitter import Mode, SlotTransmitter
 from r2p.units import NEVER
 
 _NOTHING: tuple[Action, ...] = ()
-# Python 3.11 takes its time to find a member of an enum.
+# Python 3.11 is slow to find a member of an enum.
 _FIRMWARE, _ELECTING, _LISTENING = Profile.FIRMWARE, Role.ELECTING, Stage.LISTENING
 _SILENT, _FREE, _SLOTTED = Mode
 
@@ -58,7 +58,7 @@ class Engine:
 
     def __init__(self, settings: EngineSettings) -> None:
         if settings.id8 is not None and not 0 < settings.id8 <= ID8_MAX:
-            raise ValueError(f"id8 {settings.id8}: it is a byte, and not 0")
+            raise ValueError(f"id8 {settings.id8}: use 1 to 255")
         self.settings = settings
         context = EngineContext(settings)
         self.timing = context.timing
@@ -107,22 +107,22 @@ class Engine:
 
     @property
     def waiting(self) -> int:
-        """Messages that wait to be sent, and management that waits for silence."""
+        """The number of waiting messages, and of management messages that wait for silence."""
         return self.transmitter.queue.size + len(self._limiter.waiting)
 
     def network_time(self, now: int) -> int | None:
-        """The time that all nodes of the network share (ns); None while it is not known."""
+        """Return the time that all nodes of the network share (ns); None while unknown."""
         return self.cycle.network_time(now)
 
     def utc(self, now: int) -> tuple[int, int] | None:
-        """UTC by the master, and how far off it may be (both ns); None while it is not known."""
+        """Return UTC by the master, and its possible error (both ns); None while unknown."""
         time, network = self.network_time(now), self.network
         if time is None or network.utc_error == management.NO_UTC:
             return None
         return time + network.utc_offset, network.utc_error * 1000
 
     def set_utc(self, now: int, utc: int, error: int) -> None:
-        """Set UTC and its error (both ns), which this node sends to the others while it is the master."""
+        """Set UTC and its error (both ns), which this node distributes while it is the master."""
         time = self.network_time(now)
         if time is not None and self.election.role is Role.MASTER:
             self.network.utc_offset = utc - time
@@ -145,7 +145,7 @@ class Engine:
         return self._drain()
 
     def stop(self, now: int) -> Sequence[Action]:
-        """Stop, as the bus can no longer be used, or the node leaves. Everything that waits is discarded."""
+        """Stop, as the bus can no longer be used, or the node leaves. Waiting messages are discarded."""
         self._running = False
         self.node_id.stop(now)  # first: messages are discarded, and a master steps down, before the cycle stops
         self.network.stop(now)
@@ -175,7 +175,7 @@ class Engine:
         return self._drain() if self._actions else _NOTHING
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> Sequence[Action]:
-        """Take note of what became of a frame that was to be transmitted, and when it was over (for SENT: its end)."""
+        """Note the outcome of a frame to transmit, and its time (for SENT: the end of the frame)."""
         self.transmitter.confirm(now, mailbox, outcome, at)
         return self._drain() if self._actions else _NOTHING
 
@@ -194,7 +194,7 @@ class Engine:
         return due if due < NEVER else None
 
     def poll(self, now: int) -> Sequence[Action]:
-        """Do what is due."""
+        """Carry out due work."""
         if not self._running:
             return _NOTHING
         # Timers go first: a lease that is over must not send in the slot that begins now.
@@ -217,8 +217,8 @@ class Engine:
     ) -> Sequence[Action]:
         """Send a message: soft real-time with the instant `deadline`, non real-time without.
 
-        When it is overdue it is dropped, or (not `drop`) sent with laxity 1. `Done` says what became of it, if there
-        is a `handle`. Raises `MessageError` beyond 1..1024 bytes, and for high bytes that are not a topic's.
+        An overdue message is dropped, or (not `drop`) sent with laxity 1. `Done` reports its fate, if there is a
+        `handle`. Raises `MessageError` beyond 1..1024 bytes, and for high bytes that are not a topic's.
         """
         _check_topic(high)
         message = QueuedMessage(self._message_id(high), payload, deadline, drop and deadline != NEVER, handle)
@@ -232,7 +232,7 @@ class Engine:
     def manage(self, now: int, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Sequence[Action]:
         """Send a management message of 32 bytes, within 50 ms, or 1 ms and before all others if `urgent`.
 
-        `Done` says what became of it, if there is a `handle` and the node may send.
+        `Done` reports its fate, if there is a `handle` and the node may send.
         """
         if self.ready:
             self.management.send_bytes(now, data, urgent=urgent, handle=handle)
@@ -265,7 +265,7 @@ class Engine:
         return self._drain()
 
     def fill(self, now: int, high: int, payload: bytes | None) -> Sequence[Action]:
-        """Give the data that `Due` asked for; None: nothing this time. Raises `ValueError` for data of another size."""
+        """Give the data for a `Due`; None: nothing this time. Raises `ValueError` for data of another size."""
         periodic = self.periodics.get(high)
         if periodic is None or not self.ready:
             return self._drain()
@@ -280,7 +280,7 @@ class Engine:
         return self._drain()
 
     def release(self, now: int, high: int) -> Sequence[Action]:
-        """End a periodic message; its slots come free."""
+        """End a periodic message, and free its slots."""
         self._end_periodic(now, high)
         return self._drain()
 
@@ -292,9 +292,9 @@ class Engine:
         Three gates are set here: the transmitter's mode; `queue.only`, which holds all but management back during an
         election; and `_joined`, without which `ready` is False and `publish`, `manage`, `reserve` and `fill` send
         nothing.
-        Called after each sync, timer, change of the id8, and management message of the bus: whatever may change one.
+        Called after each sync, timer, change of the id8, and management message of the bus.
         """
-        # While a master is elected only management may go: so its first sync meets a quiet bus.
+        # During an election only management may go, so that the first sync meets a quiet bus.
         electing, held = self.election.role is _ELECTING, self.transmitter.queue.only is not None
         self.transmitter.queue.only = self._message_id(MANAGEMENT) if electing else None
         if self.node_id.stage is _LISTENING or self.network.mismatch is not None:
@@ -331,7 +331,7 @@ class Engine:
         self._update_mode(now)
 
     def _discard(self, now: int) -> None:
-        """Give up everything that waits to be sent."""
+        """Give up all waiting messages."""
         handles = self._limiter.clear() + [message.handle for message in self.transmitter.mailboxes.discard()]
         self._actions += [Done(each, Fate.DISCARDED, missed=True, at=now) for each in handles if each is not None]
         self.requests.revoke_all(now, "the node may not send")
@@ -348,8 +348,8 @@ class Engine:
     def _is_sync(self, identifier: int) -> bool:
         """Return whether a frame with the identifier of a sync is one.
 
-        When firmware has no time left it sends laxity 0: then the last frame of its management has the identifier of
-        the sync of cycle 0, and in a network of firmware a topic may have that of another one.
+        Firmware sends overdue messages with laxity 0: then the last frame of its management has the identifier of the
+        sync of cycle 0, and in a network of firmware a topic may have that of another sync.
         """
         message = rtcan.message_of(identifier)
         if self.profile is _FIRMWARE:
@@ -477,4 +477,4 @@ class Engine:
 
 def _check_topic(high: int) -> None:
     if not rtcan.FIRST_TOPIC <= high <= HIGH_MAX:
-        raise MessageError(f"high byte {high}: those of topics are {rtcan.FIRST_TOPIC} to {HIGH_MAX}")
+        raise MessageError(f"high byte {high}: topics have {rtcan.FIRST_TOPIC} to {HIGH_MAX}")

@@ -32,7 +32,7 @@ class EngineSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     - `number`: 64 random bits. `id8`: 1..255, None: claim a free one. `priority`: in the election, 0: never the master.
     - `slots`, `cycle` (nominal), `bit_rate` must be the same in the whole network.
-    - `listen`: how long before anything is sent. `receive_latency`: from the end of a frame to its stamp.
+    - `listen`: the time before anything is sent. `receive_latency`: from the end of a frame to its stamp.
       `transmit_latency`: from the hand-over of a frame to its start. `coarse`: the port can't hit a slot; so a frame
       may start anywhere in a run of free slots.
     - `reserves`: ask for slots for periodic messages. `capacity`: messages in the queue.
@@ -70,7 +70,7 @@ class Fate(enum.Enum):
 
 
 class Received(msgspec.Struct, frozen=True, gc=False):
-    """A whole message. `identifier` is its first frame's, `stamp` the instant when that frame ended."""
+    """A complete message. `identifier` is its first frame's, `stamp` the end of that frame."""
 
     identifier: int
     payload: bytes
@@ -82,12 +82,12 @@ class Received(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def high(self) -> int:
-        """The topic, at that module."""
+        """The message id: the topic at that module."""
         return rtcan.high_byte(self.message)
 
     @property
     def source(self) -> int:
-        """The sender's id8; 0 for management of firmware of 2014, which does not say."""
+        """The sender's id8; 0 for management of firmware of 2014, which has none."""
         return rtcan.id8_of(self.message)
 
     @property
@@ -96,12 +96,12 @@ class Received(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def mailbox(self) -> Mailbox:
-        """The mailbox that it left from, which is its class."""
+        """The sender's mailbox, which is the message's class."""
         laxity = self.laxity
         return Mailbox.HRT if laxity == rtcan.HRT else Mailbox.NRT if laxity == rtcan.NRT else Mailbox.SRT
 
     def started(self, bit: int) -> int:
-        """The start of the first frame, exact to the stuff bits; `bit` is the bit time in ns. Not cheap: about 5 us."""
+        """Return the start of the first frame, exact to the stuff bits; `bit` is the bit time (ns). Takes 5 us."""
         return start_of_frame(Frame(self.identifier, self.payload[: rtcan.FRAME_MAX]), self.stamp, bit)
 
 
@@ -140,7 +140,7 @@ class IdConflict(msgspec.Struct, frozen=True):
 
 
 class NewMaster(msgspec.Struct, frozen=True):
-    """A node keeps the cycle from now on. `id8` None: it is firmware, or has not said yet."""
+    """A node is the master from now on. `id8` None: firmware, or not known yet."""
 
     id8: int | None
     epoch: int
@@ -209,12 +209,12 @@ class EngineContext:
         self._draws = 0
 
     def draw(self, below: int) -> int:
-        """The next random number below this one. All follow from `settings.number`, so that a run can be repeated."""
+        """Return a random number below this one. All derive from `settings.number`, so that a run can be repeated."""
         self._draws += 1
         return _mix(self.settings.number + self._draws) % below
 
     def report(self, handle: Hashable, fate: Fate, *, missed: bool, at: int) -> None:
-        """Report a message that was sent or given up, if its owner wants to know; count a missed one."""
+        """Report a message that was sent or given up, if it has a handle; count a missed one."""
         if missed:
             self.counts["missed"] += 1
         if handle is not None:

@@ -1,10 +1,10 @@
-"""Periodic messages and their slots, on lease from the master: asked for, granted, and planned slot by slot.
+"""Periodic messages and their slots, on lease from the master: requested, granted, and planned slot by slot.
 
-The node says every second which slots it still needs. A lease lasts 3 s, for its owner from the request on, for the
-master from the grant on: so an owner without answers stops first. A new master of the same epoch renews the grants of
-the last one; for three cycles it grants nothing else. `SlotGrants` is the master's side.
+The node renews the slots that it still needs every second. A lease lasts 3 s: for its owner from the request, for the
+master from the grant, so an owner without answers stops first. A new master of the same epoch renews the grants of the
+last one; for three cycles it grants nothing else. `SlotGrants` is the master's side.
 
-At the owner, `SlotRequests` keeps the leases, and `SlotPlan` says what to do in which slot. Slots are the clock of a
+At the owner, `SlotRequests` keeps the leases, and `SlotPlan` has the actions of each slot. Slots are the clock of a
 `PeriodicMessage`: `lead` before the first one of each occurrence its data are asked for, then each fragment has its
 slot. Everything lies on slot boundaries, so to wake up in time is to know the next slot.
 """
@@ -57,7 +57,7 @@ class PeriodicMessage(msgspec.Struct, eq=False):
     refused: str = ""
 
     def restart(self, payload: bytes | None = None) -> bool:
-        """Begin the next occurrence, with fresh data; return whether data of the one before were left."""
+        """Begin the next occurrence, with fresh data; return whether data of the previous one were left."""
         unfinished = self.payload is not None
         self.payload = payload
         self.sent = 0
@@ -73,7 +73,7 @@ _Fills = dict[int, list[tuple[PeriodicMessage, int]]]
 class SlotPlan:
     """The plan for the slots of the current cycle. Slot 0 of the next cycle counts as the last one of this.
 
-    After the least common multiple of all periods, which is the longest of them, all comes again: each cycle up to
+    The plan repeats after the least common multiple of all periods, which is the longest of them: each cycle up to
     there is worked out once.
     """
 
@@ -81,9 +81,9 @@ class SlotPlan:
         self.periodics: dict[int, PeriodicMessage] = {}
         """The periodic messages of this node by high byte."""
         self.sends: _Sends = {}
-        """By slot: a message, its fragment, and whether its data are only asked for now."""
+        """By slot: a message, its fragment, and whether its data are only requested now."""
         self.fills: _Fills = {}
-        """By slot: messages whose data are asked for now, and how many slots ahead of theirs."""
+        """By slot: messages whose data are requested now, and how many slots ahead of theirs."""
         self.next = following((), timing.slots)
         """By slot: the first one after it with something to do."""
         self.own = 0
@@ -107,7 +107,7 @@ class SlotPlan:
         self.sends, self.fills, self.next, self.own = known
 
     def _restart(self, cycle: int) -> None:
-        """Other messages than before have slots, some perhaps only from a later cycle on: then it is stale still."""
+        """Plan anew after a change of slots; the plan stays stale while some begin only in a later cycle."""
         messages = self.periodics.values()
         owners = [(each.from_cycle, each.reservation.period) for each in messages if each.active and each.reservation]
         self._stale = any(begins > cycle for begins, _ in owners)
@@ -140,7 +140,7 @@ class SlotPlan:
 
 
 class SlotGrants:
-    """The master's side: the slots that are granted, and until when."""
+    """The master's side: the granted slots, and until when."""
 
     def __init__(self, context: EngineContext) -> None:
         self.calendar = Calendar(context.timing.slots)
@@ -157,7 +157,7 @@ class SlotGrants:
     def answer(self, now: int, wanted: Reserve, epoch: int) -> Grant | Refuse | None:
         """Grant or refuse; None: not now."""
         held = self.calendar.get(wanted.message)
-        # With a phase: slots that it had, perhaps by the last master. It gets the same ones or none.
+        # With a phase: slots granted before, perhaps by the last master. The owner gets the same ones or none.
         outcome: Reservation | Refusal
         if wanted.phase != NO_PHASE:
             reservation = Reservation(wanted.message, wanted.period, wanted.phase, wanted.fragments)
@@ -177,7 +177,7 @@ class SlotGrants:
         return Grant(wanted.message, wanted.serial, fragments, period, phase, start, epoch, LEASE // MILLISECOND)
 
     def renew(self, now: int, wanted: Renew, id8: int) -> Renewed:
-        """Prolong the leases that a module still needs. Those without a grant are missing in the answer."""
+        """Extend the leases that a module still needs. Those without a grant are missing in the answer."""
         held = [high for high in wanted.highs if high and self.calendar.get(rtcan.message_id(high, id8)) is not None]
         for high in held:
             self._timers.set(("granted", rtcan.message_id(high, id8)), now + LEASE)
@@ -190,7 +190,7 @@ class SlotGrants:
 
 
 class SlotRequests:
-    """The owner's side: slots for the periodic messages of this node, which go by its own clock until they have some.
+    """The owner's side: slots for the periodic messages of this node, which go by its own clock without slots.
 
     `ask` sends a request to the master, which may be this node; `abandon` gives up a message that waits for its slot.
     """
@@ -215,12 +215,12 @@ class SlotRequests:
         self._serial = 0
 
     def start(self, now: int, periodic: PeriodicMessage) -> None:
-        """Ask for slots, and let the message go without until they are granted."""
+        """Request slots, and let the message go without until they are granted."""
         self.schedule(now, periodic)
         self._start_ticking(now, periodic)
 
     def on_timer(self, now: int, kind: str, periodic: PeriodicMessage) -> None:
-        """Ask for slots once more, give up those whose lease has ended, or ask for data by the node's own clock."""
+        """Request slots once more, give up slots whose lease has ended, or ask for data by the node's own clock."""
         if kind == "ask":
             self.request(now, periodic)
         elif kind == "lease":
@@ -235,7 +235,7 @@ class SlotRequests:
             self._actions.append(Due(periodic.high, at, False))
 
     def resume(self, now: int) -> None:
-        """Ask for slots, now that there is a master."""
+        """Request slots, now that there is a master."""
         self.has_master = True
         for each in self._periodics.values():
             self.schedule(now, each)
@@ -252,7 +252,7 @@ class SlotRequests:
             self.revoke(now, each, reason)
 
     def schedule(self, now: int, periodic: PeriodicMessage) -> None:
-        """Ask for slots for this message from now on, if there is a master."""
+        """Request slots for this message from now on, if there is a master."""
         if self.has_master and self._enabled:
             self._timers.set(("ask", periodic.high), now)
 
@@ -272,7 +272,7 @@ class SlotRequests:
         return had
 
     def request(self, now: int, periodic: PeriodicMessage) -> None:
-        """Ask the master for slots, and again after a while: for those that it had, or for any."""
+        """Request slots from the master, and again after a while: its former ones, or any."""
         if not self.has_master or periodic.active:
             return
         self._timers.set(("ask", periodic.high), now + _RETRY)
@@ -286,7 +286,7 @@ class SlotRequests:
         self._ask(now, Reserve(periodic.message, serial, periodic.fragments, period, flags=flags))
 
     def renew(self, now: int) -> None:
-        """Tell the master which slots are still needed."""
+        """Renew the slots that are still needed."""
         active = [each for each in self._periodics.values() if each.active]
         if not self.has_master or not active:
             return
@@ -297,7 +297,7 @@ class SlotRequests:
             self._ask(now, Renew(self._next_serial(now, *part), highs))
 
     def on_grant(self, now: int, periodic: PeriodicMessage, grant: Grant) -> None:
-        """Use the slots that the master grants. On a full bus that takes time: the lease runs from the request on."""
+        """Use granted slots. The lease runs from the request, as a grant takes time on a full bus."""
         asked = periodic.asked.get(grant.serial)
         if asked is None or grant.fragments != periodic.fragments or grant.period <= grant.fragments:
             return
@@ -317,7 +317,7 @@ class SlotRequests:
         self._actions.append(SlotsGranted(periodic.high, grant.period, grant.phase, interval))
 
     def on_renewed(self, now: int, answer: Renewed) -> None:
-        """Prolong leases as the master says, perhaps late. Slots that it no longer knows are requested again."""
+        """Extend the leases that the master renews, perhaps late. Slots unknown to it are requested again."""
         for periodic in self._periodics.values():
             asked = periodic.asked.get(answer.serial)
             if asked is None or not periodic.active:
@@ -329,7 +329,7 @@ class SlotRequests:
                 self.schedule(now, periodic)
 
     def on_refuse(self, now: int, periodic: PeriodicMessage, refuse: Refuse) -> None:
-        """Give up slots that the master refuses, and ask again later: they may come free."""
+        """Give up slots that the master refuses, and ask again later, when they may be free."""
         if periodic.active or refuse.serial not in periodic.asked:
             return
         self._start_ticking(now, periodic)
@@ -340,7 +340,7 @@ class SlotRequests:
         period, fragments, other, rival = refuse.period, refuse.fragments, refuse.other, refuse.rival
         text = Refusal(periodic.message, reason, period, fragments, other, rival).text
         self.revoke(now, periodic, text)
-        # Other slots than those that were taken may well be free, so this is asked soon.
+        # Other slots than the taken ones may well be free, so ask soon.
         self._timers.set(("ask", periodic.high), now + (_RETRY if reason is RefuseReason.TAKEN else _RENEWAL))
         if periodic.refused != text:
             periodic.refused = text
@@ -370,7 +370,7 @@ class SlotRequests:
     def _next_serial(self, now: int, *periodics: PeriodicMessage) -> int:
         self._serial = (self._serial + 1) % management.REQUEST_SERIALS
         for each in periodics:
-            # Late answers to all requests of the last 3 s count; older ones would grant a lease that is over.
+            # Late answers to requests of the last 3 s count; older ones would grant an expired lease.
             each.asked = {serial: at for serial, at in each.asked.items() if now < at + LEASE} | {self._serial: now}
         return self._serial
 

@@ -44,7 +44,7 @@ class RateLimiter:
     def put(self, data: bytes, *, urgent: bool = False, handle: Hashable = None) -> Hashable:
         """Queue a message to be sent when it is quiet, `urgent` ones first, in order.
 
-        When there are too many, the oldest that is not urgent is dropped; return its handle.
+        If there are too many, drop the oldest one that is not urgent, and return its handle.
         """
         dropped: Hashable = None
         if len(self.waiting) >= _MAX:
@@ -75,7 +75,7 @@ class RateLimiter:
         return self._quiet_from + QUIET + self._delay
 
     def pop(self, now: int) -> tuple[bytes, Hashable] | None:
-        """Take the message that may go now, with its handle."""
+        """Pop the message that may go now, with its handle."""
         if self.due > now:
             return None
         self.on_traffic(now)
@@ -154,7 +154,7 @@ class ManagementHandlers:
     def handle(self, now: int, message: management.Management, source: int) -> None:
         """Act on a message of the node with the id8 `source`.
 
-        Only the owner of a message id may speak of it, and only the master that this node follows may answer.
+        Only the owner of a message id may manage it, and only the master that this node follows may answer.
         """
         network = self._network
         match message:
@@ -174,7 +174,7 @@ class ManagementHandlers:
                 self._on_answer(now, message)
 
     def ask(self, now: int, wanted: management.Reserve | management.Renew) -> None:
-        """Ask the master for slots, which may be this node."""
+        """Request slots from the master, which may be this node."""
         id8 = self._network.node_id.id8
         if not self._is_master:
             self._send(now, wanted)

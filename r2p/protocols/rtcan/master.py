@@ -1,11 +1,10 @@
-"""The election of the master, and what a master does: it sends the sync frames (PROTOCOL.md 6, thesis 4.3.3).
+"""The election of the master, and the master's sync frames (PROTOCOL.md 6, thesis 4.3.3).
 
-The master is the highest (priority, id8) of those that say they could be. Every claim of an id8 carries a priority. A
-node that knows no master sends its claim and waits for a while; then it is elected if it knows of no better candidate,
-or else later, the later the more are better: one of those may have died. Until the new master has sent its first sync,
-nodes send nothing but management.
-Priority 0 is never elected: such a node (a PC by default) would keep the cycle worse than no master, and a better node
-that comes later does not depose a master that is there.
+The master is the candidate with the highest (priority, id8). Every claim of an id8 carries a priority. A node that
+knows no master sends its claim and waits for a while; then it is elected if it knows of no better candidate, or else
+later, as those may have died: the later, the more there are. Until the new master has sent its first sync, nodes send
+nothing but management. Priority 0 is never elected: such a node (a PC by default) would keep the cycle worse than no
+master, and a better node that joins later does not depose a present master.
 """
 
 import enum
@@ -23,8 +22,8 @@ FRESH = 1_500_000_000
 """A candidate counts for this long after its claim (ns)."""
 _WINDOW = 3  # cycles in which claims are collected
 _COLLECTING = 3  # cycles in which a new master only renews what the last one granted
-# Attempts after the first one to send the first sync, which may collide. A node alone gets no acknowledge: it leads all
-# the same.
+# Attempts after the first one to send the first sync, which may collide. A node alone gets no acknowledge, and leads
+# nevertheless.
 _RETRIES = 4
 _RETRY_PAUSE_MAX = 20_000_000  # ns, drawn at random: two nodes that collided would else collide again
 
@@ -57,7 +56,7 @@ class Election:
             self._candidates.pop(id8, None)
 
     def begin(self, now: int, *, forget: bool) -> None:
-        """Start an election: collect candidates. `forget` those known so far, which may be dead."""
+        """Start an election: collect candidates. `forget`: drop those known so far, which may be dead."""
         if forget:
             self._candidates.clear()
         self.role = Role.ELECTING
@@ -112,7 +111,7 @@ class MasterRole:
         self._inherits = False
 
     def start_network(self, now: int, *, inherits: bool) -> None:
-        """Send the first sync. If it `inherits`, the network of before goes on: the grid, the count, the leases."""
+        """Send the first sync. With `inherits`, the previous network goes on: its grid, count and leases."""
         self._grants.clear()
         self._set_inherits(inherits)
         frame, start, counter = self._cycle.first_sync(now, self._grants.calendar.mask, inherits=inherits)
@@ -154,11 +153,11 @@ class MasterRole:
         self._collecting = _COLLECTING if inherits else 0
 
     def _retry(self, now: int) -> None:
-        """Decide the election again a bit later: the first sync is tried again unless another node was first."""
+        """Repeat the election a bit later: try the first sync again unless another node was first."""
         self._context.timers.set("election", now + self._context.draw(_RETRY_PAUSE_MAX))
 
     def _first_confirmed(self, now: int, outcome: Outcome, at: int) -> None:
-        """Lead, or try again, by what became of the first sync."""
+        """Lead, or try again, depending on the outcome of the first sync."""
         first, self._first = self._first, None
         if first is None:  # cancelled meanwhile
             return

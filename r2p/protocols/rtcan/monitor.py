@@ -1,6 +1,6 @@
-"""Watching an RTCAN bus without sending: what each frame is, what the bus carries, and which slots are used.
+"""Watch an RTCAN bus without sending: describe each frame, measure the load, and the use of the slots.
 
-Lengths are counted with the bits stuffed in, so loads are true for the bit rate that is given. The cycle is the
+Lengths include stuff bits, so loads are true for the given bit rate. The cycle is the
 master's, by its sync frames (PROTOCOL.md 6): slots are counted from the start of the last one. A frame counts for the
 time at which it was on the bus, however late it is read. `BusDirectory` keeps the names, `Monitor` the numbers.
 """
@@ -31,7 +31,7 @@ class FrameKind(enum.Enum):
     NRT = "nrt"
     MANAGEMENT = "management"
     OTHER = "other"
-    """Not of RTCAN: with an 11-bit identifier, or a remote frame."""
+    """A frame that RTCAN does not use: with an 11-bit identifier, or a remote frame."""
 
 
 class SeenFrame(msgspec.Struct, frozen=True):
@@ -63,7 +63,7 @@ class TrafficCount(msgspec.Struct):
 
 
 class BusSlot(msgspec.Struct):
-    """One slot over all cycles watched: in how many it was reserved, had an HRT frame, had another one; by topic."""
+    """One slot over all watched cycles: how often it was reserved, had an HRT frame, or another one; by topic."""
 
     reserved: int = 0
     used: int = 0
@@ -72,7 +72,7 @@ class BusSlot(msgspec.Struct):
 
     @property
     def missed(self) -> int:
-        """Cycles in which it was reserved, and its owner sent nothing."""
+        """Cycles in which the slot was reserved, and its owner sent nothing."""
         return max(0, self.reserved - self.used)
 
 
@@ -80,7 +80,7 @@ class BusLoad(msgspec.Struct, frozen=True):
     """The load of the bus in `elapsed` ns; shares are of the time: 1.0 is all of it.
 
     `free` is the share without reservation, `free_frames` how many frames of full length fit in there. `nrt_gap` is
-    the longest time without a non real-time frame (ns); None where none was seen at all.
+    the longest time without a non real-time frame (ns); None if there was none at all.
     """
 
     elapsed: int
@@ -92,7 +92,7 @@ class BusLoad(msgspec.Struct, frozen=True):
     nrt_gap: int | None
 
     def share(self, bits: int) -> float:
-        """Bits as a share of the time."""
+        """Return bits as a share of the time."""
         return bits * self.bit / self.elapsed if self.elapsed else 0.0
 
     @property
@@ -113,7 +113,7 @@ class BusLoad(msgspec.Struct, frozen=True):
 
 
 class BusDirectory:
-    """Names of modules and topics, and the timing of the network, from what modules announce again and again.
+    """Names of modules and topics, and the timing of the network, from the modules' announcements.
 
     All tables are bounded by the 16 bits of a message id.
     """
@@ -131,7 +131,7 @@ class BusDirectory:
         self._greeted: set[int] = set()  # id8 with a name from a HELLO: a gateway also passes ALIVE on
 
     def learn(self, data: bytes, source: int) -> str:
-        """Learn from a management message of this id8 (0: firmware, which does not say); return its description."""
+        """Learn from a management message of this id8 (0: firmware, which has none); return its description."""
         try:
             message = management.decode(data)
         except DecodeError:
@@ -151,13 +151,13 @@ class BusDirectory:
         return describe(message)
 
     def topic(self, message: int) -> str:
-        """The topic that a message id carries; its number if that is not known yet."""
+        """Return the topic of a message id; its number if the topic is not known yet."""
         if rtcan.high_byte(message) <= rtcan.MANAGEMENT and message not in self.topics:
             return "R2P"
         return self.topics.get(message, f"0x{message:04X}")
 
     def module(self, message: int) -> str:
-        """The module that uses a message id."""
+        """Return the module that uses a message id."""
         id8 = rtcan.id8_of(message)
         return self.modules.get(id8, f"id {id8}") if id8 else "?"
 
@@ -180,14 +180,14 @@ class Monitor:
         self.reset(0)
 
     def reset(self, now: int, period: int = NEVER) -> None:
-        """Count from now on, in periods of so many ns, each of which `next_load` gives once."""
+        """Count from now on, in periods of so many ns, each of which `next_load` returns once."""
         self._period = period
         self._end = now + period
         self._loads.clear()
         self._begin_period(now)
 
     def next_load(self) -> BusLoad:
-        """The load of the next period that is over; call it when all frames of that are here."""
+        """Return the load of the next period; call it after all frames of the period."""
         if not self._loads:
             self._end_period()
         return self._loads.popleft()
@@ -214,7 +214,7 @@ class Monitor:
         self._whole = False
 
     def fault(self, kind: str) -> None:
-        """Count an error frame, or another fault that the interface reports."""
+        """Count an error frame, or another fault reported by the interface."""
         self._faults[kind] += 1
 
     def frame(self, frame: Frame, stamp: int) -> SeenFrame:
@@ -274,7 +274,7 @@ class Monitor:
 
     @property
     def slots(self) -> list[BusSlot]:
-        """The use of each slot since the last `reset`, with the names that are known by now."""
+        """Return the use of each slot since the last `reset`, with the names known by now."""
         for slot, owners in zip(self._slots, self._owners, strict=True):
             slot.owners = Counter()
             for message, count in owners.items():
@@ -282,7 +282,7 @@ class Monitor:
         return self._slots
 
     def load(self, now: int) -> BusLoad:
-        """The load since the last `reset`."""
+        """Return the load since the last `reset`."""
         gap = self._nrt_gap
         if self._nrt is not None:
             gap = max(gap or 0, now - self._nrt)
@@ -320,7 +320,7 @@ class Monitor:
                 slot.used += index in self._filled
 
     def _slot_of(self, start: int, message: int, kind: FrameKind) -> int | None:
-        """The slot in which a frame started; the frame is counted there."""
+        """Return the slot in which a frame started; the frame is counted there."""
         timing = self.directory.timing
         if self._sync is None:
             return None
@@ -363,7 +363,7 @@ class Monitor:
 
     def _kind_of(self, frame: Frame, identifier: Identifier) -> FrameKind:
         message, laxity = identifier.message_id, identifier.laxity
-        # Firmware that has no time left ends its management with the identifier of the sync of cycle 0.
+        # Overdue management of firmware ends with the identifier of the sync of cycle 0.
         ends_management = message == rtcan.FIRMWARE_MANAGEMENT and self._reassembly.ends_with_next(message)
         if rtcan.is_sync(frame.id) and len(frame.data) == rtcan.FRAME_MAX and not ends_management:
             return FrameKind.SYNC
@@ -373,7 +373,7 @@ class Monitor:
 
 
 def describe(message: management.Management) -> str:
-    """A management message as text."""
+    """Return a management message as text."""
     fields = {
         name: getattr(message, name)
         for name in message.__struct_fields__

@@ -1,4 +1,4 @@
-"""Finding, following and being the master: what the node knows of its network, and how it may use the bus by that.
+"""Finding, following and being the master: the node's knowledge of its network, and so its use of the bus.
 
     no master --sync received--> slave --four cycles without sync--> electing --elected, first sync sent--> master
                                    ^----------------------------------------------------a better one appears--'
@@ -8,7 +8,7 @@ cycle that was lost goes on where it should be by now, it is the same network, w
 not followed while there is one on it. A master that receives a foreign sync sends NETWORK at once; of two masters the
 one of lower (priority, id8) steps down when it receives that.
 
-`Detector` finds out what kind of network it is, `MasterTracker` whose syncs these are; `NetworkMembership` acts on it,
+`Detector` finds out the kind of network, `MasterTracker` the sender of the syncs; `NetworkMembership` acts on it,
 with `Election` and `MasterRole` (master.py).
 """
 
@@ -27,7 +27,7 @@ from r2p.protocols.rtcan.transmitter import SlotTransmitter
 from r2p.units import LONG_AGO, SECOND
 
 REPEAT = SECOND
-"""NETWORK is sent this often (ns)."""
+"""Ns between two NETWORK."""
 FORGOTTEN = 3_000_000_000
 """A master without NETWORK for this long is gone (ns): two may be lost."""
 _ANSWER_APART = 3  # cycles between two NETWORK that answer others
@@ -56,11 +56,11 @@ class Detector:
         self._firmware = False
 
     def firmware_seen(self) -> None:
-        """Note a frame with high byte 0 that is not a sync: only firmware sends such ones."""
+        """Note a frame with high byte 0 that is not a sync: only firmware sends such frames."""
         self._firmware = True
 
     def decide(self, *, synced: bool) -> None:
-        """Decide, after listening, what kind of network it is; `synced`: there are sync frames."""
+        """Decide on the kind of network, after listening; `synced`: there are sync frames."""
         if self.profile is Profile.AUTO:
             self.profile = Profile.FIRMWARE if self._firmware and not synced else Profile.RTCAN
 
@@ -77,7 +77,7 @@ class MasterTracker:
         self._since = 0
 
     def on_network(self, now: int, network: management.Network, master: int | None, epoch: int | None) -> bool:
-        """Note a NETWORK, and return whether it is of the node's master, which so far is `master`."""
+        """Note a NETWORK, and return whether it is from the node's master, so far `master`."""
         self._latest = now, network
         rank = network.priority, network.id8
         if self._is_another(now, network, master, epoch):
@@ -99,7 +99,7 @@ class MasterTracker:
         return self._recall(now, self._latest)
 
     def on_aligned(self, now: int) -> management.Network | None:
-        """Note one more sync on the grid; return the NETWORK of another master than so far if it must be that one's."""
+        """Note one more sync on the grid; return the NETWORK of another master if the sync must be that master's."""
         rival = self._rival
         if rival is None or now < rival[0] + _YIELDED * self._cycle.timing.cycle:
             return None
@@ -136,7 +136,7 @@ class MasterTracker:
         return not (same_grid and (network.priority, network.id8) > self._rank)
 
     def _recall(self, now: int, received: tuple[int, management.Network] | None) -> management.Network | None:
-        """A NETWORK as its master would send it now, if that can be the master of this cycle."""
+        """Return a NETWORK as its master would send it now, if it can be the master of this cycle."""
         if received is None or now > received[0] + FORGOTTEN:
             return None
         at, network = received
@@ -291,7 +291,7 @@ class NetworkMembership:
         )
 
     def forget_mismatch(self, now: int) -> None:
-        """Forget that parameters differ: no NETWORK says so any longer, or one says that they don't."""
+        """Forget that parameters differ: no NETWORK shows it any longer, or one shows the opposite."""
         if self.mismatch is None:
             return
         self.mismatch = None
@@ -329,7 +329,7 @@ class NetworkMembership:
         self._follow(now, self._tracker.on_started(now))
 
     def _follow(self, now: int, network: management.Network | None) -> None:
-        """Follow the NETWORK of the master whose syncs these are, and whose parameters fit; None: not known yet."""
+        """Follow the NETWORK of the syncs' master, whose parameters fit; None: not known yet."""
         if network is None:
             return
         renumbered = self._cycle.anchor(network.cycle)  # phases count from cycle 0: the node has other slots then
@@ -349,7 +349,7 @@ class NetworkMembership:
             self._requests.resume(now)
 
     def _verify_by_length(self, now: int) -> None:
-        """Accept a master that sends no NETWORK when its cycle is as long as this node's."""
+        """Accept a master without NETWORK if its cycle is as long as this node's."""
         ours = self._tracker.has_our_length(now)
         if ours and self.mismatch is None:
             self.verified = True

@@ -1,9 +1,9 @@
 """The id8 of this node, claimed with a random number (PROTOCOL.md 9).
 
-The node listens first, to learn which ids are taken and how the network works; then it claims one, and may use it when
-no other node objects. Of two claims the lower number wins. A node that owns its id8 yields only to the second better
-claim: a real rival repeats its claim when this node answers, a broken one does not. A node that uses this id8 without
-ever claiming it is firmware, which can't yield: so this node does. After yielding it listens again.
+The node listens first, to learn the ids in use and the kind of network; then it claims one, and may use it if no other
+node objects. Of two claims the lower number wins. A node that owns its id8 yields only to the second better claim: a
+real rival repeats its claim when this node answers, a broken one does not. A node that uses this id8 without ever
+claiming it is firmware, which can't yield: so this node does. After yielding it listens again.
 """
 
 import enum
@@ -17,7 +17,7 @@ from r2p.units import LONG_AGO, SECOND
 OBJECTION = 250_000_000
 """Time in which others may object to a claim."""
 REPEAT = 3_000_000_000
-"""Claims are repeated this often."""
+"""Time between two claims."""
 _YIELDS = SECOND  # a node that has claimed this id8 with a higher number has this long to yield
 _APART = 100_000_000  # between two claims of this node
 _INSISTING = 4_000_000_000  # a node that has a better claim repeats it within this: REPEAT, and room for a full bus
@@ -35,7 +35,7 @@ class Stage(enum.Enum):
 
 
 class NodeId:
-    """The id8 of a node, as its settings want it: fixed, or any that is free.
+    """The id8 of a node, by its settings: fixed, or any free one.
 
     `send_claim(now)` sends a claim of this node; `on_stage(now)` is called when the stage changes.
     """
@@ -66,7 +66,7 @@ class NodeId:
         return CLAIM_FIXED if self.fixed else 0
 
     def start(self, now: int) -> None:
-        """Listen which id8 are taken."""
+        """Listen for the id8 in use."""
         self._suspected_at = None
         self._taken.clear()
         self.stop(now)

@@ -21,7 +21,7 @@ _FIRST = 1 << 62  # more than any count of messages: taken off the order of mana
 
 
 class QueuedMessage(msgspec.Struct, eq=False):
-    """A message that waits. `deadline` NEVER: non real-time. `drop`: given up when overdue, unless it has started.
+    """A waiting message. `deadline` NEVER: non real-time. `drop`: given up when overdue, unless it has started.
 
     Once its first frame is sent it is always finished: firmware of 2014 loses the next message as well when the end of
     one is missing. `recalled`: its frame was withdrawn, as the node uses the bus in another way from now on.
@@ -46,9 +46,8 @@ class QueuedMessage(msgspec.Struct, eq=False):
 
 
 class _MessageFifo(msgspec.Struct, eq=False):
-    """The messages of one topic. `busy`: a frame of the first one is with the port; `held`: no try before this instant.
-
-    `deadline`, `order` and `expiry` are the first of those of its messages.
+    """The messages of one topic. `busy`: the port has a frame of the first one; `held`: no try before this instant.
+    `deadline`, `order` and `expiry` are the earliest of its messages.
     """
 
     waiting: deque[QueuedMessage]
@@ -70,7 +69,7 @@ class LaxityQueue:
         self._fifos: dict[int, _MessageFifo] = {}  # by message id
         self._sorted: list[tuple[int, int, _MessageFifo]] = []  # by deadline and order
         self.size = 0
-        """Messages that wait."""
+        """The number of waiting messages."""
         self._count = 0
         self._expiry = NEVER  # not later than the first message to drop, so that `expire` seldom looks at all FIFOs
 
@@ -121,7 +120,7 @@ class LaxityQueue:
         return self._expiry if self.size else NEVER
 
     def best(self, now: int, *, nrt: bool = True) -> QueuedMessage | None:
-        """The message to try now. `nrt=False`: only among real-time ones."""
+        """Return the message to try now. `nrt=False`: only a real-time one."""
         if self.only is not None:
             fifo = self._fifos.get(self.only)
             return fifo.waiting[0] if fifo is not None and not fifo.busy and fifo.held <= now else None
@@ -146,7 +145,7 @@ class LaxityQueue:
         return chosen[2].waiting[0]
 
     def best_nrt(self, now: int) -> QueuedMessage | None:
-        """The non real-time message to try now."""
+        """Return the non real-time message to try now."""
         if self.only is not None:
             return None
         for entry in self._sorted[bisect_left(self._sorted, (NEVER,)) :]:
@@ -155,12 +154,12 @@ class LaxityQueue:
         return None
 
     def next_frame(self, message: QueuedMessage, now: int) -> Frame:
-        """The next frame of a message, with the laxity of now. The topic competes again when it is sent or put back."""
+        """Return a message's next frame, with its present laxity. The topic competes again once it is sent or back."""
         fifo = self._fifos[message.message]
         fifo.busy = True
         laxity = NRT if fifo.deadline == NEVER else rtcan.srt_laxity(fifo.deadline - now)
         at = message.sent * FRAME_MAX
-        # `encode_identifier` inlined: it would check for each frame what was checked for the message.
+        # `encode_identifier` inlined: it would repeat the checks of the message for each frame.
         identifier = laxity << LAXITY_SHIFT | message.message << MESSAGE_SHIFT | message.frames - 1 - message.sent
         return Frame(identifier, message.payload[at : at + FRAME_MAX])
 
@@ -186,7 +185,7 @@ class LaxityQueue:
         return False
 
     def remove(self, message: QueuedMessage) -> None:
-        """Give up a message whose frame the port no longer has."""
+        """Give up a message without a frame at the port."""
         fifo = self._fifos[message.message]
         if message is fifo.waiting[0]:
             fifo.busy = False
@@ -208,7 +207,7 @@ class LaxityQueue:
         return message in self._fifos
 
     def messages(self) -> Iterator[QueuedMessage]:
-        """All of them, topic by topic."""
+        """Yield all messages, topic by topic."""
         for fifo in self._fifos.values():
             yield from fifo.waiting
 
@@ -235,7 +234,7 @@ class LaxityQueue:
         del self._sorted[bisect_left(self._sorted, (fifo.deadline, fifo.order))]
 
     def _append(self, fifo: _MessageFifo, message: QueuedMessage) -> None:
-        """Put it after the others: the FIFO may become more urgent by that."""
+        """Append a message, which may make the FIFO more urgent."""
         fifo.waiting.append(message)
         if message.deadline < fifo.deadline:
             self._leave(fifo)
@@ -246,13 +245,13 @@ class LaxityQueue:
             self._expiry = min(self._expiry, fifo.expiry)
 
     def _place(self, fifo: _MessageFifo, deadline: int) -> int:
-        """The index for a message with this deadline: not before one that has started."""
+        """Return the index for a message with this deadline: not before one that has started."""
         started = fifo.busy or fifo.waiting[0].sent > 0
         later = (place for place, each in enumerate(fifo.waiting) if each.deadline > deadline and place >= started)
         return next(later, len(fifo.waiting))
 
     def _enter(self, fifo: _MessageFifo) -> None:
-        """Sort it in, as urgent as its most urgent message. A FIFO is sorted anew by `_leave`, changes, `_enter`."""
+        """Sort a FIFO in, as urgent as its most urgent message. To sort it anew: `_leave`, changes, `_enter`."""
         waiting = fifo.waiting
         first = waiting[0]
         fifo.order = first.order

@@ -1,4 +1,4 @@
-"""Frames to messages, with an account of what was lost, by source (PROTOCOL.md 6).
+"""Frames to messages, with losses by source (PROTOCOL.md 6).
 
 A frame says only how many follow it, so a beginning is known by the size that its topic must have. A frame that
 does not continue a message in the right way ends it; the rest is skipped up to the next beginning. A repeat of the last
@@ -22,8 +22,8 @@ _IDLE = -1  # `SourceBuffer.expected` between two messages
 class SourceBuffer(msgspec.Struct, eq=False):
     """The unfinished message of one publisher. All of them have `size` bytes, and begin with `first` fragments left.
 
-    With `parts`, a message is being received and `expected` is what its next frame says; without, frames from
-    `expected` down are the rest of something lost. `tail` is the last frame of the message before.
+    With `parts`, a message is being received and `expected` is the number of its next frame; without, frames from
+    `expected` down are the rest of a lost one. `tail` is the last frame of the previous message.
     """
 
     message: int
@@ -72,7 +72,7 @@ class Reassembly:
 
     @property
     def messages(self) -> list[int]:
-        """The ids of messages that are received."""
+        """The ids of received messages."""
         return list(self._buffers)
 
     def receive(self, frame: Frame, stamp: int) -> Received | None:
@@ -98,7 +98,7 @@ class Reassembly:
         return NEVER
 
     def poll(self, now: int) -> None:
-        """Give up messages whose next frame stays away."""
+        """Give up messages whose next frame is overdue."""
         while self.due <= now:
             oldest = next(iter(self.open.values()))
             self._reset(oldest, "time-out")
@@ -128,7 +128,7 @@ class Reassembly:
         return self._begin(buffer, frame, left, stamp)
 
     def _begin(self, buffer: SourceBuffer, frame: Frame, left: int, stamp: int) -> Received | None:
-        """Nothing is open: the frame is a beginning, or belongs to a message of which the beginning is missing."""
+        """Handle a frame without an open message: a beginning, or part of a message without its beginning."""
         rest = left == buffer.expected  # of something that has been counted as lost
         if left == buffer.first and not rest:
             buffer.identifier, buffer.started = frame.id, stamp

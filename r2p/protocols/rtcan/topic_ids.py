@@ -1,4 +1,4 @@
-"""High bytes for topics: which one a publisher uses (PROTOCOL.md 6).
+"""High bytes for topics (PROTOCOL.md 6).
 
 Firmware subscribers look at the high byte of a message id and nothing else, so no two topics on a bus may share one,
 and all publishers of one topic have to: the one with the lowest id8 leads, or firmware, which can't use another. The
@@ -37,7 +37,7 @@ class TopicIdAllocator:
 
     def __init__(self) -> None:
         self.refused: set[str] = set()
-        """Topics of this module for which no high byte is free."""
+        """Topics of this module without a high byte."""
         self._lease = _LEASE
         self._ours: dict[str, int] = {}
         self._announced: dict[int, _AnnouncedId] = {}  # by message id; the lease that ends first comes first
@@ -46,7 +46,7 @@ class TopicIdAllocator:
         self._freed = False
 
     def set_rate(self, rate: float) -> None:
-        """Modules on this bus make so many announcements a second: a lease lasts until the longest round has ended."""
+        """Set how many announcements a second modules on this bus make: a lease lasts for the longest round."""
         self._lease = max(_LEASE, round(_ROUNDS * _MESSAGES * _COUNT / rate * SECOND))
 
     def pick(self, topic: str) -> int | None:
@@ -95,7 +95,7 @@ class TopicIdAllocator:
             self._forget(message)
 
     def retry(self, now: int) -> list[str]:
-        """Return the own topics for which there was no high byte, and may be one now."""
+        """Return own topics without a high byte that may get one now."""
         self._forget_ended(now)
         freed, self._freed = self._freed, False
         return list(self.refused) if freed else []
@@ -111,7 +111,7 @@ class TopicIdAllocator:
         return all(other == topic for other in self._topics.get(high, {}).values())
 
     def _leader(self, topic: str) -> int | None:
-        """The message id of the other publisher of a topic whose high byte all of them use."""
+        """Return the message id of the other publisher of a topic whose high byte all of them use."""
         messages = self._messages.get(topic, {})
         return min(
             messages.values(),

@@ -1,10 +1,10 @@
-"""The node's frames, and when they leave: three mailboxes, in the slots of the cycle or, without a cycle, at once.
+"""The node's frames on their way out: three mailboxes, in the slots of the cycle or, without a cycle, at once.
 
 In a reserved slot only its owner sends. In a free one the message of the least laxity is tried, chosen anew in every
-slot. Nothing starts unless it ends in its slot: what comes too late stays in the queue (PROTOCOL.md 6).
+slot. A frame starts only if it ends in its slot: a late one stays in the queue (PROTOCOL.md 6).
 
-`Mailboxes` holds the frames that are with the port, and settles their messages; `SlotTransmitter` decides which frame
-goes when. Whether the node may send at all is decided by `Engine._update_mode`.
+`Mailboxes` holds the port's frames, and settles their messages; `SlotTransmitter` decides on the next frame. Whether
+the node may send at all is decided by `Engine._update_mode`.
 """
 
 import enum
@@ -29,7 +29,7 @@ _PAUSE_SPREAD = 8_000_000  # ns; two nodes that collided would else collide agai
 _MANAGEMENT_MAX = 128  # management messages that wait
 _CONFIRMED = 10  # cycles in a row with the own slots in the mask, after which one without them is doubted
 _CLOSE = 5  # bits between the hand-over and the last moment: then stuff bits are counted
-# Python 3.11 takes its time to find a member of an enum.
+# Python 3.11 is slow to find a member of an enum.
 _HRT, _SRT, _NRT = Mailbox
 _SENT, _UNKNOWN, _LOST, _ERROR = Outcome.SENT, Outcome.UNKNOWN, Outcome.LOST, Outcome.ERROR
 _ALL_SENT = Fate.SENT
@@ -50,7 +50,7 @@ _SILENT, _FREE, _SLOTTED = Mode
 class FirstSync(msgspec.Struct, frozen=True):
     """The sync frame that makes a node the master, planned for the instant `start` as that of cycle `counter`.
 
-    `done(now, outcome, at)` gets what became of it, and when.
+    `done(now, outcome, at)` gets its outcome, and the time of that.
     """
 
     frame: Frame
@@ -71,12 +71,12 @@ Item = QueuedMessage | PeriodicMessage | FirstSync | NoMessage
 
 
 class Mailboxes:
-    """The frames that are with the port: `boxes` has for each mailbox the owner of the frame in it."""
+    """The port's frames: `boxes` has for each mailbox the owner of the frame in it."""
 
     def __init__(self, context: EngineContext, queue: LaxityQueue) -> None:
         self.boxes: list[Item | None] = [None, None, None]
         self.idle = True
-        """True if no frame of the queue is with the port."""
+        """True if the port has no frame of the queue."""
         self._context = context
         self._counts = context.counts
         self._actions = context.actions
@@ -100,7 +100,7 @@ class Mailboxes:
         self.put(message, frame, _NRT if frame.id >> LAXITY_SHIFT == rtcan.NRT else _SRT, first, last)
 
     def empty(self, mailbox: Mailbox) -> Item | None:
-        """Empty a mailbox whose frame the port has done with; return the frame's owner."""
+        """Empty a mailbox whose frame is done; return the frame's owner."""
         boxes = self.boxes
         item, boxes[mailbox] = boxes[mailbox], None
         self.idle = boxes[_SRT] is None and boxes[_NRT] is None
@@ -112,7 +112,7 @@ class Mailboxes:
         self.idle = True
 
     def fill(self, now: int) -> None:
-        """Without slots: hand over one frame of each class."""
+        """Hand over one frame of each class, without slots."""
         if self._held <= now:
             self._held = NEVER
         if not self._queue.size:
@@ -150,7 +150,7 @@ class Mailboxes:
             self._report(message.handle, Fate.OVERDUE, missed=True, at=now)
 
     def confirm(self, now: int, message: QueuedMessage, outcome: Outcome, at: int, *, slotted: bool) -> None:
-        """Settle a message by what became of a frame of it."""
+        """Settle a message by the outcome of one of its frames."""
         if outcome is _SENT or outcome is _UNKNOWN:  # not again if unknown: receivers would count a repeat, or a gap
             message.unknown = message.unknown or outcome is _UNKNOWN
             if self._queue.frame_sent(message):
@@ -205,7 +205,7 @@ class SlotTransmitter:
         self._sync = Frame(0, b"")
         self._confirmed = 0  # cycles in a row whose mask had the own slots
         self._doubted = 0
-        # A try now would come too late for the slots before `now + ahead`; a coarse port may still try in that one.
+        # A try now would be too late for the slots before `now + ahead`; a coarse port may still try in that one.
         self._ahead = self._latency - (self._slot if self._coarse else self._bit)
         self._close = _CLOSE * self._bit
         self._longest = [(can_bits.frame_bits_max(n) + INTERMISSION) * self._bit for n in range(FRAME_MAX + 1)]  # ns
@@ -213,7 +213,7 @@ class SlotTransmitter:
     # Messages
 
     def withdraw_network(self, id8: int) -> None:
-        """Drop a NETWORK that waits: it is no longer true."""
+        """Drop a waiting NETWORK, which is no longer true."""
         message = rtcan.message_id(rtcan.MANAGEMENT, id8)
         self.queue.withdraw(message, lambda each: type_of(each.payload) == ManagementType.NETWORK)
 
@@ -248,7 +248,7 @@ class SlotTransmitter:
         self.mailboxes.put(_SYNC, frame, _HRT, start, last)
 
     def send_first_sync(self, first: FirstSync) -> bool:
-        """Send a new master's first sync, which may be late, as there are no slots yet. False: the mailbox is full."""
+        """Send a new master's first sync, which may be late, as there are no slots yet. Return False if it can't."""
         if self.mailboxes.boxes[_HRT] is not None:
             return False
         self.mailboxes.put(first, first.frame, _HRT, first.start, NEVER)
@@ -280,7 +280,7 @@ class SlotTransmitter:
         self._schedule(now)
 
     def reschedule(self, now: int) -> None:
-        """Find out anew what is due, as there may be something new to send."""
+        """Work out again what is due, as there may be something new to send."""
         if self.mode is _FREE:
             self.mailboxes.fill(now)
             self.due = self.mailboxes.due
@@ -311,7 +311,7 @@ class SlotTransmitter:
                 self._schedule(now)
 
     def confirm(self, now: int, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        """Take note of what became of the frame in this mailbox, and when it was over."""
+        """Note the outcome of the frame in this mailbox, and its time."""
         item = self.mailboxes.empty(mailbox)
         if isinstance(item, QueuedMessage):
             self.mailboxes.confirm(now, item, outcome, at, slotted=self.mode is _SLOTTED)
@@ -337,9 +337,9 @@ class SlotTransmitter:
     # Slots
 
     def _check_mask(self, own: int) -> None:
-        """Doubt a mask without the own slots, which the last ones had: it is more likely forged than true.
+        """Doubt a mask without own slots of the last ones: it is more likely forged than true.
 
-        A cycle with such a mask is like one without a sync, of which there may be three.
+        A cycle with such a mask counts as one without a sync, of which there may be three.
         """
         mask = self._cycle.mask
         if mask is None:
@@ -414,13 +414,13 @@ class SlotTransmitter:
         self.mailboxes.put_queued(message, frame, start, last)
 
     def _latest_start(self, now: int, frame: Frame, end: int) -> int:
-        """The last instant at which the frame surely ends in its slot. `end` is when that is over."""
+        """Return the last start at which the frame surely ends in its slot, which ends at `end`."""
         last = end - self._longest[len(frame.data)]
         close = last - now - self._latency < self._close
         return self._exact_latest_start(frame, end) if close else last
 
     def _exact_latest_start(self, frame: Frame, end: int) -> int:
-        """As above, to the stuff bit. That is not cheap, unless the same frame is seen again."""
+        """Return the same as above, to the stuff bit. Expensive, except for a repeated frame."""
         bits = can_bits.frame_bits(frame.id, frame.data) + INTERMISSION
         return end - bits * self._bit
 
@@ -455,7 +455,7 @@ class SlotTransmitter:
         identifier = rtcan.encode_identifier(rtcan.HRT, periodic.message, periodic.fragments - 1 - fragment)
         frame = Frame(identifier, payload[at : at + FRAME_MAX])
         start = self._cycle.reference + slot * self._slot
-        # To the stuff bit, as there is no other slot for it; a slot that is over is missed.
+        # To the stuff bit, as there is no other slot for it; a passed slot is missed.
         last = self._exact_latest_start(frame, start + self._slot) if slot == current else LONG_AGO
         if mask is not None and not mask >> slot & 1:
             self.abandon(now, periodic, "not in the mask")

@@ -1,11 +1,11 @@
-"""Publishers: the three classes of the thesis (5.3.6), and what each does where there is no room.
+"""Publishers: the three classes of the thesis (5.3.6), which differ when there is no room.
 
     non_real_time   waits for room, at most `stall` seconds, then goes on without the slow subscribers
     sporadic        never waits; a message that is not in every queue and on every link by its deadline is missed
-    periodic        never waits; `fill` is called at every period, and the message is missed where there is no room
+    periodic        never waits; `fill` is called at every period, and the message is missed without room
 
 Read `base` first: there each miss is counted, logged at most once a second, and given to the callbacks of the class
-value (`r2p.runtime.qos`). What waits is in the queues of `r2p.runtime.backpressure`.
+value (`r2p.runtime.qos`). Waiting messages are in the queues of `r2p.runtime.backpressure`.
 """
 
 from typing import Any

@@ -1,10 +1,10 @@
-"""The part that all publishers share: their topic, their counters, and how they report what was missed or late.
+"""The base of all publishers: their topic, their counters, and their reports of missed and late messages.
 
     _miss      a message has not reached a queue or a link: `missed`, and `on_missed`
     link_late  a message was sent after its deadline: `late`, and `on_late`; publishers report their own delays likewise
     link_degraded   a link, or its slots, are lost: `on_degraded`
 
-All go through `_report`: one line of the log a second at most, and the callback of the class value.
+All go through `_report`: at most one line of the log a second, and the callback of the class value.
 """
 
 import asyncio
@@ -88,7 +88,7 @@ class BasePublisher(Generic[M, C]):
 
     @property
     def subscribers(self) -> int:
-        """The number that would get a message now: queues of this module, and links with subscribers behind them."""
+        """The number of subscribers now: queues of this module, and links with subscribers behind them."""
         return len(self._topic.queues) + sum(remote.reachable for remote in self._topic.remote_subscribers)
 
     async def wait_subscriber(self) -> None:
@@ -100,7 +100,7 @@ class BasePublisher(Generic[M, C]):
 
     @property
     def guarantees(self) -> dict[str, str]:
-        """The meaning of the publisher's class on each link, in words, by the link's name; "" is this module."""
+        """The guarantees of the publisher's class on each link, in words, by the link's name; "" is this module."""
         local = {
             PublisherClass.NON_REAL_TIME: "waits for room in every queue",
             PublisherClass.SPORADIC: "in every queue by the deadline, or signalled",
@@ -153,14 +153,14 @@ class BasePublisher(Generic[M, C]):
         self._report(Missed(self.topic, reason, where=link, count=0), self._on_degraded)
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
-        """Report that a link gave up a message that it had accepted, as one in a slot that passed; `late` in seconds.
+        """Report that a link gave up an accepted message, such as one for a slot that has passed; `late` is in seconds.
 
         With its `sequence` a message that is missed on several links counts once.
         """
         self._miss(sequence, reason, link, late)
 
     def link_late(self, link: str, reason: str, late: float = 0.0) -> None:
-        """Report that a link sent a message after its deadline; `late` in seconds."""
+        """Report that a link sent a message after its deadline; `late` is in seconds."""
         self.late += 1
         self._report(Missed(self.topic, reason, link, late), self._on_late)
 
@@ -186,7 +186,7 @@ class BasePublisher(Generic[M, C]):
         """Count and report a message that has not reached these sinks, or this link: once, however many they are."""
         is_first = self._is_first_miss(sequence)
         self.missed += is_first
-        # `_report`, inlined: where a queue is full, this runs for each message, mostly without a line and a callback.
+        # `_report`, inlined: with a full queue this runs for each message, mostly without a line and a callback.
         suffix = None if reason == LINK_DOWN else self._log_limit.suffix("", self._clock.monotonic())
         if self._on_missed is not None or suffix is not None:
             names = without if isinstance(without, str) else where(without)
@@ -209,7 +209,7 @@ class BasePublisher(Generic[M, C]):
         self._miss(sample.sequence, LINK_DOWN, sinks)
 
     def _report(self, missed: Missed, callback: Signal | None) -> None:
-        """Log it, and call the user's callback; a link that is down has been logged as such."""
+        """Log the miss, and call the user's callback; a link that is down has been logged as such."""
         suffix = None if missed.reason == LINK_DOWN else self._log_limit.suffix("", self._clock.monotonic())
         self._log_and_call(missed, callback, suffix)
 
@@ -230,13 +230,13 @@ class BasePublisher(Generic[M, C]):
         try:
             callback(missed)
         except Exception as error:  # noqa: BLE001 - the user's code: whatever it raises crashes its node
-            # Later: a link may be at work in the node's own task, where a crash would raise through it.
+            # Later: this may run in the node's own task, in a call of a link, where a crash would raise through it.
             self._space.loop.call_soon(self.node.crash, error)
         finally:
             self._in_callback = False
 
     def _defer(self, missed: Missed, callback: Signal) -> None:
-        """Report later: a callback has published a message that is missed as well, and must not be called in itself."""
+        """Report later: a callback published a message that was missed as well, and must not be called recursively."""
         if not self._deferred:
             self._space.loop.call_later(_CALLBACK_PAUSE, self._call_deferred)
         elif len(self._deferred) >= _DEFERRED_MAX and self._deferred[-1][0] is callback:
@@ -250,5 +250,5 @@ class BasePublisher(Generic[M, C]):
 
 
 def where(sinks: Sequence[Sink]) -> str:
-    """The names of nodes and links, for a `Missed`."""
+    """Return the names of nodes and links, for a `Missed`."""
     return ", ".join(dict.fromkeys(sink.owner for sink in sinks))

@@ -20,11 +20,11 @@ class Publisher(BasePublisher[M, NonRealTime]):
     publisher_class = PublisherClass.NON_REAL_TIME
 
     async def publish(self, message: M) -> None:
-        """Publish a message, and wait until all queues and links that keep up have it.
+        """Publish a message, and wait until all queues and links that keep up have accepted it.
 
-        Those with room get it at once. A full send buffer or queue (but not a lossy one, nor one of this node) is
-        waited for, at most `stall` seconds; from then on it loses messages, counted in `missed`, until it has room.
-        Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
+        Queues and links with room get it at once. A full send buffer or queue (but not a lossy one, nor one of this
+        node) is waited for, at most `stall` seconds; from then on it loses messages, counted in `missed`, until it has
+        room. Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """
         # `_sample`, inlined: this is the path of every message.
         if message.__class__ is not self.type:
@@ -43,7 +43,7 @@ class Publisher(BasePublisher[M, NonRealTime]):
             await checkpoint()
 
     def publish_nowait(self, message: M) -> bool:
-        """Publish without waiting, as callbacks must. False if a full queue or link lost a message, which is counted.
+        """Publish without waiting, as callbacks must. Return False if a full queue or link lost a message, counted.
 
         Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """
@@ -52,7 +52,7 @@ class Publisher(BasePublisher[M, NonRealTime]):
         return blocked is None or self._force(sample, blocked)
 
     def _force(self, sample: Sample, sinks: list[Sink]) -> bool:
-        """Force the sample into full sinks without waiting; False if any of them loses a message by that."""
+        """Force the sample into full sinks without waiting; return False if any of them loses a message."""
         without = []
         for sink in sinks:
             lost = sink.lost
@@ -67,7 +67,7 @@ class Publisher(BasePublisher[M, NonRealTime]):
         lossy = [sink for sink in blocked if not sink.blocks_publishers]
         if lossy:
             self._force(sample, lossy)
-            # `_force` may call the user's code, which may make more of them lossy, or these wait again.
+            # `_force` may call the user's code, which may make more sinks lossy, or these wait again.
             blocked = [sink for sink in blocked if sink.blocks_publishers and sink not in lossy]
             if not blocked:
                 return
@@ -93,7 +93,7 @@ class _WaitingDelivery(PendingDelivery):
     def __init__(self, sample: Sample, sinks: list[Sink], over: asyncio.Future[None]) -> None:
         self.over = over
         self.failed: list[Sink] = []
-        """The sinks that lost it."""
+        """The sinks that lost the message."""
         self.reason = ""
         super().__init__(sample, sinks)
 

@@ -1,6 +1,6 @@
-"""Periodic: never waits; `fill` is called at every period, and the message is missed where there is no room.
+"""Periodic: never waits; `fill` is called at every period, and the message is missed without room.
 
-How a miss is reported, always by `_miss` or `_report` of the base:
+Reports of a miss, all by `_miss` or `_report` of the base:
 
     tick                 the period began late, or periods were skipped: the event loop was blocked (`on_late`)
     _deliver_later       a subscriber's queue is full (`on_missed`); a full link has until the next period
@@ -46,7 +46,7 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
     ) -> None:
         super().__init__(space, node, topic, layout, klass, latch=latch)
         self.period = klass.period
-        """Seconds: that of the slots, while a link has some for it."""
+        """Seconds; the period of the slots, while a link has slots for the topic."""
         self.skipped = 0
         """Periods that passed without a message because the event loop was blocked."""
         self.lead = klass.lead
@@ -87,8 +87,8 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
     def tick(self, scheduled: int, late: int, skipped: int) -> Sample | None:
         """Publish the message of one period: due at `scheduled` (monotonic ns), `late` by ns, after `skipped` periods.
 
-        Local queues and all other links get the message from here; the link of the slots gets it as the result. None:
-        there is no message.
+        Local queues and all other links get the message from here; the link of the slots gets the result. None: no
+        message.
         """
         self._give_up(NO_ROOM)  # before `fill`: a link without room loses the old message, not the new one
         if self._encode == self._closed or self.node.ending:
@@ -127,7 +127,7 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
             self._miss_unreachable(sample, down)
 
     def delivery_completed(self, delivery: "_PeriodDelivery[M]", sink: Sink, reason: str) -> None:
-        """Note that a link has a sample that waited, or has lost it for this reason."""
+        """Note that a link has a waiting sample, or has lost it for this reason."""
         late = self._clock.monotonic() - delivery.since
         if reason:
             self._miss(delivery.sample.sequence, reason, [sink])
@@ -136,7 +136,7 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
             self._report(Missed(self.topic, "sent late", where([sink]), late / SECOND), self._on_late)
 
     def _give_up(self, reason: str) -> None:
-        """Withdraw what still waits from the period before: it is stale."""
+        """Withdraw messages that still wait from the period before: they are stale."""
         delivery, self._pending = self._pending, None
         if delivery is not None and (without := delivery.drop_remaining(GIVEN_UP)):
             self._miss(delivery.sample.sequence, reason, without)

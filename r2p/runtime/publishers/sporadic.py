@@ -32,7 +32,7 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         self._alarm = Alarm(space.loop, self._overdue)
 
     async def publish(self, message: M) -> None:
-        """Publish an event; returns at once, also where there is no room for it yet.
+        """Publish an event; return at once, even if there is no room for it yet.
 
         Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """
@@ -43,7 +43,7 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
             await checkpoint()
 
     def publish_nowait(self, message: M) -> bool:
-        """Publish an event, also from a callback. False if it waits for room somewhere, or a link is down.
+        """Publish an event, also from a callback. Return False if it waits for room somewhere, or a link is down.
 
         Raises MessageError for a message that does not fit the type, and Closed once the publisher is closed.
         """
@@ -72,7 +72,7 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         self._arm()
 
     def delivery_completed(self, event: "_EventDelivery[M]", sink: Sink, reason: str) -> None:
-        """Note that a sink has an event that waited, or has lost it for this reason."""
+        """Note that a sink has a waiting event, or has lost it for this reason."""
         if not event.remaining:
             self._pending.remove(event)
             self._arm()

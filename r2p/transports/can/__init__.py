@@ -2,9 +2,9 @@
 
 In the order in which to read it:
 
-    port       what RTCAN needs of a controller; what ports to real interfaces share: life, and mailboxes in software
+    port       the interface of a controller to RTCAN; the common part of real ones: life, and mailboxes in software
     socketcan  Linux's CAN interfaces: rawsocket (batches of frames, error frames), netlink (state of the interface)
-    pythoncan  the adapters that python-can knows
+    pythoncan  the adapters of python-can
 
 The simulated controller is in `r2p.sim`.
 """

@@ -1,6 +1,6 @@
 """The kernel's CAN interfaces, their state and its changes, by rtnetlink. Read-only.
 
-This file can be imported on any system, other than `socketcan`: `r2p doctor` needs it everywhere.
+Unlike `socketcan`, this file can be imported on any system, for `r2p doctor`.
 """
 
 import asyncio
@@ -42,7 +42,7 @@ _READ_MAX = 1 << 16  # bytes: more than the kernel puts into one datagram
 
 
 class Interface(msgspec.Struct, frozen=True):
-    """A CAN interface. What its driver does not report is None or empty; a virtual one reports nothing."""
+    """A CAN interface. Values that its driver does not report are None or empty; a virtual one reports nothing."""
 
     name: str
     kind: str  # "can", "vcan", "vxcan", "slcan" ...
@@ -83,7 +83,7 @@ def find_interface(name: str) -> Interface | None:
 
 
 def list_interfaces() -> list[Interface]:
-    """List all CAN interfaces. Raises OSError where the kernel has no rtnetlink."""
+    """List all CAN interfaces. Raises OSError if the kernel has no rtnetlink."""
     found: list[Interface] = []
     request = _HEADER.pack(_HEADER.size + _LINK.size, _GETLINK, _REQUEST_ALL, 1, 0) + _LINK.pack(0, 0, 0, 0, 0)
     with _rtnetlink() as netlink:
@@ -153,7 +153,7 @@ def _aligned(length: int) -> int:
 
 
 def _u32(data: bytes | None, index: int = 0) -> int | None:
-    """The 32-bit number at this index of an attribute; None if the attribute is missing or too short."""
+    """Return the 32-bit number at this index of an attribute; None if the attribute is missing or too short."""
     if data is None or len(data) < 4 * (index + 1):
         return None
     number: int = struct.unpack_from("=I", data, 4 * index)[0]

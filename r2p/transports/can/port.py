@@ -1,4 +1,4 @@
-"""The port: what RTCAN needs of a CAN controller, and what the ports to real interfaces share.
+"""The port: the interface of a CAN controller to RTCAN, and the common part of ports to real interfaces.
 
     EngineDriver  --transmit, withdraw, filters-->  CanPort  <-->  simulated bus, SocketCAN, python-can
                   <--frames, confirmations, state--
@@ -7,7 +7,7 @@ A port moves frames and reports when each one was on the bus; it knows nothing o
 instants are ns of the port's own clock `now()`, which is the module's monotonic clock, except where a simulated node
 has a clock that drifts.
 
-Real interfaces queue frames and confirm them late, so each has mailboxes in software before it (`TxMailboxes`).
+Real interfaces queue frames and confirm them late, so each has mailboxes in software in front of it (`TxMailboxes`).
 """
 
 import abc
@@ -24,7 +24,7 @@ from r2p.transports.stats import RETRY_AFTER_ERROR
 from r2p.units import NEVER
 
 RETRY_INTERVAL = 500_000
-"""Ns until the next try when the driver's queue is full, some four frames: no interface reports that it has room."""
+"""Ns until the next try when the driver's queue is full, some four frames: no interface reports free room."""
 
 
 class CanPortListener(Protocol):
@@ -46,7 +46,7 @@ class CanPortListener(Protocol):
         """Begin to use the bus."""
 
     def on_down(self, reason: str) -> None:
-        """Stop using the bus: interface down or gone, or bus-off. No frame that is in a mailbox is sent later."""
+        """Stop using the bus: interface down or gone, or bus-off. No frame in a mailbox is sent later."""
 
     def on_waiting(self, reason: str) -> None:
         """Report that the bus can't be used yet. The port goes on trying."""
@@ -55,14 +55,14 @@ class CanPortListener(Protocol):
         """Count a fault of the bus by its kind, such as what an error frame reports."""
 
     def internal_error(self, error: Exception) -> None:
-        """Count and log what the handling of a frame or of a timer raised. The port goes on with the next one."""
+        """Count and log an exception in the handling of a frame or a timer. The port goes on with the next one."""
 
 
 class PortAlarm(Protocol):
     """One timer that can be moved."""
 
     def set(self, deadline: int | None) -> None:
-        """Go off once at this instant of the port's clock (ns), at once if it is over; None switches it off."""
+        """Go off once at this instant of the port's clock (ns), at once if it has passed; None switches it off."""
 
     def close(self) -> None:
         """Never go off again."""
@@ -83,19 +83,19 @@ class CanPort(abc.ABC):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        """As in the URL, without the scheme and options: `can0`."""
+        """The name as in the URL, without the scheme and options: `can0`."""
 
     @abc.abstractmethod
     async def run(self, listener: CanPortListener, opened: Callable[[], object]) -> None:
         """Keep the interface open until cancelled, then close it.
 
-        Calls `opened()` once it works, or waits for the interface to work. Raises TransportError for what waiting can't
-        mend, and before `opened()` also for an interface that does not exist.
+        Calls `opened()` as soon as the port works, or waits for its interface. Raises TransportError for permanent
+        faults, and before `opened()` also for an interface that does not exist.
         """
 
     @abc.abstractmethod
     def transmit(self, order: Transmit) -> None:
-        """Put the frame into its empty mailbox, to start between the order's two instants (see `Engine`, 3)."""
+        """Put the frame into its empty mailbox. It is to start between the order's two instants (see `Engine`, 3)."""
 
     @abc.abstractmethod
     def withdraw(self, order: Withdraw) -> None:
@@ -113,11 +113,11 @@ class CanPort(abc.ABC):
         return clock_of().monotonic()
 
     def monotonic(self, instant: int) -> int:
-        """An instant of the port's clock, by the module's monotonic clock."""
+        """Translate an instant of the port's clock to the module's monotonic clock."""
         return instant
 
     def alarm(self, callback: Callable[[], object]) -> PortAlarm:
-        """A timer on the port's clock: never early, and as exact as the system allows."""
+        """Return a timer on the port's clock: never early, and as exact as the system allows."""
         return ExactAlarm(asyncio.get_running_loop(), callback)
 
 
@@ -155,7 +155,7 @@ class OpenInterface(abc.ABC):
 
     @abc.abstractmethod
     def _send(self, frame: Frame, mailbox: Mailbox) -> bool:
-        """Hand a frame to the driver. False if the driver has no room."""
+        """Hand a frame to the driver. Return False if the driver has no room."""
 
     def _poll(self) -> None:
         now = self._clock.monotonic()
@@ -181,7 +181,7 @@ B = TypeVar("B", bound=OpenInterface)
 
 
 class InterfacePort(CanPort, Generic[B]):
-    """A port whose interface comes and goes: `_bus` is None while it can't be used, and what is sent then is lost."""
+    """A port whose interface may vanish and return: `_bus` is None meanwhile, and frames are lost."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -202,7 +202,7 @@ class InterfacePort(CanPort, Generic[B]):
             self._bus.set_filters(filters)
 
     async def _use(self, bus: B, listener: CanPortListener) -> str:
-        """Use an interface that was opened until it ends. Returns why it did."""
+        """Use an open interface until its end. Return the reason for the end."""
         bus.set_filters(self._filters)
         self._bus = bus
         try:
@@ -233,7 +233,7 @@ class TxMailboxes:
 
     A frame that waits can be withdrawn; one that was handed over can't, and is never handed over twice.
 
-    `send(frame, mailbox)` hands a frame over, and returns False when there is no room. `confirm(mailbox, outcome, at)`
+    `send(frame, mailbox)` hands a frame over, and returns False without room. `confirm(mailbox, outcome, at)`
     is called once for each frame. `latency`: ns from the hand-over to the start of frame. `confirm_timeout`: ns until a
     confirmation is given up. `one_at_a_time`: hand over only one frame at a time, so that an error frame, which names
     no frame, must be about that one.
@@ -279,7 +279,7 @@ class TxMailboxes:
             self._end(mailbox, Outcome.LATE, now)
 
     def seen(self, identifier: int, data: bytes, at: int, now: int) -> bool:
-        """Confirm an own frame that was on the bus. False if it is none of those that were handed over."""
+        """Confirm an own frame that was on the bus. Return False if it was not handed over here."""
         for mailbox, pending in self._frames.items():
             frame = pending.order.frame
             if pending.handed_over and frame.id == identifier and frame.data == data:
@@ -305,7 +305,7 @@ class TxMailboxes:
         return due if due < NEVER else None
 
     def poll(self, now: int) -> None:
-        """Hand over what is due, the most urgent class first; give up what is too late."""
+        """Hand over due frames, the most urgent class first; give up late ones."""
         for mailbox in Mailbox:  # in the order of urgency
             pending = self._frames.get(mailbox)
             if pending is None:
@@ -334,6 +334,6 @@ class TxMailboxes:
         return too_late if blocked else min(pending.due, too_late)
 
     def _end(self, mailbox: Mailbox, outcome: Outcome, at: int) -> None:
-        # The mailbox is empty before its listener hears of it, which may put the next frame there at once.
+        # The mailbox is empty before its listener learns of it: the listener may put the next frame there at once.
         del self._frames[mailbox]
         self._confirm(mailbox, outcome, at)

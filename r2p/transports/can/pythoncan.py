@@ -1,8 +1,8 @@
 """The port to the interfaces of python-can: adapters with a driver of their own, slcan, virtual, udp_multicast ...
 
-python-can may block, wherever it is called. So one thread of this module opens, sends and closes, python-can's Notifier
-reads in another, and the event loop gets what was read in batches. What an interface needs besides its channel and bit
-rate stands in python-can's own configuration file.
+Any call of python-can may block. So one thread of this module opens, sends and closes, python-can's Notifier reads in
+another, and the event loop gets frames in batches. Further settings of an interface than channel and bit rate stand in
+python-can's own configuration file.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ CONFIRM_TIMEOUT_NS = SECOND
 """Ns until a confirmation is given up."""
 
 QUEUE_MAX = 4096
-"""Frames that wait for the event loop at most: half a second of a saturated bus of 1 Mbit/s."""
+"""Frames that wait for the event loop, at most: half a second of a saturated bus of 1 Mbit/s."""
 
 _BATCH = 64  # frames that one turn of the event loop handles: other tasks wait for so long
 _SEND_TIMEOUT_S = 0.5  # for a driver that waits for room in its queue
@@ -54,7 +54,7 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
     coarse = True
 
     def __init__(self, interface: str, channel: str, bitrate: int) -> None:
-        """Raises TransportError when python-can is not installed, or does not know the interface."""
+        """Raises TransportError if python-can is not installed, or does not know the interface."""
         super().__init__(f"{interface}:{channel}")
         self._can = _library()
         if interface not in self._can.VALID_INTERFACES:
@@ -72,7 +72,7 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
             await asyncio.sleep(backoff.delay())
 
     async def _serve(self, listener: CanPortListener, opened: Callable[[], object]) -> bool:
-        """Use the interface until it fails. False if it can't be opened now."""
+        """Use the interface until it fails. Return False if it can't be opened now."""
         bus = _PythonCanBus(self._can, listener, echo=self._interface in ECHO_ON_REQUEST | ECHO_ALWAYS)
         try:
             problem = await self._open(bus)
@@ -87,7 +87,7 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
         return True
 
     async def _open(self, bus: "_PythonCanBus") -> str:
-        """Open the interface. Returns why it can't be opened now; raises TransportError when it never can."""
+        """Open the interface. Return why it can't be opened now; raise TransportError if it never can."""
         try:
             await bus.open(self._make)
         except _PERMANENT_ERRORS as error:
@@ -111,7 +111,7 @@ others may pass, such as those of an adapter that is not plugged in.
 
 
 class _PythonCanBus(OpenInterface):
-    """An open interface. All runs in the event loop but the last methods, which run in other threads."""
+    """An open interface. All methods run in the event loop but the last ones, which run in other threads."""
 
     def __init__(self, library: Any, listener: CanPortListener, *, echo: bool) -> None:
         super().__init__(listener, latency=_LATENCY, confirm_timeout=CONFIRM_TIMEOUT_NS)
@@ -127,11 +127,11 @@ class _PythonCanBus(OpenInterface):
         self._reported = 0
 
     async def open(self, make: Callable[[], "can.BusABC"]) -> None:
-        """Open it. Raises what python-can raises."""
+        """Open the interface. Raises the exceptions of python-can."""
         await self._loop.run_in_executor(self._thread, self._open_in_thread, make)
 
     async def aclose(self) -> None:
-        """Close it and wait until it is closed, also when it is just being opened."""
+        """Close the interface and wait until it is closed, also while it is being opened."""
         self._closed.set()
         self._timer.close()
         self._mailboxes.clear()
@@ -161,7 +161,7 @@ class _PythonCanBus(OpenInterface):
         return True
 
     def _handed_over(self, frame: Frame, mailbox: Mailbox, error: BaseException | None) -> None:
-        """Confirm a frame that the driver has, unless it shows own frames; `error` is what it raised."""
+        """Confirm a frame that the driver has accepted, unless it returns own frames; `error` is its exception."""
         now = self._clock.monotonic()
         if isinstance(error, self._can.CanTimeoutError):  # the driver may send it all the same
             self._mailboxes.failed(mailbox, Outcome.UNKNOWN, now)
@@ -172,7 +172,7 @@ class _PythonCanBus(OpenInterface):
         self._arm()
 
     def _handle_batch(self) -> None:
-        """Handle what the Notifier's thread has read."""
+        """Handle frames that the Notifier's thread has read."""
         self._scheduled = False  # first: a frame that is read from here on schedules the next batch
         now, utc = self._clock.monotonic(), time.time()
         for _ in range(min(len(self._queue), _BATCH)):
@@ -207,7 +207,7 @@ class _PythonCanBus(OpenInterface):
                 self._listener.on_frame(Frame(message.arbitration_id, data), stamp)
 
     def _call_in_thread(self, action: Callable[[], object], finished: Callable[[BaseException | None], object]) -> None:
-        """Call `action` in the thread, then `finished` in the event loop with what it raised."""
+        """Call `action` in the thread, then `finished` in the event loop with its exception, if any."""
         future = self._loop.run_in_executor(self._thread, action)
         future.add_done_callback(lambda done: None if done.cancelled() else finished(done.exception()))
 

@@ -1,4 +1,4 @@
-"""A CAN_RAW socket that reads up to 64 frames with one system call, and what its error frames say.
+"""A CAN_RAW socket that reads up to 64 frames with one system call, and decodes its error frames.
 
 The call is `recvmmsg`: it returns a batch of frames, each with its flags (own or not) and its stamp. Python's socket
 module lacks it; the module's `recvmsg` returns one frame only, and asks the kernel for the interface's name each time.
@@ -22,7 +22,7 @@ from r2p.codecs.can_bits import Frame
 from r2p.units import SECOND
 
 BATCH = 64
-"""Frames that one call returns at most."""
+"""Frames in one call, at most."""
 
 OWN = 0x800
 """Flag MSG_CONFIRM: this socket sent the frame, and the controller reports that it was on the bus."""
@@ -77,10 +77,10 @@ class _MMsgHdr(ctypes.Structure):
 
 
 class RawSocket:
-    """A CAN_RAW socket on one interface. Raises OSError where Python's sockets do."""
+    """A CAN_RAW socket on one interface. Raises OSError as Python's sockets do."""
 
     def __init__(self, name: str) -> None:
-        """Open it. It receives nothing until `set_filters`."""
+        """Open the socket. It receives nothing until `set_filters`."""
         self.dropped = 0
         """Frames that the kernel dropped because this socket's queue was full."""
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
@@ -113,7 +113,7 @@ class RawSocket:
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(packed))
 
     def send(self, frame: Frame, priority: int) -> bool:
-        """Hand a frame to the kernel's queue of the interface. False if the queue is full."""
+        """Hand a frame to the kernel's queue of the interface. Return False if the queue is full."""
         if priority != self._priority:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, priority)
             self._priority = priority
@@ -126,7 +126,7 @@ class RawSocket:
         return True
 
     def receive(self) -> list[ReceivedFrame]:
-        """Read the frames that are there, at most BATCH."""
+        """Read the waiting frames, at most BATCH."""
         frames, self.dropped = self._batch.receive(self.dropped)
         return frames
 
@@ -161,7 +161,7 @@ class _Batch:
         self._flags = numbers[_MsgHdr.flags.offset // 4 :: ctypes.sizeof(_MMsgHdr) // 4]
 
     def receive(self, dropped: int) -> tuple[list[ReceivedFrame], int]:
-        """Read a batch. Returns its frames, and how many were dropped since the socket was opened."""
+        """Read a batch. Return its frames, and how many were dropped since the socket was opened."""
         count = self._recvmmsg(self._fd, self._messages, BATCH, socket.MSG_DONTWAIT, None)
         if count < 0:
             code = ctypes.get_errno()
@@ -180,7 +180,7 @@ class _Batch:
             if not oldest < stamp < now:
                 stamp = now
             received.append((identifier, data if length == 8 else data[:length], flag, stamp))
-        # The kernel attaches the count of drops once there was one; the last frame has the newest count.
+        # The kernel attaches the count of drops after the first one; the last frame has the newest count.
         if self._messages[count - 1].header.control_length > _STAMP_ONLY:
             dropped = control[8]
         ctypes.memmove(self._messages, self._unused, count * ctypes.sizeof(_MMsgHdr))

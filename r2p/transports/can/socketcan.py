@@ -1,11 +1,10 @@
 """The port to SocketCAN: Linux's CAN interfaces.
 
-One socket does it all, without python-can, whose bus object lacks what is needed here: batches of frames, the flag that
-marks own frames, stamps in ns, error frames, and a priority for each frame. The priority is the socket's at the moment
-of the hand-over, so one socket serves three classes, and its receive queue keeps the order of what others sent and of
-what became of the own frames.
+One socket does it all, without python-can, whose bus object lacks batches of frames, the flag that marks own frames,
+stamps in ns, error frames, and a priority for each frame. The priority is the socket's at the moment of the hand-over,
+so one socket serves three classes, and its receive queue keeps the order of others' frames and of confirmations.
 
-r2p never configures an interface: it waits until it can be used, and reports which command would make it so.
+r2p never configures an interface: it waits until the interface can be used, and reports the command for that.
 """
 
 import errno
@@ -48,7 +47,7 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
         self._monotonic = clock_of().monotonic
 
     def now(self) -> int:
-        """The instant when the batch was read that is being handed out: the clock is read once for each batch."""
+        """The instant at which the current batch was read: the clock is read once for each batch."""
         bus = self._bus
         return self._monotonic() if bus is None or bus.read_at is None else bus.read_at
 
@@ -66,7 +65,7 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
                 await watch.wait(backoff.delay())
 
     def alarm(self, callback: Callable[[], object]) -> PortAlarm:
-        """A timer that reads what has come in before it goes off: no time-out may outrun a frame in the kernel."""
+        """A timer that reads waiting frames before it goes off: no time-out may outrun a frame in the kernel."""
 
         def read_and_call() -> None:
             if self._bus is not None:
@@ -76,7 +75,7 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
         return super().alarm(read_and_call)
 
     async def _serve(self, listener: CanPortListener) -> bool:
-        """Use the interface until it is gone. False if it can't be used now."""
+        """Use the interface until it is gone. Return False if it can't be used now."""
         bus = self._open(listener)
         if isinstance(bus, str):
             listener.on_waiting(bus)
@@ -105,7 +104,7 @@ class SocketCanPort(InterfacePort["_SocketCanBus"]):
 
 
 class _SocketCanBus(OpenInterface):
-    """An interface that is up, until it is not."""
+    """An interface while it is up."""
 
     def __init__(self, sock: RawSocket, listener: CanPortListener, *, one_shot: bool) -> None:
         # A one-shot controller reports a failure by an error frame, which names no frame: so one at a time.
@@ -116,7 +115,7 @@ class _SocketCanBus(OpenInterface):
             one_at_a_time=one_shot,
         )
         self.read_at: int | None = None
-        """The instant when the batch was read that is being handed out; None outside of batches."""
+        """The instant at which the current batch was read; None outside of batches."""
         self._socket = sock
         self._one_shot = one_shot
         self._dropped = 0
@@ -137,7 +136,7 @@ class _SocketCanBus(OpenInterface):
             self._end(_reason(error))
 
     def read_all(self) -> None:
-        """Read all frames that are there, but not without end."""
+        """Read all waiting frames, but not without end."""
         for _ in range(_BATCHES_MAX):
             if self._read_batch() < rawsocket.BATCH:
                 return
@@ -152,7 +151,7 @@ class _SocketCanBus(OpenInterface):
             return False
 
     def _read_batch(self) -> int:
-        """Read a batch and hand it out. Returns the number of frames."""
+        """Read a batch and hand it out. Return the number of frames."""
         if self.ended.done():
             return 0
         try:

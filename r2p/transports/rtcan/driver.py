@@ -4,8 +4,8 @@
     timer    ------------poll---------------->          --messages, events--->    DriverOwner
              <-----------next_deadline--------
 
-What an action brings about comes after the actions before it: a port may confirm from within `transmit`, and the owner
-may publish from within `act`. Both end in `carry_out`, which then only queues.
+Consequences of an action come after the actions before it: a port may confirm from within `transmit`, and the owner may
+publish from within `act`. Both end in `carry_out`, which then only queues.
 
 `UtcEstimator` translates the engine's network time to UTC.
 """
@@ -48,13 +48,13 @@ class DriverOwner(Protocol):
         """Count a fault of the bus by its kind."""
 
     def internal_error(self, error: Exception) -> None:
-        """Count and log what the handling of a frame or an action raised. The next one follows."""
+        """Count and log an exception in the handling of a frame or an action. The next one follows."""
 
 
 class EngineDriver:
     """Drives `engine` on `port`, as the port's `CanPortListener`.
 
-    Its owner calls the engine as well, and passes what that returns to `carry_out`.
+    Its owner calls the engine as well, and passes the returned actions to `carry_out`.
     """
 
     def __init__(self, engine: Engine, port: CanPort, owner: DriverOwner) -> None:
@@ -122,7 +122,7 @@ class EngineDriver:
     # Act, and re-arm the timer
 
     def carry_out(self, actions: Sequence[Action]) -> None:
-        """Act on what a call of the engine returned, then re-arm the timer for its next deadline."""
+        """Carry out the actions of the engine, then re-arm the timer for its next deadline."""
         if actions:
             self._actions.extend(actions)
             if self._acting:
@@ -146,7 +146,7 @@ class EngineDriver:
             self._acting = False
 
     def _failed(self, error: Exception) -> None:
-        """The engine raised: go on with it, but not at once where it can't get past a deadline that is over."""
+        """Go on after an exception of the engine, but not at once if it can't get past a passed deadline."""
         self.internal_error(error)
         deadline = self.engine.next_deadline()
         self._timer.set(None if deadline is None else max(deadline, self.now() + RETRY_AFTER_ERROR))
@@ -154,11 +154,11 @@ class EngineDriver:
     # For the owner
 
     def update_filters(self) -> None:
-        """Pass the engine's filters to the port: it needs other frames than before."""
+        """Pass the engine's new filters to the port."""
         self.port.set_filters(self.engine.filters())
 
     async def drain(self, timeout: float, pending: Callable[[], object] | None = None) -> None:
-        """Wait until nothing is `pending` (by default: all that the engine has to send), at most `timeout` seconds."""
+        """Wait until nothing is `pending` (default: in the engine's send queues), at most `timeout` seconds."""
         self._pending = pending or (lambda: self.engine.waiting)
         if self._pending():
             self._drained = asyncio.get_running_loop().create_future()
@@ -173,8 +173,8 @@ class EngineDriver:
 class UtcEstimator:
     """Estimates the offset of UTC, by the module's clock, from the network's time.
 
-    Each measurement is off by an unknown delay, so the estimate is the middle of the last ones, and their spread is how
-    far it may be off.
+    Each measurement is off by an unknown delay, so the estimate is the middle of the last ones, and their spread is its
+    possible error.
     """
 
     def __init__(self, driver: EngineDriver) -> None:
@@ -184,7 +184,7 @@ class UtcEstimator:
         self._offset: ClockOffset | None = None
 
     def offset(self, now: int) -> ClockOffset | None:
-        """The estimate at this instant of the engine's clock (ns); None while there is no network time."""
+        """Return the estimate at this instant of the engine's clock (ns); None without network time."""
         if now - self._measured_at >= _MEASURE_INTERVAL:
             self._measured_at = now
             self._measure()

@@ -1,4 +1,4 @@
-"""The link of a module on an RTCAN bus: one engine on its port, and the discovery that runs over it.
+"""The link of a module on an RTCAN bus: one engine on its port, and its discovery.
 
 Each publisher class has room of its own (see `tx`), so bulk data never keeps an event out. Nothing is announced before
 the node has an id8, and everything is announced again when it gets another one. A remote publisher is known by its
@@ -57,7 +57,7 @@ from r2p.units import LONG_AGO, MILLISECOND
 _MANAGEMENT = MANAGEMENT.encode()
 _LOSSES = ("undecodable", "management dropped")  # what the engine counts as lost without a publisher of this module
 
-# How much discovery may send. After a start all modules have much to announce at once.
+# The rate of discovery. After a start all modules have much to announce at once.
 _RATE = 100.0  # messages a second: a fifteenth of a bus of 1 Mbit/s, and the same share of slower ones
 _BURST, _BURST_MIN = 8, 4  # messages at once, on a bus of 1 Mbit/s and on the slowest ones
 _BIT = 1000  # ns at 1 Mbit/s
@@ -72,7 +72,7 @@ _CLASSES = {
 
 
 class ReceivedMessage(msgspec.Struct, frozen=True, gc=False):
-    """A whole message that came in."""
+    """A complete received message."""
 
     topic: bytes
     data: bytes
@@ -81,7 +81,7 @@ class ReceivedMessage(msgspec.Struct, frozen=True, gc=False):
 
 
 class RtcanLink(BufferedLink):
-    """A module's link to an RTCAN bus. `utc_error` (ns): how well the module knows UTC, None if it does not."""
+    """A module's link to an RTCAN bus. `utc_error` (ns): the accuracy of the module's UTC, None if unknown."""
 
     max_payload: ClassVar[int] = rtcan.PAYLOAD_MAX
     has_slots: ClassVar[bool] = True
@@ -110,7 +110,7 @@ class RtcanLink(BufferedLink):
         self._transmitter = Transmitter(self, self.driver, self._slotted)
         self._on_bus = False
 
-    # What the driver calls
+    # Called by the driver
 
     def act(self, action: Action) -> None:
         if isinstance(action, Received):  # the most frequent one first
@@ -171,7 +171,7 @@ class RtcanLink(BufferedLink):
         return text
 
     def _limit_discovery(self, profile: Profile) -> None:
-        """Let discovery send what this bus bears, now that the profile is known."""
+        """Set the rate of discovery for this bus, now that the profile is known."""
         bit = self.engine.timing.bit
         rate, burst, quiet = _RATE * _BIT / bit, max(_BURST_MIN, _BURST * _BIT // bit), 0.0
         if profile is Profile.FIRMWARE:
@@ -188,7 +188,7 @@ class RtcanLink(BufferedLink):
     # In
 
     def sample(self, topic: str, arrival: ReceivedMessage) -> Sample:
-        """The sample of a message of this topic. Its stamp is the start of the message's first frame."""
+        """Make the sample of a message of this topic. Its stamp is the start of the message's first frame."""
         self.stats.bytes_received += len(arrival.data)
         received = arrival.received
         now = self.driver.now()
@@ -197,7 +197,7 @@ class RtcanLink(BufferedLink):
             self._utc_offset_until = now + _OFFSET_VALID
         stamp = self._utc_offset + self.driver.port.monotonic(self._started(received))
         source = self._senders.source(topic, rtcan.id8_of(arrival.message_id))
-        # A laxity is the time to the deadline (ms), where there is one. SRT_MAX stands for more, too, so it gives none.
+        # A laxity is the time to the deadline (ms), if there is one. SRT_MAX also stands for more, so it gives none.
         laxity = received.laxity
         deadline = stamp + laxity * MILLISECOND if rtcan.HRT < laxity < rtcan.SRT_MAX else 0
         sender = self.discovery.modules.get(source.module)
@@ -214,7 +214,7 @@ class RtcanLink(BufferedLink):
         )
 
     def _started(self, received: Received) -> int:
-        """The start of the first frame; roughly on a coarse port, whose stamps are not worth the counting of bits."""
+        """Return the start of the first frame; roughly on a coarse port, whose stamps do not justify counting bits."""
         bit = self.engine.timing.bit
         if self.driver.port.coarse:
             return received.stamp - can_bits.frame_bits_max(min(len(received.payload), rtcan.FRAME_MAX)) * bit
@@ -224,7 +224,7 @@ class RtcanLink(BufferedLink):
         return arrival.message_id
 
     def receive_other(self, arrival: Any) -> None:
-        """Handle management: nothing else comes in unless it is subscribed."""
+        """Handle management: all other messages are of subscribed topics."""
         data, message_id = arrival.data, arrival.message_id
         source = rtcan.id8_of(message_id)
         if message_id == rtcan.FIRMWARE_MANAGEMENT:
@@ -239,7 +239,7 @@ class RtcanLink(BufferedLink):
             self.manage(data, source)
 
     def _renumber(self, names: Sequence[str]) -> None:
-        """Announce topics of this module that have to take another high byte, or may find one now."""
+        """Announce topics of this module that need another high byte, or may find one now."""
         for name in names:
             topic = self._space.topics.get(name)
             if topic is not None:
@@ -318,7 +318,7 @@ class RtcanLink(BufferedLink):
         refused.discard(topic.name)  # `params`, which this calls, puts it back if there is still no high byte
         super().topic_changed(topic)
         if topic.name in refused and not known:
-            text = f"topic {topic.name}: all message ids are taken; it is published as soon as one comes free"
+            text = f"topic {topic.name}: all message ids are taken; publishing starts as soon as one is free"
             self._hub.link_notice(self, "no id", text, trouble=True)
         announced = self._announced.get(topic.name)
         if announced is None or not announced.publishes:
@@ -336,7 +336,7 @@ class RtcanLink(BufferedLink):
 
     @property
     def slots(self) -> dict[str, SlottedTopic]:
-        """The periodic topics of this module, and how well their slots are kept."""
+        """The periodic topics of this module, and the state of their slots."""
         return self._slotted.by_topic
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
@@ -368,7 +368,7 @@ class RtcanLink(BufferedLink):
         return self._utc.offset(self.driver.now())
 
     def utc(self) -> tuple[int, int] | None:
-        """UTC by the RTCAN master, and how far off it may be (both ns); None if it is not known."""
+        """Return UTC by the RTCAN master, and its possible error (both ns); None if unknown."""
         return self.engine.utc(self.driver.now())
 
     def _set_utc(self) -> None:
@@ -387,18 +387,18 @@ class RtcanLink(BufferedLink):
     # Life
 
     async def drain(self, timeout: float) -> None:
-        """Wait until the samples that the engine has are on the bus, at most `timeout` seconds."""
+        """Wait until the engine's samples are on the bus, at most `timeout` seconds."""
         await self.driver.drain(timeout, lambda: self._transmitter.pending)
 
     def close(self) -> None:
-        """Release the slots and announce the end. The bus takes its time for that: see `driver.drain`."""
+        """Release the slots and announce the end, which takes time on the bus: see `driver.drain`."""
         if not self._closed:
             self._slotted.close()  # while the engine can still send that
             super().close()
             self._slotted.wake_waiters()
 
 
-# What users read
+# Texts for users
 
 
 def no_slots(engine: Engine) -> str:
@@ -412,7 +412,7 @@ def no_slots(engine: Engine) -> str:
 
 
 def describe_guarantee(driver: EngineDriver, publisher_class: PublisherClass, slotted: SlottedTopic | None) -> str:
-    """Say what a publisher class means for a topic now; `slotted` if the topic is periodic and may have slots."""
+    """Describe what a publisher class means for a topic now; `slotted`: the topic is periodic and may have slots."""
     engine = driver.engine
     if engine.network.mismatch is not None:
         return f"nothing is sent: {engine.network.mismatch}"
@@ -425,7 +425,7 @@ def describe_guarantee(driver: EngineDriver, publisher_class: PublisherClass, sl
             laxity = "fresh at each try" if driver.port.one_shot else "fixed when a frame is handed to the controller"
             return f"soft real-time, least laxity first, {laxity}; late ones are signalled"
         case _:
-            return "non real-time: what the others leave of the bus; waits for room"
+            return "non real-time: uses what other classes leave of the bus; waits for room"
 
 
 def _periodic_guarantee(engine: Engine, slotted: SlottedTopic | None) -> str:

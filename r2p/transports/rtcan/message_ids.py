@@ -25,7 +25,7 @@ _LINGER = SECOND  # ns during which what still comes from a publisher that has l
 
 
 def address_of(data: bytes, modules: dict[str, ModuleInfo]) -> int:
-    """FIRMWARE or R2P: who sent a management message with the id of firmware. `modules` are those known by name."""
+    """Return the sender of a management message with firmware's id, FIRMWARE or R2P. `modules` are known by name."""
     message_type = management.type_of(data)
     if message_type == ManagementType.ALIVE:
         alive = _decoded(data)
@@ -37,7 +37,7 @@ def address_of(data: bytes, modules: dict[str, ModuleInfo]) -> int:
 
 
 def publisher_in(data: bytes, source: int) -> tuple[str, int] | None:
-    """Topic and message id of the publisher that a management message from this address offers, if it can be true.
+    """Return topic and message id of the publisher that a management message from this address offers, if plausible.
 
     Every offer of r2p has the message id; of firmware only the answer to a subscriber has it.
     """
@@ -52,7 +52,7 @@ def publisher_in(data: bytes, source: int) -> tuple[str, int] | None:
 
 
 def _decoded(data: bytes) -> management.Management | None:
-    """The message; None where discovery will count it as undecodable. The codec remembers it for discovery."""
+    """Return the message; None if discovery will count it as undecodable. The codec remembers it for discovery."""
     try:
         return management.decode(data)
     except DecodeError:
@@ -66,7 +66,7 @@ class MessageIdMap:
         self.topics: dict[int, bytes] = {}
         """Names of topics by message id."""
         self.lingering: dict[int, int] = {}
-        """Ids of publishers that have left, and until when (monotonic ns) what still comes from them is counted."""
+        """Ids of publishers that have left, and until when (monotonic ns) their late messages are counted."""
         self._link = link
         self._engine = engine
         self._space = space
@@ -93,7 +93,7 @@ class MessageIdMap:
             self._remove_id(now, message_id)
 
     def end_lingering(self, now: int) -> bool:
-        """Stop counting what comes from publishers that have left long enough ago. Returns whether there were any."""
+        """Stop counting messages of publishers that left long enough ago. Return whether there were any."""
         over = [message_id for message_id, until in self.lingering.items() if until <= now]
         for message_id in over:
             del self.lingering[message_id]
@@ -101,7 +101,7 @@ class MessageIdMap:
         return bool(over)
 
     def _plausible(self, message_id: int, source: PeerAddress) -> bool:
-        # Without this check a module could claim the id of another one, and end what is received from that.
+        # Without this check a module could claim the id of another one, and end its reception.
         if self._engine.profile is Profile.FIRMWARE:
             return message_id != rtcan.FIRMWARE_MANAGEMENT
         return rtcan.high_byte(message_id) >= rtcan.FIRST_TOPIC and rtcan.id8_of(message_id) == source
@@ -109,7 +109,7 @@ class MessageIdMap:
     def _assign(self, now: int, message_id: int, name: str, source: PeerAddress) -> None:
         """Assign an id to this publisher alone."""
         ids = self._ids[name, source]
-        # With an address of its own a publisher has one id at a time. Those that share an address have one each.
+        # With an address of its own a publisher has one id at a time. Publishers that share an address have one each.
         stale = set() if source in (FIRMWARE, R2P) else ids - {message_id}
         if self.topics.get(message_id, name.encode()) != name.encode():
             stale.add(message_id)

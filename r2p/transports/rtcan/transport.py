@@ -1,7 +1,7 @@
 """The meaning of an `rtcan:` URL: the options of a node, the port to its CAN controller, and the life of its link.
 
-The options are those of every RTCAN transport, the simulated one included: who the node is, and what all nodes of its
-network have to agree on.
+The options are those of every RTCAN transport, the simulated one included: the node's identity, and the parameters that
+all nodes of its network share.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ _LEAVE_TIMEOUT = 0.5  # seconds for the announcement of the end
 class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     """The options of an RTCAN node, as a URL has them. Times in s.
 
-    `id`: 1 to 255, None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
+    `id`: 1 to 255; None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
     and `bitrate` must be the same in the whole network. `profile`: auto, rtcan or firmware-2014. `utc`: how far the
     module's UTC may be off, if it is known: as the master it distributes UTC.
     """
@@ -54,7 +54,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def timing(self) -> Timing:
-        """The slots of the network's cycle. Raises ValueError where no frame fits a slot."""
+        """The slots of the network's cycle. Raises ValueError if no frame fits a slot."""
         return timing(self.slots, self._cycle, self.bitrate)
 
     @property
@@ -67,7 +67,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
         return round(self.cycle * SECOND)
 
     def settings(self, number: int, port: CanPort) -> EngineSettings:
-        """The settings of an engine on this port. `number`: 64 random bits."""
+        """Return the settings of an engine on this port. `number`: 64 random bits."""
         return EngineSettings(
             number=number,
             id8=self.id,
@@ -85,7 +85,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def apply_options(url: str, values: dict[str, Any], defaults: RtcanOptions) -> RtcanOptions:
-    """Apply the options of a URL to the defaults. Raises TransportError where no frame fits a slot."""
+    """Apply the options of a URL to the defaults. Raises TransportError if no frame fits a slot."""
     options = msgspec.structs.replace(defaults, **values)
     try:
         _ = options.timing
@@ -132,12 +132,12 @@ async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanP
 
 
 def from_url(url: Url) -> RtcanTransport:
-    """The transport of `rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`, with the options of `RtcanOptions`."""
+    """Return the transport of `rtcan:CHANNEL` or `rtcan:INTERFACE:CHANNEL`, with the options of `RtcanOptions`."""
     options = apply_options(str(url), url.parsed(OPTIONS), RtcanOptions())
     if options.priority and not options.holds_slots_on_coarse_port:
         raise TransportError(
-            f"{url}: a PC can't be the master with slots of {options.timing.slot // 1000} us, its syncs would come too "
-            "late: leave it to a module (priority=0), or give the whole network longer ones, such as "
+            f"{url}: a PC can't be the master with slots of {options.timing.slot // 1000} us, as its syncs would be "
+            "too late: leave that to another module (priority=0), or give the whole network longer slots, such as "
             "slots=20,cycle=10ms"
         )
     interface, colon, channel = url.address.partition(":")
@@ -152,7 +152,7 @@ def from_url(url: Url) -> RtcanTransport:
 
 
 def _port_maker(interface: str, channel: str, options: RtcanOptions) -> Callable[[], CanPort]:
-    # Imported here: SocketCAN is Linux's, and python-can takes its time to load.
+    # Imported here: SocketCAN is Linux's, and python-can takes long to load.
     if interface == "socketcan":
         from r2p.transports.can.socketcan import SocketCanPort
 
@@ -162,7 +162,7 @@ def _port_maker(interface: str, channel: str, options: RtcanOptions) -> Callable
     return lambda: PythonCanPort(interface, channel, options.bitrate)
 
 
-# Converters of options: each raises ValueError with a text that says what to write instead
+# Converters of options: each raises ValueError, whose text says what to write instead
 
 
 def _int_between(least: int, most: int) -> Callable[[str], int]:
@@ -193,7 +193,7 @@ def _profile(text: str) -> Profile:
     try:
         return Profile(text)
     except ValueError:
-        raise ValueError(f"it is one of {', '.join(each.value for each in Profile)}") from None
+        raise ValueError(f"use one of {', '.join(each.value for each in Profile)}") from None
 
 
 OPTIONS: dict[str, Callable[[str], Any]] = {

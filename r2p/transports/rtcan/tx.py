@@ -1,4 +1,4 @@
-"""The way out over an RTCAN bus: samples by their deadlines, slots, and management as this network wants it.
+"""The way out over an RTCAN bus: samples by their deadlines, slots, and management in this network's form.
 
 NonRealTime  laxity 63: what the others leave of the bus
 Sporadic     soft real-time, least laxity first
@@ -95,12 +95,12 @@ class SlottedTopics:
     """The periodic topics of one link.
 
     A slot is requested as soon as a topic is advertised, subscribed or not: admission must not depend on subscribers.
-    It is used only while there are some. Until the master grants it, and when it is lost, the publisher's own ticker
-    sends, as for every other link, and the link makes soft real-time messages of that.
+    It is used only while there are some. Until the master grants it, and after its loss, the publisher's own ticker
+    sends, as for every other link, and the link sends soft real-time messages.
     """
 
     def __init__(self, link: Link, driver: EngineDriver, has_subscribers: Callable[[str], bool]) -> None:
-        """`has_subscribers` says whether a topic has any on the bus that can be reached."""
+        """`has_subscribers` returns whether a topic has reachable subscribers on the bus."""
         self.by_topic: dict[str, SlottedTopic] = {}
         self._link = link
         self._driver = driver
@@ -111,7 +111,7 @@ class SlottedTopics:
     def update(self, topic: Topic, high: int | None) -> None:
         """Request and release slots after a change of a topic's publishers, or of its high byte, None without one.
 
-        Of the publishers that can use slots the first gets them.
+        The first publisher that can use slots gets them.
         """
         publisher = next(iter(topic.slot_publishers), None)
         known = self.by_topic.get(topic.name)
@@ -126,7 +126,7 @@ class SlottedTopics:
         await self._changed.wait()
 
     def wake_waiters(self) -> None:
-        """Wake the tasks that wait for slots: something about them, or about the bus, has changed."""
+        """Wake the tasks that wait for slots, after a change of slots or bus."""
         self._changed.set()
 
     def close(self) -> None:
@@ -156,13 +156,13 @@ class SlottedTopics:
             each.publisher.link_degraded(self._link.name, f"slots lost: {event.reason}")
 
     def fill(self, due: Due) -> None:
-        """Give the engine the data of a slot, or none where a tick is due and there is no slot."""
+        """Give the engine the data of a slot, or nothing if a tick is due without a slot."""
         each = self._by_high.get(due.high)
         payload = self._payload(each, due) if each is not None and due.slotted else None
         self._driver.carry_out(self._driver.engine.fill(self._driver.now(), due.high, payload))
 
     def completed(self, each: SlottedTopic, done: Done) -> None:
-        """Count what became of the data of a slot."""
+        """Count the outcome of a slot."""
         if done.fate in _SENT:
             each.measure(done.at)
             return
@@ -227,7 +227,7 @@ class ResponseHandle(msgspec.Struct, eq=False):
 
 
 class Transmitter:
-    """Passes to the engine what a link sends, counts what the engine has, and reports what was late or lost."""
+    """Passes a link's messages to the engine, counts them there, and reports late and lost ones."""
 
     def __init__(self, link: Link, driver: EngineDriver, slotted: SlottedTopics) -> None:
         self._name = link.name
@@ -255,7 +255,7 @@ class Transmitter:
         return self._frames < NRT_FRAMES_MAX if sample.publisher_class == _NRT else self._messages < SRT_MESSAGES_MAX
 
     def send(self, subscriber: LinkSubscriber | None, topic: str, high: int, sample: Sample) -> Sequence[Action]:
-        """Send a sample of a topic, which has this high byte, and a `subscriber` if this module has the topic."""
+        """Send a sample of a topic with this high byte, and a `subscriber` if this module has the topic."""
         now, data = self._driver.now(), sample.data
         publisher = subscriber.topic.publisher_of(sample) if subscriber is not None else None
         frames = rtcan.fragment_count(len(data))
@@ -271,7 +271,7 @@ class Transmitter:
         return self._engine.publish(now, high, data, deadline=deadline, drop=sample.drop_late, handle=handle)
 
     def completed(self, handle: SampleHandle, done: Done) -> None:
-        """Count that the engine has sent a sample, or given it up."""
+        """Count a sample that the engine has sent or given up."""
         if handle.deadline == NEVER:
             self._frames -= handle.frames
         else:
@@ -280,7 +280,7 @@ class Transmitter:
             self._report_missed(handle, done)
 
     def send_management(self, data: bytes, *, urgent: bool) -> Sequence[Action]:
-        """Send a management message, marked as r2p's where all modules have one id."""
+        """Send a management message, marked as r2p's if all modules have one id."""
         handle = None  # only of a response its end is of interest
         if management.type_of(data) == ManagementType.SUBSCRIBE_RESPONSE and self._engine.ready:
             handle = self._response = ResponseHandle()
@@ -299,7 +299,7 @@ class Transmitter:
         return True
 
     def response_sent(self, response: ResponseHandle) -> list[str]:
-        """Note that a response is on the bus, or lost. Returns the topics that waited for it."""
+        """Note that a response is on the bus, or lost. Return the topics that waited for it."""
         if response is self._response:
             self._response = None
         topics = [topic for topic, awaited in self._awaited.items() if awaited is response]
@@ -308,7 +308,7 @@ class Transmitter:
         return topics
 
     def remove_topic(self, topic: str) -> None:
-        """Let a topic wait no longer: it has lost its subscribers."""
+        """Stop a topic's wait, as it has lost its subscribers."""
         self._awaited.pop(topic, None)
 
     def _report_missed(self, handle: SampleHandle, done: Done) -> None:
@@ -322,12 +322,12 @@ class Transmitter:
             self._stats.lost[LINK_DOWN] += 1
             return
         self._stats.lost[done.fate.value] += 1
-        # REPLACED by newer data in a slot is no miss: until there were slots, nothing was promised.
+        # REPLACED by newer data in a slot is not a miss: before there were slots, nothing was promised.
         if publisher is not None and done.fate is not Fate.REPLACED:
             publisher.link_missed(self._name, done.fate.value, late)
 
     def _time_left(self, topic: str, sample: Sample, publisher: PublisherHandle | None) -> int:
-        """Ns until the deadline. A latched value that is sent once more gets a new one."""
+        """Return the ns until the deadline. A latched value that is sent again gets a new one."""
         # A sample from another computer has `expires`, its deadline by the clock here.
         left = sample.due - self._driver.clock.now() if sample.deadline else 0
         if left > 0 or (sample.deadline and not (publisher is not None and publisher.latch)):

@@ -2,12 +2,12 @@
 
 In the order to read it:
 
-    transport   opens a session for a module, and explains why it can't; config: what the URL and the user's file say
+    transport   opens a session for a module, and explains why it can't; config: the URL and the user's file
     link        tokens, topics and management messages of one module on one network
     sender      out: the subscribers in other modules, and the credit they grant; publish: in which packets, and when
     subscribe   in: from zenoh's ring to the queues of a topic
-    session     one zenoh session, and the way from its threads into the event loop; threads: which those are
-    diagnose    why there is no connection
+    session     one zenoh session, and the way from its threads into the event loop; threads: those threads
+    diagnose    explains why a connection fails
 
 zenoh itself is imported when a session is opened, not before.
 """

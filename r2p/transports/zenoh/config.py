@@ -1,7 +1,6 @@
 """The options of a `zenoh:` URL, and zenoh's configuration for them.
 
-The configuration is what r2p needs, then what the user's file says, then what the URL says. So a file can change what
-r2p prefers, and the URL has the last word.
+The configuration consists of r2p's needs, then the user's file, then the URL. Later ones take precedence.
 """
 
 import json
@@ -32,7 +31,9 @@ _PORT_MAX = 65_535
 
 
 class ZenohOptions(msgspec.Struct, frozen=True):
-    """A checked URL. What is None is left to the configuration file, or to zenoh; the network to `choose_network`."""
+    """A checked URL. Options that are None are left to the configuration file or to zenoh, the network to
+    `choose_network`.
+    """
 
     name: str
     network: str | None = None
@@ -75,14 +76,13 @@ def parse_options(url: Url) -> ZenohOptions:
 
 
 def default_network() -> str:
-    """Return the name of the network where the URL names none: the host's, without its domain."""
+    """Return the network's name for a URL without one: the host's, without its domain."""
     return re.sub(r"[^A-Za-z0-9_.-]", "", socket.gethostname().partition(".")[0]) or "robot"
 
 
 def choose_network(found: set[str]) -> str:
-    """Return the network that a tool joins if its URL names none: the host's, or else the only one that there is.
-
-    Raises ValueError where there are several others.
+    """Return the network that a tool joins if its URL names none: the host's, or the only one. Raises ValueError for
+    several.
     """
     own = default_network()
     others = sorted(found - {own})
@@ -96,7 +96,7 @@ def choose_network(found: set[str]) -> str:
 
 
 def list_networks(networks: list[str]) -> str:
-    """Return the names for a text: the first ones, where there are many."""
+    """Return the names for a text: only the first ones, if there are many."""
     more = len(networks) - _NAMED_MAX
     return ", ".join(networks[:_NAMED_MAX]) + f" and {more} more" * (more > 0)
 
@@ -156,7 +156,7 @@ _PARSERS: dict[str, Callable[[str], str]] = {
 
 
 LEASE_MS = 1000
-"""Milliseconds without a sign of life after which a peer is gone: one that hangs is noticed within two seconds."""
+"""Milliseconds without a sign of life after which a peer is gone: a hanging one is noticed within two seconds."""
 
 _NEEDED: dict[str, object] = {
     "scouting/delay": 0,  # else opening a session takes half a second
@@ -182,8 +182,8 @@ _LOOPBACK = re.compile(r"(unix|serial|vsock)|[a-z]+/(localhost|127\.[0-9.]+|\[::
 """Endpoints that other computers do not reach over a network."""
 
 _NEEDED_TO_LISTEN: dict[str, object] = {
-    # The session's own admin space says where it listens. Not for clients: zenoh keeps 37 kB for ever of each session
-    # that is closed with one.
+    # The session's own admin space says where it listens. Not for clients: zenoh never frees 37 kB of each closed
+    # session with one.
     "adminspace/enabled": True,
 }
 
@@ -202,7 +202,7 @@ def build_config(options: ZenohOptions) -> "zenoh.Config":
 
 
 def use_any_port(config: "zenoh.Config", options: ZenohOptions) -> bool:
-    """Listen at any port, as the default one is in use. False if the user chose one, or this was tried already."""
+    """Listen at any port, as the default one is in use. Return False if the user chose one, or it was tried already."""
     if not _may_choose(options) or json.loads(config.get_json("listen/endpoints")) != _DEFAULT_LISTEN:
         return False
     for key, value in _ANY_PORT.items():
@@ -211,7 +211,7 @@ def use_any_port(config: "zenoh.Config", options: ZenohOptions) -> bool:
 
 
 def open_endpoints(config: "zenoh.Config") -> list[str]:
-    """Return the endpoints where other computers can connect without saying who they are."""
+    """Return the endpoints where other computers can connect without authentication."""
     if (
         json.loads(config.get_json("mode")) == "client"
         or json.loads(config.get_json("transport/auth/usrpwd"))["dictionary_file"]
@@ -226,7 +226,7 @@ def open_endpoints(config: "zenoh.Config") -> list[str]:
 
 
 def connection_settings(config: "zenoh.Config") -> ConnectionSettings:
-    """Return what the session connects to, and with what; and where it listens."""
+    """Return the endpoints that the session connects to and listens at, and its credentials."""
     tls = json.loads(config.get_json("transport/link/tls"))
     user = json.loads(config.get_json("transport/auth/usrpwd"))
     names = Tls(

@@ -15,7 +15,7 @@ _ALERT_TIMEOUT_S = 0.5  # seconds for a server to refuse a client's certificate:
 _HANDSHAKE_TIMEOUT_S = 1.0  # seconds for a server that speaks TLS to answer in it
 
 NOT_ADMITTED = "accepts the connection, but not this module"
-"""Part of a text that is also right for a moment when a router comes back, until zenoh tries again."""
+"""Part of a text that is also true for a moment after a router's return, until zenoh tries again."""
 
 _STREAMS = {"tcp", "tls", "ws"}
 _DATAGRAMS = {"udp", "quic"}
@@ -24,7 +24,7 @@ _NO_TLS = "it does not speak TLS: connect to tcp/ instead of tls/, or correct th
 
 
 class Tls(msgspec.Struct, frozen=True):
-    """The files that zenoh's configuration names."""
+    """The files of zenoh's configuration."""
 
     root: str | None = None
     certificate: str | None = None
@@ -51,7 +51,7 @@ class _ParsedEndpoint(msgspec.Struct, frozen=True):
     interface: str
 
     def interface_error(self) -> str:
-        """Return what is wrong with the interface; empty: nothing."""
+        """Return what is wrong with the interface, or an empty string."""
         there = [name for _, name in socket.if_nameindex()]
         if not self.interface or self.interface in there:
             return ""
@@ -59,10 +59,7 @@ class _ParsedEndpoint(msgspec.Struct, frozen=True):
 
 
 def diagnose_listening(settings: ConnectionSettings) -> str:
-    """Return what keeps a session from listening, and what to do; empty: nothing that can be tried here.
-
-    Blocks as long as it takes to look names up.
-    """
+    """Return what keeps a session from listening, and a remedy, or an empty string. Blocks to look names up."""
     return next(filter(None, map(_diagnose_listener, settings.listens)), "")
 
 
@@ -153,7 +150,7 @@ async def _connection(host: str, port: int) -> AsyncIterator[tuple[asyncio.Strea
 
 
 async def _start_tls(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str, tls: Tls) -> None:
-    """Start TLS as zenoh does; raises what zenoh does not say."""
+    """Start TLS as zenoh does; raise the error that zenoh does not report."""
     context = _context(tls)
     try:
         async with asyncio.timeout(_HANDSHAKE_TIMEOUT_S):

@@ -1,11 +1,11 @@
-"""A module's link to a zenoh network: its tokens, its topics, and whether the network can be reached.
+"""A module's link to a zenoh network: its tokens, its topics, and its state.
 
 Keys, all under `r2p/NETWORK/`:
 
-    live/...                what each module has, as liveliness tokens (r2p.codecs.liveliness)
+    live/...                topics and nodes of each module, as liveliness tokens (r2p.codecs.liveliness)
     topic/TOPIC             messages: one or several, packed; the rest is in the attachment (r2p.codecs.attachment)
-    credit/SESSION          to a publisher's module: how far a subscriber has come
-    control                 management messages, from a module to all; the attachment says who sends them
+    credit/SESSION          a subscriber's progress, to the publisher's module
+    control                 management messages, from a module to all; the attachment names the sender
     schema/SESSION/TYPE     asks a module for the fields of a type, by fingerprint
 """
 
@@ -51,7 +51,7 @@ class ZenohLink(Link):
     passes_probes: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool) -> None:
-        """`connects`: it is up while it is connected; else it takes connections, and is up even alone.
+        """`connects`: up while it is connected; otherwise it accepts connections, and is up even alone.
 
         `batching`: several messages may share a payload.
         """
@@ -92,7 +92,7 @@ class ZenohLink(Link):
         session.answer_queries(f"{prefix}/schema/{self.instance:x}/*", self._schema, queue)
 
     def _queue(self, handle: Callable[[Any], None], most: int = _EVENTS_MAX) -> LoopQueue:
-        """Make a way from zenoh's threads into the loop."""
+        """Make a queue from zenoh's threads into the loop."""
         queue = LoopQueue(self._space.loop, handle, self.stats.lost, most=most)
         self._queues.append(queue)
         return queue
@@ -198,14 +198,14 @@ class ZenohLink(Link):
         return None
 
     def _schema(self, key: str) -> bytes | None:
-        """Return what this module knows of the type that a query asks for."""
+        """Return the fields of the type in a query, if this module knows them."""
         wanted = key.rpartition("/")[2]
         for topic in self._space.topics.values():
             if topic.layout is not None and topic.layout.fingerprint.hex() == wanted:
                 return schemas.encode(topic.layout.cls.__name__, topic.layout.schema)
         return None
 
-    # What comes in; in the loop
+    # Received; in the loop
 
     def _on_transport(self, change: tuple[str, bool]) -> None:
         other, opened = change
@@ -233,14 +233,14 @@ class ZenohLink(Link):
         self._apply(self._liveliness.refused(self._clock.monotonic()))
 
     def _query_tokens(self) -> None:
-        """Query all tokens: zenoh reports each only once, and some were refused."""
+        """Query all tokens, as zenoh reports each only once, and some were refused."""
         if self._session is not None:
             self._tokens.begin_query()
             prefix = f"{self._prefix}/{liveliness.KEY_PREFIX}"
             self._session.query_tokens(prefix, _TOKENS_TIMEOUT_S, self._token_answers)
 
     def _on_token_answer(self, answer: str | bool) -> None:
-        """Handle a token, or at last whether these were all."""
+        """Handle a token, or finally whether these were all."""
         if self._closed:
             return
         if isinstance(answer, str):
@@ -274,14 +274,13 @@ class ZenohLink(Link):
 # Tokens of other modules
 
 _SETTLE_S = 0.02
-"""Seconds after which a token that went is believed to be gone: when a connection is lost, tokens go just before it."""
+"""Seconds until the end of a token is believed: when a connection is lost, tokens end just before it."""
 
 
 class TokenDebouncer:
-    """Decides when a token that zenoh reports is believed to be there, or to be gone: not while the link is down.
+    """Decides when to believe that a token has appeared or ended: not while the link is down.
 
-    `settled(key, there)` gets what is to be believed; `refused` is called for each token that has no room before the
-    link is up.
+    `settled(key, there)` gets the verdict; `refused` is called for each token without room before the link is up.
     """
 
     def __init__(
@@ -297,7 +296,7 @@ class TokenDebouncer:
         """Tokens that ended since a query began: answers about them may be older than that. None without a query."""
 
     def on_change(self, key: str, there: bool) -> None:
-        """Note that a token came or went."""
+        """Note that a token appeared or ended."""
         if not self._up:
             self._changed_early(key, there)
         elif there:
@@ -311,28 +310,28 @@ class TokenDebouncer:
             self._note_end(key)
 
     def begin_query(self) -> None:
-        """Note that all tokens are queried: what goes from now on is newer than the answers."""
+        """Note that all tokens are queried: ends from now on are newer than the answers."""
         self._went = set(self._going)
 
     def on_answer(self, key: str) -> None:
-        """Believe a token that is among the answers, unless it went meanwhile."""
+        """Believe a token among the answers, unless it ended meanwhile."""
         if self._went is not None and key not in self._went:
             self._settled(key, True)
 
     def end_query(self) -> bool:
-        """Return whether the answers could be used: all have come."""
+        """Return whether the answers are complete and could be used."""
         usable, self._went = self._went is not None, None
         return usable
 
     def on_up(self) -> None:
-        """Believe what came before the link was up."""
+        """Believe tokens from before the link was up."""
         self._up = True
         early, self._early = self._early, {}
         for key in early:
             self._settled(key, True)
 
     def on_down(self) -> None:
-        """Believe nothing that goes now: with the link down, or closed, tokens do not go by themselves."""
+        """Ignore ends of tokens: with the link down or closed, they say nothing about their modules."""
         self._up = False
         self._went = None
         for timer in self._going.values():

@@ -1,9 +1,8 @@
-"""Messages on their way to zenoh: in which packets they go out, when, and with which publisher of zenoh.
+"""Messages on their way to zenoh: grouped into packets, and sent by one of zenoh's publishers.
 
-What a publisher sends without a pause goes out in few packets. Each is a payload of messages one after the other, with
-one header for all (r2p.codecs.attachment): giving each message to zenoh for itself would take both ends longer than all
-the rest of what they do. So the first message goes out at once, and those that follow in the same turn of the event
-loop go together when it ends.
+Messages without a pause in between go out in few packets. Each is a payload of messages one after the other, with one
+header for all (r2p.codecs.attachment): handing each message to zenoh separately would take both ends longer than
+everything else. So the first message goes out at once, and later ones of the same turn go together at its end.
 """
 
 import asyncio
@@ -32,7 +31,7 @@ BATCH_MAX = PACKET_MAX
 _BATCH_BYTES_MAX = 16 * 1024  # bytes of a packet of several messages
 
 FLOOD = 8
-"""Messages in one turn that make a flood; what comes more slowly goes out when its turn is over."""
+"""Messages in one turn that make a flood; slower ones go out at the end of their turn."""
 
 FLOOD_TURNS = 12
 """Turns of the loop in which messages of a flood wait for more of them, at most."""
@@ -60,15 +59,16 @@ class TxStream:
         self._put: Put = put_nowhere
 
     def prepare(self, source: Source, origin: Origin, put: Put) -> None:
-        """Switch to another publisher, once nothing of the one before waits."""
+        """Switch to another publisher, after sending the previous one's messages."""
         self.source = source
         self._packer = Packer(origin)
         self._put = put
 
     def send(self, stats: LinkStats, *, batching: bool) -> None:
-        """Send what waits; zenoh drops it where the network is too slow.
+        """Send waiting messages; zenoh drops them if the network is too slow.
 
-        What is not sent is counted here. Subscribers must not count it as well, so what follows gets its serials.
+        Messages that are not sent are counted here. Subscribers must not count them as well, so later ones get their
+        serials.
         """
         all_samples, self.samples = self.samples, []
         serial = self.window.serial - len(all_samples) + 1  # each was given one when it was offered
@@ -133,7 +133,7 @@ class Batcher:
         self._streams: dict[TxStream, None] = {}
 
     def add(self, stream: TxStream) -> None:
-        """Send soon: a message waits in a stream that was empty, or that is full now."""
+        """Send soon: the stream is not empty any more, or full now."""
         if not self._turn_begun:  # so a message that comes alone is not held up
             self._turn_begun = True
             self._loop.call_soon(self._end_turn)
@@ -143,19 +143,19 @@ class Batcher:
         stream.send(self._stats, batching=self._batching)
 
     def send(self, stream: TxStream) -> None:
-        """Send what waits in this stream."""
+        """Send the waiting messages of this stream."""
         if self._streams.pop(stream, stream) is None:
             stream.send(self._stats, batching=self._batching)
 
     def flush(self) -> None:
-        """Send what waits in all streams."""
+        """Send the waiting messages of all streams."""
         streams, self._streams = self._streams, {}
         self._turns = self._count = 0
         for stream in streams:
             stream.send(self._stats, batching=self._batching)
 
     def discard(self) -> int:
-        """Drop what waits, and return how much that was. It is counted here, so what follows gets its serials."""
+        """Drop waiting messages, and return their number. They are counted here, so later ones get their serials."""
         streams, self._streams = self._streams, {}
         count = sum(len(stream.samples) for stream in streams)
         for stream in streams:
@@ -164,7 +164,7 @@ class Batcher:
         return count
 
     def _end_turn(self) -> None:
-        """Send what waits, unless it is a flood: more and more, which makes fewer and fuller packets a turn later."""
+        """Send waiting messages, unless they are a growing flood: a turn later makes fewer and fuller packets."""
         count = sum([len(stream.samples) for stream in self._streams])
         self._turn_begun = count > 0
         if self._turn_begun:
@@ -177,7 +177,7 @@ class Batcher:
 
 
 class PublisherCache:
-    """The publishers of zenoh that one link sends with, and the windows of what it sent; they outlast subscribers.
+    """The zenoh publishers of one link, and the windows of their messages; they outlast subscribers.
 
     There is one publisher for each topic and class, declared as soon as the topic is published: so zenoh looks for a
     route before the first subscriber is there.
@@ -197,11 +197,11 @@ class PublisherCache:
         self._prefix = prefix
 
     def close(self) -> None:
-        """Stop sending; what is declared goes with the session."""
+        """Stop sending; declarations end with the session."""
         self._session = None
 
     def declare(self, topic: Topic) -> None:
-        """Declare the publishers of a topic that is published now."""
+        """Declare the publishers of a newly published topic."""
         classes = {publisher.publisher_class for publisher in topic.publishers}
         for publisher_class in classes or {PublisherClass.NON_REAL_TIME}:  # none in this module: a gateway passes it on
             self._publisher(topic.name, publisher_class)
@@ -233,7 +233,7 @@ class PublisherCache:
         self._answers[topic] = bool(reached)
 
     def put(self, topic: str, publisher_class: PublisherClass) -> Put:
-        """Return what sends packets of the topic. It raises BlockingIOError if too many wait already."""
+        """Return the function that sends packets of the topic. It raises BlockingIOError if too many wait already."""
         publisher = self._publisher(topic, publisher_class)
         if publisher is None or self._session is None:
             return put_nowhere
@@ -260,6 +260,6 @@ class PublisherCache:
 
 
 def _reaches(publisher: zenoh.Publisher) -> bool:
-    # The stubs of zenoh promise a bool; what comes is an object with one, and is itself always true.
+    # The stubs of zenoh promise a bool; the result is an object with one, and is itself always true.
     status: object = publisher.matching_status
     return bool(getattr(status, "matching", status))

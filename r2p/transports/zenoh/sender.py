@@ -2,7 +2,7 @@
 
     SubscriberJoined -> Reachability (do messages arrive there?) -> ZenohSubscriber -> TxStream
     credit           -> CreditReader -> ZenohSubscriber, whose waiting publishers go on
-    SubscriberLeft   -> FinalCredits: is anything unknown that the subscriber was sent?
+    SubscriberLeft   -> FinalCredits: did the subscriber get all its messages?
 
 A topic goes out no further than its subscribers have room (r2p.protocols.flow_control).
 """
@@ -38,13 +38,13 @@ _CHECK_S = 0.25  # seconds between two checks whether what was sent is acknowled
 _RESENDS = 6  # checks at which latched values are sent once more, before the user has to know
 
 FINAL_CREDIT_S = 1.0
-"""Seconds after the end of a token in which a final credit may come: far more than threads and networks take."""
+"""Seconds after the end of a token in which a final credit may arrive: far more than threads and networks take."""
 
 
 class ZenohSubscriber(LinkSubscriber):
     """One topic on its way out, to all its subscribers on the network.
 
-    Subscribers without room are waited for as the class of the publisher says.
+    The publisher's class decides how to wait for subscribers without room.
     """
 
     __slots__ = ("_batcher", "_sender", "_streams", "resending", "silent_checks")
@@ -82,7 +82,7 @@ class ZenohSubscriber(LinkSubscriber):
         return True
 
     def _has_credit(self, stream: TxStream) -> bool:
-        """Return whether the subscribers have room, as far as their credit says; it is read now, if need be."""
+        """Return whether the subscribers have room, by their credit, which is read now if need be."""
         window = stream.window
         if window.serial < window.limit:
             return True
@@ -116,7 +116,7 @@ class ZenohSubscriber(LinkSubscriber):
         return session in self._streams[_NRT].window.subscribers
 
     def add_session(self, session: int, window: int) -> None:
-        """Add a session that subscribes, or give it another window."""
+        """Add a subscribing session, or change its window."""
         # Events and periodic messages never wait; their windows only count what was acknowledged.
         for publisher_class, stream in self._streams.items():
             stream.window.add(session, window if publisher_class == _NRT else 0)
@@ -131,7 +131,7 @@ class ZenohSubscriber(LinkSubscriber):
         return unacknowledged
 
     def acknowledge(self, credit: Credit) -> None:
-        """Note how far a session has come; a publisher that waits for that goes on with `refill`."""
+        """Note a session's progress; a waiting publisher goes on with `refill`."""
         self._streams[credit.publisher_class].window.acknowledge(credit.session, credit.serial)
         self.set_leaving(credit.session, leaving=credit.leaving)
 
@@ -141,7 +141,7 @@ class ZenohSubscriber(LinkSubscriber):
             stream.window.set_leaving(session, leaving=leaving)
 
     def resend_latched(self) -> None:
-        """Send what is latched, whether or not there is room."""
+        """Send latched values, even without room."""
         self.resending = True
         try:
             self.topic.resend_latched(self)
@@ -156,7 +156,7 @@ class ZenohSubscriber(LinkSubscriber):
         )
 
     def unacknowledged(self) -> set[int]:
-        """Return the sessions that were sent something, and have acknowledged nothing in any class."""
+        """Return the sessions that got messages, and have acknowledged none in any class."""
         windows = [stream.window for stream in self._streams.values()]
         answered = {number for window in windows for number, each in window.subscribers.items() if each.answered}
         return {number for window in windows for number in window.unacknowledged()} - answered
@@ -169,7 +169,7 @@ class ZenohSubscriber(LinkSubscriber):
 
 
 class ZenohSender:
-    """All topics that go out by one link."""
+    """All topics that a link sends."""
 
     def __init__(self, link: Link, hub: Hub, subscribers: dict[str, LinkSubscriber], *, batching: bool) -> None:
         """`subscribers` are those of the link, by topic; `batching`: several messages may share a payload."""
@@ -199,17 +199,17 @@ class ZenohSender:
         self.publishers.close()
 
     def subscribers(self) -> Iterator[ZenohSubscriber]:
-        """Return what the link sends to: one for each topic that other modules subscribe to."""
+        """The link's subscribers: one for each topic that other modules subscribe to."""
         return (each for each in self._subscribers.values() if isinstance(each, ZenohSubscriber))
 
     def subscriber(self, topic: str) -> ZenohSubscriber | None:
         subscriber = self._subscribers.get(topic)
         return subscriber if isinstance(subscriber, ZenohSubscriber) else None
 
-    # Subscribers that come and go
+    # Subscribers that join and leave
 
     def add_subscriber(self, topic: str, session: int, window: int) -> None:
-        """Add a subscriber whose token appeared, or give it another window."""
+        """Add a subscriber whose token appeared, or change its window."""
         subscriber = self.subscriber(topic)
         current = subscriber is not None and subscriber.topic is self.topics.get(topic)
         if subscriber is not None and current and subscriber.has_session(session):  # messages reach it already
@@ -218,7 +218,7 @@ class ZenohSender:
             self.reachability.add(topic, session, window)
 
     def admit(self, topic: str, session: int, window: int, *, leaving: bool = False) -> None:
-        """Send to a subscriber that messages reach: what is latched, and all that is published from now on."""
+        """Send latched values and all messages from now on to a subscriber, which they reach."""
         here = self.topics[topic]
         subscriber = self.subscriber(topic)
         if subscriber is not None and subscriber.topic is here:
@@ -233,7 +233,7 @@ class ZenohSender:
             subscriber.set_leaving(session, leaving=True)
 
     def remove_subscriber(self, topic: str, session: int, *, gone: bool) -> None:
-        """Stop sending to a subscriber. `gone`: its token is, too; else it goes on to accept what is on the way."""
+        """Stop sending to a subscriber. `gone`: its token, too; otherwise it still accepts messages on the way."""
         self.reachability.remove(topic, session)
         subscriber = self.subscriber(topic)
         unacknowledged = 0 if subscriber is None else subscriber.remove_session(session)
@@ -243,7 +243,7 @@ class ZenohSender:
             self.count_unknown(unacknowledged)
 
     def count_unknown(self, count: int) -> None:
-        """Count messages of which it stays unknown whether a subscriber got them."""
+        """Count messages that a subscriber may not have got."""
         self.link.stats.lost["unknown at disconnect"] += count
 
     def report_unreachable(self, topic: str, session: int) -> None:
@@ -258,7 +258,7 @@ class ZenohSender:
     # Publishers
 
     def origin(self, topic: Topic, sample: Sample) -> Origin:
-        """Return what the headers say of the publisher of a message."""
+        """Return the publisher of a message as in headers."""
         own, source, hooks = self._hub.instance, sample.source, self.link.gateway_hooks
         return Origin(
             sample.publisher_class,
@@ -270,18 +270,18 @@ class ZenohSender:
         )
 
     def _instance_of(self, module: str) -> int:
-        """Return the number of a module on any link; 0: firmware, or not known."""
+        """Return the number of a module on any link; 0: firmware, or unknown."""
         links = (each for each in self._hub.space.links if isinstance(each, Link))
         found = (each.discovery.modules.get(module) for each in links)
         return next((info.instance for info in found if info is not None and info.instance is not None), 0)
 
 
 class CreditReader:
-    """Reads what subscribers grant, when a publisher has come to the end of its credit.
+    """Reads the credit of subscribers when a publisher has used up its own.
 
-    Under load the thread of the event loop seldom lets another one run, and credit that had to come through another
-    thread would come when the publisher has stopped for it. So it stays in zenoh's ring until a publisher has no room,
-    or for _CREDIT_PAUSE_S.
+    Under load the thread of the event loop seldom lets another one run, and credit through another thread would arrive
+    after the publisher has stopped for it. So it stays in zenoh's ring until a publisher has no room, or for
+    _CREDIT_PAUSE_S.
     """
 
     def __init__(self, sender: ZenohSender) -> None:
@@ -298,7 +298,7 @@ class CreditReader:
         self._waits = True
 
     def receive(self) -> None:
-        """Read what has come; publishers that wait for it go on when the present work is done."""
+        """Read the credit; waiting publishers go on after the present work."""
         if self._reader is not None:
             first = self._reader.receive()
             if first is not None:
@@ -306,7 +306,7 @@ class CreditReader:
                 self._loop.call_soon(self._serve)
 
     def wait(self) -> None:
-        """Have the next credit read as soon as it comes: a publisher waits."""
+        """Read the next credit as soon as it arrives: a publisher waits."""
         if self._reader is not None and not self._waits:
             self._waits = True
             self._reader.wait()
@@ -344,14 +344,14 @@ class CreditReader:
                 self._sender.reachability.set_leaving(credit.topic, credit.session)
 
     def _serve(self) -> None:
-        """Let publishers that wait go on."""
+        """Let waiting publishers go on."""
         if self._reader is None:
             return
         subscribers = list(self._sender.subscribers())
         for subscriber in subscribers:
             if subscriber.get_wait_queue():
                 self._lost.guard(subscriber.refill)
-        # Only a publisher that waits has a thread woken for the next credit; else that is read after a pause.
+        # Only for a waiting publisher, a thread is woken for the next credit; otherwise it is read after a pause.
         if any(subscriber.awaits_credit for subscriber in subscribers):
             self.wait()
         elif not self._waits and self._pause is None:
@@ -363,7 +363,7 @@ class CreditReader:
 
 
 class _PendingSubscriber(msgspec.Struct, eq=False):
-    """A subscriber whose token is there, while messages are not known to reach it."""
+    """A subscriber with a token, as long as messages may not reach it."""
 
     window: int
     retries: int = 0
@@ -373,8 +373,8 @@ class _PendingSubscriber(msgspec.Struct, eq=False):
 class Reachability:
     """Check that messages reach the subscribers: before sending to them, and after.
 
-    Tokens and routes for messages spread through the network at different times, and a router's access control may let
-    pass the one and not the other.
+    Tokens and routes for messages spread through the network at different times, and a router's access control may pass
+    only one of them.
     """
 
     def __init__(self, sender: ZenohSender) -> None:
@@ -445,7 +445,7 @@ class Reachability:
 
 
 class _DepartedSubscriber(msgspec.Struct, eq=False):
-    """A subscriber whose token is gone; what it did not acknowledge is counted when the timer ends."""
+    """A subscriber whose token is gone; its unacknowledged messages are counted when the timer ends."""
 
     unacknowledged: int
     timer: asyncio.TimerHandle
@@ -454,7 +454,7 @@ class _DepartedSubscriber(msgspec.Struct, eq=False):
 class FinalCredits:
     """Waits for the final credit of subscribers whose token is gone.
 
-    A subscriber that sends one has left in order. What another one did not acknowledge counts as unknown.
+    A subscriber that sends one has left in order. Unacknowledged messages of any other one count as unknown.
     """
 
     def __init__(self, sender: ZenohSender) -> None:
@@ -472,13 +472,13 @@ class FinalCredits:
         self._departed[key] = _DepartedSubscriber(unacknowledged, timer)
 
     def receive(self, topic: str, session: int) -> None:
-        """Count nothing of a subscriber whose final credit came: it did not want what it did not acknowledge."""
+        """Count nothing of a subscriber whose final credit arrived: it did not want the unacknowledged messages."""
         departed = self._departed.pop((topic, session), None)
         if departed is not None:
             departed.timer.cancel()
 
     def close(self) -> None:
-        """Count what is open, as no further credit comes."""
+        """Count open messages, as no further credit arrives."""
         self._sender.credits.receive()
         departed, self._departed = self._departed, {}
         for each in departed.values():

@@ -1,8 +1,8 @@
 """One zenoh session, and the way from zenoh's threads into the event loop.
 
-A thread waits at zenoh's channel of each subscriber, and only hands what came to the loop: no code of the user, and
-none of the protocols, runs outside of the loop. What blocks (opening, closing) runs in a thread, so the loop never
-waits for a network.
+A thread waits at zenoh's channel of each subscriber, and only hands samples to the loop: neither user code nor a
+protocol runs outside of the loop. Blocking calls (opening, closing) run in a thread, so the loop never waits for a
+network.
 """
 
 import asyncio
@@ -33,8 +33,8 @@ _CONTROL_BYTES_MAX = 4096
 """Bytes of a management message or its attachment; r2p sends far shorter ones, and longer ones are not copied."""
 
 _CHANNEL_MAX = 65_536
-"""Items that wait in zenoh until their thread runs: more than there can be. zenoh may put in all of them during the
-very call that asks for them, while it holds its locks, and would wait there for ever if they did not fit.
+"""Items that wait in zenoh until their thread runs: more than there can be. zenoh may add all of them during the call
+that requests them, while it holds its locks, and would wait there for ever if they did not fit.
 """
 
 _PRIORITIES: dict[PublisherClass, zenoh.Priority] = {
@@ -61,7 +61,7 @@ class LoopQueue:
         self._items: deque[Any] = deque()
         self._scheduled = False
         self.overflowed = 0
-        """Items that did not fit, as `most` were in it."""
+        """Items that did not fit, as there were `most` already."""
 
     def put(self, item: Any) -> None:
         """Append an item; in any thread."""
@@ -75,12 +75,12 @@ class LoopQueue:
                 self._loop.call_soon_threadsafe(self._drain)
 
     def count_error(self, error: Exception) -> None:
-        """Count an error that kept an item from being put in; in any thread."""
+        """Count an error that kept an item out; in any thread."""
         with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._lost.internal_error, error)
 
     def _drain(self) -> None:
-        # Cleared before the items are read: one that comes from now on schedules the next call.
+        # Cleared before the items are read: a later one schedules the next call.
         self._scheduled = False
         items = self._items
         self._lost.drain(items, self._handle, MESSAGES_PER_TURN)
@@ -115,15 +115,15 @@ class SubscriptionReader:
         threads.start_thread(self._run, "reader")
 
     def receive(self) -> zenoh.Sample | None:
-        """Return the next sample that waits, or None."""
+        """Return the next waiting sample, or None."""
         if self._passed:
             self._received += 1
             return self._passed.popleft()
-        # Only while the thread is paused: else it may have the next sample in its hands, and the order would change.
+        # Only while the thread is paused: otherwise it may hold the next sample, and the order would change.
         return self._try_receive() if self._thread_paused else None
 
     def wait(self) -> None:
-        """Call `on_sample` with the next sample; soon with one that was passed meanwhile."""
+        """Call `on_sample` with the next sample; soon with one passed meanwhile."""
         self._waits = True
         if self._passed:
             self._loop.call_soon(self._hand_out)
@@ -139,7 +139,7 @@ class SubscriptionReader:
             self._resume_thread.release()
 
     def _run(self) -> None:
-        """In the thread: pass samples, and pause while the loop has not received the one before the last."""
+        """Pass samples, in the thread; pause while the loop has not received the last but one."""
         receive = self._subscriber.handler.recv
         count = 0
         with contextlib.suppress(zenoh.ZError, RuntimeError):  # it is undeclared; the loop is closed
@@ -152,7 +152,7 @@ class SubscriptionReader:
                     self._resume_thread.acquire()
 
     def _pass(self, sample: zenoh.Sample, pauses: bool) -> None:
-        """In the loop, for each sample of the thread; behind the last one the thread may pause."""
+        """Handle each sample of the thread, in the loop; after the last one the thread may pause."""
         self._thread_paused = pauses
         if self._waits and not self._passed:
             self._waits = False
@@ -162,7 +162,7 @@ class SubscriptionReader:
             self._passed.append(sample)
 
     def _hand_out(self) -> None:
-        """Call `on_sample` with what was passed before `wait`: it comes before all that is passed after it."""
+        """Call `on_sample` with a sample passed before `wait`, ahead of all later ones."""
         if not self._waits or self._closed:
             return
         if self._passed:
@@ -174,9 +174,8 @@ class SubscriptionReader:
 
 
 async def open_session(config: zenoh.Config, on_error: Callable[[Exception], object]) -> "ZenohSession":
-    """Open a session; `on_error` gets what its calls raise in a thread.
-
-    Raises Unreachable where that may work later, TransportError where it can't.
+    """Open a session; `on_error` gets exceptions of its calls in a thread. Raises Unreachable if it may work later,
+    TransportError if it can't.
     """
     try:
         return ZenohSession(await _in_thread(lambda: zenoh.open(config), zenoh.Session.close), on_error)
@@ -199,7 +198,7 @@ class ZenohSession:
         self._token_count = 0
 
     def watch_transports(self, queue: LoopQueue) -> None:
-        """Report each transport to another session, those that are open included: (its id, whether it opened)."""
+        """Report each transport to another session, open ones included: (its id, whether it opened)."""
 
         def changed(event: zenoh.TransportEvent) -> None:
             queue.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
@@ -208,7 +207,7 @@ class ZenohSession:
         self._forward(self._session.info.declare_transport_events_listener(events, history=True), changed, queue)
 
     def watch_tokens(self, prefix: str, queue: LoopQueue) -> None:
-        """Report each token under a prefix, those that are there included: (rest of its key, whether it is there)."""
+        """Report each token under a prefix, present ones included: (rest of its key, whether it exists)."""
         start = len(prefix) + 1
 
         def changed(sample: zenoh.Sample) -> None:
@@ -222,9 +221,8 @@ class ZenohSession:
         self._forward(declared, changed, queue)
 
     def query_tokens(self, prefix: str, timeout: float, queue: LoopQueue) -> None:
-        """Query the tokens under a prefix that is watched: the rest of each key, and at last whether these are all.
-
-        A thread of its own waits for them, not that of `outbound`: it may take seconds where there are many.
+        """Query the tokens under a watched prefix: the rest of each key, and finally whether these are all. A thread of
+        its own waits for them, not that of `outbound`: many tokens take seconds.
         """
         start = len(prefix) + 1
 
@@ -254,10 +252,9 @@ class ZenohSession:
         threads.start_thread(run, "token query")
 
     def listen(self, key: str, queue: LoopQueue) -> None:
-        """Report each message of a key: (its attachment, payload), either of them empty if it is too long for r2p.
-
-        The key has no wildcard: zenoh's router keeps 3 kB for ever of each closed session that subscribed with a
-        wildcard, if another session has subscribed by the same key expression.
+        """Report each message of a key: (its attachment, payload), either of them empty if too long for r2p. The key
+        has no wildcard: zenoh's router never frees 3 kB of each closed session that subscribed with a wildcard, if
+        another session has subscribed by the same key expression.
         """
 
         def arrived(sample: zenoh.Sample) -> None:
@@ -285,7 +282,7 @@ class ZenohSession:
         self._forward(self._session.declare_queryable(key, queries), queue.put, queue)
 
     def _forward(self, declared: Any, put: Callable[[Any], object], queue: LoopQueue) -> None:
-        """Call `put` in a thread with each item that comes."""
+        """Call `put` in a thread with each item."""
 
         def listen() -> None:
             receive = declared.handler.recv
@@ -303,9 +300,8 @@ class ZenohSession:
         threads.start_thread(listen, "listener")
 
     def subscribe(self, key: str, most: int, on_sample: Callable[[zenoh.Sample], None]) -> SubscriptionReader:
-        """Call `on_sample` in the loop with the first sample that comes; those behind it are received from the reader.
-
-        Of more than `most` that wait, the oldest are lost.
+        """Call `on_sample` in the loop with the first sample; later ones are received from the reader. Of more than
+        `most` waiting ones, the oldest are lost.
         """
         handler: RingChannel[zenoh.Sample] = RingChannel(most)
         subscriber = self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE)
@@ -332,8 +328,8 @@ class ZenohSession:
     def put(
         self, key: str, data: bytes, *, attachment: bytes | None = None, urgent: bool = False, final: bool = False
     ) -> None:
-        """Send something of the protocol's own. `final`: nothing makes up for it if it is lost, so where zenoh has no
-        room for it a thread waits, and what is sent afterwards waits behind it.
+        """Send a message of the protocol. `final`: its loss can't be made up for, so if zenoh has no room, a thread
+        waits, and later messages wait behind it.
         """
         call = self.outbound.submit if final else self.outbound.call
         call(
@@ -375,7 +371,7 @@ class ZenohSession:
         return await _in_thread(query)
 
     async def find_networks(self, *, tools: bool) -> set[str]:
-        """Return the names of the r2p networks with modules; or else with a publisher; or else with `tools`."""
+        """Return the names of r2p networks with modules; failing that, with a publisher; failing that, with `tools`."""
 
         def tokens(kind: str) -> list[tuple[str, str]]:
             replies: FifoChannel[zenoh.Reply] = FifoChannel(_CHANNEL_MAX)
@@ -393,7 +389,7 @@ class ZenohSession:
         return await _in_thread(find)
 
     async def listening_endpoints(self) -> list[str]:
-        """Return the endpoints where the session takes connections, as its admin space has them."""
+        """Return the endpoints where the session accepts connections, from its admin space."""
 
         def find() -> list[str]:
             answers = self._session.get(f"@/{self._session.zid()}/*", timeout=1.0)
@@ -403,7 +399,7 @@ class ZenohSession:
         return await _in_thread(find)
 
     async def close(self) -> None:
-        """Close the session; what was put before is sent."""
+        """Close the session; earlier messages are sent."""
         publishers, self._publishers = self._publishers, set()
         await _in_thread(functools.partial(self._close, publishers))
 
@@ -416,9 +412,8 @@ class ZenohSession:
 
 
 async def _in_thread(function: Callable[[], T], abandoned: Callable[[T], None] | None = None) -> T:
-    """Call `function` in a thread; return what it returns, or raise what it raises.
-
-    When this is cancelled the thread goes on, and what it returns then goes to `abandoned`.
+    """Call `function` in a thread; return its result, or raise its exception. If this is cancelled, the thread goes on,
+    and its result goes to `abandoned`.
     """
     done: concurrent.futures.Future[T] = concurrent.futures.Future()
     done.set_running_or_notify_cancel()  # so that cancelling this leaves it alone

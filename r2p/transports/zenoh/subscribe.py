@@ -1,11 +1,11 @@
-"""Messages that come in from zenoh, on their way to the queues of their topics.
+"""Messages from zenoh on their way to the queues of their topics.
 
     zenoh's ring -> SubscriptionReader -> RxStream (packets) -> Topic.deliver (messages) -> credit
 
 Each topic has a stream, and its own bounded ring inside zenoh, so that no topic delays another. A non real-time message
-waits for as long as the topic's subscribers have no room, and what follows waits behind it. Whether its publisher waits
-too, or goes on without these subscribers, is decided by its class, at its side (r2p.protocols.flow_control). Events and
-periodic messages wait a few turns of the event loop, then they replace older messages.
+waits as long as the topic's subscribers have no room, and later ones wait behind it. The publisher's class decides
+whether the publisher waits too, or goes on without these subscribers (r2p.protocols.flow_control). Events and periodic
+messages wait a few turns of the event loop, then they replace older messages.
 """
 
 import itertools
@@ -31,7 +31,7 @@ RING = 4096
 """Packets of one topic that zenoh keeps; of more, it loses the oldest."""
 
 WINDOW = 2048
-"""Messages of one publisher that may be on the way to one subscriber's module, at most."""
+"""Messages of one publisher on the way to one subscriber's module, at most."""
 
 _WINDOW_BYTES = 192 * 1024  # bytes of those: five topics at full speed fit into zenoh's own queue of 1 MB
 _OVERHEAD = 32  # bytes of a message besides its payload, in a packet of several: its stamp and its share of the header
@@ -46,10 +46,10 @@ ReceiveWindows = dict[tuple[int, PublisherClass], ReceiveWindow]
 
 
 class RemotePublisher(msgspec.Struct, eq=False):
-    """A publisher in another module, as one sender (its own module, or a gateway) passes on its messages.
+    """A publisher in another module, by one sender of its messages: its own module, or a gateway.
 
     `size` is that of its messages in bytes, -1: any; `last_size` and `sequence` are those of the last message.
-    `last_received` is shared by all ways on which its messages come, by other gateways and other links.
+    `last_received` is shared by all ways of its messages, by other gateways and other links.
     """
 
     origin: Origin
@@ -65,7 +65,7 @@ class RemotePublisher(msgspec.Struct, eq=False):
 
 
 class RxStream:
-    """The messages that come in on one topic."""
+    """The received messages of one topic."""
 
     def __init__(self, topic: Topic, receiver: "ZenohReceiver", windows: ReceiveWindows) -> None:
         self.topic = topic
@@ -74,7 +74,7 @@ class RxStream:
         self.reader: SubscriptionReader | None = None
         self.last: Sample | None = None
         self.windows = windows
-        """The session that was used last is the last entry."""
+        """Sessions in the order of their last use."""
         self.backlog = Backlog(receiver.loop, receiver.link.stats.lost, self._deliver, self._resume)
         self._stats = receiver.link.stats
         self._receiver = receiver
@@ -84,7 +84,7 @@ class RxStream:
         self._headers = HeaderReader(self._new_publisher)
 
     def update(self) -> None:
-        """Apply a change of the topic's type, or of how many messages its subscribers let be on the way."""
+        """Apply a change of the topic's type, or of the number of messages on the way."""
         topic_type = type_of(self.topic)
         if topic_type != self._type:
             self._type = topic_type
@@ -96,11 +96,11 @@ class RxStream:
                 window.resize(size)
 
     def add_session(self, session: int) -> None:
-        """Remember a publisher's module: it gets a final credit even if nothing of what it sent has come yet."""
+        """Remember a publisher's module, which gets a final credit even if none of its messages has arrived yet."""
         self._window(session, _NRT)
 
     def remove_sender(self, sender: Hashable) -> None:
-        """Forget a publisher's module: should it come back, what it repeats is as good as new."""
+        """Forget a publisher's module: after its return, its repeated messages count as new."""
         if sender in self.senders:
             self.senders.discard(sender)
             self.topic.remote_publishers -= 1
@@ -121,7 +121,7 @@ class RxStream:
             self._stats.lost["not subscribed"] += dropped
 
     def _send_final_credits(self) -> None:
-        """Tell the publishers that what is still on the way is no longer wanted."""
+        """Inform publishers that messages still on the way are no longer wanted."""
         latest = itertools.islice(reversed(self.windows.items()), _FINAL_CREDITS_MAX)
         for (session, publisher_class), window in latest:
             last = (window.next_serial - 1) & SERIAL_WRAP if window.next_serial >= 0 else 0
@@ -148,7 +148,7 @@ class RxStream:
                 return
             packet = reader.receive()
         if packet is None:
-            # Behind the readers that these messages woke: their answers go out before the thread is switched to.
+            # Behind the readers that these messages woke: their answers go out before the switch to the thread.
             self._loop.call_soon(self._check_again)
         else:
             self._loop.call_soon(self.on_packet, packet)
@@ -188,7 +188,7 @@ class RxStream:
         if deadline:
             self._set_expiry(publisher, samples)
         first = samples[0]
-        # The hot path: what was expected next, of the size of the message before. All else is checked one by one.
+        # The hot path: the expected next message, of the same size as before. All others are checked one by one.
         if (
             len(first.data) == publisher.last_size
             and serial == publisher.window.next_serial
@@ -245,7 +245,7 @@ class RxStream:
     # Messages
 
     def _deliver(self, publisher: RemotePublisher, serial: int, sample: Sample | None) -> None:
-        """Deliver a message, or wait for room for it; None: it needs none, and is only acknowledged."""
+        """Deliver a message, or wait for room for it; None is only acknowledged."""
         sinks = None if sample is None else self._deliver_to_topic(sample)
         if sample is None or sinks is None:
             self._acknowledge(publisher, serial)
@@ -253,7 +253,7 @@ class RxStream:
             self.backlog.block(publisher, serial, sample, sinks)
 
     def _deliver_to_topic(self, sample: Sample) -> list[Sink] | None:
-        """Hand a message to the topic; return the sinks that have no room. One that raises is lost, and counted."""
+        """Hand a message to the topic; return the sinks without room. A message that raises is lost, and counted."""
         try:
             return self.topic.deliver(sample)
         except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
@@ -276,7 +276,7 @@ class RxStream:
         return fits
 
     def _acknowledge(self, publisher: RemotePublisher, serial: int) -> None:
-        """Note that the queues accepted a message: now and then its publisher gets credit for that."""
+        """Note that the queues accepted a message, and grant its publisher credit now and then."""
         publisher.window.until_credit -= 1
         if not publisher.window.until_credit:
             self._send_credit(publisher, serial)
@@ -321,7 +321,7 @@ class RxStream:
         return False
 
     def _advance(self, publisher: RemotePublisher, serial: int) -> bool:
-        """Count what is missing before this serial. False for one that came before."""
+        """Count the gap before this serial. Return False for a serial that arrived before."""
         gap = publisher.window.advance(serial)
         if gap > 0:
             self._stats.lost["on the way"] += gap
@@ -329,8 +329,8 @@ class RxStream:
         return gap >= 0
 
     def _reject(self, publisher: RemotePublisher, serial: int) -> None:
-        """Acknowledge a message of the wrong type: it is no gap, as it came and was counted, and its publisher must not
-        wait for it. The acknowledgement waits behind the messages before it.
+        """Acknowledge a message of the wrong type: it is not a gap, as it was counted, and its publisher must not wait
+        for it. The acknowledgement waits behind the messages before it.
         """
         if publisher.window.next_serial >= 0 and not self._advance(publisher, serial):
             return  # serials are counted from the first message that is of use
@@ -340,7 +340,7 @@ class RxStream:
             self._append(publisher, serial, None)
 
     def _drop_duplicate(self, publisher: RemotePublisher, serial: int, sequence: int) -> None:
-        """Drop a message that came before: by this sender, which repeats it until it is acknowledged, or by another."""
+        """Drop a duplicate: of this sender, which repeats it until it is acknowledged, or of another one."""
         if sequence == publisher.sequence:
             origin = publisher.origin
             self._receiver.send_credit(self.topic.name, origin.sender, origin.publisher_class, serial)
@@ -360,7 +360,7 @@ class RxStream:
             self._window(*key),
             -1,  # until `_check_type`, as well as the next one
             False,
-            # By the run of the module, whatever way it comes; firmware has no such number, so there by the sender.
+            # By the run of the module, on any way; firmware has no such number, so there by the sender.
             self.topic.last_received((origin.instance or key, origin.module, origin.node, origin.publisher_class)),
         )
         self._check_type(publisher)
@@ -382,7 +382,7 @@ class RxStream:
 
 
 class ZenohReceiver:
-    """All topics that come in by one link."""
+    """All topics that a link receives."""
 
     def __init__(self, link: Link, hub: Hub) -> None:
         self.link = link
@@ -393,7 +393,7 @@ class ZenohReceiver:
         self._prefix = ""
         self._streams: dict[str, RxStream] = {}
         self._kept: dict[str, tuple[ReceiveWindows, dict[tuple[int, PublisherClass], int]]] = {}
-        """The windows of each topic when the link went down, and how far they had come then."""
+        """The windows of each topic when the link went down, with their progress."""
         self._kept_until = 0.0
         self._up = False
 
@@ -408,7 +408,7 @@ class ZenohReceiver:
         self._start_reading(stream)
 
     def connect(self, session: ZenohSession, prefix: str) -> None:
-        """Use this session; subscribe to the topics that were opened before there was one."""
+        """Use this session; subscribe to the topics opened before."""
         self._session = session
         self._prefix = prefix
         for stream in self._streams.values():
@@ -431,26 +431,26 @@ class ZenohReceiver:
             self._session.put(f"{self._prefix}/credit/{session:x}", data, final=leaving)
 
     def on_down(self) -> None:
-        """Keep how far each publisher had come when the link went down, as what it sends until then is lost."""
+        """Keep each publisher's progress when the link goes down, as its messages meanwhile are lost."""
         self._up = False
         if len(self._kept) >= _SENDERS_MAX or self.loop.time() >= self._kept_until:
             self._kept.clear()  # what was kept at an earlier outage, and is not used
         self._kept |= {name: (stream.windows, _progress(stream.windows)) for name, stream in self._streams.items()}
 
     def on_up(self) -> None:
-        """Use what was kept of an outage for a while: the link is up again."""
+        """Use the kept progress for a while: the link is up again."""
         self._up = True
         self._kept_until = self.loop.time() + _RESUME_S
 
     def _resume_windows(self, topic: str) -> ReceiveWindows:
-        """Return how far the publishers of a topic had come when the link went down, if that was not long ago."""
+        """Return the publishers' progress when the link went down, if that was not long ago."""
         if self.loop.time() >= self._kept_until:
             self._kept.clear()
         windows, _ = self._kept.pop(topic, ({}, {}))
         return windows
 
     def window(self, topic: Topic) -> int:
-        """Return how many messages may be on the way; 0: any number, as the subscribers would rather lose some."""
+        """Return how many messages may be on the way; 0: any number, as the subscribers are lossy."""
         if topic.queues and all(queue.lossy for queue in topic.queues):
             return 0
         size = self.link.max_payload if topic.layout is None else topic.layout.size
@@ -471,7 +471,7 @@ class ZenohReceiver:
                 queue.publisher_joined()
 
     def remove_publisher(self, name: str, sender: Hashable) -> None:
-        """Remove a module that published the topic, though what it sent may still be on the way."""
+        """Remove a module that published the topic; its messages may still be on the way."""
         stream = self._streams.get(name)
         if stream is not None:
             stream.remove_sender(sender)
@@ -507,5 +507,5 @@ def _split(data: bytes, count: int) -> list[bytes]:
 
 
 def _progress(windows: ReceiveWindows) -> dict[tuple[int, PublisherClass], int]:
-    """The serial that is expected of each publisher of which a message has come."""
+    """The next serial of each publisher from which a message has arrived."""
     return {key: window.next_serial for key, window in windows.items() if window.next_serial >= 0}

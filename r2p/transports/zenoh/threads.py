@@ -2,9 +2,9 @@
 
 The event loop makes the calls of zenoh itself, except while there are very many tokens. zenoh's router, which is in
 this process where a session takes connections, holds its tables while it sends every token to a new session, and while
-it forgets those of one that is gone. That takes time with the square of their number: some 20 ms for a thousand,
-seconds for twenty thousand. Each call that sends or declares something waits for it. So from MANY_TOKENS on a thread
-makes these calls, one after the other, and the event loop goes on.
+it forgets those of a closed one. That takes time with the square of their number: some 20 ms for a thousand, seconds
+for twenty thousand. Each call that sends or declares something waits for it. So from MANY_TOKENS on a thread makes
+these calls, one after the other, and the event loop goes on.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ _threads: WeakSet[threading.Thread] = WeakSet()
 
 
 def start_thread(function: Callable[[], object], name: str) -> threading.Thread:
-    """Call it in a thread of its own, which does not keep the program from ending. `name` says what the thread does."""
+    """Call the function in a thread of its own, which does not keep the program from ending."""
     thread = threading.Thread(target=function, name=f"r2p zenoh {name}", daemon=True)
     _threads.add(thread)
     thread.start()
@@ -46,7 +46,7 @@ def start_thread(function: Callable[[], object], name: str) -> threading.Thread:
 
 
 def as_exception(error: BaseException) -> Exception:
-    """Return what a thread caught as an error that may be raised, or counted, in the event loop.
+    """Return an exception from a thread as an error that may be raised, or counted, in the event loop.
 
     A panic in zenoh's Rust is pyo3's PanicException, a BaseException that code which counts errors would miss.
     """
@@ -67,7 +67,7 @@ def _join() -> None:
 class OutboundThread:
     """Makes the calls of one session that may wait for zenoh, in order: at once, or in a thread.
 
-    `on_error` gets, in the loop, what they raise in the thread.
+    `on_error` gets, in the loop, exceptions from the thread.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, on_error: Callable[[Exception], object]) -> None:
@@ -80,7 +80,7 @@ class OutboundThread:
         self._done = 0
 
     def set_token_count(self, tokens: int) -> None:
-        """Note how many tokens there are; in any thread."""
+        """Note the number of tokens; in any thread."""
         self._many_tokens = tokens >= (MANY_TOKENS // 2 if self._many_tokens else MANY_TOKENS)
 
     @property
@@ -90,16 +90,16 @@ class OutboundThread:
 
     @property
     def uses_thread(self) -> bool:
-        """Return whether the thread makes the calls now; also the last ones that wait, to keep their order."""
+        """Return whether the thread makes the calls now, also the last waiting ones, to keep their order."""
         return self._many_tokens or self._submitted != self._done
 
     @property
     def full(self) -> bool:
-        """Return whether too many calls wait already to add what can be sent later, or not at all."""
+        """Return whether too many calls are waiting to add one that can be sent later, or not at all."""
         return self.pending_calls >= PENDING_MAX
 
     def call(self, function: Callable[[], object]) -> None:
-        """Call it: now, or in the thread while that makes the calls."""
+        """Call the function now, or in the thread while that makes the calls."""
         if self.uses_thread:
             self.submit(function)
         else:
@@ -112,7 +112,7 @@ class OutboundThread:
         then: Callable[[T | None], object] | None = None,
         max_pending: int | None = None,
     ) -> None:
-        """Have the thread call it. `then` gets, in the loop, what it returns, or None if it raises.
+        """Have the thread call the function. `then` gets, in the loop, its result, or None if it raises.
 
         Raises BlockingIOError if `max_pending` calls wait already.
         """
@@ -124,7 +124,7 @@ class OutboundThread:
         self._jobs.put(function if then is None else lambda: self._answer(function, then))
 
     def finish(self) -> None:
-        """Wait for all calls, and end the thread. Call it outside the event loop, which submits nothing then."""
+        """Wait for all calls, and end the thread. Call it outside of the event loop, which submits nothing then."""
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join()

@@ -93,7 +93,7 @@ class ZenohTransport(Transport):
                 await asyncio.sleep(backoff.delay())
 
     async def _network(self, session: "ZenohSession", hub: Hub) -> str:
-        """Return the network's name. A tool looks for one; a robot's program must not depend on what came first."""
+        """Return the network's name. A tool looks for one; a robot's program must not depend on who is first."""
         if self._options.network is not None or not hub.observer:
             return self._options.network or default_network()
         found: set[str] = set()
@@ -108,7 +108,7 @@ class ZenohTransport(Transport):
             raise self._options.error(str(error)) from error
 
     async def _report_addresses(self, session: "ZenohSession", link: "ZenohLink", hub: Hub, exposed: list[str]) -> None:
-        """Report where the session accepts connections, and, but for a tool, that it does so without authentication."""
+        """Report where the session accepts connections; unless for a tool, warn if that needs no authentication."""
         addresses = await session.listening_endpoints() if self._options.listen is not None or exposed else []
         if self._options.listen is not None:
             for address in addresses:
@@ -119,7 +119,7 @@ class ZenohTransport(Transport):
             hub.link_notice(link, "open to all", f"{text}{_RESTRICT}", trouble=True)
 
     async def _explain(self, config: "zenoh.Config", link: "ZenohLink") -> None:
-        """Report what is wrong whenever the link is down; never returns."""
+        """Report the reason whenever the link is down; never returns."""
         reason = ""
         while True:
             await asyncio.sleep(_DIAGNOSE_EVERY_S)

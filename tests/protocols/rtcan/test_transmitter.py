@@ -222,7 +222,7 @@ def test_what_is_not_ready_or_does_not_fit() -> None:
     assert (engine.id8, engine.next_deadline(), engine.poll(5)) == (None, None, ())
     with pytest.raises(MessageError, match="1 to 1024"):
         engine.publish(0, 2, bytes(1025))
-    with pytest.raises(MessageError, match="high byte 1: those of topics are 2 to 255"):
+    with pytest.raises(MessageError, match="high byte 1: topics have 2 to 255"):
         engine.publish(0, 1, b"x")
     with pytest.raises(MessageError, match="high byte 256"):
         engine.reserve(0, 256, 8, MS)
