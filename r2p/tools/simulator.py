@@ -172,8 +172,8 @@ def addresses(robot: Triskar2) -> list[str]:
 def program() -> str:
     """Return what to type for this program in another terminal in the same folder."""
     typed = sys.argv[0]
-    if Path(typed).name == "__main__.py" and not shutil.which("r2p"):
-        return f"{'python' if shutil.which('python') == sys.executable else sys.executable} -m r2p"
+    if Path(typed).name == "__main__.py":
+        return f"{sys.orig_argv[0]} -m r2p"
     if Path(typed).name != "r2p" or not os.access(typed, os.X_OK):  # not started as a command
         return "r2p"
     found = shutil.which("r2p")
