@@ -9,6 +9,7 @@ to look at. It needs Chromium (Debian's package, or BROWSER with the path of one
 import argparse
 import functools
 import http.server
+import itertools
 import os
 import shutil
 import sys
@@ -137,7 +138,7 @@ class Checker:
 
     def _press_buttons(self, page: Page) -> None:
         """Copy each block of commands."""
-        for block in page.query_selector_all(".language-console"):
+        for block in page.query_selector_all(".highlight:has(.gp)"):
             wanted = block.evaluate(_COMMANDS).strip()
             page.evaluate("navigator.clipboard.writeText('nothing was copied')")
             block.query_selector(_BUTTON).click(force=True)  # type: ignore[union-attr]
@@ -199,9 +200,8 @@ def _check(pages: list[str], shots: Path | None) -> Checker:
         options = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
         browser = playwright.chromium.launch(executable_path=path, args=options)
         checker = Checker(browser, server.url, shots)
-        for scheme in SCHEMES:
-            for width in WIDTHS:
-                checker.check(pages, scheme, width)
+        for scheme, width in itertools.product(SCHEMES, WIDTHS):
+            checker.check(pages, scheme, width)
         browser.close()
         server.shutdown()
         return checker

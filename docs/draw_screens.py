@@ -53,13 +53,13 @@ _COLOURED = {"force_terminal": True, "color_system": "standard", "legacy_windows
 
 _CELL, _LINE, _SIZE, _PAD, _BAR = 8.4, 18, 14, 16, 30  # px: a character, a line, the font, the border, the title bar
 _STYLE = """
-    .window { fill: #1b1f27; stroke: #76808e; stroke-opacity: .5 }
+    .window { fill: #14171d; stroke: #76808e; stroke-opacity: .5 }
     .button { fill: #4a5160 }
     .reverse { fill: #d7dce5 }
     text { fill: #d7dce5; white-space: pre }
     .prompt, .dim { fill: #8f99a8 }
     .bold { font-weight: 700 }
-    .on-reverse { fill: #1b1f27 }
+    .on-reverse { fill: #14171d }
     .cyan { fill: #5fd3e0 }
     .green { fill: #7fd88f }
     .yellow { fill: #f2cc60 }
@@ -196,7 +196,8 @@ async def _robot() -> dict[str, Screen]:
         screens["hz"] = Screen("r2p topic hz odometry -n 3", terminal.getvalue())
         await seen.wait()
         robot.cancel()
-        await asyncio.wait([robot])
+        with contextlib.suppress(asyncio.CancelledError):
+            await robot
     return screens
 
 

@@ -1,5 +1,6 @@
 """The pages themselves: no block escapes the tests, TOML is TOML, and frames are what the codecs make of them."""
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -32,6 +33,15 @@ def test_no_block_escapes_the_tests(page: Path) -> None:
 @pytest.mark.parametrize("block", blocks("toml"), ids=str)
 def test_toml_is_toml(block: Block) -> None:
     assert tomllib.loads(block.text)
+
+
+def test_only_commands_look_like_commands() -> None:
+    """The button of a block copies what follows a prompt; for the site's lexer, `# ` in an output is one."""
+    pygments = pytest.importorskip("pygments")
+    lexer = pytest.importorskip("pygments.lexers").get_lexer_by_name("console")
+    for block in blocks("console"):
+        prompts = [text for token, text in pygments.lex(block.text, lexer) if str(token) == "Token.Generic.Prompt"]
+        assert prompts == ["$ "] * len(re.findall(r"^\$ ", block.text, re.MULTILINE)), str(block)
 
 
 @pytest.mark.parametrize("block", [each for each in blocks("console") if "not run" in each.notes], ids=str)
