@@ -1,7 +1,7 @@
-"""The gateway of a module: its ports, the tree that they are part of, and what passes between them besides topics.
+"""The gateway of a module: its ports, their tree, and everything but topics that passes between them.
 
-`Bridge` feeds the tree with what gateways send, and does what the tree says. Topics are the business of `routing`,
-modules and nodes that of `directory_relay`, orders that of `orders`.
+`Bridge` feeds the tree with messages of gateways, and carries out its actions. `routing` handles topics,
+`directory_relay` modules and nodes, `orders` orders.
 """
 
 import itertools
@@ -58,7 +58,7 @@ _HANDLED = {
 
 
 class RouteStatistics(msgspec.Struct, frozen=True):
-    """One topic from one link to another; `dropped` by reason, all since the route exists."""
+    """One topic from one link to another; `dropped` by reason, since the route was added."""
 
     topic: str
     source: str
@@ -70,8 +70,8 @@ class RouteStatistics(msgspec.Struct, frozen=True):
 class PortStatistics(msgspec.Struct, frozen=True):
     """One link of a gateway: its state in the tree, and how many other gateways are on its network.
 
-    `dropped` counts what came in while nothing was forwarded. `offset` (ns) is UTC less the time of the link's network,
-    where that has one, known to +-`error` (ns).
+    `dropped` counts messages that arrived while nothing was forwarded. `offset` (ns) is UTC less the time of the link's
+    network, where that has one, known to +-`error` (ns).
     """
 
     link: str
@@ -90,13 +90,13 @@ class GatewayStatistics(msgspec.Struct, frozen=True):
 
 
 class Bridge:
-    """The gateway of a module. `notify(link, kind, text, trouble)` is called with what the user should know."""
+    """The gateway of a module. `notify(link, kind, text, trouble)` is called with news for the user."""
 
     def __init__(
         self, space: TopicSpace, instance: int, options: BridgeOptions, notify: Callable[[Link, str, str, bool], None]
     ) -> None:
         self.ports: dict[str, BridgePort] = {}
-        """By the name of the link."""
+        """Ports by the name of the link."""
         self.tree = SpanningTree(instance)
         self.policy = Policy(options)
         self.routing = RoutingTable(self.ports, space, self.policy)
@@ -111,7 +111,7 @@ class Bridge:
         self._client_numbers = itertools.count(FIRST_CLIENT)
         self._held = HeldMessages()
         self._changed: set[int] = set()
-        """Ports with another place in the tree, which is yet to be passed on to routing and directory."""
+        """Ports with a new place in the tree, not yet passed on to routing and directory."""
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
     def make_topic(self, name: str, wake_scheduler: WakeScheduler) -> Topic:
@@ -176,10 +176,10 @@ class Bridge:
         self._alarm.close()
         self.directory.close()
 
-    # What comes in
+    # Received
 
     def handle_management(self, port: BridgePort, data: bytes) -> bool:
-        """Handle a management message; True if discovery need not see it."""
+        """Handle a management message; return True if discovery need not see it."""
         if management.type_of(data) not in _HANDLED:
             return False
         try:
@@ -197,7 +197,7 @@ class Bridge:
         return self._is_own(port, message) or self._receive_presence(port, message, data)
 
     def _receive_presence(self, port: BridgePort, message: management.Management, data: bytes) -> bool:
-        """Handle an ALIVE, which may be a probe, or a HELLO; True if discovery need not see it."""
+        """Handle an ALIVE, which may be a probe, or a HELLO; return True if discovery need not see it."""
         if isinstance(message, management.Hello):
             if message.flags & management.HELLO_QUERY:
                 self.directory.query(port)
@@ -254,7 +254,7 @@ class Bridge:
         count_internal_error((port.link.stats.lost for port in self.ports.values()), error)
 
     def _act(self) -> None:
-        """Do what the tree says. Where something raises, that is counted and the rest is done."""
+        """Carry out the tree's actions. If one raises, count that and carry out the rest."""
         try:
             for action in self.tree.pop_actions():
                 self._do(action)
@@ -284,7 +284,7 @@ class Bridge:
             port.link.stats.lost.guard(self._send, port, action)
 
     def _apply_place(self, port: BridgePort) -> None:
-        """Pass on a new place in the tree; where routing raises, it is tried again, or topics would not pass."""
+        """Pass on a new place in the tree; if routing raises, try again, or topics would not pass."""
         lost = port.link.stats.lost
         lost.guard(self._report_state, port)
         if lost.guard(self.routing.port_changed, port):
@@ -322,7 +322,7 @@ class Bridge:
     # For users
 
     def statistics(self) -> GatewayStatistics:
-        """Return what the gateway has done so far."""
+        """Return the gateway's statistics so far."""
         ports = [_port_statistics(port) for port in self.ports.values()]
         routes = [
             RouteStatistics(topic, source, target, route.forwarded, dict(route.dropped))

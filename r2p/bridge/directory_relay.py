@@ -27,7 +27,7 @@ from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 from r2p.units import LONG_AGO, MILLISECOND, SECOND
 
 ROUNDS = 5
-"""Looks at what has changed in a second, at most."""
+"""Rounds of looking for changes in a second, at most."""
 
 _REPEAT = 3 * SECOND // 2  # ns in which everything is repeated, if there is little of it
 _REPEAT_MAX = 20 * SECOND  # ns; a HELLO is believed for 65 s at most
@@ -42,8 +42,8 @@ _Key = tuple[object, ...]
 
 
 class _ModuleFact(msgspec.Struct, frozen=True):
-    """A module as it is known on a link, by its canonical name; `foreign`: it is not the robot's. When it was heard is
-    left out: it is no news.
+    """A module as it is known on a link, by its canonical name; `foreign`: it is not the robot's. The time of its last
+    message is left out, as it always changes.
     """
 
     name: str
@@ -130,7 +130,7 @@ class DirectoryRelay:
         self._set_alarm(self._clock.monotonic())
 
     def changed(self, port: BridgePort) -> None:
-        """Look at a link where a module or a node came or went, or that has another place in the tree."""
+        """Check a link after a change of its modules or nodes, or of its place in the tree."""
         link = self._link(port)
         if not link.dirty:  # else the alarm is set: many changes at once must not cost as many looks at all links
             link.dirty = True
@@ -152,12 +152,12 @@ class DirectoryRelay:
         return link
 
     def own_modules(self) -> list[str]:
-        """The canonical names of the robot's modules that are known."""
+        """The canonical names of the robot's known modules."""
         names = (name for kind, name, *_ in self._sources if kind == "module")
         return [name for name in names if isinstance(name, str) and not self.foreign_link(name)]
 
     def foreign_link(self, name: str) -> str:
-        """The link where the module of this name is foreign; "": it is the robot's, or not known."""
+        """Return the link where the module of this name is foreign; "": it is the robot's, or unknown."""
         facts = self._sources.get(("module", name))
         if facts is None:
             return ""
@@ -211,7 +211,7 @@ class DirectoryRelay:
             self._repeating()
 
     def _repeat(self, port: BridgePort, now: int, period: int) -> None:
-        """Repeat on a link what a peer asks for, or what was not announced for a while."""
+        """Repeat announcements on a link, because a peer asks for them, or after a while."""
         self._meet(port)
         link = self._link(port)
         if link.asked and now >= link.answered_at + _APART:
@@ -238,7 +238,7 @@ class DirectoryRelay:
         return min(max(_REPEAT, count * SECOND // _REPEATED), _REPEAT_MAX)
 
     def _meet(self, port: BridgePort) -> None:
-        """See whether a peer is new there, which is to get everything."""
+        """Check for a new peer on the link, which is to get everything."""
         link = self._link(port)
         if link.met is not None and not link.facts:
             return
@@ -254,7 +254,7 @@ class DirectoryRelay:
     # What is known
 
     def _look(self, now: int) -> None:
-        """See what has changed on the links, and announce it on the others."""
+        """Find changes on the links, and announce them on the others."""
         catch_up = {name for name, link in self._links.items() if link.behind}
         changed: dict[_Key, None] = {}
         for name, link in list(self._links.items()):
@@ -276,7 +276,7 @@ class DirectoryRelay:
                 link.behind = True
 
     def _look_at(self, name: str, link: _LinkDirectory, now: int, changed: dict[_Key, None]) -> bool:
-        """See what has changed on a link; True: it has just joined the tree, or left it."""
+        """Find changes on a link; return True if it has just joined the tree, or left it."""
         port = self._ports.get(name)
         if port is not None and port.link.up and not self._is_open(port, now):
             link.behind = True  # what is known there holds until the gateways agree
@@ -290,7 +290,7 @@ class DirectoryRelay:
         return True
 
     def _collect(self, name: str, link: _LinkDirectory, port: BridgePort | None, changed: dict[_Key, None]) -> None:
-        """Read what is known on a link now, and enter the keys of what has changed."""
+        """Read the present facts of a link, and enter the keys of changes."""
         before = link.facts
         link.facts = {} if port is None or not port.link.up or not port.in_tree else self._facts_of(port)
         for key in before.keys() - link.facts.keys():
@@ -337,7 +337,7 @@ class DirectoryRelay:
             link.to_repeat, link.answering = None, False
 
     def _announce(self, port: BridgePort, key: _Key) -> _Announced | None:
-        """Announce on a link what has changed of a fact; return what is known there from now on."""
+        """Announce the change of a fact on a link; return the fact as known there from now on."""
         announced = self._link(port).announced
         before = announced.get(key)
         new = self._desired(port, key) if port.in_tree else None
@@ -361,7 +361,7 @@ class DirectoryRelay:
         port.link.stats.lost.guard(port.link.relay, message)
 
     def _desired(self, port: BridgePort, key: _Key) -> _Announced | None:
-        """Return what others are to know of a fact on this link, if anything."""
+        """Return the part of a fact that others on this link are to know, if any."""
         sources = self._sources.get(key, {})
         names = [name for name in sources if name != port.name]
         if not names:
@@ -403,7 +403,7 @@ class DirectoryRelay:
 
 
 def _subject(message: Relayed) -> object:
-    """Return what a message is about."""
+    """Return the subject of a message."""
     match message:
         case management.Hello(_, instance):
             return instance
@@ -413,7 +413,7 @@ def _subject(message: Relayed) -> object:
 
 
 def _withdrawal(message: Relayed) -> Relayed | None:
-    """The message that takes this one back; None for one that just gets old."""
+    """Return the message that revokes this one; None for one that just gets old."""
     match message:
         case management.Hello():
             return msgspec.structs.replace(message, flags=message.flags | management.HELLO_LEAVING)

@@ -1,12 +1,12 @@
-"""A gateway's links and topics: what comes in by one link goes out by those others where it is subscribed.
+"""A gateway's links and topics: messages from one link go out by the others where they are subscribed.
 
     link  ->  BridgedTopic.deliver  ->  Route  ->  RemoteSubscriber of another link
 
 `RoutingTable` makes the routes when demand changes. The first message that then comes from a link looks up which of
 them are in use, and the result is kept for the next ones. So forwarding is one loop over a list, and a change costs as
 much as the routes that it concerns. For each message the clock is read to see whether both ports may still forward: a
-gateway that was stopped must not go on with an old tree. Messages that come in while the gateway listens anew are held.
-They are forwarded if it may forward afterwards.
+gateway that was stopped must not go on with an old tree. Messages that arrive while the gateway listens anew are held,
+and forwarded if it may forward afterwards.
 """
 
 import functools
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from r2p.protocols.discovery.events import TopicType
 
 HOPS_MAX = 15
-"""Gateways that a message crosses at most: the last defence against loops where messages carry hops."""
+"""Gateways on a message's way, at most: the last defence against loops where messages carry hops."""
 
 HELD_MAX = 4096
-"""Messages that are held at most."""
+"""Held messages, at most."""
 
 
 class BridgePort:
@@ -49,9 +49,9 @@ class BridgePort:
         """True if no gateway may be at the link's other end."""
         self.tree_port = TreePort(number, 0)
         self.state = PortState.LISTENING
-        """As it was reported last."""
+        """The last reported state."""
         self.dropped: Counter[str] = Counter()
-        """Messages that came in, or were published here, while nothing was forwarded."""
+        """Messages that arrived, or were published here, while nothing was forwarded."""
         self.announced_types: dict[str, tuple[TopicType, TopicType]] = {}
         """Types with which the link publishes and subscribes to forwarded topics, by canonical name. Kept here, as
         clients come and go under new names: what another table had of them would stay.
@@ -60,7 +60,7 @@ class BridgePort:
         self.denied_at = LONG_AGO
         """Time of the last answer that an order does not pass (monotonic ns)."""
         self.refusal_lines = LineLimit(1)  # a second
-        """For the lines of the log that say so."""
+        """Limit of the log lines about these."""
 
     @property
     def name(self) -> str:
@@ -102,7 +102,7 @@ class HeldMessages:
         return bool(self._held)
 
     def hold(self, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
-        """Hold a message; False if it expires or there are too many. `go_on` returns the sinks without room."""
+        """Hold a message; return False if it expires or there are too many. `go_on` returns the sinks without room."""
         # Events and periods are of no use later.
         if sample.publisher_class != PublisherClass.NON_REAL_TIME or len(self._held) >= HELD_MAX:
             return False
@@ -110,7 +110,7 @@ class HeldMessages:
         return True
 
     def release(self, failed: Callable[[Exception], object]) -> None:
-        """Go on with all of them; `failed` is called with what one of them raises."""
+        """Go on with all messages; `failed` is called with exceptions."""
         held, self._held = self._held, deque()
         for sample, go_on in held:
             try:
@@ -135,7 +135,7 @@ class Route:
         self.subscriber: RemoteSubscriber | None = None
         self.forwarded = 0
         self.dropped: Counter[str] = Counter()
-        """By reason; the link counts only what it would have sent but for the tree (`converging`)."""
+        """Losses by reason; the link counts only those due to the tree (`converging`)."""
 
 
 class BridgedTopic(Topic):
@@ -179,7 +179,7 @@ class BridgedTopic(Topic):
         return self.relayed is not None or super().in_use
 
     def last_received(self, publisher: Hashable) -> LastReceived:
-        """Return a new one for each link, as one link may have to drop what another one forwards later."""
+        """Return a new one for each link, as one link may drop a message that another one forwards later."""
         return LastReceived()
 
     # Messages
@@ -194,7 +194,7 @@ class BridgedTopic(Topic):
             if not (port.resumes and self._held.hold(sample, functools.partial(self._deliver_held, port, sample))):
                 port.count_dropped("converging")
             return None
-        # A latched value comes again, unchanged, for each new subscriber.
+        # A latched value arrives again, unchanged, for each new subscriber.
         if sample.sequence and not self._duplicates.accept(sample) and not port.link.latched(self.name):
             port.count_dropped("seen before")
             return None
@@ -245,7 +245,7 @@ class BridgedTopic(Topic):
     def _send(
         self, subscribers: list[RemoteSubscriber], sample: Sample, blocked: list[Sink] | None, slot_link: object
     ) -> list[Sink] | None:
-        """Send what is published here on the links that this gateway forwards to; others send the rest."""
+        """Send this module's messages on links to which this gateway forwards; other gateways serve the rest."""
         now = self._monotonic()
         silent = [each for each in subscribers if now >= self._ports[each.link_name].tree_port.forwards_until]
         for each in silent:
@@ -287,7 +287,7 @@ class BridgedTopic(Topic):
         self._forward_latched(sink)
 
     def _forward_latched(self, sink: SubscriberQueue | RemoteSubscriber) -> None:
-        """Send what publishers on other links latch to a link where the topic is subscribed now."""
+        """Send values latched on other links to a link with a new subscriber."""
         if self.relayed is None or not isinstance(sink, RemoteSubscriber):
             return
         for topic in self.relayed.topics.values():
@@ -312,15 +312,15 @@ class RelayedTopic:
         self.subscribed_on: list[BridgePort] = []
         self.subscribed_on_kinds: PortsByKind = []
         self.sources: set[str] = set()
-        """The links whose routes to all of `targets` are there."""
+        """Links with routes to all of `targets`."""
         self.targets: set[str] = set()
         self._from: dict[str, dict[str, Route]] = {}
-        """Routes by the name of the link that they come from, and that of the link that they go to."""
+        """Routes by the names of their source and of their target."""
         self._into: dict[str, dict[str, Route]] = {}
-        """The other way round."""
+        """Routes by the names of their target and of their source."""
 
     def set_demand(self, published_on: list[BridgePort], subscribed_on: list[BridgePort]) -> None:
-        """Enter where the topic is published and subscribed now."""
+        """Enter the links where the topic is published and subscribed now."""
         self.published_on, self.published_on_kinds = published_on, by_kind(published_on)
         self.subscribed_on, self.subscribed_on_kinds = subscribed_on, by_kind(subscribed_on)
 
@@ -330,11 +330,11 @@ class RelayedTopic:
         return (((source, target), route) for source, routes in self._from.items() for target, route in routes.items())
 
     def route(self, source: str, target: str) -> Route | None:
-        """The route from one link to another, if there is one."""
+        """Return the route from one link to another, if there is one."""
         return self._from.get(source, {}).get(target)
 
     def active_from(self, source: str) -> list[Route]:
-        """The routes that messages from a link take now."""
+        """Return the routes that messages from a link take now."""
         return [route for route in self._from.get(source, {}).values() if route.subscriber is not None]
 
     def add(self, source: str, route: Route) -> None:
@@ -382,7 +382,7 @@ class RelayedTopic:
 
 
 def _offer(route: Route, sample: Sample, blocked: list[Sink] | None) -> list[Sink] | None:
-    """Send a message; return the sinks without room, and this one with them if its publisher has to wait for it."""
+    """Send a message; return the sinks without room, and this sink if its publisher has to wait for it."""
     subscriber = route.subscriber
     if subscriber is None:  # it has left while the message was on its way through the routes
         return blocked

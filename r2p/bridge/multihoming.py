@@ -19,11 +19,11 @@ from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _TYPES = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
 _ALL: frozenset[int] = frozenset()
-"""Topics that all links can carry: those that no link has to do without."""
+"""Topics that all links can carry."""
 
 
 class MultihomedModule:
-    """The links of one module. `notify(link, kind, text, trouble)` is called with what the user should know."""
+    """The links of one module. `notify(link, kind, text, trouble)` is called with news for the user."""
 
     def __init__(self, space: TopicSpace, instance: int, notify: Callable[[Link, str, str, bool], None]) -> None:
         self.selection = LinkSelection(instance)
@@ -31,7 +31,7 @@ class MultihomedModule:
         self._instance = instance
         self._notify = notify
         self._ports: dict[str, _MultihomedPort] = {}
-        """By the name of the link."""
+        """Ports by the name of the link."""
         self._by_number: dict[int, _MultihomedPort] = {}
         self._attached = 0
         self._changes = 0
@@ -88,7 +88,7 @@ class MultihomedModule:
     # Received messages
 
     def handle_management(self, port: "_MultihomedPort", data: bytes) -> bool:
-        """Handle a management message; True if discovery need not see it."""
+        """Handle a management message; return True if discovery need not see it."""
         if management.type_of(data) not in _TYPES:
             return False
         try:
@@ -101,7 +101,7 @@ class MultihomedModule:
         return is_for_us
 
     def _select(self, now: int, number: int, message: management.Management, data: bytes) -> bool:
-        """Enter what a message shows about the links; False: nothing."""
+        """Enter what a message shows about the links; return False for nothing."""
         match message:
             case management.Bridge():
                 self.selection.receive_bridge(now, number, message)
@@ -118,7 +118,7 @@ class MultihomedModule:
         return True
 
     def discovery_changed(self, port: "_MultihomedPort") -> None:
-        """See whether discovery has found which module is at the other end, or how long messages of a topic are."""
+        """Check whether discovery has found the module at the other end, or the size of a topic's messages."""
         if port.link.point_to_point and port.link.discovery.generation != port.generation:
             port.generation = port.link.discovery.generation
             self.selection.set_remote(self._now(), port.number, port.link.discovery.sole_peer)
@@ -137,7 +137,7 @@ class MultihomedModule:
     # Topics
 
     def review_use(self, topic: Topic, port: "_MultihomedPort") -> bool:
-        """Decide whether the topic takes this link; one that is down keeps what it had, until it is up again."""
+        """Decide whether the topic uses this link; a link that is down keeps its topics until it is up again."""
         if port.number not in self.selection.by_number:
             return True
         without = self._unable_for(topic)
@@ -149,7 +149,7 @@ class MultihomedModule:
         return port.number in without or port.number in self.selection.used(self._now(), without)
 
     def _unable_for(self, topic: Topic) -> frozenset[int]:
-        """The links that can't carry the topic."""
+        """Return the links that can't carry the topic."""
         size = topic.layout.size if topic.layout is not None else 0
         if not size:
             infos = (port.link.discovery.topics.get(topic.name) for port in self._by_number.values())
@@ -161,7 +161,7 @@ class MultihomedModule:
         return self._unable[key]
 
     def _drop_filter(self, topic: Topic) -> Callable[[str], bool]:
-        """Return what says whether a message came in by a link that is no longer used.
+        """Return a function that decides whether a message came from a link that is no longer used.
 
         It is asked before each message while gateways consent to the use of several links for a while only: a module
         that was stopped must not go on with them.
@@ -175,7 +175,7 @@ class MultihomedModule:
 
         return drops
 
-    # What follows
+    # Consequences
 
     def _now(self) -> int:
         return self._space.clock.monotonic()
@@ -205,7 +205,7 @@ class MultihomedModule:
         self._alarm.set(self.selection.next_deadline())
 
     def _choose(self) -> None:
-        """Follow a choice of other links than before."""
+        """Follow a change of the chosen links."""
         before = self._used
         withouts = {_ALL, *self._without.values()}
         self._used = {without: self.selection.used(self._now(), without) for without in withouts}
@@ -223,7 +223,7 @@ class MultihomedModule:
         self._announce(list(self._space.topics.values()), [port.link for port in ports])
 
     def _announce(self, topics: list[Topic], links: list[Link]) -> None:
-        """Have these links announce what these topics are to be there now."""
+        """Have these links announce the new state of these topics."""
         for topic in topics:
             for link in links:
                 link.stats.lost.guard(link.topic_changed, topic)
@@ -248,7 +248,7 @@ class MultihomedModule:
 
 
 class _MultihomedPort(GatewayHooks):
-    """One link of the module, and what the module decides about it."""
+    """One link of the module, and the module's decisions about it."""
 
     def __init__(self, owner: MultihomedModule, link: Link, number: int) -> None:
         self.link = link

@@ -33,7 +33,7 @@ _SURE = 8  # intervals after which a period counts as known
 _PREFIX = re.compile(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_")
 
 IP = frozenset({"tcp", "tcp-listen", "zenoh"})
-"""Schemes of links that may be reached from anywhere in an IP network: REBOOT and the like need permission there."""
+"""Schemes of links that any computer of an IP network may reach: REBOOT and the like need permission there."""
 
 
 class ClassOf(msgspec.Struct, frozen=True):
@@ -44,7 +44,7 @@ class ClassOf(msgspec.Struct, frozen=True):
 
 
 class Rule(msgspec.Struct, frozen=True):
-    """Topics and the links that they come from and go to; all three are patterns as in a shell."""
+    """Topics, their source link and their target link; all three are patterns as in a shell."""
 
     topic: str
     source: str = "*"
@@ -86,7 +86,7 @@ def parse_rule(text: str) -> Rule:
 
 
 def check_prefix(text: str) -> str:
-    """Return the prefix; raises Error for one that no topic can have."""
+    """Return the prefix; raise Error for one that no topic can have."""
     if text and not _PREFIX.fullmatch(text):
         valid = "up to 16 letters, digits and underscores, and a slash: robot1/"
         raise Error(f"{text!r} is not a valid prefix: write {valid}")
@@ -143,7 +143,7 @@ class Policy:
         return 0 if harmless or self._may_control(source) else DENIED_CONTROL
 
     def class_of(self, topic: str, source: str) -> ClassOf | None:
-        """The class of messages from a debug line; None: the one that they carry."""
+        """Return the class of messages from a debug line; None: the one that they carry."""
         is_line = source.partition(":")[0] in {"tcp", "serial"}
         return _first(self._options.classes, topic) if is_line else None
 
@@ -154,27 +154,27 @@ class Policy:
     def shaper(
         self, topic: str, source: str, *, soften: bool, reserve: "Callable[[int, float], RelayedPeriodic] | None" = None
     ) -> "Shaper | None":
-        """Return what changes a topic's messages from this link; None: nothing does. For the rest see `Shaper`."""
+        """Return the shaper of a topic's messages from this link, or None. For the arguments see `Shaper`."""
         rate, klass = _first(self._options.rate_limit, topic), self.class_of(topic, source)
         return Shaper(rate, klass, soften=soften, reserve=reserve) if rate or klass or soften else None
 
     def to_link_name(self, topic: str, link: str) -> str:
-        """The name of a topic on this link."""
+        """Return the name of a topic on this link."""
         return self.prefix(link) + topic
 
     def to_canonical(self, name: str, link: str) -> str | None:
-        """The canonical name of a topic on this link; None if it is not the robot's."""
+        """Return the canonical name of a topic on this link; None if it is not the robot's."""
         prefix = self.prefix(link)
         return name.removeprefix(prefix) if name.startswith(prefix) else None
 
     def module_to_link_name(self, name: str, link: str, *, foreign: bool) -> str | None:
-        """The name of a module on this link; None where it is not visible. `foreign` ones are not the robot's."""
+        """Return the name of a module on this link; None if it is not visible. `foreign`: not the robot's."""
         prefix = self.prefix(link)
         return (None if foreign else prefix + name) if prefix else name
 
     def module_to_canonical(self, name: str, link: str) -> tuple[str, bool] | None:
-        """The canonical name of a module on this link, and whether it is foreign: on the network, and not the robot's.
-        None for one of another robot.
+        """Return the canonical name of a module on this link, and whether it is foreign: on the network, and not the
+        robot's. None for a module of another robot.
         """
         prefix = self.prefix(link)
         if not prefix:
@@ -184,7 +184,7 @@ class Policy:
         return None if "/" in name else (name, True)
 
     def source_name(self, module: str, source: str, target: str) -> str:
-        """The name of a publisher's module on the link that its message goes to."""
+        """Return the name of a publisher's module on the target link of its message."""
         before, after = self.prefix(source), self.prefix(target)
         if after and not before:
             return after + module if module else module
@@ -208,14 +208,14 @@ class Policy:
 
 
 class RelayedPeriodic(SlotPublisher):
-    """A publisher in slots of a bus, of `size` bytes each `period` seconds, for what comes in by another link."""
+    """A publisher in slots of a bus, of `size` bytes each `period` seconds, for messages of another link."""
 
     lead = 0.0005
 
     def __init__(self, size: int, period: float) -> None:
         self.period = period
         self.missed = 0
-        """Messages that were overtaken by the next one before their slot came, or that the bus lost."""
+        """Messages replaced by the next one before their slot, or lost by the bus."""
         self._size = size
         self._latest: Sample | None = None
         self._slot_link: object = None
@@ -225,7 +225,7 @@ class RelayedPeriodic(SlotPublisher):
         return self._size
 
     def offer(self, sample: Sample) -> bool:
-        """Keep a message for the next slot; False if the bus has no slots for it now, or not of this size."""
+        """Keep a message for the next slot; return False if the bus has no slots for it, or not of this size."""
         if self._slot_link is None or len(sample.data) != self._size:
             return False
         self.missed += self._latest is not None
@@ -248,7 +248,7 @@ class RelayedPeriodic(SlotPublisher):
         return latest
 
     def link_degraded(self, link: str, reason: str) -> None:
-        """The slots are lost: messages go as sporadic ones, which the link's notices report."""
+        """Note that the slots are lost: messages go as sporadic ones, and the link's notices report it."""
 
     def link_missed(self, link: str, reason: str, late: float = 0.0, sequence: int = 0) -> None:
         self.missed += 1
@@ -281,7 +281,7 @@ class Shaper:
         self._times_left = TimesLeft()
 
     def shape(self, sample: Sample, now: int, utc: int) -> Sample | None:
-        """The message to forward at `now` (monotonic ns; the same in UTC); None for one that exceeds the rate."""
+        """Return the message to forward at `now` (monotonic ns; the same in UTC); None if it exceeds the rate."""
         if self._gap is not None:
             if now < self._free_at:
                 return None
@@ -304,7 +304,7 @@ class Shaper:
         )
 
     def _period(self, sample: Sample) -> int:
-        """The publisher's period (ns), as its stamps show it."""
+        """Return the publisher's period (ns), by its stamps."""
         source = sample.source
         known = self._periods.get((source.module, source.node))
         if known is None:

@@ -1,8 +1,8 @@
-"""Orders for modules (STOP, REBOOT, BOOTLOAD) across a gateway: which of them pass, and which module each one means.
+"""Orders for modules (STOP, REBOOT, BOOTLOAD) across a gateway: whether each passes, and to which module.
 
-An order names a module by its alias of 7 characters. On links with a prefix that is the alias of the name with the
-prefix, so `ModuleNames` finds the one module that it stands for, or says that there are two. What does not pass is
-logged, and its sender gets a DENIED.
+An order names a module by its alias of 7 characters. On links with a prefix this is the alias of the name with the
+prefix, so `ModuleNames` finds the module, or reports that there are two. Refused orders are logged, and their sender
+gets a DENIED.
 """
 
 import msgspec
@@ -38,7 +38,7 @@ class ModuleNames:
         self._ambiguous: set[str] = set()
 
     def to_canonical(self, alias: str, link: str) -> str | None:
-        """The module that an order on this link names; None if it is none of the robot's, or ambiguous."""
+        """Return the module that an order on this link names; None if it is not the robot's, or ambiguous."""
         prefix = self._policy.prefix(link)
         if not prefix:
             return alias
@@ -51,14 +51,14 @@ class ModuleNames:
         return alias.removeprefix(prefix) if alias.startswith(prefix) else None
 
     def to_link_name(self, name: str, link: str) -> str | None:
-        """The name of a module on a link; None where it is not visible."""
+        """Return the name of a module on a link; None if it is not visible there."""
         foreign = self._directory.foreign_link(name)
         if foreign:
             return name if link == foreign or not self._policy.prefix(link) else None
         return self._policy.prefix(link) + name
 
     def translate(self, name: str, link: str, other: str) -> str | None:
-        """The name on another link of a module that has this name on one link; None if the two must not be confused."""
+        """Return a module's name on another link, by its name on one; None if the two must not be confused."""
         module = self._policy.module_to_canonical(name, link)
         if module is None or module[1]:
             return None
@@ -84,7 +84,7 @@ class OrderRelay:
         self._names = names
 
     def forward(self, port: BridgePort, order: management.Order) -> bool:
-        """Forward an order that came in; True: it is for this module, which does not obey it."""
+        """Forward an order; return True if it is for this module, which does not obey it."""
         harmless = isinstance(order, management.Stop)
         if order.module == self._module:
             reason = self._policy.order_denied(port.name, None, harmless=harmless)
@@ -128,7 +128,7 @@ class OrderRelay:
                 other.link.write_management(management.encode(named))
 
     def _open_from(self, port: BridgePort) -> list[BridgePort]:
-        """The ports to which what came in here may be forwarded now."""
+        """Yield the ports to which messages from this one may be forwarded now."""
         now = self._clock.monotonic()
         if now >= port.tree_port.forwards_until:
             port.count_dropped("converging")

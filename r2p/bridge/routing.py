@@ -1,8 +1,8 @@
 """The topics that a gateway forwards, and announces on each link: worked out whenever demand changes.
 
-On a link, a gateway publishes what other links may send there, and subscribes to what is subscribed on
-another one to which it may go. All of that only on links that are in the tree; so demand travels along the tree, and
-can't feed itself.
+On a link, a gateway publishes the topics that other links may send there, and subscribes to those that may go to
+subscribers on another one. It does so only on links in the tree; so demand travels along the tree, and can't feed
+itself.
 
 A change of demand costs as much as there are links, not pairs of links: only new routes are looked at, the policy is
 asked for pairs of kinds of links, and types are looked up once for all links.
@@ -29,7 +29,7 @@ logger = get_logger("r2p.bridge")
 
 _NAME = re.compile(r"[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)?")
 LONG_NAMES = 64
-"""Names too long for a link that are remembered, so that each is logged once; beyond that one a second is logged."""
+"""Remembered names that are too long for a link, each logged once; beyond that, one a second is logged."""
 
 _LINES = 1  # of the log in a second about names that are too long, when there are many of them
 
@@ -48,7 +48,7 @@ class RoutingTable:
         self._to_review: dict[str, None] = {}
         self._reviewing = False
         self._idle: set[str] = set()
-        """Topics that are published or subscribed, and may go nowhere as long as no other link comes."""
+        """Topics that are published or subscribed, and may go nowhere until there is another link."""
         self._known: dict[tuple[str, int], list[tuple[BridgePort, TopicType]]] | None = None
         """A cache of `_known_types`, for a pass over all links that asks about the same topics."""
         self._too_long: dict[str, None] = {}
@@ -61,8 +61,8 @@ class RoutingTable:
         self._review_all(topic for name in names if (topic := self._to_canonical(name, port)) is not None)
 
     def port_changed(self, port: BridgePort) -> None:
-        """Review what is published and subscribed on a link that is new, or gone, or has another place in the tree, and
-        announce there what other links publish and subscribe to.
+        """Review the topics of a link that is new, or gone, or has another place in the tree, and announce there the
+        topics of other links.
         """
         there = {topic for name in port.demand.topics() if (topic := self._to_canonical(name, port))}
         self._review_all(there | self._idle)
@@ -77,7 +77,7 @@ class RoutingTable:
             self._announce_on(topic, port)
 
     def check_types(self) -> None:
-        """See whether other types, or sizes, are known than those that are announced."""
+        """Check whether types or sizes differ from the announced ones."""
         self._known = {}
         try:
             changed = {
@@ -91,7 +91,7 @@ class RoutingTable:
         self._review_all(changed)
 
     def _review_all(self, topics: Iterable[str]) -> None:
-        """Look at these anew, at once: what comes in next may need a new route."""
+        """Review these topics at once: the next message may need a new route."""
         self._to_review.update(dict.fromkeys(sorted(topics)))
         if self._reviewing:  # what a review announces may change demand: that is reviewed after it
             return
@@ -165,7 +165,7 @@ class RoutingTable:
     def _add_routes(
         self, relayed: RelayedTopic, topic: str, published_on: list[BridgePort], subscribed_on: list[BridgePort]
     ) -> None:
-        """Add the routes from and to what is new here: looking at all pairs each time would cost links squared."""
+        """Add the routes from and to new links: looking at all pairs each time would cost links squared."""
         new = [port for port in published_on if port.name not in relayed.sources]
         old = [port for port in published_on if port.name in relayed.sources]
         added = [port for port in subscribed_on if port.name not in relayed.targets]
@@ -218,7 +218,7 @@ class RoutingTable:
     # What is announced
 
     def _announce(self, topic: str, ended: dict[str, BridgedTopic] | None = None) -> None:
-        """Announce a topic on all links; `ended`: what it was called while it was forwarded."""
+        """Announce a topic on all links; `ended`: its name while it was forwarded."""
         self._known = {}
         try:
             for port in list(self._ports.values()):
@@ -236,7 +236,7 @@ class RoutingTable:
             port.link.stats.lost.guard(port.link.topic_changed, here)
 
     def desired_state(self, port: BridgePort, topic: Topic, own: Announcement) -> Announcement:
-        """Return what a link is to announce of a topic of which this module itself has `own`."""
+        """Return a link's announcement of a topic; `own` is this module's."""
         if not port.in_tree:
             return NOTHING
         name = self._policy.to_canonical(topic.name, port.name)
@@ -258,7 +258,7 @@ class RoutingTable:
         )
 
     def _types(self, topic: str, port: BridgePort) -> _Types:
-        """The types with which a link is to publish and to subscribe: what publishers announce, if there are any.
+        """Return the types with which a link is to publish and to subscribe: those of publishers, if there are any.
 
         Those on the link itself are asked for what they have, so that another type elsewhere does not end the topic.
         """
@@ -269,13 +269,13 @@ class RoutingTable:
         return published or asked or TopicType(), here or asked or published or TopicType()
 
     def _type_elsewhere(self, topic: str, port: BridgePort, ports: list[BridgePort], role: int) -> TopicType | None:
-        """The type on the first other one of these links; where there are none, the first that is known."""
+        """Return the type on the first other one of these links; without any, the first known type."""
         if ports:
             return self._type_on(topic, (each for each in ports if each is not port), role)
         return next((known for each, known in self._known_types(topic, role) if each is not port), None)
 
     def _known_types(self, topic: str, role: int) -> list[tuple[BridgePort, TopicType]]:
-        """The first two links that know a type: so each link finds one besides its own, and none looks at all."""
+        """Return the first two links that know a type: so each link finds another one without looking at all."""
         known = None if self._known is None else self._known.get((topic, role))
         if known is None:
             types = ((port, self._type_on(topic, [port], role)) for port in self._ports.values() if port.in_tree)
@@ -285,7 +285,7 @@ class RoutingTable:
         return known
 
     def _type_on(self, topic: str, ports: Iterable[BridgePort], role: int) -> TopicType | None:
-        """The type that is announced on the first of these links where one is."""
+        """Return the first announced type on these links."""
         infos = (each.link.discovery.topics.get(self._policy.to_link_name(topic, each.name)) for each in ports)
         return next((info.types[role] for info in infos if info is not None and role in info.types), None)
 
@@ -297,7 +297,7 @@ class RoutingTable:
         return here
 
     def _to_canonical(self, name: str, port: BridgePort) -> str | None:
-        """The canonical name; None for another robot's topics, and for names that only a hostile peer can send."""
+        """Return the canonical name; None for another robot's topics, and for names that only a hostile peer sends."""
         topic = self._policy.to_canonical(name, port.name)
         return topic if topic and _NAME.fullmatch(topic) else None
 

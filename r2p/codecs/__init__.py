@@ -6,7 +6,7 @@ of the caller (`MessageError`). Bytes that are not such a message raise `DecodeE
 - `debug`: the lines of the debug transport; `rtcan`: the identifiers and frames of RTCAN; `can_bits`: their length.
 - `management`: the messages of the topic `R2P`; `loader`: those of `BOOT_<module>`; both in terms of `_records`.
 - `attachment`, `liveliness`: what accompanies messages on zenoh, and the tokens there.
-- `schemas`: answers to the question for a type; `probes`: how gateways look for loops.
+- `schemas`: answers to requests for a type; `probes`: messages by which gateways find loops.
 """
 
 import enum
@@ -15,7 +15,7 @@ from r2p.errors import DecodeError
 
 
 class UnknownType(DecodeError):
-    """A type byte, or the version of an r2p type, that is not known: ignored, as firmware does (PROTOCOL.md 4)."""
+    """An unknown type byte, or version of an r2p type: ignored, as firmware does (PROTOCOL.md 4)."""
 
 
 class PublisherClass(enum.IntEnum):

@@ -1,6 +1,6 @@
 """Fields inside the messages of gateways (PROTOCOL.md 9): parts, counts and serials, acknowledgements, neighbours.
 
-`r2p.codecs.management` has their messages, and exports what is here.
+`r2p.codecs.management` has their messages, and exports these functions.
 """
 
 import struct
@@ -17,17 +17,17 @@ _HEARD = struct.Struct("<BIB")
 
 
 def make_part(number: int, last: int) -> int:
-    """The `part` of a Name or a Mesh: the number of this part, and of the last one."""
+    """Return the `part` of a Name or a Mesh: the number of this part, and of the last one."""
     return number << _PART_BITS | last
 
 
 def split_part(part: int) -> tuple[int, int]:
-    """The number of this part, from 0, and of the last one."""
+    """Return the number of this part, from 0, and of the last one."""
     return part >> _PART_BITS, part & PARTS_MAX - 1
 
 
 def next_serial(serial: int) -> int:
-    """The count of a Bridge or a Leaf, or the serial of a Mesh, that follows this one."""
+    """Return the next count of a Bridge or a Leaf, or the next serial of a Mesh."""
     return (serial + 1) % _SERIALS
 
 
@@ -37,25 +37,25 @@ def is_newer_serial(serial: int, last: int) -> bool:
 
 
 def leaf_port(number: int) -> int:
-    """The `port` of a Leaf for the link with this number: its low byte, as the field has one byte."""
+    """Return the `port` of a Leaf for the link with this number: its low byte, as the field has one byte."""
     return number & 0xFF
 
 
 def encode_acks(acks: Iterable[tuple[int, int]], places: int) -> bytes:
-    """The `acks` of a Bridge (BRIDGE_ACKS places) or a Leaf (LEAF_ACKS): senders and counts."""
+    """Return the `acks` of a Bridge (BRIDGE_ACKS places) or a Leaf (LEAF_ACKS): senders and counts."""
     return b"".join(_ACK.pack(*ack) for ack in acks).ljust(places * _ACK.size, b"\0")
 
 
 def decode_acks(acks: bytes) -> list[tuple[int, int]]:
-    """Senders and counts in the `acks` of a Bridge or a Leaf; the sender of a free place is 0."""
+    """Return senders and counts in the `acks` of a Bridge or a Leaf; the sender of a free place is 0."""
     return list(_ACK.iter_unpack(acks))
 
 
 def encode_heard(heard: Iterable[tuple[int, int, int]]) -> bytes:
-    """The `heard` of a Mesh: own port, other gateway, and its port."""
+    """Return the `heard` of a Mesh: own port, other gateway, and its port."""
     return b"".join(_HEARD.pack(*each) for each in heard).ljust(MESH_HEARD * _HEARD.size, b"\0")
 
 
 def decode_heard(heard: bytes) -> list[tuple[int, int, int]]:
-    """Own port, other gateway and its port in the `heard` of a Mesh, free places left out."""
+    """Return own port, other gateway and its port in the `heard` of a Mesh, free places left out."""
     return [each for each in _HEARD.iter_unpack(heard) if each[1]]

@@ -42,7 +42,7 @@ class Record(Generic[T]):
         return self.cls(*(self._name(name, value) if is_name else value for (name, _, is_name), value in values))
 
     def _packable(self, message: T, name: str, kind: str) -> int | bytes:
-        """The value of an attribute, checked: `struct` itself would cut and pad bytes without an error."""
+        """Return the value of an attribute, checked: `struct` itself would cut and pad bytes without an error."""
         value: int | str | bytes = getattr(message, name)
         where = f"{self.cls.__name__}.{name} = {value!r}"
         if isinstance(value, int):

@@ -1,10 +1,10 @@
-"""The header of messages on zenoh: what the payload, which is one packed message or several, does not contain.
+"""The header of messages on zenoh, whose payload is one packed message or several.
 
 It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by the origin, which stays the same from
-message to message of one publisher; so a reader looks it up in a table, and decodes it once. What a publisher sends
-without a pause may travel together: the payload is then several messages of one size, one after the other, whose
-serials and sequences count on from those in the header. The codecs of credit, and of the sender of management messages,
-are here, too.
+message to message of one publisher; so a reader looks it up in a table, and decodes it once. Messages without a pause
+in between may travel together: the payload is then several messages of one size, one after the other, whose serials and
+sequences count on from those in the header. The codecs of credit, and of the sender of management messages, are here,
+too.
 
 | bytes | what |
 | --- | --- |
@@ -12,8 +12,8 @@ are here, too.
 | 1 | flags: bit 0 the stamp is not the publisher's, bit 1 there is a clock part |
 | 2 | hops: gateways that the message has crossed |
 | 3 | messages in the payload besides the first one: m |
-| 4..7 | serial: counts what the sender has sent on this topic in this class; what is missing was lost on the way |
-| 8..15 | sequence: counts what the publisher has published, from 1; 0: not known |
+| 4..7 | serial: counts the sender's messages on this topic in this class; missing ones were lost on the way |
+| 8..15 | sequence: counts the publisher's messages, from 1; 0: unknown |
 | 16..23 | stamp, UTC in ns |
 | 24..31 | deadline, UTC in ns; 0: none |
 | 16 more, if flagged | clock: `u32 epoch; i64 offset; u32 error` |
@@ -68,8 +68,8 @@ _SHOWN_MAX = 40  # bytes of a wrong name that an error shows
 class Origin(msgspec.Struct, frozen=True):
     """The publisher of a message, and the module that put it on this network.
 
-    `sender` is the r2p module that sent it: the publisher's, or a gateway; `instance` the number of the module that
-    published it, 0 for firmware. Names are empty where they are not known. `fingerprint` all zero: type not known.
+    `sender` is the r2p module that sent it: the publisher's, or a gateway; `instance` the number of the publisher's
+    module, 0 for firmware. Unknown names are empty. `fingerprint` all zero: unknown type.
     """
 
     publisher_class: PublisherClass
@@ -92,7 +92,7 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     stamped: bool = True
     clock: ClockOffset | None = None
     more: tuple[int, ...] = ()
-    """The stamps of the messages that follow in the same payload."""
+    """The stamps of the later messages in the same payload."""
 
 
 class Packer:
@@ -142,16 +142,16 @@ class HeaderReader(Generic[T]):
     def __init__(self, remember: Callable[[Origin], T]) -> None:
         self._make = remember
         self._recent: dict[bytes, T] = {}
-        """By the bytes of the origin, those that were new or used since `_older` was replaced."""
+        """Entries by the bytes of the origin that were new or used since `_older` was replaced."""
         self._older: dict[bytes, T] = {}
 
     @property
     def known(self) -> dict[bytes, T]:
-        """A copy of what is remembered, by the bytes of the origin."""
+        """Return a copy of the remembered entries, by the bytes of the origin."""
         return self._older | self._recent
 
     def forget(self, key: bytes) -> None:
-        """Forget an origin: `remember` is called again should it come back."""
+        """Forget an origin: `remember` is called again if it returns."""
         self._recent.pop(key, None)
         self._older.pop(key, None)
 
@@ -161,7 +161,7 @@ class HeaderReader(Generic[T]):
 
         Raises `UnknownType` for a version to ignore, else `DecodeError`.
         """
-        # A tuple, not a `Header`: this is done for each packet, and its reader unpacks the parts at once.
+        # A tuple, not a `Header`: this runs for each packet, and its reader unpacks the parts at once.
         try:
             version, flags, hops, more, serial, sequence, stamp, deadline = _unpack(data)
         except struct.error:  # too short; a header of another version may be
@@ -197,7 +197,7 @@ class HeaderReader(Generic[T]):
             known = self._make(_decode_origin(tail))
         if len(self._recent) >= _REMEMBERED_MAX // 2:
             # Forged origins can fill both. An origin that is evicted loses what recognises duplicates of its messages,
-            # so it must not be one in use: only one that did not come while 2048 others did.
+            # so it must not be one in use: only one that was absent while 2048 others arrived.
             self._older, self._recent = self._recent, {}
         self._recent[tail] = known
         return known

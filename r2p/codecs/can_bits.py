@@ -1,8 +1,8 @@
-"""CAN frames, and how many bits they take on the wire: controllers stamp the end of a frame, so its start follows.
+"""CAN frames, and their length in bits: controllers stamp the end of a frame, so its start follows.
 
 A frame's length in bits depends on its content: after five equal bits the controller stuffs in a sixth, opposite one,
-also in the CRC. Bits are counted a byte at a time: a table has for each state of the stuffing (which bit came last, how
-often) and each byte the next state and how many bits were stuffed in.
+also in the CRC. Bits are counted a byte at a time: a table has for each state of the stuffing (the last bit, how often)
+and each byte the next state and the number of stuffed bits.
 """
 
 from functools import lru_cache
@@ -35,20 +35,20 @@ class OtherFrame(msgspec.Struct, frozen=True):
 
 
 def frame_bits_min(size: int) -> int:
-    """The bits of the shortest frame with `size` bytes of data: nothing stuffed in. Without intermission."""
+    """Return the bits of the shortest frame with `size` bytes of data: no stuff bits. Without intermission."""
     return _HEADER + 8 * size + _CRC + TAIL
 
 
 def frame_bits_max(size: int) -> int:
-    """The bits of the longest frame with `size` bytes of data: after the first bit, every fourth has one stuffed in."""
+    """Return the bits of the longest frame with `size` bytes of data: after the first bit, one stuffed in per four."""
     return frame_bits_min(size) + (_HEADER + 8 * size + _CRC - 1) // 4
 
 
 @lru_cache(maxsize=64)  # all that deal with one frame ask at about the same time
 def frame_bits(identifier: int, data: bytes, *, extended: bool = True) -> int:
-    """The bits of a data frame from its start to its end, those stuffed in included, without intermission.
+    """Return the bits of a data frame from its start to its end, stuff bits included, without intermission.
 
-    `extended=False` is for frames with 11-bit identifiers, which RTCAN does not send. Raises `MessageError` when the
+    `extended=False` is for frames with 11-bit identifiers, which RTCAN does not send. Raises `MessageError` if the
     identifier or the data are too long.
     """
     row, crc, bits = _header(identifier, len(data), extended)
@@ -79,7 +79,7 @@ def start_of_frame(frame: Frame, end: int, bit: int) -> int:
 
 
 def other_frame_bits(frame: OtherFrame) -> int:
-    """The bits of a frame that RTCAN does not use. Counts and raises as `frame_bits` does."""
+    """Return the bits of a frame that RTCAN does not use. Counts and raises as `frame_bits` does."""
     if frame.remote is None:
         return frame_bits(frame.id, frame.data, extended=frame.extended)
     if frame.id >> (IDENTIFIER_BITS if frame.extended else 11) or not 0 <= frame.remote <= 0xF:
@@ -90,7 +90,7 @@ def other_frame_bits(frame: OtherFrame) -> int:
 
 
 def bits_until_lost(winner: int, loser: int) -> int:
-    """Bits from the start of frame to the end of the one where `loser` gives up: the first in which the two differ.
+    """Return the bits from the start of frame to the end of the bit where `loser` gives up: the first that differs.
 
     Both are 29-bit identifiers, `winner` the lower one.
     """
@@ -102,7 +102,7 @@ def bits_until_lost(winner: int, loser: int) -> int:
 
 
 def wire_bits(frame: Frame) -> str:
-    """The bits of a frame as its sender sends them, `0` dominant, with those stuffed in. Slow: for looking closely."""
+    """Return the bits of a frame as sent, `0` dominant, with stuff bits. Slow: for error frames."""
     count = _HEADER + 8 * len(frame.data)
     bits = (_arbitration(frame.id) << 7 | len(frame.data)) << 8 * len(frame.data) | int.from_bytes(frame.data, "big")
     bits, count = bits << _CRC | _crc(bits.to_bytes(13, "big")), count + _CRC
@@ -115,7 +115,7 @@ def wire_bits(frame: Frame) -> str:
     return sent + "1" * TAIL
 
 
-# How bits are counted. The state of the stuffing is (the last bit) << 2 | (how many of it there were) - 1.
+# Counting bits. The state of the stuffing is (the last bit) << 2 | (its run length) - 1.
 
 _HEADER = 39  # bits: start of frame, 11 of the identifier, SRR, IDE, 18 of the identifier, RTR, 2 reserved, 4 of length
 _STANDARD_HEADER = _HEADER - 20  # with an identifier of 11 bits, one of the reserved bits, and no SRR
@@ -123,11 +123,11 @@ _REMOTE = 1 << 6  # RTR, with what follows it of the header
 _CRC = 15
 _START = 1 << 2  # before a frame the bus is recessive; the start of frame is dominant, so how long does not matter
 _Row: TypeAlias = "list[tuple[_Row, int]]"
-"""A state of the stuffing: for each byte, and then for each 7 bits, the next state and how many bits are sent."""
+"""A state of the stuffing: for each byte, and then for each 7 bits, the next state and the number of bits sent."""
 
 
 def _arbitration(identifier: int) -> int:
-    """The 32 bits from the start of frame to the end of the identifier."""
+    """Return the 32 bits from the start of frame to the end of the identifier."""
     return identifier >> 18 << 20 | 0b11 << 18 | identifier & 0x3FFFF
 
 
@@ -151,7 +151,7 @@ def _header(identifier: int, size: int, extended: bool) -> tuple[_Row, int, int]
 
 
 def _crc(data: bytes) -> int:
-    """CRC-15. Zeros in front leave it as it is."""
+    """Return the CRC-15. Zeros in front leave it unchanged."""
     crc = 0
     for byte in data:
         crc = (crc << 8 ^ _REMAINDER[crc >> 7 ^ byte]) & 0x7FFF
@@ -159,7 +159,7 @@ def _crc(data: bytes) -> int:
 
 
 def _stuff(state: int, bits: int, count: int) -> int:
-    """Send `count` bits: (how many were stuffed in) << 3 | the state after them."""
+    """Send `count` bits: return (number of stuff bits) << 3 | the state after them."""
     stuffed = 0
     for shift in range(count - 1, -1, -1):
         bit = bits >> shift & 1
@@ -192,5 +192,5 @@ for _state, _row in enumerate(_ROWS):
 _REMAINDER = tuple(_remainder(byte) for byte in range(256))
 _PLACES = [tuple(_crc(bytes((byte, *bytes(after)))) for byte in range(256)) for after in range(FRAME_MAX)]
 _REMAINDERS = [_PLACES[:size][::-1] for size in range(FRAME_MAX + 1)]
-"""CRC-15 is linear: the sum of what each byte makes alone. By size of the data, place of the byte, and its value."""
+"""CRC-15 is linear: the sum of those of single bytes. By size of the data, place of the byte, and its value."""
 _1ST, _2ND, _3RD, _4TH, _5TH, _6TH, _7TH, _8TH = _REMAINDERS[FRAME_MAX]

@@ -21,10 +21,10 @@ from r2p.names import TOPIC_MAX
 PAYLOAD_MAX = 255
 
 OPENING = b"\r\n\r\n"
-"""Ends whatever the reader at the other end has begun to read: the first bytes on a line."""
+"""The first bytes on a line, which end any unfinished message of the other end's reader."""
 
 NO_DEADLINE = 0x7FFFFFFF
-"""Microseconds after the stamp, where a message has no deadline: as firmware does it."""
+"""Microseconds after the stamp, for a message without a deadline: as in firmware."""
 
 _HEX = b"0123456789ABCDEFabcdef"
 _PRINTABLE = bytes(range(0x20, 0x7F))
@@ -75,7 +75,7 @@ def encoder(topic: bytes) -> Callable[[bytes, int], bytes]:
 class Reader:
     """Turns a stream into lines. It never fails: bytes that are not a message are counted by reason in `drops`.
 
-    | reason | what came |
+    | reason | received |
     | --- | --- |
     | garbage | anything between messages but line ends, once for each run up to a line end or an `@` |
     | cut short | a line end inside a message |
@@ -84,12 +84,12 @@ class Reader:
     | empty payload | a payload length of 0 |
     | checksum | a wrong sum, which firmware does not check |
 
-    What follows a dropped message up to the line end belongs to it, and is not counted again. The reader holds at most
+    Bytes after a dropped message up to the line end belong to it, and are not counted again. The reader holds at most
     one unfinished message, less than 600 bytes.
     """
 
     def __init__(self, drops: dict[str, int] | None = None) -> None:
-        """`drops` is the counter to use, where several readers share one."""
+        """`drops` is the counter to use, if several readers share one."""
         self.drops: dict[str, int] = {} if drops is None else drops
         self._held = b""
         self._counted = False  # the noise that comes next, up to a line end, is already counted
@@ -127,7 +127,7 @@ class Reader:
         return end
 
     def _read(self, buffer: bytes, start: int, lines: list[Line]) -> int:
-        """Read one message field by field; returns where to go on: behind the wrong character, as in firmware."""
+        """Read one message field by field; return where to go on: behind the wrong character, as in firmware."""
         fields = _Fields(buffer, start + 1)
         try:
             lines.append(fields.line())
@@ -142,7 +142,7 @@ class Reader:
 
 
 def _checked(whole: re.Match[bytes]) -> Line | None:
-    """The line of a match, if its hex digits, lengths and checksum are right."""
+    """Return the line of a match, if its hex digits, lengths and checksum are right."""
     deadline, name_size, topic, payload, checksum = whole.groups()
     try:
         raw = unhexlify(deadline + name_size + payload + checksum)
@@ -155,7 +155,7 @@ def _checked(whole: re.Match[bytes]) -> Line | None:
 
 
 class _Unfinished(Exception):
-    """Raised while a message is valid so far, and its rest has yet to come."""
+    """Raised for the valid beginning of a message whose rest is missing."""
 
 
 class _Wrong(Exception):

@@ -68,8 +68,8 @@ class ModuleToken(msgspec.Struct, frozen=True):
 class TopicToken(msgspec.Struct, frozen=True):
     """A publisher or subscriber (`role` is ROLE_...) of a topic.
 
-    `publisher_class` is CLASS_..., a sum; `size` in bytes, 0: not known. A subscriber with a `window` wants its
-    publishers to wait for it: so many messages may be on their way. 0: it would rather lose some.
+    `publisher_class` is CLASS_..., a sum; `size` in bytes, 0: unknown. A subscriber with a `window` wants its
+    publishers to wait for it: so many messages may be on their way. 0: a lossy one.
     """
 
     session: int
@@ -165,7 +165,7 @@ def token_key(token: str) -> str:
 
 
 def token_of(suffix: str) -> str:
-    """Return the token of what follows `live/` in a key; other implementations may leave out the wildcard."""
+    """Return the token in a key after `live/`; other implementations may leave out the wildcard."""
     return suffix.removeprefix(_WILD)
 
 

@@ -1,7 +1,7 @@
 """The messages of a module's loader, topic `BOOT_<module>`: a 30-byte body and a type byte (PROTOCOL.md 5).
 
 Addresses are in the module's memory, lengths in bytes; both are unsigned 32-bit numbers. Fields of raw bytes have their
-full size in both directions: how much of them is used depends on the messages before.
+full size in both directions: the used part depends on earlier messages.
 """
 
 from typing import dataclass_transform
@@ -19,7 +19,7 @@ REASON_NO_MEMORY = 1
 REASON_ZERO_LENGTH = 2
 REASON_OUT_OF_RANGE = 3
 
-# Nack.kind, what Nack.value holds
+# Nack.kind, the meaning of Nack.value
 VALUE_NONE = 0
 VALUE_TEXT = 1
 VALUE_INT = 2
@@ -71,7 +71,7 @@ class LinkingSetup(Loader):
 
 
 class LinkingAddresses(Loader):
-    """The addresses that an app is to be linked to."""
+    """The addresses for linking an app."""
 
     infoadr: int
     pgmadr: int
@@ -82,7 +82,7 @@ class LinkingAddresses(Loader):
 
 
 class LinkingOutcome(Loader):
-    """The addresses and lengths that came out of linking."""
+    """The addresses and lengths after linking."""
 
     mainadr: int
     cfgadr: int
@@ -107,7 +107,7 @@ class IhexRecord(Loader):
 
 
 class RemoveLast(Loader):
-    """Remove the app that was loaded last."""
+    """Remove the last loaded app."""
 
 
 class RemoveAll(Loader):

@@ -1,8 +1,8 @@
 """The messages of the management topic `R2P`: a 31-byte body and a type byte (PROTOCOL.md 4 and 9).
 
 Modules find each other and agree on what flows with these messages. Where firmware leaves something open, `decode` is
-tolerant: it ignores what stands behind the NUL of a name and reserved bytes, and of STOP, REBOOT and BOOTLOAD, of which
-a tool of 2013 has a layout of its own, it reads the name only.
+tolerant: it ignores bytes after the NUL of a name and reserved bytes, and reads only the name of STOP, REBOOT and
+BOOTLOAD, for which a tool of 2013 has another layout.
 
 Types from 0x40 on are r2p's own. Their body begins with a version. Those up to 0x4F stay on one RTCAN bus, among the
 modules that are directly on it. After the version, without gaps (`slot` and `utc_offset` in ns, `utc_error` in us):
@@ -53,7 +53,7 @@ SIZE = 32
 
 
 class ManagementType(enum.IntEnum):
-    """The type byte of each message, which is its last one."""
+    """The type byte of each message, its last byte."""
 
     ALIVE = 0x11
     STOP = 0x12
@@ -86,13 +86,13 @@ class ManagementType(enum.IntEnum):
 R2P_TYPES = range(0x40, 0x100)
 """The types that firmware does not know."""
 RTCAN_TYPES = range(0x40, 0x50)
-"""The types that concern one RTCAN bus, and that gateways don't pass on."""
+"""The types for one RTCAN bus, which gateways don't pass on."""
 PARAMS_TYPES = (ManagementType.ADVERTISE, ManagementType.SUBSCRIBE_REQUEST, ManagementType.SUBSCRIBE_RESPONSE)
 """The types that have `params`."""
 ORDER_TYPES = (ManagementType.STOP, ManagementType.REBOOT, ManagementType.BOOTLOAD)
 """The orders that a gateway may deny."""
 GATEWAY_TYPES = (ManagementType.BRIDGE, ManagementType.MESH, ManagementType.LEAF)
-"""The types by which gateways agree on their tree."""
+"""The types of messages between gateways about their tree."""
 
 # Alive.flags
 FLAG_STOPPED = 1
@@ -136,8 +136,9 @@ QUEUE = 5
 QUEUE_MAX = 16
 """Entries of such a queue at most."""
 QUEUE_BYTES_MAX = 1024
-"""Bytes of such a queue at most. Firmware has 20 kB of RAM and takes the queue from its heap; where there is no room
-left it writes to NULL."""
+"""Bytes of such a queue at most. Firmware has 20 kB of RAM and takes the queue from its heap; without room it writes to
+NULL.
+"""
 QUEUE_ENTRY = 8
 """Bytes that firmware needs for an entry besides its message."""
 
@@ -210,7 +211,7 @@ Order = Stop | Reboot | Bootload
 class Advertise(msgspec.Struct, frozen=True, gc=False):
     """A topic has a publisher. `size` is the payload's, in bytes; `queue` means nothing here.
 
-    `params` belong to the transport that the message travels on: on RTCAN bytes 0 and 1 are the message id.
+    `params` belong to the transport of the message: on RTCAN, bytes 0 and 1 are the message id.
     """
 
     topic: str
@@ -318,7 +319,7 @@ class Name(msgspec.Struct, frozen=True, gc=False):
 
 
 class Bridge(msgspec.Struct, frozen=True, gc=False):
-    """A gateway lives: `count` numbers its messages, `agreement` is the hash of the network as the gateway sees it.
+    """A gateway lives: `count` numbers its messages, `agreement` is the hash of the mesh as the gateway sees it.
 
     `root` is the lowest gateway of its mesh. `acks` are 2 times the sender (u32) and `count` (u16) of the last BRIDGE
     or LEAF that it received on this network.
@@ -518,17 +519,17 @@ def type_of(data: bytes) -> int:
 
 
 def order_type(order: Order) -> int:
-    """The type byte of an order, by which a Denied names it."""
+    """Return the type byte of an order, as in a Denied."""
     return _CODEC.code_of(order)
 
 
 def queue_length(size: int, wanted: int = QUEUE) -> int:
-    """The entries of a queue to request of firmware, for messages of `size` bytes: 1 to 16, and 1024 bytes at most."""
+    """Return the queue to request from firmware for messages of `size` bytes: 1 to 16 entries, 1024 bytes at most."""
     return max(1, min(wanted, QUEUE_MAX, QUEUE_BYTES_MAX // (size + QUEUE_ENTRY)))
 
 
 def alias_messages(name: str) -> list[Name]:
-    """The messages that say what the alias of a module's name stands for; none if the name fits into a message."""
+    """Return the messages that announce the name behind a module's alias; none if the name fits into a message."""
     alias = module_alias(name)
     if alias == name:
         return []
@@ -536,21 +537,21 @@ def alias_messages(name: str) -> list[Name]:
     return [Name(alias, make_part(number, len(pieces) - 1), piece) for number, piece in enumerate(pieces)]
 
 
-# What params hold: on RTCAN a message id and the mark, and in the last byte the state of an r2p subscription.
+# Contents of params: on RTCAN a message id and the mark, and in the last byte the state of an r2p subscription.
 
 
 def with_unanswered(params: bytes) -> bytes:
-    """The params of an ADVERTISE to which no r2p module has subscribed yet."""
+    """Return the params of an ADVERTISE without an r2p subscriber yet."""
     return params[:-1] + UNANSWERED[-1:]
 
 
 def rtcan_params(message_id: int) -> bytes:
-    """The params that offer a topic under this message id."""
+    """Return the params that offer a topic under this message id."""
     return message_id.to_bytes(2, "little").ljust(len(NO_PARAMS), b"\0")
 
 
 def rtcan_message_id(params: bytes) -> int:
-    """The message id in the params of an ADVERTISE or a SUBSCRIBE_RESPONSE."""
+    """Return the message id in the params of an ADVERTISE or a SUBSCRIBE_RESPONSE."""
     return int.from_bytes(params[:2], "little")
 
 
@@ -563,7 +564,7 @@ def mark(data: bytes) -> bytes:
 
 
 def unmark(data: bytes) -> bytes:
-    """Take the mark away."""
+    """Remove the mark."""
     return _with_mark(data, bytes(len(_MARK))) if is_marked(data) else data
 
 

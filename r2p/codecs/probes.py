@@ -1,6 +1,6 @@
-"""Probes: what a gateway sends to find out whether it comes back by another link, through gateways of firmware.
+"""Probes, by which a gateway finds out whether messages return by another link, through gateways of firmware.
 
-Those pass on every ALIVE, and nothing that they do not know. So a probe is the ALIVE of a module that can't exist: its
+Those pass on every ALIVE, but nothing unknown to them. So a probe is the ALIVE of a module that can't exist: its
 name begins with `_`, as those of tools, which send no ALIVE. Six digits to the base 62 hold the gateway and its port.
 """
 
@@ -11,11 +11,11 @@ from r2p.codecs import management
 _DIGITS = string.digits + string.ascii_letters
 _LENGTH = 6
 PORT_MODULUS = 13
-"""A probe carries the number of its port modulo this: 62^6 / 2^32 values are left beside the gateway's 32 bits."""
+"""A probe carries the number of its port modulo this: 62^6 / 2^32 values are left besides the gateway's 32 bits."""
 
 
 def encode(gateway: int, port: int) -> bytes:
-    """The probe of a port."""
+    """Return the probe of a port."""
     number = gateway * PORT_MODULUS + port % PORT_MODULUS
     name = ""
     for _ in range(_LENGTH):
@@ -25,7 +25,7 @@ def encode(gateway: int, port: int) -> bytes:
 
 
 def decode(data: bytes) -> tuple[int, int] | None:
-    """Gateway and port of a probe; None for any other ALIVE."""
+    """Return gateway and port of a probe; None for any other ALIVE."""
     name = data[: _LENGTH + 1].decode("latin-1")
     if name[0] != "_" or not all(each in _DIGITS for each in name[1:]):
         return None

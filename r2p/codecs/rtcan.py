@@ -44,7 +44,7 @@ _ALL_SLOTS = (1 << SLOTS_MAX) - 1
 
 
 class Identifier(msgspec.Struct, frozen=True, gc=False):
-    """The parts of an identifier: laxity 0..63, message id 0..0xFFFF, fragments that come after this one 0..127."""
+    """The parts of an identifier: laxity 0..63, message id 0..0xFFFF, fragments after this one 0..127."""
 
     laxity: int
     message_id: int
@@ -52,14 +52,14 @@ class Identifier(msgspec.Struct, frozen=True, gc=False):
 
 
 class Sync(msgspec.Struct, frozen=True, gc=False):
-    """The frame that starts a cycle: its counter mod 256, and a mask in which bit i says that slot i is reserved."""
+    """The frame that starts a cycle: its counter mod 256, and a mask; bit i: slot i is reserved."""
 
     cycle: int
     mask: int
 
 
 def encode_identifier(laxity: int, message: int, left: int = 0) -> int:
-    """The identifier of a frame. Raises `MessageError` when a part does not fit its field."""
+    """Return the identifier of a frame. Raises `MessageError` if a part does not fit its field."""
     if not (0 <= laxity <= NRT and 0 <= message <= MESSAGE_MAX and 0 <= left <= LEFT_MASK):
         parts = f"laxity {laxity} (0..{NRT}), message id {message:#x} (0..{MESSAGE_MAX:#x})"
         raise MessageError(f"does not fit the identifier: {parts}, {left} fragments left (0..{LEFT_MASK})")
@@ -67,56 +67,56 @@ def encode_identifier(laxity: int, message: int, left: int = 0) -> int:
 
 
 def decode_identifier(identifier: int) -> Identifier:
-    """The parts of an identifier. Raises `DecodeError` for more than 29 bits."""
+    """Return the parts of an identifier. Raises `DecodeError` for more than 29 bits."""
     if identifier >> IDENTIFIER_BITS:
         raise DecodeError(f"{identifier:#x} has more than 29 bits")
     return Identifier(laxity_of(identifier), message_of(identifier), identifier & LEFT_MASK)
 
 
 def laxity_of(identifier: int) -> int:
-    """The laxity in an identifier."""
+    """Return the laxity in an identifier."""
     return identifier >> LAXITY_SHIFT
 
 
 def message_of(identifier: int) -> int:
-    """The message id in an identifier."""
+    """Return the message id in an identifier."""
     return identifier >> MESSAGE_SHIFT & MESSAGE_MAX
 
 
 def high_filter(high: int) -> tuple[int, int]:
-    """The identifier and the mask of a filter for all messages with this high byte."""
+    """Return the identifier and the mask of a filter for all messages with this high byte."""
     return high << HIGH_SHIFT, HIGH_MASK
 
 
 def id8_filter(id8: int) -> tuple[int, int]:
-    """The identifier and the mask of a filter for all messages of the module `id8`."""
+    """Return the identifier and the mask of a filter for all messages of the module `id8`."""
     return id8 << MESSAGE_SHIFT, ID8_MASK
 
 
 def message_filter(message: int) -> tuple[int, int]:
-    """The identifier and the mask of a filter for one message id."""
+    """Return the identifier and the mask of a filter for one message id."""
     return message << MESSAGE_SHIFT, MESSAGE_MASK
 
 
 def message_id(high: int, id8: int) -> int:
-    """The id of a topic (or SYNC, MANAGEMENT) at the module `id8`. Raises `MessageError` beyond a byte each."""
+    """Return the id of a topic (or SYNC, MANAGEMENT) at the module `id8`. Raises `MessageError` beyond a byte each."""
     if not (0 <= high <= HIGH_MAX and 0 <= id8 <= ID8_MAX):
         raise MessageError(f"high byte {high}, id8 {id8}: each is a byte")
     return high << 8 | id8
 
 
 def high_byte(message: int) -> int:
-    """The high byte of a message id: the topic."""
+    """Return the high byte of a message id: the topic."""
     return message >> 8
 
 
 def id8_of(message: int) -> int:
-    """The low byte of a message id: the module."""
+    """Return the low byte of a message id: the module."""
     return message & ID8_MAX
 
 
 def srt_laxity(remaining: int) -> int:
-    """The laxity of a soft real-time message with `remaining` ns to its deadline, which may be over: 1..62."""
+    """Return the laxity of a soft real-time message, 1..62, with `remaining` ns to its deadline, which may be over."""
     laxity = remaining // MILLISECOND
     if laxity < SRT_MIN:
         return SRT_MIN
@@ -133,7 +133,7 @@ def fragment_count(size: int) -> int:
 
 
 def fragments(payload: bytes) -> list[tuple[int, bytes]]:
-    """The frames of a message, in order, as (fragments left, data). Raises `MessageError` beyond 1..1024 bytes."""
+    """Return a message's frames in order, as (fragments left, data). Raises `MessageError` beyond 1..1024 bytes."""
     count = fragment_count(len(payload))
     if count == 1:
         return [(0, payload)]
@@ -141,7 +141,7 @@ def fragments(payload: bytes) -> list[tuple[int, bytes]]:
 
 
 def encode_sync(cycle: int, mask: int) -> Frame:
-    """The sync frame, with the lowest 8 bits of the counter. Raises `MessageError` for a slot beyond 63."""
+    """Return the sync frame, with the lowest 8 bits of the counter. Raises `MessageError` for a slot beyond 63."""
     if mask & ~_ALL_SLOTS:
         raise MessageError(f"reservation mask {mask:#x}: a cycle has at most {SLOTS_MAX} slots")
     return Frame((cycle & CYCLE_MASK) << MESSAGE_SHIFT, mask.to_bytes(FRAME_MAX, "little"))

@@ -12,14 +12,14 @@ two Python functions around one `struct.Struct`, so that packing costs little mo
 
 The order on the wire is the order of definition, base classes first; a field that is defined again keeps its place.
 
-A value is packed exactly or refused with a MessageError: no number is wrapped or cut, no text is shortened. Numbers are
-what the struct module accepts: a bool, or an object with `__index__`, is an integer, and an integer is a float; an f32
+A value is packed exactly or refused with a MessageError: no number is wrapped or cut, no text is shortened. The struct
+module decides what is a number: a bool, or an object with `__index__`, is an integer, and an integer is a float; an f32
 is rounded to its 24 bits; NaN and infinities pass. A bool has to be a bool, an array a tuple, and a nested message an
 instance of exactly its class. When a message is unpacked, any byte but 0 is True, and a text ends at its first NUL:
-firmware leaves rubbish behind it.
+firmware leaves garbage after it.
 
-`shapes` is what layouts and fields are made of, `packing` generates the functions, `layouts` has the classes and
-compiles them, and `schemas` builds a class from its schema.
+`shapes` has the parts of layouts and fields, `packing` generates the functions, `layouts` has the classes and compiles
+them, and `schemas` builds a class from its schema.
 """
 
 from r2p.messages.layouts import SIZE_MAX, ClockOffset, Message, Timestamp, layout

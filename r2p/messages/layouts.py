@@ -1,7 +1,6 @@
-"""Message classes, and how a layout is compiled from their annotations at first use.
+"""Message classes, and the layouts compiled from their annotations at first use.
 
-A layout is kept in its class, not in a table: so a class that a tool has built from a schema can be collected, with its
-layout.
+A layout is kept in its class, not in a table: so a class built from a schema can be garbage-collected, with its layout.
 """
 
 import keyword
@@ -85,7 +84,7 @@ class Timestamp(Message):
 
     @classmethod
     def from_ns(cls, ns: int) -> Self:
-        """The time stamp of an instant in ns since 1970. Raises MessageError outside of 1970 to 2106."""
+        """Return the time stamp of an instant in ns since 1970. Raises MessageError outside of 1970 to 2106."""
         sec, nsec = divmod(ns, SECOND)
         if not 0 <= sec < 1 << 32:
             raise MessageError(f"{show(ns)} ns is not between 1970 and 2106, the years of a Timestamp")
@@ -117,7 +116,7 @@ def check_field_name(path: str, name: str) -> None:
 
 
 def _find_or_compile(cls: Any, outer: tuple[type, ...]) -> Layout[Any]:
-    """The layout of a class; `outer` are the classes that contain it, to find one that contains itself."""
+    """Compile the layout of a class; `outer` are the classes that contain it, to find one that contains itself."""
     found: Layout[Any] | None = vars(cls).get("_layout") if isinstance(cls, type) else None  # not a base class's
     if found is None:
         if not (isinstance(cls, type) and issubclass(cls, Message)):
@@ -148,7 +147,7 @@ def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
 
 
 def _hints(cls: type[Message]) -> Iterator[tuple[str, Any]]:
-    """Field names and annotations in wire order: `get_type_hints` begins with the base classes."""
+    """Return field names and annotations in wire order: `get_type_hints` begins with the base classes."""
     try:
         hints = get_type_hints(cls, include_extras=True)
     except (NameError, AttributeError, SyntaxError, TypeError) as error:
@@ -252,7 +251,7 @@ def _item(base: Any) -> str:
 
 
 def _leaves(shape: Shape, path: str) -> Iterator[str]:
-    """The schema's `path:kind` of each leaf of a field."""
+    """Yield the schema's `path:kind` of each leaf of a field."""
     match shape:
         case Nested(inner):
             for field in inner.fields:

@@ -1,6 +1,6 @@
 """The two functions that pack and unpack one message class: generated source around one `struct.Struct`.
 
-The generated `encode` only detects that a value does not fit; a slow walk through the shapes finds out which one.
+The generated `encode` only detects that a value does not fit; a slow walk through the shapes finds the value.
 """
 
 import struct
@@ -10,8 +10,8 @@ from typing import Any
 from r2p.errors import DecodeError, MessageError
 from r2p.messages.shapes import Array, Chars, Field, Nested, Scalar, Shape, show
 
-# `encode` catches everything: users put objects of any kind into messages, and whatever these raise when they are
-# checked or packed (OverflowError, AttributeError, something of their own) means that they do not fit.
+# `encode` catches everything: users put objects of any kind into messages, and any exception when these are checked or
+# packed (OverflowError, AttributeError, one of their own) means that they do not fit.
 _SOURCE = """
 def encode(message):
     try:
@@ -68,7 +68,7 @@ class _SourceCode:
         self.slots: list[str] = []
 
     def add(self, shape: Shape, value: str) -> str:
-        """Add the packing of the expression `value`; returns the expression that rebuilds it from slots."""
+        """Add the packing of the expression `value`; return the expression that rebuilds it from slots."""
         match shape:
             case Array(item, count):
                 return self.add_array(item, count, value)
@@ -130,7 +130,7 @@ def _text(data: bytes) -> str:
 
 
 def _misfit(cls: type[Any], fields: tuple[Field, ...], message: object) -> MessageError:
-    """The error that names what did not pack."""
+    """Return the error that names the value that did not pack."""
     if type(message) is not cls:
         return MessageError(f"{show(message)} is not a {cls.__name__}")
     for field in fields:

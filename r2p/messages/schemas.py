@@ -2,11 +2,11 @@
 
 A schema lists the leaves of a message in wire order, each with its path: "stamp.sec:u32 stamp.nsec:u32 wheels[0]:f32".
 `_SchemaReader` turns this list back into the tree: leaves that share the first part of their path are one field, and
-what is left of their paths says what the field is, in the same way. An array is built from its first element alone.
+the rest of their paths describes the field in the same way. An array is built from its first element alone.
 
-A schema comes from the network, so it may be anything: elements that differ, fields in pieces, a leaf twice. None of
-this is checked on the way, where only size and depth are limited. Instead `message_type` compares the schema of the new
-class with the one it was given, which finds whatever was wrong.
+A schema comes from the network, so it may be anything: different elements, fields in pieces, a leaf twice. None of this
+is checked on the way, where only size and depth are limited. Instead `message_type` compares the schema of the new
+class with the given one, which finds any error.
 """
 
 import keyword
@@ -78,7 +78,7 @@ class _SchemaReader:
         return cast("type[Message]", made)
 
     def _field_type(self, name: str, leaves: tuple[_Leaf, ...]) -> Any:
-        """The annotation of a field that has these leaves; `name` is for its class, if it is a message."""
+        """Return the annotation of a field with these leaves; `name` is for its class, if it is a message."""
         parts, kind = leaves[0]
         if not parts:
             return _leaf_type(kind)
@@ -99,7 +99,7 @@ class _SchemaReader:
 
 
 def _leaf_type(kind: str) -> Any:
-    """The annotation of a leaf of this kind, such as `u32`, `char[8]` or `f32[3]`."""
+    """Return the annotation of a leaf of this kind, such as `u32`, `char[8]` or `f32[3]`."""
     found = _KIND.fullmatch(kind)
     base, count = found.groups() if found else ("", None)
     if base == "char" and count:

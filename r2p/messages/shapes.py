@@ -1,4 +1,4 @@
-"""Shapes: what fields are made of, and layouts: what message classes are made of.
+"""Shapes of fields, and layouts of message classes.
 
 Packing is generated from them, and tools use them to turn text into fields.
 
@@ -156,7 +156,7 @@ class Layout(msgspec.Struct, Generic[S], frozen=True, eq=False):
 
     @property
     def zero(self) -> S:
-        """The message of zero bytes, made anew: a class that kept an instance of itself would never be collected."""
+        """The message of zero bytes, made anew: a class with an instance of itself would never be garbage-collected."""
         return self.decode(bytes(self.size))
 
     def __repr__(self) -> str:
@@ -188,7 +188,7 @@ i64 = Annotated[int, Scalar("i64", "q")]
 f32 = Annotated[float, Scalar("f32", "f")]
 """A float of 4 bytes: 24 bits of precision, up to 3.4e38; rounded when it is packed."""
 f64 = Annotated[float, Scalar("f64", "d")]
-"""A float of 8 bytes: what a Python float is."""
+"""A float of 8 bytes: the same as a Python float."""
 
 BOOL = Scalar("bool", "?")
 HINTS: dict[str, Any] = {

@@ -1,7 +1,7 @@
 """A node: one asyncio task of a module, and what it publishes and subscribes.
 
 The body of its function is initialisation and loop; cancellation is termination. Everything that the node opened is
-closed when its function ends, however it ends.
+closed when its function ends, for any reason.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ from r2p.units import SECOND
 M = TypeVar("M", bound=Message)
 
 QUEUE = 16
-"""Messages that a subscriber's queue holds unless it says otherwise."""
+"""Messages in a subscriber's queue, by default."""
 
 
 class Tick(NamedTuple):
@@ -52,7 +52,7 @@ class NodeLogger(logging.LoggerAdapter[logging.Logger]):
 
 
 def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -> str:
-    """A log record as `logging` would print it, traceback included."""
+    """Return a log record as `logging` would print it, traceback included."""
     try:
         text = logging.LogRecord("", level, "", 0, msg, args, None).getMessage()
     except (TypeError, ValueError):  # arguments that do not fit; logging itself says so on stderr
@@ -84,27 +84,27 @@ class Node:
     ) -> None:
         self.name = name
         self.module = space.module
-        """The name of its module."""
+        """The name of the node's module."""
         self.priority = priority
         """Nodes of higher priority get their messages first."""
         self.log = NodeLogger(node_logger(space.module, name), lambda level, text: log(level, name, text))
-        """Its logger; records from INFO up also go to the module's `log` topic."""
+        """The node's logger; records from INFO up also go to the module's `log` topic."""
         self.publishers: dict[AnyPublisher, None] = {}
-        """Its open publishers, in order (the values mean nothing)."""
+        """Open publishers, in order (the values mean nothing)."""
         self.subscribers: dict[Subscriber[Any], None] = {}
-        """Its open subscribers, in order."""
+        """Open subscribers, in order."""
         self.closed = False
         self.crash_handler: Callable[[Exception], None] = self._log_crash
         """Handles an error outside the node's own task; set by its supervisor."""
         self.is_unwinding: Callable[[], bool] = lambda: False
-        """Says whether an exception is on its way out of the node's function; set by its supervisor."""
+        """Returns whether an exception is on its way out of the node's function; set by its supervisor."""
         self._ending = False
         self._space = space
         self._remap = remap or {}
         self._events = events or EventHub()
         self._tickers: set[Ticker] = set()
         self._reminder: _SpinReminder | None = None
-        """From the first subscription with a callback until `spin` is called."""
+        """A reminder from the first subscription with a callback until `spin` is called."""
         self._started = False
 
     @overload
@@ -134,10 +134,10 @@ class Node:
         """Publish a topic. The class value says how: `NonRealTime()`, `Sporadic(deadline)` or `Periodic(period, fill)`.
 
         With `latch` the last message is sent to every subscriber that joins later, and again when its module reboots.
-        With `strict` a link that is known not to keep what the class asks for raises TransportError.
+        With `strict`, raise TransportError if a link is known to give less than the class asks for.
 
-        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or a class value
-        that makes no sense, TypeMismatch if the topic has another layout, and Closed once the node has ended.
+        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or an invalid
+        class value, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
         shape = layout(type)
         name = self._resolve(topic)
@@ -216,11 +216,11 @@ class Node:
         Messages older than `max_age` seconds are skipped, and counted in `stale`. The age is measured from the
         publisher's stamp to this computer's clock, so the two clocks have to agree.
 
-        When nothing comes for `timeout` seconds, `on_timeout` is called once; without it, reading raises TimeoutError.
-        A `callback` is called from `spin()`, in this node's task.
+        When no message arrives for `timeout` seconds, `on_timeout` is called once; without it, reading raises
+        TimeoutError. A `callback` is called from `spin()`, in this node's task.
 
-        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or an option
-        that makes no sense, TypeMismatch if the topic has another layout, and Closed once the node has ended.
+        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or an invalid
+        option, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
         options = SubscriberOptions(callback, queue, lossy, keep, max_age, timeout, on_timeout)
         options.check(topic)
@@ -234,7 +234,7 @@ class Node:
         return subscriber
 
     async def spin(self, timeout: float | None = None) -> bool:
-        """Wait for messages of subscriptions with a callback, and call it for each; False if there was none.
+        """Wait for messages of subscriptions with a callback, and call it for each; return False if there was none.
 
         Callbacks run in this node's task, one at a time; a coroutine function is awaited. The wait ends without a
         message after `timeout` seconds, or when a subscription without `on_timeout` has had none for its own `timeout`.
@@ -296,7 +296,7 @@ class Node:
             self._tickers.discard(ticker)
 
     def now(self) -> int:
-        """UTC in ns since 1970; never jumps back."""
+        """Return UTC in ns since 1970, which never jumps back."""
         return self._space.clock.now()
 
     def network_time(self) -> int | None:
@@ -311,12 +311,12 @@ class Node:
         return self._events.listen()
 
     def crash(self, error: Exception) -> None:
-        """End this node with the error of a function that it gave away: a `fill`, an `on_missed`, an `on_timeout`."""
+        """End this node with the error of one of its callbacks: a `fill`, an `on_missed`, an `on_timeout`."""
         self.crash_handler(error)
 
     @property
     def ending(self) -> bool:
-        """Whether its end has begun: it was stopped, it crashed, or an exception has reached a `finally` in it.
+        """Return whether the node's end has begun: it was stopped, it crashed, or an exception is in a `finally` of it.
 
         From then on no `fill`, `on_missed`, `on_timeout` or the like is called: only its clean-up runs.
         """
@@ -330,8 +330,8 @@ class Node:
                 publisher.silence()
 
     def forget(self, endpoint: object) -> None:
-        """Drop a publisher or subscriber of the node that was closed."""
-        # The type checker wants a key that may be there; it is in one of the two at most.
+        """Drop a closed publisher or subscriber of the node."""
+        # In one of the two at most; the type checker wants a key for both.
         self.publishers.pop(endpoint, None)  # type: ignore[call-overload]
         self.subscribers.pop(endpoint, None)  # type: ignore[call-overload]
 
@@ -346,7 +346,7 @@ class Node:
         self._space.wake_scheduler.node_started(self.priority)
 
     def close(self) -> None:
-        """Close all its publishers and subscribers. The module does so when the node's function has ended."""
+        """Close all publishers and subscribers. The module does so when the node's function has ended."""
         self.closed = self._ending = True
         self._forget_reminder()
         for each in (*self.publishers, *self.subscribers, *self._tickers):
@@ -375,7 +375,7 @@ class Node:
     def _check_links(
         self, topic: str, size: int, klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool
     ) -> None:
-        """Warn of links that can't send the topic; `strict`: raise TransportError for those that give less."""
+        """Warn of links that can't send the topic; `strict`: raise TransportError for links that give less."""
         for link in self._space.links:
             reason = link.refusal(size)
             if reason and not strict:
@@ -394,7 +394,7 @@ class Node:
         return served
 
     async def _arrival(self) -> None:
-        """Wait until a message comes for a subscription with a callback."""
+        """Wait for a message of a subscription with a callback."""
         subscribers = self._with_callback()
         if not subscribers and not any(isinstance(each, PeriodicPublisher) for each in self.publishers):
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")

@@ -57,7 +57,7 @@ class ConfigFile(msgspec.Struct):
 
 
 class Settings(msgspec.Struct):
-    """What a command works with. `types`: "package.module:Class" by topic."""
+    """Settings of a command. `types`: "package.module:Class" by topic."""
 
     via: list[str] = []
     module: str | None = None

@@ -444,14 +444,14 @@ _CONNECTING = {
     "rtcan": "r2p doctor\nip -details -statistics link show DEVICE",
     "zenoh": "is a zenoh 1 router or an r2p program running there? ss -ltn | grep 7447",
 }
-"""What to do if a link does not come up, by scheme."""
+"""Remedies if a link does not come up, by scheme."""
 
 _GARBAGE = {
     "serial": "most likely another baud rate: --via serial:DEVICE,baud=57600\nwho else reads it? fuser -v DEVICE",
     "tcp": "another program listens at this port: r2p needs the debug line, from r2p or from R2P firmware",
     "rtcan": "another bit rate, or a bus without RTCAN: r2p bus dump --via rtcan:DEVICE",
 }
-"""What to do if bytes arrive that are not r2p."""
+"""Remedies if bytes arrive that are not r2p."""
 
 _SILENCE = {
     "serial": "is the module powered? are TX and RX crossed, and the grounds connected?",
@@ -459,7 +459,7 @@ _SILENCE = {
     "rtcan": "is another node powered? are both ends of the bus terminated?\nr2p bus dump --via rtcan:DEVICE",
     "zenoh": "is there a module on this network? on zenoh, networks have names: ?network=NAME",
 }
-"""What to do if nothing arrives."""
+"""Remedies if nothing arrives."""
 
 _GOOD = {"master", "own parameters"}  # notices that are no problem
 _NOTICES = {
@@ -467,7 +467,7 @@ _NOTICES = {
     "other parameters": "give slots, slot length and bit rate as the other nodes have them (docs: RTCAN)",
     "id conflict": "give one of them another id: rtcan:can0,id=0x22",
 }
-"""What to do about a notice of a link, by its kind."""
+"""Remedies for a notice of a link, by its kind."""
 
 
 def _read(path: Path) -> str:

@@ -15,7 +15,7 @@ from r2p.tools.options import time_option
 from r2p.tools.session import Session, TimedOut, UsageError, joined
 
 Kind = Literal["topic", "node", "module"]
-"""What one can wait for."""
+"""The kinds of things to wait for."""
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 _POLL = 0.05  # seconds between two looks at what is known of the network

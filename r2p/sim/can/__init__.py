@@ -1,4 +1,4 @@
-"""A CAN bus in software, exact to the bit: who wins arbitration, how long frames take, what errors do.
+"""A CAN bus in software, exact to the bit: arbitration, the length of frames, and errors.
 
     bus = CanBus(asyncio.get_running_loop(), seed=1)
     a = bus.attach(CanNode("A", one_shot=True, drift_ppm=30.0))

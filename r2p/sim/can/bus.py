@@ -348,7 +348,7 @@ class Listeners:
     def __init__(self) -> None:
         self.live: list[CanController] = []
         self.audience = _Cache(self._find_audience)
-        """By controller: its name, and the receivers of what it sends alone."""
+        """By controller: its name, and the receivers of frames that it sends alone."""
         self.concerned = _Cache(self._find_concerned)
         """By identifier: the controllers that a good frame concerns."""
 

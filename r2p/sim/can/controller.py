@@ -1,7 +1,7 @@
 """The CAN controller of a node: mailboxes, callbacks, error counters, and a clock.
 
-`CanController` is what the node's software uses; `BusWire` is what the controller needs of the bus. Instants inside are
-true time; the stamps that callbacks get are those of the node's clock.
+`CanController` is the interface to the node's software; `BusWire` is the bus as the controller sees it. Instants inside
+are true time; the stamps that callbacks get are those of the node's clock.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ class Timeline:
         return timer
 
     def catch_up(self) -> None:
-        """On an ordinary loop, run the events that are due, so that what follows is done in the present."""
+        """Run due events on an ordinary loop, so that the following code runs in the present."""
         if self._virtual is None and not self._running:
             self._run()
 

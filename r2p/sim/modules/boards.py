@@ -39,7 +39,7 @@ from r2p.units import SECOND
 
 Via = str | Transport | Iterable[str | Transport] | None
 DistanceTo = Callable[[int], float]
-"""Returns the distance in mm to what sensor 0 to 3 sees, or infinity."""
+"""A function that returns the distance in mm to the object before sensor 0 to 3, or infinity."""
 
 _CATCH_UP = 1.0  # s of physics to make up for after the loop was blocked; more would hang after a long sleep
 _VOLTAGE_COUNT = 36_000 / ADC_MAX  # mV per count: a divider turns 36 V into 3.3 V
@@ -123,7 +123,7 @@ class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
     timeout: float = 0.2
     """Seconds without a setpoint after which the motor stops."""
     encoder: str = "encoder"
-    """Topic of the movement in ticks since the message before."""
+    """Topic of the movement in ticks since the previous message."""
     period: float = 0.02
     """Period of `encoder`, time-triggered, s."""
     current: str = "current"
@@ -199,7 +199,7 @@ class RangeArray:
 
 
 async def proximity(node: r2p.Node, sensors: RangeArray, topic: str, period: float) -> None:
-    """Publish what the sensors see: event-triggered, because an obstacle needs an immediate reaction."""
+    """Publish the distances: event-triggered, because an obstacle needs an immediate reaction."""
     ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=_REACTION))
     async for _ in node.every(period):
         await ranges.publish(sensors.read())
@@ -268,7 +268,7 @@ class InertialUnit:
         return IMURaw9(*self._acc.counts, *self._gyro.counts, *self._mag.counts)
 
     def tilt(self) -> Tilt:
-        """Return the pitch: what a robot that balances on two wheels needs."""
+        """Return the pitch, for a robot that balances on two wheels."""
         return Tilt(angle=self.attitude.angles[1])
 
     def pressure(self) -> Pressure:
@@ -383,7 +383,7 @@ class IoModule(Board):
 
 
 def measured(battery: Battery) -> BatteryMessage:
-    """Return what the A/D converter measures, with a resolution of 9 mV and 12 mA; the charge is not calibrated."""
+    """Return the readings of the A/D converter, with a resolution of 9 mV and 12 mA; the charge is not calibrated."""
     return BatteryMessage(
         voltage=round(round(battery.voltage * 1000 / _VOLTAGE_COUNT) * _VOLTAGE_COUNT),
         current=max(-32768, min(32767, round(round(battery.current * 1000 / _CURRENT_COUNT) * _CURRENT_COUNT))),
@@ -434,6 +434,6 @@ class GatewayModule(Board):
         outside: Iterable[str | Transport] = (),
         options: BridgeOptions | None = None,
     ) -> None:
-        """`options`: what it forwards, by default everything but commands. Raises as `r2p.Module` does."""
+        """`options`: rules for forwarding, by default everything but commands. Raises as `r2p.Module` does."""
         links = [via, *outside]
         super().__init__(name, via=links, bridge=False if len(links) == 1 else options or True)

@@ -1,6 +1,6 @@
 """A module with the firmware of 2014, as seen on its debug line (PROTOCOL.md 3 and 4): bytes in, bytes out.
 
-It sends what the recorded firmware sends, in the same order: the boot marker, ALIVE, the announcements of its nodes
+It sends the same as the recorded firmware, in the same order: the boot marker, ALIVE, the announcements of its nodes
 half a second later, then one step of repetition each half second. It has no r2p extensions. Three things differ from
 firmware: a line with a wrong checksum is dropped and counted (firmware does not check it), invalid lines do no lasting
 harm, and there is no loader in boot mode.
@@ -79,7 +79,7 @@ class FirmwareModule:
         """`heap`: bytes for queues. `behind_gateway`: behind firmware's gateway, data needs a second response."""
         self.name = module_name(name)
         self.flags = 0
-        """The flags of its ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
+        """Flags of ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
         self.fault = ""
         """The reason why the module has failed; only `power_on` helps."""
         self.heap_free = 0
@@ -90,7 +90,7 @@ class FirmwareModule:
         self.last: dict[str, Message] = {}
         """The last message received on each topic."""
         self.drops: Counter[str] = Counter()
-        """Lines and messages that it dropped, by reason."""
+        """Dropped lines and messages, by reason."""
         self._publishers = {topic_name(each.topic): _FirmwarePublisher(each) for each in publishers}
         self._subscribers = {topic_name(each.topic): _FirmwareSubscriber(each) for each in subscribers}
         self._repeats = repeats
@@ -123,7 +123,7 @@ class FirmwareModule:
         return self._drain()
 
     def receive(self, now: int, data: bytes) -> bytes:
-        """Receive bytes from its line."""
+        """Receive bytes from the line."""
         return b"".join([self.receive_line(now, line) for line in self._reader.feed(data)])
 
     def receive_line(self, now: int, line: debug.Line) -> bytes:
@@ -139,7 +139,7 @@ class FirmwareModule:
         return self._drain()
 
     def poll(self, now: int) -> bytes:
-        """Do what is due: call it at `next_deadline()`."""
+        """Carry out due work: call it at `next_deadline()`."""
         if self.halted:
             return b""
         if self._boot_at is not None and now >= self._boot_at:

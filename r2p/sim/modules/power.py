@@ -1,7 +1,7 @@
-"""Runs an emulated module: its timer, and the lines that connect it.
+"""Run an emulated module: its timer, and its lines.
 
-All peers on its lines receive everything that the module sends, as on one serial line; what each of them sends is read
-separately, so that half a line of one does not corrupt the line of another.
+All peers on its lines receive everything that the module sends, as on one serial line; the bytes of each of them are
+read separately, so that half a line of one does not corrupt the line of another.
 """
 
 import asyncio
@@ -19,7 +19,7 @@ from r2p.transports.line import Carrier, LineLink
 from r2p.transports.link import Hub, Transport
 
 BUFFER = 64 * 1024
-"""Bytes that are kept for a peer that does not read; beyond that it loses what the module sends."""
+"""Bytes kept for a peer that does not read; it loses any more."""
 
 _CHUNK = 4096
 

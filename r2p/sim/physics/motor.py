@@ -1,8 +1,8 @@
 """A brushed DC motor with gear and encoder, its load, its closed-loop control, and the battery.
 
 The inductance of the winding is left out: its time constant, 0.2 ms, is shorter than every useful step. What is left is
-a first-order system, which `MotorSpec.gain` and `MotorSpec.time_constant` describe completely. The control is what the
-firmware of the motor module does between the encoder and the bridge (thesis 7.3.2), with everything in ticks.
+a first-order system, which `MotorSpec.gain` and `MotorSpec.time_constant` describe completely. The control is that of
+the motor module's firmware, from the encoder to the bridge (thesis 7.3.2), with everything in ticks.
 """
 
 import math
@@ -102,7 +102,7 @@ class Motor:
 
 
 class Axle:
-    """A wheel off the ground with a load of its own: what a motor drives without a robot."""
+    """A wheel off the ground with a load of its own, for a motor without a robot."""
 
     def __init__(self, motor: Motor, inertia: float) -> None:
         """`inertia` of the load at the wheel, without the rotor's, kg m^2."""

@@ -1,6 +1,6 @@
 """A flat world: walls, the range finders that measure it, and a body that drives on three omni wheels.
 
-The range finder is of Sharp's GP2Y series; `millimetres` is what the proximity module computes from its voltage.
+The range finder is of Sharp's GP2Y series; `millimetres` is the proximity module's conversion of its voltage.
 
 The body has its kinematics (thesis 8.1.1) and its dynamics; its wheels are 120 degrees apart. `wheel_speeds` is
 equation 8.2. Equation 8.1 of the thesis is its transpose, not its inverse: its rows for x and y need a factor 2/3, the
@@ -24,7 +24,7 @@ NOTHING = 65535
 ADC_MAX = 4095
 """Counts of the modules' A/D converters, 12 bits."""
 ADC_REFERENCE = 3.3
-"""The voltage of that many counts, V."""
+"""Return the voltage of that many counts, V."""
 
 _COS30, _COS60 = math.cos(math.pi / 6), 0.5
 

@@ -51,7 +51,7 @@ class OdometryFigures(msgspec.Struct, frozen=True):
 
     @property
     def fresh(self) -> bool:
-        """Whether the next one is not overdue."""
+        """Return whether the next message is in time."""
         return self.age <= _FRESH
 
     @property
@@ -105,7 +105,7 @@ class Figures(msgspec.Struct, frozen=True):
 
     @property
     def too_slow(self) -> bool:
-        """Whether the computer is too slow for the simulation: figures of real time then mean little."""
+        """Return whether the computer is too slow for the simulation: then figures of real time mean little."""
         return self.late > _LATE_MAX
 
     @property

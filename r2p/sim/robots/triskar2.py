@@ -95,7 +95,7 @@ class Latest(Generic[M]):
 def sender(
     node: r2p.Node, topic: str, type: type[M], fill: Callable[[], M | None], *, traffic: Traffic, period: float
 ) -> Callable[[], object]:
-    """Publish what `fill` returns, None for nothing: every `period` seconds ("hrt"), or when the result is called."""
+    """Publish the result of `fill`, None for nothing: every `period` seconds ("hrt"), or when the result is called."""
     if traffic == "hrt":
         node.advertise(topic, type, r2p.Periodic(period, fill))
         return lambda: None

@@ -45,7 +45,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def condition(self) -> str:
-        """When it is ready, for messages."""
+        """Return the ready condition as text, for messages."""
         ports = [f"port {host}:{port}" for host, port in self.ports]
         return ", ".join(["ended"] * self.ends + ports + [f"{kind} {name}" for kind, name in self.seen]) or "started"
 

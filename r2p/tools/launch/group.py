@@ -53,7 +53,7 @@ class Group:
 
     def __init__(self, entries: Iterable[Entry], start: Start, wait_ready: WaitReady) -> None:
         self.exit_code = 0
-        """That of the first command that failed for good."""
+        """Exit code of the first command that failed for good."""
         self._members = {entry.name: _Member(entry) for entry in entries}
         self._start = start
         self._wait_ready = wait_ready

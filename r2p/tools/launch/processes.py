@@ -1,7 +1,7 @@
 """Commands of a group as processes: how they start, how their output is shown, and how they get signals.
 
 Each command has a session of its own, so Ctrl-C at the terminal reaches only the launcher, which stops the commands in
-order. A thread for each pipe shows its lines: while nobody reads the launcher's own output, the commands wait, as they
+order. A thread for each pipe shows its lines: while the launcher's own output is not read, the commands wait, as they
 would in a shell, and the launcher still supervises them.
 """
 
@@ -35,7 +35,7 @@ class LinePrinter:
     def __init__(self, names: Iterable[str], on_error: Callable[[], object]) -> None:
         """`on_error` is called in another thread when the output can't be written any more."""
         self.error: OSError | None = None
-        """Why the output can't be written, if so; BrokenPipeError: its reader has ended."""
+        """The error of the output, if it can't be written; BrokenPipeError: its reader has ended."""
         self._names = list(names)
         self._width = max(map(len, self._names), default=0)
         self._lock = threading.Lock()

@@ -1,7 +1,7 @@
 """`r2p topic`: the group of commands.
 
-`list` (with `info` and `find`), `echo`, `pub` and `rates` (`hz`, `bw`, `delay`) are the commands; `watching` is what
-they share.
+`list` (with `info` and `find`), `echo`, `pub` and `rates` (`hz`, `bw`, `delay`) are the commands; `watching` is their
+common code.
 """
 
 from r2p.tools import session
