@@ -105,6 +105,7 @@ class _Printer:
 
     async def _subscribe_to_all(self, tasks: asyncio.TaskGroup, received: Callable[[], None]) -> None:
         """Subscribe to the log, and to that of each namespace as soon as it is known."""
+        self._session.module.query()  # for the names of nodes and modules
         while True:
             known = {_TOPIC, *(name for name in self._session.module.network.topics() if name.endswith(f"/{_TOPIC}"))}
             for name in known - self._subscribers.keys():
@@ -118,21 +119,26 @@ class _Printer:
             record = sample.message
             if not isinstance(record, Log):
                 continue
-            module = sample.source.module
-            if namespace and module and "/" not in module:
-                module = namespace + module
-            if self._left == 0 or record.level < self._level.number or not self._is_wanted(module, record.node):
+            modules = self._modules(sample.source.module, namespace, record.node)
+            if self._left == 0 or record.level < self._level.number or not self._is_wanted(modules, record.node):
                 continue
             received()
             self._first.set()
             if self._left is not None:
                 self._left -= 1
-            await self._put(module, record, record.stamp.ns or sample.stamp)
+            await self._put(modules[0] if len(modules) == 1 else "", record, record.stamp.ns or sample.stamp)
             if self._left == 0:
                 self._last.set()
 
-    def _is_wanted(self, module: str, node: str) -> bool:
-        return self._wanted in {"", module, node, f"{module}/{node}"}
+    def _modules(self, module: str, namespace: str, node: str) -> list[str]:
+        """Return the modules that a record may come from: a debug line carries no names, but nodes are announced."""
+        if not module:
+            return [each for each, name in self._session.module.network.nodes() if name == node and each]
+        return [namespace + module if namespace and "/" not in module else module]
+
+    def _is_wanted(self, modules: list[str], node: str) -> bool:
+        paths = (f"{module}/{node}" for module in modules)
+        return self._wanted in {"", node, *modules, *paths}
 
     async def _put(self, module: str, record: Log, stamp: int) -> None:
         level = _level_of(record.level)

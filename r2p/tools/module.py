@@ -85,6 +85,7 @@ async def _send(session: Session, command: r2p.Command, name: str, timeout: floa
     if not session.settings.via:
         raise UsageError("no network to send a command on: give --via tcp:HOST:PORT or set R2P_VIA")
     await session.settle(wait=0)
+    session.module.query()
     loop = asyncio.get_running_loop()
     started, limit = loop.time(), timeout or TIMEOUT
     sender = _CommandSender(session, command, name)
@@ -121,6 +122,8 @@ class _CommandSender:
         """Say what the command waits for."""
         if self._flags:
             return f"{self._name} to confirm {self._command.name}"
+        if not self._may_be_firmware():
+            return f"{self._name} to announce itself"
         return f"{self._name} (firmware announces itself within {_ROUND:g} s)"
 
     async def watch(self, events: AsyncIterator[r2p.ModuleEvent]) -> None:
@@ -141,6 +144,8 @@ class _CommandSender:
         while True:
             if self._is_unknown():
                 raise r2p.Error(_unknown_text(self._session, self._name))
+            if not self._flags:
+                self._session.module.query()  # again: a gateway may not have heard the first one
             self._session.module.command(self._command, self._name)
             self._sent_at = asyncio.get_running_loop().time()
             if await wait_until(self._is_over, _REPEAT) and not self._is_unknown():
@@ -155,9 +160,11 @@ class _CommandSender:
         """Return whether the module would have been heard by now."""
         if self._flags or not self._settled.done():
             return False
+        return not self._may_be_firmware() or asyncio.get_running_loop().time() >= self._firmware_heard_at
+
+    def _may_be_firmware(self) -> bool:
         on_bus = any(link.up and link.has_slots for link in self._session.module.links)
-        may_be_firmware = on_bus or self._session.may_have_firmware()
-        return not may_be_firmware or asyncio.get_running_loop().time() >= self._firmware_heard_at
+        return on_bus or self._session.may_have_firmware()
 
     def _confirmed(self) -> bool:
         if not self._flags:

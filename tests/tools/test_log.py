@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
+from r2p.codecs import management
+from r2p.msg import Log
 from r2p.tools.log import Level, log
-from r2p.tools.session import TimedOut
+from r2p.tools.session import Session, Settings, TimedOut
 from tests.tools.rig import printed, robot, tool
+from tests.transports.conversation import Script, line, manage
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from r2p.tools.session import Session
 
 pytestmark = pytest.mark.virtual_time
 
@@ -79,6 +81,23 @@ async def test_a_namespace_has_a_log_of_its_own(capsys: pytest.CaptureFixture[st
         remapped.start(plan)
         tasks.create_task(log(session, "robot1/ARM", once=True))
     assert [each["module"] for each in printed(capsys)] == ["robot1/ARM"]
+
+
+async def test_a_line_carries_no_names_but_nodes_have_modules(capsys: pytest.CaptureFixture[str]) -> None:
+    script = Script()
+    async with r2p.Module("_tool01", via=script, observer=True, watchdog=False) as module:
+        session, size = Session(module, Settings(via=["tcp:robot1"])), r2p.layout(Log).size
+        nodes = [("BOT", 7, "drive"), ("BOT", 7, "motor"), ("ARM", 8, "motor")]
+        for name, instance, node in nodes:
+            endpoint = management.Endpoint(management.ROLE_PUBLISHES, instance, node, "leds", 1)
+            script.hear(manage(management.Hello(name, instance)) + manage(endpoint))
+        printing = asyncio.create_task(log(session, "BOT", count=2))
+        await asyncio.sleep(0.1)
+        script.hear(manage(management.Advertise("log", size)) + manage(management.SubscribeResponse("log", size)))
+        for node in ("plan", "drive", "motor"):
+            script.hear(line("log", Log(level=20, node=node, text="x").encode()))
+        await printing
+    assert [(each["module"], each["node"]) for each in printed(capsys)] == [("BOT", "drive"), (None, "motor")]
 
 
 async def test_silence_is_explained_and_ends_at_the_time_out(capsys: pytest.CaptureFixture[str]) -> None:
