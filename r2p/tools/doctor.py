@@ -419,7 +419,9 @@ def _losses(session: Session) -> Iterator[Check]:
         if not counts:
             yield Check("losses", True, "none")
             continue
-        stray = all(reason in {"garbage", "cut short"} and n <= _STRAY for reason, n in counts.items())
+        stray = bool(_named(session)) and all(
+            reason in {"garbage", "cut short"} and n <= _STRAY for reason, n in counts.items()
+        )
         do = (
             ""
             if stray
