@@ -58,12 +58,11 @@ def run(
                 host.start(function, name=node, restart=restart)
             await host.wait()
 
-    with default_logging():
-        try:
-            run_main(main)
-        except Error as error:
-            _print_in_one_line(error)
-            raise
+    try:
+        run_main(main)
+    except Error as error:
+        _print_in_one_line(error)
+        raise
 
 
 def _named(
@@ -104,7 +103,8 @@ def _excepthook(kind: type[BaseException], error: BaseException, trace: Tracebac
 def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
     """Run `main()` on the fastest event loop, and return its result; None if SIGINT or SIGTERM ended it.
 
-    Raises Error where an event loop runs already.
+    Use it instead of `asyncio.run` for programs that open modules themselves: it logs as `run` does, and a NodeCrashed
+    that nothing catches is one line. Raises Error where an event loop runs already.
     """
     if asyncio._get_running_loop() is not None:  # noqa: SLF001 - as get_running_loop, without its RuntimeError
         raise Error(
@@ -122,8 +122,12 @@ def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
                 return None
             raise
 
-    with _Signals() as signals, asyncio.Runner(loop_factory=loop_factory()) as runner:
-        return runner.run(guarded())
+    try:
+        with default_logging(), _Signals() as signals, asyncio.Runner(loop_factory=loop_factory()) as runner:
+            return runner.run(guarded())
+    except NodeCrashed as error:  # what crashed is in the log already
+        _print_in_one_line(error)
+        raise
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:

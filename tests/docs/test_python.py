@@ -1,8 +1,8 @@
 """Python in the pages: every block is a program that runs, and that the type checker accepts.
 
 Programs run under virtual time, so that one that blinks for ever ends after LIMIT seconds of its own time, which take
-no time. `r2p.run` and `asyncio.run` are what is replaced; other transports than `memory:` and `sim:` are checked, and
-then left out.
+no time. `r2p.run`, `r2p.run_main` and `asyncio.run` are replaced; other transports than `memory:` and `sim:` are
+checked, and then left out.
 """
 
 import asyncio
@@ -58,6 +58,7 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         return run_bounded(lambda: main)
 
     monkeypatch.setattr(sys.modules["r2p.modules.runner"], "run_main", run_bounded)
+    monkeypatch.setattr("r2p.run_main", run_bounded)
     monkeypatch.setattr("r2p.modules.module.open_transport", open_here)
     monkeypatch.setattr(asyncio, "run", run_coroutine)
     monkeypatch.setattr(sys, "argv", ["program"])
