@@ -50,7 +50,7 @@ QUEUE_MAX = 8192
 # After a period, frames of it may still be unread. These decide when none are left.
 _CHECK_INTERVAL = 10_000_000  # ns
 _QUIET_CHECKS = 4  # checks in a row without a new frame
-_STALLED = 40_000_000  # ns by which a check is late when the process stood still: what came meanwhile is not read yet
+_STALLED = 40_000_000  # ns by which a check is late when the process stood still, with frames still unread
 _STALL_REPORTED = 500_000_000  # ns: longer than a busy computer delays a program
 
 

@@ -260,7 +260,7 @@ class Shaper:
     `rate`: messages a second at most, with room for two at once. `klass`: the class, which a debug line does not carry.
     `soften`: periodic messages become sporadic ones that are due within their period, as the next link has no slots for
     them. `reserve` is called with size (bytes) and period (s) when those of a publisher are known, and again when it
-    comes back with another size; it returns what takes the messages from then on.
+    comes back with another size; it returns the publisher for the messages from then on.
     """
 
     def __init__(

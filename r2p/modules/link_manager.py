@@ -133,7 +133,7 @@ class LinkManager:
         self._bridging.close()
 
     def _topic_changed(self, topic: Topic) -> None:
-        for link in self.links:  # an error in one of them is neither the user's nor that of the others
+        for link in self.links:  # an error of one of them concerns neither the user nor the others
             link.stats.lost.guard(link.topic_changed, topic)
 
     # Called by transports
@@ -239,7 +239,7 @@ class LinkManager:
         meanwhile = "" if first else f", after {outage:.1f} s"
         if lost:
             meanwhile += f"; {lost} messages lost meanwhile"
-        # A client says who it is a moment later: tools, which come and go with each command, fill no log.
+        # A client gives its name a moment later: tools, which join and leave with each command, fill no log.
         expected = link.transient or (self.observer and first and outage < _PROMPT)
         self._log_change(link, logging.DEBUG if expected else logging.INFO, "up", f"is up{meanwhile}")
         self._events.emit(LinkUp(link.name, outage, lost))

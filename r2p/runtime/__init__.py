@@ -4,8 +4,8 @@ Read in this order:
 
     sample        one published message, with its source, stamp and deadline; filters for duplicates
     qos           the classes of publisher, as values that programs give
-    backpressure  who waits when a queue or a link is full
-    queues        the bounded queues of subscribers, and who is woken first
+    backpressure  waiting for room in a full queue or link
+    queues        the bounded queues of subscribers, and the order of waking them
     topic         joins publishers, queues and links: `Topic.deliver` is the way of every message
     publishers/   one file for each class of publisher
     subscriber    reading a queue: `async for`, `fetch`, callbacks

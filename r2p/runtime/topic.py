@@ -164,7 +164,7 @@ class Topic:
                     wake_scheduler.wake_later(sink.priority, waiter)
                 elif not waiter.done():
                     waiter.set_result(None)
-        if self.remote_subscribers and not sample.source.link:  # what came by a link goes to others by gateways only
+        if self.remote_subscribers and not sample.source.link:  # only gateways pass messages from a link on
             blocked = self._send(self.remote_subscribers, sample, blocked, slot_link)
         return blocked if blocked is None else self._remaining(blocked)
 

@@ -14,7 +14,7 @@ app = group("Show the settings, and where they come from.")
 
 File = Annotated[
     Path | None,
-    typer.Argument(metavar="FILE", help="Default: what R2P_CONFIG names, or r2p.toml.", show_default=False),
+    typer.Argument(metavar="FILE", help="Default: the file in R2P_CONFIG, or r2p.toml.", show_default=False),
 ]
 """A file like r2p.toml, as an argument of a command."""
 

@@ -304,7 +304,7 @@ async def try_links(urls: list[str], output: Output) -> None:
                 if not check.ok:
                     failed.append(url)
     if failed:
-        raise r2p.Error(f"{', '.join(dict.fromkeys(failed))}: see what to do at each line that fails")
+        raise r2p.Error(f"{', '.join(dict.fromkeys(failed))}: each failing line above says what to do")
 
 
 async def _try_url(url: str) -> AsyncGenerator[Check, None]:

@@ -202,7 +202,7 @@ def _yaml_dumper() -> Callable[[Any, bool], str]:
     import yaml
 
     base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    dumper: Any = type("Dumper", (base,), {})  # because representers apply to everyone who uses the class
+    dumper: Any = type("Dumper", (base,), {})  # because representers apply to all users of the class
 
     def represent(to: Any, items: Iterable[Any]) -> Any:
         """Lists of plain values on one line."""
@@ -265,7 +265,7 @@ def _csv(cells: Iterable[Any]) -> str:
 
 
 def abandon_stdout() -> None:
-    """Redirect standard output to /dev/null, so that the interpreter can flush what is left without an error."""
+    """Redirect standard output to /dev/null, so that the interpreter can flush the rest without an error."""
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):  # no real file, or closed

@@ -17,7 +17,7 @@ from r2p.messages import Array, Chars, Layout, Message, Nested, Scalar, Shape, l
 M = TypeVar("M", bound=Message)
 
 META = "_"
-"""The key of what is not part of a message: its topic, stamp, source."""
+"""The key of a message's context: its topic, stamp, source."""
 
 DEPTH = 32
 """Levels of mappings and lists that are accepted; no message has as many."""

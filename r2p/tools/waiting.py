@@ -23,7 +23,7 @@ _QUERY = 1.0  # seconds between two queries: a module that starts later announce
 
 
 def check_name(kind: Kind, name: str) -> None:
-    """Raise InvalidName for what is not a valid name of a topic, a node (`NODE` or `MODULE/NODE`) or a module."""
+    """Raise InvalidName unless it is a valid name of a topic, a node (`NODE` or `MODULE/NODE`) or a module."""
     if kind == "topic":
         topic_name(name)
     elif kind == "module":

@@ -102,7 +102,7 @@ class BufferedLink(Link):
 
     @property
     def flow_controlled(self) -> bool:
-        """Return whether the other end waits while nothing is read, and nothing is lost by that."""
+        """Return whether the other end waits while nothing is read, without losing anything."""
         return False
 
     def pause(self) -> None:
@@ -148,7 +148,7 @@ class BufferedLink(Link):
         else:
             topic.resend_latched(subscriber)
 
-    # In: which topics, and from whom
+    # In: topics and their senders
 
     def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
         key = topic.name.encode()
@@ -231,7 +231,7 @@ class BufferedLink(Link):
             except Exception as error:  # noqa: BLE001 - counted and logged; the next one follows
                 lost.internal_error(error)
         self._space.loop.call_soon(self._deliver)
-        self._pause_reading()  # what comes in meanwhile would only wait here
+        self._pause_reading()  # further messages would only wait here
 
     def _pause_reading(self) -> None:
         if not self._paused:

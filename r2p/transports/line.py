@@ -51,7 +51,7 @@ class Carrier(abc.ABC):
     """
 
     flow_controlled: ClassVar[bool] = False
-    """True if the other end waits while nothing is read, and nothing is lost by that."""
+    """True if the other end waits while nothing is read, without losing anything."""
 
     unconfirmed = 0
     """Return the number of bytes sent that the other end has not confirmed, as far as known when the carrier breaks."""

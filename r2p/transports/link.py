@@ -132,7 +132,7 @@ class Hub(Protocol):
         """Report that a link went down (`reason`), or up (after `outage` seconds; `lost` messages were lost)."""
 
     def link_notice(self, link: "Link", kind: str, text: str, *, trouble: bool) -> None:
-        """Report something to the user, who need not do anything about it unless it is `trouble`."""
+        """Report something to the user, who need not act on it unless it is `trouble`."""
 
     def discovered(self, link: "Link", event: Event) -> None:
         """Handle what the discovery of a link has found."""
@@ -234,7 +234,7 @@ class Link(abc.ABC):
         self.unreachable_reason = ""
         self.stats.ups += 1
         self._hub.link_changed(self, "", outage, lost)
-        for name in self._lapsed:  # before discovery finds out who subscribes now
+        for name in self._lapsed:  # before discovery finds the present subscribers
             self._remove_subscriber(name)
         self._lapsed.clear()
         self._apply(self.discovery.link_up(self._clock.monotonic()))

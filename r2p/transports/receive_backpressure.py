@@ -113,7 +113,7 @@ class LinkBackpressure(ReceiveBackpressure):
     """Backpressure of a link with one way in. While a message waits for room, the link delivers no other.
 
     `resume` is called when the message has been delivered or given up. `flow_controlled` says whether the other end
-    waits while nothing is read, and nothing is lost by that.
+    waits while nothing is read, without losing anything.
     """
 
     def __init__(
@@ -156,8 +156,7 @@ class LinkBackpressure(ReceiveBackpressure):
         # Only other links stall this one: a slow reader in this module loses messages, so that other topics go on.
         may_stall = self._flow_controlled() and not self._closed
         slow = [sink for sink in message.remaining if not (may_stall and isinstance(sink, RemoteSubscriber))]
-        # Events and periodic messages stall nothing: they would be stale. The other link is waited for all the same
-        # later.
+        # Events and periodic messages stall nothing: they would be stale. The other link is still waited for later.
         stalls = message.sample.publisher_class == PublisherClass.NON_REAL_TIME
         rest = slow if stalls else list(message.remaining)
         for sink in rest:

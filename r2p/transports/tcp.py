@@ -1,7 +1,7 @@
 """The debug line over TCP: a client that reconnects, and a server for many clients, each on a link of its own.
 
 Lines must not wait where nothing can be overtaken or discarded: asyncio's buffer holds only what the socket did not
-take of the last piece, and the others wait in the link. A client for whom the server has no place gets the reason.
+take of the last piece, and the others wait in the link. A client without a place at the server gets the reason.
 """
 
 import abc

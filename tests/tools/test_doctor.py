@@ -261,7 +261,7 @@ async def test_a_link_to_something_else_than_r2p() -> None:
 @pytest.mark.anyio
 @pytest.mark.parametrize("anyio_backend", ["asyncio"])
 async def test_a_link_that_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(r2p.Error, match=r"tcp:localhost:\d+: see what to do at each line that fails"):
+    with pytest.raises(r2p.Error, match=r"tcp:localhost:\d+: each failing line above says what to do"):
         await doctor.try_links([f"tcp:localhost:{free_port()}"], Output("json"))
     name, connects = printed(capsys)
     assert (name["check"], name["ok"], connects["check"], connects["ok"]) == ("name", True, "connects", False)

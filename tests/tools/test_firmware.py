@@ -72,7 +72,7 @@ async def test_what_it_does_not_announce_needs_a_type(capsys: pytest.CaptureFixt
         with pytest.raises(TimedOut):
             await echo(session, ["leds"], timeout=3)
         captured = capsys.readouterr()
-        assert "leds has not been advertised: firmware may announce nothing, then give --type" in captured.err
+        assert "leds has not been advertised: if its firmware announces nothing, give --type" in captured.err
         assert not power.module.fault
         await echo(session, ["leds"], type="Led", count=1, timeout=0.3)
         assert len(printed(capsys)) == 1

@@ -43,7 +43,7 @@ class CandidateLink(msgspec.Struct, eq=False):
 
     `twins` are other links to the same network, by number, and when that last showed; `loops` those that lead to it
     through a gateway of firmware. LEAF is sent soon if there is `something_new`, and once when it `asks` whose messages
-    came in; `suspected_at`: when that was asked first. `echoes`: it gives back what is sent. `remote` is the instance
+    came in; `suspected_at`: when that was asked first. `echoes`: it returns own messages. `remote` is the instance
     of the module at the other end of a line.
     """
 

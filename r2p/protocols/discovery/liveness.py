@@ -191,7 +191,7 @@ class PeerLiveness:
 
     def _enter(self, now: int, before: ModuleInfo | None, info: ModuleInfo) -> None:
         """Enter a module's information, and report it unless it only shows that the module lives."""
-        forgotten = self._directory.enter(info)  # made room for this one: as good as gone
+        forgotten = self._directory.enter(info)  # made room for this one: counts as gone
         if info.r2p:
             self._timers.set(("module", info.name), now + info.lease)
         if before is None or before.differs(info):

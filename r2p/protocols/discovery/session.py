@@ -283,7 +283,7 @@ class Discovery(DiscoveryProtocol):
         if self._announcer.set_topic(topic, role, own):
             self._negotiation.type_changed(topic, counterpart(role))
             if role == ROLE_PUBLISHES and self._demand is not None:
-                # Those who asked before there was a publisher need not ask again.
+                # Earlier requests, before there was a publisher, need not be repeated.
                 for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES):
                     self._negotiation.requested(now, management.SubscribeRequest(topic, own.type.size, 1), source)
         return self._flush(now)
@@ -353,7 +353,7 @@ class Discovery(DiscoveryProtocol):
     def poll(self, now: int) -> list[Event]:
         """End the leases that have run out, and repeat what is due.
 
-        Called far too late, it ends no lease: this program was suspended, and has yet to read what came in meanwhile.
+        Called far too late, it ends no lease: this program was suspended, and has messages to read.
         """
         due = self._timers.next()
         if due is not None and now - due > _SUSPENDED:

@@ -146,7 +146,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         for key in list(self._tokens):
             self._remove_token(now, key)
         self._refused.clear()
-        self._modules.clear()  # what is left is firmware, which gateways announce by messages
+        self._modules.clear()  # only firmware is left, which gateways announce by messages
         return self._outbox.drain()
 
     def leave(self, now: int) -> list[Event]:

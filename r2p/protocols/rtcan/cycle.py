@@ -63,7 +63,7 @@ class CycleState(enum.Enum):
     LEADING = "leading"  # the node is the master
 
 
-_NONE = CycleState.NONE  # Python 3.11 takes its time to find a member of an enum
+_NONE = CycleState.NONE  # Python 3.11 is slow to find a member of an enum
 
 
 class Alignment(enum.Enum):

@@ -201,7 +201,7 @@ class NetworkMembership:
             self._counts["foreign syncs"] += 1
             self._answer(now)
             return
-        self._transmitter.poll(now)  # first what is left to do of the cycle that ends now
+        self._transmitter.poll(now)  # first the rest of the cycle that ends now
         bridged = self._cycle.state is CycleState.HOLDING
         match self._cycle.on_sync(frame, stamp):
             case Alignment.ALIGNED:

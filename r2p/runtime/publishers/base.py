@@ -29,7 +29,7 @@ C = TypeVar("C", bound=NonRealTime | Sporadic | Periodic[Any])
 
 _LOG_LINES = 1  # a second about what is missed or late
 _CALLBACK_PAUSE = 0.001  # seconds between callbacks where one causes the next: else the event loop would stand still
-_DEFERRED_MAX = 4  # callbacks that wait for that one by one; what comes on top is added to the last one
+_DEFERRED_MAX = 4  # callbacks that wait their turn; any more are added to the last one
 _REMEMBERED = 64  # sequence numbers of messages that were missed last: several links may report one message
 
 

@@ -101,7 +101,7 @@ class Timeline:
                 self._virtual.run_ahead(self._events)
             else:
                 self._run_due(self.clock.monotonic())
-        finally:  # an exception goes to the loop's exception handler; the next event runs all the same
+        finally:  # an exception goes to the loop's exception handler; the next event still runs
             self._running = False
             self._now = 0
             if self._events:

@@ -20,7 +20,7 @@ from r2p.units import SECOND
 
 _WINDOW = 1.0  # seconds to average rates over
 _FRESH = 0.5  # seconds; odometry comes each 0.1 s
-_LATE_MAX = 0.1  # of all periodic messages; on a PC that is fast enough some are late all the same
+_LATE_MAX = 0.1  # of all periodic messages; even on a fast PC some are late
 _LEFT_OUT = ("log", "current", "power")  # topics that are no part of the control chain
 _HARD, _PERIODIC, _SOFT, _NOT = "hard: in slots", "by the clock", "soft: by deadline", "no"
 _CLASSES = {

@@ -68,7 +68,7 @@ async def received_samples(
     def report_unadvertised() -> None:
         view = session.module.network.topics().get(topic)
         if not typed and session.may_have_firmware() and not (view and is_published(view)):
-            notify(f"{topic} has not been advertised: firmware may announce nothing, then give --type to subscribe")
+            notify(f"{topic} has not been advertised: if its firmware announces nothing, give --type")
 
     samples = subscriber.samples()
     waiting, hints = session.waiting(awaited), hint(session, f"{topic} has no publisher", topic, is_published)

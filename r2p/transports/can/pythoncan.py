@@ -163,7 +163,7 @@ class _PythonCanBus(OpenInterface):
     def _handed_over(self, frame: Frame, mailbox: Mailbox, error: BaseException | None) -> None:
         """Confirm a frame that the driver has accepted, unless it returns own frames; `error` is its exception."""
         now = self._clock.monotonic()
-        if isinstance(error, self._can.CanTimeoutError):  # the driver may send it all the same
+        if isinstance(error, self._can.CanTimeoutError):  # the driver may still send it
             self._mailboxes.failed(mailbox, Outcome.UNKNOWN, now)
         elif error is not None:
             self._failed(error)

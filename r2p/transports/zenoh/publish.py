@@ -90,7 +90,7 @@ class TxStream:
 
     def _header(self, samples: list[Sample], serial: int) -> bytes:
         first = samples[0]
-        hops = first.hops + bool(first.source.link)  # what comes from another link crosses this gateway
+        hops = first.hops + bool(first.source.link)  # messages from another link cross this gateway
         if first.clock is None:  # nearly always: packed in one call, without a `Header`
             start = start_of(hops, stamped=first.stamped)
             if len(samples) == 1:

@@ -93,7 +93,7 @@ class ZenohTransport(Transport):
                 await asyncio.sleep(backoff.delay())
 
     async def _network(self, session: "ZenohSession", hub: Hub) -> str:
-        """Return the network's name. A tool looks for one; a robot's program must not depend on who is first."""
+        """Return the network's name. A tool looks for one; a robot's program must not depend on the first one."""
         if self._options.network is not None or not hub.observer:
             return self._options.network or default_network()
         found: set[str] = set()
