@@ -13,11 +13,12 @@ import contextlib
 import logging
 import os
 import sys
+import textwrap
 import traceback
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from r2p.units import SECOND
 
@@ -143,6 +144,30 @@ def node_logger(module: str, node: str) -> logging.Logger:
 
 # Output
 
+_HANGING = "  "  # before all lines but the first of a text that was wrapped
+
+
+def wrapped(text: str, stream: TextIO) -> str:
+    """Return text whose lines fit the terminal that `stream` is, broken between words; else return it as it is.
+
+    A terminal would break them inside of words. Words that are longer than a line, such as URLs, stay whole.
+    """
+    width = _width(stream) if stream.isatty() else 0
+    return "\n".join(_wrapped_line(line, width) if 0 < width < len(line) else line for line in text.split("\n"))
+
+
+def _wrapped_line(line: str, width: int) -> str:
+    indent = line[: len(line) - len(line.lstrip())] + _HANGING
+    return textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+
+
+def _width(stream: TextIO) -> int:
+    """Return the columns of a terminal, or COLUMNS; 0: unknown."""
+    try:
+        return int(os.environ.get("COLUMNS", "0")) or os.get_terminal_size(stream.fileno()).columns
+    except (OSError, ValueError):
+        return 0
+
 
 class LineFormatter(logging.Formatter):
     """Formats a record as a short line that begins with `MODULE/NODE`, or with `r2p` where no node logs.
@@ -158,15 +183,18 @@ class LineFormatter(logging.Formatter):
         _, _, rest = record.name.partition(".")
         module, _, node = rest.partition(".")
         where = f"{module}/{node}" if node else "r2p"
-        text = record.getMessage()
-        if record.exc_info:
-            text += "\n" + (record.exc_text or self.formatException(record.exc_info))
-        text = printable(text, "\n\t")
+        text = printable(record.getMessage(), "\n\t")
         if not self._times:
             level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
-            return f"{where}: {level}{text}"
-        time = f"{self.formatTime(record, '%H:%M:%S')}.{int(record.msecs):03}"
-        return f"{time} {_coloured(f'{record.levelname:<7}', record.levelno)} {where}: {text}"
+            line = wrapped(f"{where}: {level}{text}", sys.stderr)
+        else:
+            time = f"{self.formatTime(record, '%H:%M:%S')}.{int(record.msecs):03}"
+            level = f"{record.levelname:<7}"
+            line = wrapped(f"{time} {level} {where}: {text}", sys.stderr)
+            line = line.replace(level, _coloured(level, record.levelno), 1)
+        if record.exc_info:  # as it is: a traceback quotes code
+            line += "\n" + printable(record.exc_text or self.formatException(record.exc_info), "\n\t")
+        return line
 
 
 def _coloured(text: str, level: int) -> str:

@@ -3,12 +3,13 @@ limited.
 """
 
 import contextlib
+import io
 import logging
 from collections.abc import Iterator
 
 import pytest
 
-from r2p.log_lines import LineFormatter, LineLimit, StderrHandler, default_logging, get_logger, printable
+from r2p.log_lines import LineFormatter, LineLimit, StderrHandler, default_logging, get_logger, printable, wrapped
 
 
 @pytest.mark.parametrize(
@@ -115,3 +116,45 @@ def test_what_a_program_has_configured_stays(capsys: pytest.CaptureFixture[str])
             logging.getLogger().addHandler(logging.NullHandler())
             logger.error("error")
     assert capsys.readouterr().err == ""
+
+
+class TerminalStream(io.StringIO):
+    """A stream at a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_lines_at_a_terminal_break_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    text = "0 gaps at the publisher, 2 lost\n  on zenoh:tcp/127.0.0.1:7447,scouting=off here\n" + "x" * 20
+    assert wrapped(text, io.StringIO()) == text
+    assert wrapped(text, TerminalStream()).splitlines() == [
+        "0 gaps at the",
+        "  publisher, 2 lost",
+        "  on",
+        "    zenoh:tcp/127.0.0.1:7447,scouting=off",
+        "    here",
+        "x" * 20,
+    ]
+    monkeypatch.setenv("COLUMNS", "")  # the stream has no width to ask for either
+    assert wrapped(text, TerminalStream()) == text
+
+
+def test_log_records_at_a_terminal_break_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stderr", TerminalStream())
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    record = logging.makeLogRecord({"name": "r2p.PC1.wheels", "levelname": "WARNING", "levelno": logging.WARNING})
+    record.msg = "a line of more than forty characters, with a traceback"
+    record.exc_info, record.exc_text = (
+        (ValueError, ValueError(), None),
+        "    quoted = code + that + is + longer + than + that",
+    )
+    assert LineFormatter().format(record).splitlines() == [
+        "PC1/wheels: warning: a line of more than",
+        "  forty characters, with a traceback",
+        "    quoted = code + that + is + longer + than + that",
+    ]
+    assert "\x1b[33mWARNING\x1b[0m PC1/wheels:" in LineFormatter(times=True).format(record)

@@ -151,7 +151,7 @@ class _Printer:
         }
         where = "/".join(part for part in (module or "?", record.node) if part)
         text = f"{_clock_text(stamp)} {level.name:<8} {where}: {record.text}"
-        await self._output.put(values, text, colour=_COLOURS.get(level))
+        await self._output.put(values, text, colour=_COLOURS.get(level), wrap=True)
 
 
 def _level_of(number: int) -> Level:

@@ -9,6 +9,7 @@ import typer
 
 import r2p
 from r2p.bridge import ClassOf
+from r2p.clock import LONGEST, SHORTEST
 from r2p.names import topic_name
 from r2p.transports.url import duration
 
@@ -21,13 +22,13 @@ CLASS_NAMES = {
 
 
 def seconds(text: str) -> float:
-    """Parse a duration greater than 0: "10ms", "20us", or seconds."""
+    """Parse a duration that a clock can count: "10ms", "20us", or seconds."""
     try:
         value = duration(text)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    if value <= 0:
-        raise typer.BadParameter(f"{text!r}: the time must be greater than 0")
+    if not SHORTEST <= value <= LONGEST:
+        raise typer.BadParameter(f"{text!r}: the time must be from {SHORTEST:g} to {LONGEST:g} s")
     return value
 
 
@@ -54,13 +55,13 @@ def valid_topic(text: str) -> str:
 
 
 def hertz(text: str) -> float:
-    """Parse a rate greater than 0 Hz."""
+    """Parse a rate in Hz whose period a clock can count."""
     try:
         value = float(text)
     except ValueError:
         value = 0.0
-    if not 0 < value < float("inf"):
-        raise typer.BadParameter(f"{text!r}: the rate must be a number greater than 0 (Hz)")
+    if not 1 / LONGEST <= value <= 1 / SHORTEST:
+        raise typer.BadParameter(f"{text!r}: the rate must be a number from {1 / LONGEST:g} to {1 / SHORTEST:g} (Hz)")
     return value
 
 

@@ -24,7 +24,7 @@ import textwrap
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, TextIO
 
-from r2p.log_lines import StderrHandler, printable
+from r2p.log_lines import StderrHandler, printable, wrapped
 
 Record = Mapping[str, Any]
 
@@ -51,7 +51,8 @@ class Output:
         self._stream = stream or sys.stdout
         self.format = format or ("text" if self._stream.isatty() else "json")
         """"text", "yaml", "json" or "csv"."""
-        self._columns: list[str] | None = None
+        self._columns: list[str] | None = None  # of CSV
+        self._omitted = False  # values that have no column
         self._lock = asyncio.Lock()
 
     @contextlib.asynccontextmanager
@@ -81,24 +82,39 @@ class Output:
         finally:
             loop.remove_reader(fd)
 
-    async def put(self, record: Record, text: str | None = None, *, colour: int | None = None) -> None:
+    async def put(
+        self, record: Record, text: str | None = None, *, colour: int | None = None, wrap: bool = False
+    ) -> None:
         """Write one record of a stream; at a terminal as `text`, by default as YAML. Raises PipeClosed.
 
-        `colour` is the SGR number of the text's colour; without effect where the environment has NO_COLOR.
+        `colour` is the SGR number of the text's colour; without effect where the environment has NO_COLOR. With `wrap`,
+        a text that is wider than the terminal breaks between words; not for columns.
         """
+        if text is not None and wrap:
+            text = wrapped(text, self._stream)
         written = self._record(record, text)
         if colour is not None and self.format == "text" and not os.environ.get("NO_COLOR"):
             written = f"\x1b[{colour}m{written.rstrip()}\x1b[0m\n"
         async with self._lock:
             await self._write(written)
 
+    async def header(self, columns: Iterable[str]) -> None:
+        """Write the header of CSV, where records that differ follow; else that of the first record is written."""
+        if self.format == "csv":
+            self._columns = list(dict.fromkeys(columns))
+            async with self._lock:
+                await self._write(_csv(self._columns))
+
     async def table(self, rows: Iterable[Record], columns: list[str], *, units: Mapping[str, str] = _NONE) -> None:
-        """Write records with the same keys; at a terminal in aligned columns, with `units`. Raises PipeClosed."""
+        """Write records with the same keys; at a terminal in aligned columns, with `units`. Raises PipeClosed.
+
+        A terminal gets no header without rows: the command reports that there is nothing, and why.
+        """
         rows = list(rows)
         match self.format:
             case "text":
                 rows = [{**row, **{name: f"{row[name]} {unit}" for name, unit in units.items()}} for row in rows]
-                text = aligned(rows, columns, shutil.get_terminal_size().columns)
+                text = aligned(rows, columns, shutil.get_terminal_size().columns) if rows else ""
             case "csv":
                 text = _csv(columns) + "".join(_csv([_cell(row[name]) for name in columns]) for row in rows)
             case _:
@@ -129,6 +145,10 @@ class Output:
         if self._columns is None:
             self._columns = list(leaves)
             return _csv(self._columns) + self._row(record)
+        if not (self._omitted or leaves.keys() <= set(self._columns)):
+            self._omitted = True
+            names = ", ".join(name for name in leaves if name not in self._columns)
+            notify(f"the CSV has no column for {names}: these are left out")
         return _csv([leaves.get(name, "") for name in self._columns])
 
     async def _write(self, text: str) -> None:
@@ -275,7 +295,8 @@ def abandon_stdout() -> None:
 def notify(text: str) -> None:
     """Print a message for the user on stderr."""
     with contextlib.suppress(OSError):  # stderr is closed
-        print(printable(f"r2p: {text}", "\n\t"), file=sys.stderr, flush=True)  # noqa: T201 - the one place
+        line = wrapped(printable(f"r2p: {text}", "\n\t"), sys.stderr)
+        print(line, file=sys.stderr, flush=True)  # noqa: T201 - the one place
 
 
 _HANDLER = StderrHandler()

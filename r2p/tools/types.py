@@ -51,6 +51,8 @@ def type_name(cls: type[r2p.Message]) -> str:
     """Return the name of a class for `--type`; only its bare name if it was learnt from another module."""
     if cls.__module__ == LEARNT:
         return cls.__name__
+    if vars(load_module(STANDARD)).get(cls.__name__) is cls:  # its own module may be a private one
+        return f"{STANDARD}:{cls.__name__}"
     return f"{cls.__module__}:{cls.__name__}"
 
 
@@ -120,6 +122,16 @@ def suggestion(size: int) -> str:
     """Return the standard types of this size, for the end of a sentence."""
     names = of_size(size)
     return f"; types of {size} bytes: {', '.join(names)}" if names else ""
+
+
+def describe_other(settings: Settings, what: str, cls: type[r2p.Message], size: int, fingerprint: bytes) -> str:
+    """Say that a topic (`what`: with a verb) has another type than `cls`, and which to give."""
+    known, own, name = Types(settings).by_fingerprint(fingerprint), r2p.layout(cls).size, type_name(cls)
+    if known is not None:
+        return f"{what} {type_name(known)} ({size} bytes), not {name} ({own} bytes): give --type {type_name(known)}"
+    if size == own:
+        return f"{what} another type of {size} bytes than {name}: give the right --type, or none"
+    return f"{what} messages of {size} bytes, but {name} has {own}: give the right --type{suggestion(size)}"
 
 
 def complete_type(incomplete: str) -> list[str]:

@@ -50,7 +50,7 @@ class Session:
             "PATH": f"{binaries}:{os.environ['PATH']}",
             "HOME": str(directory),
             "TERM": "dumb",
-            "COLUMNS": "120",
+            "COLUMNS": "200",
             "LANG": "C.UTF-8",
         }
         self._running: dict[str, Process] = {}

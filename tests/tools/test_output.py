@@ -69,6 +69,25 @@ async def test_csv_has_a_header_and_flat_columns() -> None:
     )
 
 
+@pytest.mark.virtual_time
+async def test_csv_with_a_header_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    stream = io.StringIO()
+    output = Output("csv", stream)
+    await output.header(["a", "b", "a"])
+    for record in {"b": 1}, {"a": 2, "c": 3}, {"d": 4}:
+        await output.put(record)
+    assert stream.getvalue() == "a,b\n,1\n2,\n,\n"
+    assert capsys.readouterr().err == "r2p: the CSV has no column for c: these are left out\n"
+
+
+@pytest.mark.virtual_time
+async def test_a_table_without_rows() -> None:
+    text, csv = Terminal(), Terminal()
+    await Output(stream=text).table([], ["a", "b"])
+    await Output("csv", csv).table([], ["a", "b"])
+    assert (text.getvalue(), csv.getvalue()) == ("", "a,b\n")
+
+
 HOSTILE = "\x1b]0;title\x07\x9b2J\r\nforged,line\x7f\u202e\u2028\\"
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import r2p
 from r2p.msg import IMU, Led, Proximity, Speed2, StampedPose3, Text, Velocity3
 from r2p.tools.output import to_yaml
-from r2p.tools.types import standard_types
+from r2p.tools.types import load_type, of_size, standard_types, type_name
 from r2p.tools.values import from_plain, parse, parse_line, pick, shortest_f32, to_plain
 from tests.messages.strategies import messages
 
@@ -50,6 +50,12 @@ def test_what_echo_prints_pub_takes(cls: type[r2p.Message], data: st.DataObject)
     assert parse_line(cls, json.dumps(plain, allow_nan=False)).encode() == sent.encode()
     assert parse(cls, [json.dumps(plain, allow_nan=False)]).encode() == sent.encode()
     assert parse(cls, [to_yaml(plain)]).encode() == sent.encode()
+
+
+def test_types_are_offered_by_names_that_type_takes() -> None:
+    assert [load_type(type_name(cls)) for cls in standard_types()] == standard_types()
+    assert all(type_name(cls).startswith("r2p.msg:") for cls in standard_types())
+    assert "r2p.msg:Timestamp" in of_size(8)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -1,7 +1,9 @@
 """`r2p topic echo`: print messages as they arrive."""
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager
 from typing import Annotated, Any
 
 import msgspec
@@ -10,15 +12,20 @@ import typer
 import r2p
 from r2p.names import topic_name
 from r2p.tools.options import Count, Format, Once, Timeout
-from r2p.tools.output import Output, notify
-from r2p.tools.session import Session, UsageError, patience
-from r2p.tools.topic.watching import Topics, TypeName, received_samples
+from r2p.tools.output import Output, flatten, notify
+from r2p.tools.session import REPORT_WAITING_AFTER, Session, UsageError, patience
+from r2p.tools.topic.filter import Filter, FilterError
+from r2p.tools.topic.watching import Topics, TypeName, received_samples, while_publishers_fit
 from r2p.tools.types import Types, suggestion
 from r2p.tools.values import META, pick, to_plain
 from r2p.units import SECOND
 
 QUEUE = 1024
 """Messages that wait for a slow terminal or pipe; beyond that the oldest are lost, and counted."""
+
+_HEX = "data"  # the field of a message of unknown type
+
+logger = logging.getLogger("r2p.echo")
 
 
 async def echo(
@@ -30,6 +37,10 @@ async def echo(
         list[str] | None,
         typer.Option("--field", metavar="PATH", help="Only this field: x, stamp.sec, value[0] (repeatable)."),
     ] = None,
+    filter: Annotated[
+        str | None,
+        typer.Option("--filter", metavar="EXPR", help="Only messages for which it is true: 'x > 3 and abs(w) < 0.1'."),
+    ] = None,
     meta: Annotated[bool, typer.Option("--meta", help="Add topic, stamp, source and sequence, under `_`.")] = False,
     count: Count = None,
     once: Once = False,
@@ -38,35 +49,64 @@ async def echo(
 ) -> None:
     """Print the messages of topics.
 
-    Messages of unknown type are printed as bytes in hex. Ctrl-C ends it.
+    Messages of unknown type are printed as bytes in hex. With --filter, messages that do not pass count neither for -n
+    nor for --timeout. Ctrl-C ends it.
     """
     output = Output(format)
     names = list(dict.fromkeys(map(topic_name, topics)))
-    if output.format == "csv" and len(names) > 1:
-        raise UsageError("--format csv has one header, so it allows only one topic")
     types = Types(session.settings)
-    readers = [_TopicReader(session, name, types, type) for name in names]
-    with_meta, left = meta or len(names) > 1, 1 if once else count
+    readers = [_TopicReader(session, name, types, type, filter) for name in names]
+    selection = _Selection(field, meta=meta, several=len(names) > 1, csv=output.format == "csv")
+    left = 1 if once else count
 
     async def print_all(reader: _TopicReader) -> None:
         nonlocal left
-        async for record, sample in reader.records():
-            received()
-            if left == 0:
-                return
-            if left is not None:
-                left -= 1
-            await output.put(_chosen(record, field) | (_meta(reader.topic, sample) if with_meta else {}))
-            if left == 0:
-                for task in tasks:
-                    task.cancel()
+        async with reader.while_type_fits():
+            async for record, sample in reader.records():
+                received()
+                if left == 0:
+                    return
+                if left is not None:
+                    left -= 1
+                await output.put(selection.of(reader.topic, record, sample))
+                if left == 0:
+                    for task in tasks:
+                        task.cancel()
 
+    what = ", ".join(names) + (" that passes the filter" if filter else "")
     try:
-        async with output.while_read(), patience(", ".join(names), timeout) as received, asyncio.TaskGroup() as group:
+        async with output.while_read(), patience(what, timeout) as received, asyncio.TaskGroup() as group:
+            if selection.labelled:
+                if not all(each.typed for each in readers):
+                    await session.settle()
+                await output.header([path for each in readers for path in await each.columns(selection)])
             tasks = [group.create_task(print_all(reader)) for reader in readers]
     finally:
         for reader in readers:
-            reader.report_losses()
+            reader.report()
+
+
+class _Selection(msgspec.Struct):
+    """What is printed of a message: the `fields` that the user chose, and where it comes from."""
+
+    fields: list[str] | None
+    meta: bool
+    several: bool
+    csv: bool
+
+    @property
+    def labelled(self) -> bool:
+        """Whether a column names the topic of each row: CSV has one header for all topics."""
+        return self.csv and self.several
+
+    def of(self, topic: str, record: dict[str, Any], sample: r2p.Sample | None) -> dict[str, Any]:
+        """Return the record to print. Raises UsageError if it lacks a field."""
+        row = _chosen(record, self.fields)
+        if self.labelled:
+            row = {"topic": topic} | {"topic_" if name == "topic" else name: value for name, value in row.items()}
+        if self.meta or (self.several and not self.csv):
+            row[META] = _meta(topic, sample)
+        return row
 
 
 def _chosen(record: dict[str, Any], fields: list[str] | None) -> dict[str, Any]:
@@ -81,36 +121,78 @@ def _chosen(record: dict[str, Any], fields: list[str] | None) -> dict[str, Any]:
 class _TopicReader:
     """One topic, decoded with the type that the user or the peer gives; otherwise in hex."""
 
-    def __init__(self, session: Session, topic: str, types: Types, given: str | None) -> None:
+    def __init__(self, session: Session, topic: str, types: Types, given: str | None, filter: str | None) -> None:
         self.topic = topic
         self._session = session
         self._types = types
         self._cls = types.stated(topic, given)
+        self._filter = _filter(filter, self._cls)
         self._subscriber: r2p.Subscriber[Any] = session.node.subscribe(topic, self._cls, queue=QUEUE, lossy=True)
         self._next_look_up = 0  # ns
         self._reported = False  # that the type is unknown
+        self._report_rejected_at = 0  # ns; 0: no message has arrived
+
+    @property
+    def typed(self) -> bool:
+        return self._cls is not None
 
     async def records(self) -> AsyncIterator[tuple[dict[str, Any], r2p.Sample]]:
-        """Yield each message as a record, with its sample."""
-        async for sample in received_samples(self._session, self._subscriber, typed=self._cls is not None):
-            record = self._decoded(sample)
-            if record is None:
+        """Yield each message that passes the filter as a record, with its sample. Raises UsageError."""
+        async for sample in received_samples(self._session, self._subscriber, typed=self.typed):
+            message = self._decoded(sample)
+            if message is None:
                 await self._look_up_type(sample)
-                record = self._decoded(sample)
-            yield {"data": sample.data.hex()} if record is None else record, sample
+                message = self._decoded(sample)
+            if self._passes(message):
+                yield {_HEX: sample.data.hex()} if message is None else to_plain(message), sample
 
-    def report_losses(self) -> None:
+    def while_type_fits(self) -> AbstractAsyncContextManager[None]:
+        """Raise r2p.Error in the block when all publishers have another type than the one stated."""
+        return while_publishers_fit(self._session, self._subscriber, self._cls)
+
+    async def columns(self, selection: _Selection) -> list[str]:
+        """Return the columns of CSV that the messages will have, as far as their type is known by now."""
+        if not self.typed:
+            await self._learn()
+        record = {_HEX: ""} if self._cls is None else to_plain(r2p.layout(self._cls).zero)
+        return list(flatten(selection.of(self.topic, record, None)))
+
+    def report(self) -> None:
         """Report what is missing in the output."""
         if self._subscriber.lost:
             notify(f"{self._subscriber.lost} messages of {self.topic} lost: the output was too slow")
         if self._subscriber.undecodable:
             notify(f"{self._subscriber.undecodable} messages of {self.topic} were of another type")
+        if self._filter is not None and self._filter.seen:
+            logger.info("%s", f"{self.topic}: {self._filter.summary}")
 
-    def _decoded(self, sample: r2p.Sample) -> dict[str, Any] | None:
+    def _passes(self, message: r2p.Message | None) -> bool:
+        if self._filter is None:
+            return True
+        if message is None:
+            raise UsageError(f"the type of {self.topic} is unknown, so --filter can't look into it: give --type")
+        try:
+            passed = self._filter.passes(message)
+        except FilterError as error:
+            raise UsageError(str(error)) from error
+        if not self._filter.passed:
+            self._report_rejected()
+        return passed
+
+    def _report_rejected(self) -> None:
+        """Report once that messages arrive, but none of them passes."""
+        now = self._session.node.now()
+        if not self._report_rejected_at:
+            self._report_rejected_at = now + round(REPORT_WAITING_AFTER * SECOND)
+        elif 0 < self._report_rejected_at <= now:
+            self._report_rejected_at = -1
+            notify(f"messages of {self.topic} arrive, but none has passed the filter yet")
+
+    def _decoded(self, sample: r2p.Sample) -> r2p.Message | None:
         if self._cls is None:
             return None
         try:
-            return to_plain(self._cls.decode(sample.data))
+            return self._cls.decode(sample.data)
         except r2p.DecodeError:  # its publisher has come back with another type
             self._cls, self._next_look_up = None, 0
             return None
@@ -121,15 +203,34 @@ class _TopicReader:
         if now < self._next_look_up:
             return
         self._next_look_up = now + SECOND
-        view = self._session.module.network.topics().get(self.topic, r2p.TopicView(self.topic))
-        self._cls = await self._types.learn(self._session, view)
+        await self._learn()
         if self._cls is None and not self._reported:
             self._reported = True
             size = len(sample.data)
             notify(f"the type of {self.topic} is unknown, so bytes are shown in hex; give --type{suggestion(size)}")
 
+    async def _learn(self) -> None:
+        view = self._session.module.network.topics().get(self.topic, r2p.TopicView(self.topic))
+        self._cls = await self._types.learn(self._session, view)
 
-def _meta(topic: str, sample: r2p.Sample) -> dict[str, Any]:
+
+def _filter(text: str | None, cls: type[r2p.Message] | None) -> Filter | None:
+    """Return the filter of one topic, for its type if that is stated. Raises UsageError."""
+    if text is None:
+        return None
+    try:
+        made = Filter(text)
+        if cls is not None:
+            made.bind(cls)
+    except FilterError as error:
+        raise UsageError(str(error)) from error
+    return made
+
+
+def _meta(topic: str, sample: r2p.Sample | None) -> dict[str, Any]:
+    """Return where a message comes from; without a sample, only the keys."""
+    if sample is None:
+        return dict.fromkeys(("topic", "stamp", "stamp_from", "source", "sequence"))
     meta = {
         "topic": topic,
         "stamp": sample.stamp,
@@ -139,4 +240,4 @@ def _meta(topic: str, sample: r2p.Sample) -> dict[str, Any]:
     }
     if sample.clock is not None:
         meta["clock"] = msgspec.to_builtins(sample.clock)
-    return {META: meta}
+    return meta

@@ -1,6 +1,9 @@
 """`r2p topic pub`: publish from the shell."""
 
 import asyncio
+import contextlib
+import json
+import logging
 import os
 import sys
 from collections.abc import AsyncIterator
@@ -11,12 +14,23 @@ import typer
 
 import r2p
 from r2p.bridge import ClassOf
+from r2p.names import topic_name
 from r2p.tools.options import Count, Once, Rate, Timeout, class_choice
 from r2p.tools.output import notify, wait_ready, waitable
-from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError
-from r2p.tools.topic.watching import Topic, TypeName, hint, is_subscribed, suggest_topics, wait_until_passed_on
+from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError, wait_until
+from r2p.tools.topic.watching import (
+    AnyPublisher,
+    Topic,
+    TypeName,
+    hint,
+    is_subscribed,
+    subscriber_names,
+    suggest_topics,
+    wait_until_passed_on,
+    while_subscribers_fit,
+)
 from r2p.tools.types import find
-from r2p.tools.values import parse, parse_line
+from r2p.tools.values import parse, parse_line, to_plain
 
 STDIN = "-"
 DEFAULT_RATE = 1.0
@@ -24,7 +38,10 @@ DEFAULT_RATE = 1.0
 _CHUNK = 65536  # bytes
 _LINE_MAX = 1 << 20  # bytes
 
-_AnyPublisher = r2p.Publisher[Any] | r2p.SporadicPublisher[Any] | r2p.PeriodicPublisher[Any]
+_EXCERPT = 120  # characters of a message that are shown
+_NAMED = 0.5  # seconds in which subscribers announce the names of their nodes
+
+logger = logging.getLogger("r2p.pub")
 
 
 async def pub(
@@ -52,9 +69,10 @@ async def pub(
 ) -> None:
     """Publish a message, by default once a second.
 
-    Fields that are left out are zero. With --once, -n or stdin it first waits for a subscriber, at most --timeout.
-    Ctrl-C ends it.
+    Fields that are left out are zero, so without MESSAGE all are. With --once, -n or stdin it first waits for a
+    subscriber, at most --timeout. Ctrl-C ends it.
     """
+    topic = topic_name(topic)
     choice = choice or ClassOf(r2p.PublisherClass.NON_REAL_TIME)
     periodic = choice.publisher_class is r2p.PublisherClass.PERIODIC
     from_stdin = message == [STDIN]
@@ -89,11 +107,11 @@ class _Publication(msgspec.Struct):
         """Publish the same message over and over."""
         publisher = self._advertise()
         ticks = self.session.node.every(1 / rate)
-        await self._wait_subscriber(publisher, needed=self.count is not None)
-        await publisher.publish(message)
-        while publisher.sent != self.count:
-            await anext(ticks)
+        async with self._reporting(publisher, message, rate):
             await publisher.publish(message)
+            while publisher.sent != self.count:
+                await anext(ticks)
+                await publisher.publish(message)
 
     async def publish_periodically(self, message: r2p.Message) -> None:
         """Publish the same message over and over, timed by a periodic publisher."""
@@ -108,14 +126,20 @@ class _Publication(msgspec.Struct):
 
         periodic = r2p.Periodic(self.choice.time, fill)
         publisher = self.session.node.advertise(self.topic, self.message_class, periodic)
-        await self._wait_subscriber(publisher, needed=not ready)
-        ready = True
-        await done.wait()
+        async with self._reporting(publisher, message, 1 / self.choice.time):
+            ready = True
+            await done.wait()
 
     async def publish_lines(self, rate: float | None) -> None:
         """Publish one message for each line of stdin."""
         publisher = self._advertise()
-        await self._wait_subscriber(publisher, needed=True)
+        await self._wait_subscriber(publisher)
+        await self._publish_lines(publisher, rate)
+        await self._report_sent(publisher)
+
+    async def _publish_lines(
+        self, publisher: r2p.Publisher[Any] | r2p.SporadicPublisher[Any], rate: float | None
+    ) -> None:
         ticks = None if rate is None else self.session.node.every(1 / rate)
         number = 0
         async for line in read_lines():
@@ -137,25 +161,64 @@ class _Publication(msgspec.Struct):
             return self.session.node.advertise(self.topic, self.message_class, r2p.Sporadic(self.choice.time))
         return self.session.node.advertise(self.topic, self.message_class)
 
-    async def _wait_subscriber(self, publisher: _AnyPublisher, *, needed: bool) -> None:
-        """Wait for a subscriber if one is needed; otherwise only report after a second that there is none."""
-        if not needed:
-            asyncio.get_running_loop().call_later(REPORT_WAITING_AFTER, self._report_no_subscriber, publisher)
-            return
+    async def _wait_subscriber(self, publisher: AnyPublisher) -> None:
         missing = f"{self.topic} has no subscriber"
         waiting = self.session.waiting(f"a subscriber of {self.topic}")
         with waiting, hint(self.session, missing, self.topic, is_subscribed):
             try:
-                async with asyncio.timeout(self.timeout):
+                async with asyncio.timeout(self.timeout), while_subscribers_fit(self.session, publisher):
                     await publisher.wait_subscriber()
                     await wait_until_passed_on(self.session, publisher.topic)
             except TimeoutError:
                 raise TimedOut(f"{self.topic} had no subscriber for {self.timeout:g} s") from None
 
-    def _report_no_subscriber(self, publisher: _AnyPublisher) -> None:
-        if not publisher.subscribers:
-            question = suggest_topics(self.session, self.topic, is_subscribed)
-            notify(f"{self.topic} has no subscriber yet, publishing anyway{question}")
+    # What the user sees of it
+
+    @contextlib.asynccontextmanager
+    async def _reporting(self, publisher: AnyPublisher, message: r2p.Message, rate: float) -> AsyncIterator[None]:
+        """Report what the block publishes, and to whom: a number of messages at the end, else once at the start.
+
+        A number of messages first waits for a subscriber.
+        """
+        if self.count is not None:
+            await self._wait_subscriber(publisher)
+            yield
+            await self._report_sent(publisher)
+            return
+        async with asyncio.TaskGroup() as tasks:
+            reporting = tasks.create_task(self._report_start(publisher, message, rate))
+            yield
+            reporting.cancel()
+
+    async def _report_start(self, publisher: AnyPublisher, message: r2p.Message, rate: float) -> None:
+        """Report what is published, and the subscribers as soon as there is one."""
+        what = f"publishing {self.topic} {_excerpt(message)} at {rate:g} Hz"
+        if await wait_until(lambda: publisher.subscribers > 0, REPORT_WAITING_AFTER):
+            logger.info("%s to %s", what, await self._subscribers())
+            return
+        logger.info("%s", what)
+        question = suggest_topics(self.session, self.topic, is_subscribed)
+        notify(f"{self.topic} has no subscriber yet, publishing anyway{question}")
+        await publisher.wait_subscriber()
+        logger.info("publishing %s to %s", self.topic, await self._subscribers())
+
+    async def _report_sent(self, publisher: AnyPublisher) -> None:
+        """Report how many messages were sent, and to whom."""
+        to = f" to {await self._subscribers()}" if publisher.subscribers else ", but no subscriber is left"
+        logger.info(
+            "%d %s of %s sent%s", publisher.sent, "message" if publisher.sent == 1 else "messages", self.topic, to
+        )
+
+    async def _subscribers(self) -> str:
+        """Return the names of the subscribers; a module announces its nodes a little later than its subscriptions."""
+        await wait_until(lambda: subscriber_names(self.session, self.topic)[1], _NAMED)
+        names, _ = subscriber_names(self.session, self.topic)
+        return ", ".join(names) or "a subscriber that is not announced"
+
+
+def _excerpt(message: r2p.Message) -> str:
+    text = json.dumps(to_plain(message))
+    return text if len(text) <= _EXCERPT else f"{text[:_EXCERPT]}..."
 
 
 async def read_lines(stream: TextIO | None = None) -> AsyncIterator[str]:

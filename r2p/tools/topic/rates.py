@@ -19,7 +19,7 @@ from r2p.names import topic_name
 from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, patience
-from r2p.tools.topic.watching import Topic, TypeName, received_samples
+from r2p.tools.topic.watching import Topic, TypeName, received_samples, while_publishers_fit
 from r2p.tools.types import Types
 from r2p.units import SECOND
 
@@ -56,6 +56,18 @@ class _Meter(ABC):
         """Start new averages with the next message, after a silence; counters go on."""
         self._arrivals.clear()
 
+    @property
+    def alone(self) -> bool:
+        """Whether there is only one message since the start or the last silence."""
+        return len(self._arrivals) == 1
+
+    def is_silent(self, now: int) -> bool:
+        """Return whether nothing has come for much longer than usual, and for at least a second (`now`: UTC ns)."""
+        if len(self._arrivals) < 2:
+            return False
+        usual = (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
+        return now - self._arrivals[-1] >= max(SECOND, _GAP * usual)
+
     def _per_second(self, amount: int) -> float | None:
         """Return the amount per second between the first and the last arrival; None if no time has passed."""
         span = (self._arrivals[-1] - self._arrivals[0]) / SECOND if self._arrivals else 0.0
@@ -85,7 +97,12 @@ def _command(name: str, kind: type[_Meter]) -> Callable[..., Coroutine[Any, Any,
                 received()
                 meter.add(sample, session.node.now())
 
-        async with output.while_read(), patience(topic, timeout) as received, asyncio.TaskGroup() as tasks:
+        async with (
+            output.while_read(),
+            patience(topic, timeout) as received,
+            while_publishers_fit(session, subscriber, cls),
+            asyncio.TaskGroup() as tasks,
+        ):
             reading = tasks.create_task(read())
             await _print(session.node, subscriber, meter, output, 1 if once else count)
             reading.cancel()
@@ -98,19 +115,22 @@ async def _print(
     node: r2p.Node, subscriber: r2p.Subscriber[Any], meter: _Meter, output: Output, count: int | None
 ) -> None:
     """Print a report once a second, `count` of them or without end."""
-    printed, measured = 0, False
+    topic, printed, waits = subscriber.topic, 0, False
     async for _ in node.every(1.0):
         report = meter.report(subscriber.lost) if meter.fresh else None
         if report is not None:
             record, text = report
-            await output.put({"topic": subscriber.topic} | record, text)
+            await output.put({"topic": topic} | record, text, wrap=True)
             printed += 1
             if printed == count:
                 return
-        elif measured and not meter.fresh:
-            notify(f"no new messages of {subscriber.topic}")
+        elif meter.is_silent(node.now()):
+            notify(f"no new messages of {topic}")
             meter.restart()
-        measured, meter.fresh = report is not None, 0
+        elif meter.alone and not (meter.fresh or waits):
+            waits = True
+            notify(f"waiting for the second message of {topic}: one has no rate")
+        meter.fresh = 0
 
 
 class _Sequences:

@@ -12,10 +12,11 @@ from typing import Annotated, Any
 import typer
 
 import r2p
+from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.tools.options import valid_topic
 from r2p.tools.output import notify
 from r2p.tools.session import Session, UsageError, call_after, settings, wait_until
-from r2p.tools.types import complete_type
+from r2p.tools.types import complete_type, describe_other
 
 
 def _complete_topic(incomplete: str) -> list[str]:
@@ -45,10 +46,13 @@ TypeName = Annotated[
 ]
 
 
+AnyPublisher = r2p.Publisher[Any] | r2p.SporadicPublisher[Any] | r2p.PeriodicPublisher[Any]
+
 HINT_AFTER = 2.0
 """Seconds without a peer after which a command suggests other topics."""
 
 _POLL = 0.5  # seconds between two checks whether there is still a publisher
+_POLL_TYPES = 0.4  # seconds between two checks whether there are only peers of another type
 _GRACE = 0.05  # seconds in which firmware acts on a response
 _SECOND_ROUND = 2.0  # seconds in which all advertisements of this module have been repeated, and answered
 
@@ -79,6 +83,70 @@ async def received_samples(
     with _reporting_departure(session, subscriber):
         async for sample in samples:
             yield sample
+
+
+@contextlib.asynccontextmanager
+async def while_publishers_fit(
+    session: Session, subscriber: r2p.Subscriber[Any], cls: type[r2p.Message] | None
+) -> AsyncIterator[None]:
+    """Raise r2p.Error in the block when all publishers have another type than `cls`: nothing would ever arrive."""
+    topic = subscriber.topic
+    async with _while_types_fit(lambda: subscriber.publishers > 0, session, topic, cls, ROLE_PUBLISHES):
+        yield
+
+
+@contextlib.asynccontextmanager
+async def while_subscribers_fit(session: Session, publisher: AnyPublisher) -> AsyncIterator[None]:
+    """Raise r2p.Error in the block when all subscribers have another type than the publisher."""
+    topic, cls = publisher.topic, publisher.type
+    async with _while_types_fit(lambda: publisher.subscribers > 0, session, topic, cls, ROLE_SUBSCRIBES):
+        yield
+
+
+@contextlib.asynccontextmanager
+async def _while_types_fit(
+    is_connected: Callable[[], bool], session: Session, topic: str, cls: type[r2p.Message] | None, role: int
+) -> AsyncIterator[None]:
+    if cls is None:
+        yield
+        return
+
+    async def watch(cls: type[r2p.Message]) -> None:
+        other: str | None = None
+        while True:
+            await asyncio.sleep(_POLL_TYPES)
+            before, other = other, None if is_connected() else _other_type(session, topic, cls, role)
+            if before and other:  # twice in a row, as a peer of the right type may need a moment to answer
+                raise r2p.Error(other)
+
+    async with asyncio.TaskGroup() as tasks:
+        watching = tasks.create_task(watch(cls))
+        yield
+        watching.cancel()
+
+
+def _other_type(session: Session, topic: str, cls: type[r2p.Message], role: int) -> str | None:
+    """Describe the type that the peers in a role have, if it is another one."""
+    for link in session.module.links:
+        info = link.discovery.topics.get(topic)
+        theirs = info.types.get(role) if info is not None and info.mismatch and link.up else None
+        if theirs is not None:
+            verb = "carries" if role == ROLE_PUBLISHES else "is subscribed as"
+            return describe_other(session.settings, f"{topic} {verb}", cls, theirs.size, theirs.fingerprint)
+    return None
+
+
+def subscriber_names(session: Session, topic: str) -> tuple[list[str], bool]:
+    """Return the subscribers of a topic as `MODULE/NODE`, and whether their modules are all known.
+
+    Firmware does not say which of its nodes subscribes (`?`), and announces its name now and then only.
+    """
+    view = session.module.network.topics().get(topic, r2p.TopicView(topic))
+    known = [f"{each.module or '?'}/{each.node}" for each in view.subscribers]
+    rest = session.unannounced(view.subscribers, view.subscribed_on).items()
+    names = known + [f"a module on {link}" if module == "?" else f"{module}/?" for link, module in rest]
+    complete = all(each.module for each in view.subscribers) and all(module != "?" for _, module in rest)
+    return names, bool(names) and complete
 
 
 def suggest_topics(session: Session, topic: str, fits: Callable[[r2p.TopicView], bool]) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Annotated
 
 import pytest
 
 import r2p
-from r2p.msg import Led, StampedPose3, Velocity3
+from r2p.msg import GatewayStatus, Led, StampedPose3, Velocity3
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.echo import QUEUE, echo
 from tests.tools.rig import Firmware, printed, robot, tool
@@ -17,6 +18,12 @@ class Private(r2p.Message):
     """A type that the tool does not know by its fingerprint."""
 
     secret: r2p.u16 = 0
+
+
+class Five(r2p.Message):
+    """Another type with as many bytes as Led."""
+
+    five: Annotated[str, r2p.Len(5)] = ""
 
 
 async def leds(node: r2p.Node) -> None:
@@ -92,10 +99,33 @@ async def test_an_unknown_field_is_a_mistake() -> None:
 
 
 @pytest.mark.virtual_time
-async def test_csv_takes_one_topic() -> None:
-    async with tool() as session:
-        with pytest.raises(UsageError):
-            await echo(session, ["a", "b"], format="csv")
+async def test_csv_of_several_topics_has_a_column_for_the_topic(capsys: pytest.CaptureFixture[str]) -> None:
+    async def gateway(node: r2p.Node) -> None:
+        publisher = node.advertise("gateway", GatewayStatus, latch=True)
+        await publisher.publish(GatewayStatus(topic="odometry"))
+        await asyncio.Event().wait()
+
+    async with robot(leds, poses, secrets, gateway), tool() as session:
+        await echo(session, ["leds", "poses", "secrets"], count=9, format="csv")
+        header, *rows = capsys.readouterr().out.splitlines()
+        assert header == "topic,led,value,timestamp.sec,timestamp.nsec,x,y,w,data"
+        assert rows.count("poses,,,5,6,0.1,0.0,0.0,") in {1, 2}
+        assert rows.count("secrets,,,,,,,,3412") in {3, 4}
+
+        await echo(session, ["gateway", "leds"], once=True, format="csv")
+        header, row = capsys.readouterr().out.splitlines()
+        values = dict(zip(header.split(","), row.split(","), strict=True))
+        assert (values["topic"], values["topic_"]) == ("gateway", "odometry")
+
+
+@pytest.mark.virtual_time
+async def test_csv_says_what_has_no_column(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot() as module, tool() as session:
+        asyncio.get_running_loop().call_later(10, module.start, leds)
+        await echo(session, ["leds", "poses"], count=2, format="csv")
+    captured = capsys.readouterr()
+    assert captured.out == "topic,data\nleds,\nleds,\n"
+    assert captured.err.count("the CSV has no column for led, value: these are left out") == 1
 
 
 @pytest.mark.virtual_time
@@ -119,11 +149,71 @@ async def test_a_type_can_be_stated(by: str, capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.virtual_time
-async def test_a_stated_type_that_is_not_the_publishers_is_refused(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_stated_type_that_is_not_the_publishers_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     async with robot(leds), tool() as session:
-        with pytest.raises(TimedOut):
+        with pytest.raises(ExceptionGroup) as caught:
             await echo(session, ["leds"], type="r2p.msg:Velocity3", timeout=2)
-    assert "topic leds is refused" in caplog.text
+        assert caught.group_contains(
+            r2p.Error, match=r"leds carries r2p.msg:Led \(5 bytes\), not r2p.msg:Velocity3 .*: give --type r2p.msg:Led$"
+        )
+    async with robot(leds), tool() as session:
+        with pytest.raises(ExceptionGroup) as caught:
+            await echo(session, ["leds"], type=f"{__name__}:Five")
+        assert caught.group_contains(r2p.Error, match=r"leds carries r2p.msg:Led \(5 bytes\), not .*:Five")
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.virtual_time
+async def test_a_stated_type_that_does_not_fit_firmware_is_an_error() -> None:
+    async with tool() as session:
+        asyncio.get_running_loop().call_later(0.1, Firmware().advertise, "leds", 5)
+        with pytest.raises(ExceptionGroup) as caught:
+            await echo(session, ["leds"], type="Velocity3")
+    assert caught.group_contains(
+        r2p.Error, match="messages of 5 bytes, but r2p.msg:Velocity3 has 12: .*; types of 5 bytes: r2p.msg:Led$"
+    )
+
+
+@pytest.mark.virtual_time
+async def test_a_publisher_of_another_type_does_not_matter_beside_one_that_fits() -> None:
+    async def other(node: r2p.Node) -> None:
+        node.advertise("leds", Velocity3)
+        await asyncio.Event().wait()
+
+    async with robot(leds), robot(other, name="OTHER"), tool() as session:
+        await echo(session, ["leds"], type="Led", count=50)
+
+
+@pytest.mark.virtual_time
+async def test_a_filter(capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "r2p.echo")
+    async with robot(leds), tool() as session:
+        await echo(session, ["leds"], filter="led % 3 == 0 and value == 1", count=2)
+    first, second = (record["led"] for record in printed(capsys))
+    assert (first % 3, second - first) == (0, 3)
+    (told,) = caplog.messages
+    passed, of, rest = told.removeprefix("leds: ").split(" ", 2)
+    assert (passed, of, rest.split(" ", 1)[1]) == ("2", "of", "messages passed the filter")
+    assert 4 <= int(rest.split(" ", 1)[0]) <= 6
+
+
+@pytest.mark.virtual_time
+async def test_a_filter_that_nothing_passes(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(leds), tool() as session:
+        with pytest.raises(TimedOut, match="nothing received on leds that passes the filter for 5 s"):
+            await echo(session, ["leds"], filter="value > 1", timeout=5)
+    assert capsys.readouterr().err == "r2p: messages of leds arrive, but none has passed the filter yet\n"
+
+
+@pytest.mark.virtual_time
+async def test_a_filter_that_does_not_fit_the_type() -> None:
+    async with robot(leds, secrets), tool() as session:
+        with pytest.raises(UsageError, match=r"Led has no field led_; did you mean led\?"):
+            await echo(session, ["leds"], type="Led", filter="led_ > 1")
+        for topic, text in (("leds", "Led has no field x; the fields are led, value"), ("secrets", "give --type")):
+            with pytest.raises(ExceptionGroup) as caught:
+                await echo(session, [topic], filter="x > 1")
+            assert caught.group_contains(UsageError, match=text)
 
 
 @pytest.mark.virtual_time

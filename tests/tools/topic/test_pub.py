@@ -9,10 +9,11 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
+import typer
 
 import r2p
 from r2p.msg import Led, Velocity3
-from r2p.tools.options import class_choice
+from r2p.tools.options import class_choice, hertz
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.pub import pub, read_lines
 from tests.tools.rig import robot, tool
@@ -52,12 +53,14 @@ class Listener:
 
 
 @pytest.mark.virtual_time
-async def test_once() -> None:
+async def test_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", "r2p.pub")
     listener = Listener()
     async with robot(listener.listen):
         async with tool() as session:
             await pub(session, "/cmd", ["led=3", "value=1"], type="Led", once=True)
         assert await listener.got(1) == [Led(led=3, value=1)]
+    assert caplog.messages == ["1 message of cmd sent to BOT/listen"]
 
 
 @pytest.mark.virtual_time
@@ -122,7 +125,10 @@ async def test_rate_and_class(options: dict[str, Any], gap: float, publisher_cla
 
 
 @pytest.mark.virtual_time
-async def test_without_a_number_it_goes_on_and_notes_that_nobody_listens(capsys: pytest.CaptureFixture[str]) -> None:
+async def test_without_a_number_it_goes_on_and_says_what_and_to_whom(
+    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "r2p.pub")
     listener = Listener()
     async with robot() as module, tool() as session:
         publishing = asyncio.create_task(pub(session, "cmd", [], type="Led", rate=10))
@@ -133,6 +139,45 @@ async def test_without_a_number_it_goes_on_and_notes_that_nobody_listens(capsys:
         publishing.cancel()
         with pytest.raises(asyncio.CancelledError):
             await publishing
+    assert caplog.messages == [
+        'publishing cmd {"led": 0, "value": 0} at 10 Hz',
+        "publishing cmd to BOT/listen",
+    ]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize(
+    ("options", "rate"), [({}, "1"), ({"rate": 0.5}, "0.5"), ({"choice": class_choice("periodic:20ms")}, "50")]
+)
+async def test_with_a_subscriber_it_says_all_at_once(
+    options: dict[str, Any], rate: str, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "r2p.pub")
+    listener = Listener()
+    async with robot(listener.listen), tool() as session:
+        publishing = asyncio.create_task(pub(session, "cmd", ["led=3"], type="Led", **options))
+        await listener.got(3)
+        publishing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await publishing
+    assert caplog.messages == [f'publishing cmd {{"led": 3, "value": 0}} at {rate} Hz to BOT/listen']
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.virtual_time
+async def test_subscribers_of_another_type_are_not_waited_for() -> None:
+    async with robot(Listener(Velocity3).listen), tool() as session:
+        with pytest.raises(ExceptionGroup) as caught:
+            await pub(session, "cmd", [], type="Led", once=True)
+    assert caught.group_contains(
+        r2p.Error, match=r"cmd is subscribed as r2p.msg:Velocity3 \(12 bytes\), not r2p.msg:Led"
+    )
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "1e9", "1e-300", "fast"])
+def test_a_rate_that_no_clock_can_count(text: str) -> None:
+    with pytest.raises(typer.BadParameter, match="the rate must be a number from 1e-09 to 1e\\+06"):
+        hertz(text)
 
 
 @pytest.mark.virtual_time

@@ -237,8 +237,26 @@ async def test_a_topic_with_a_name_much_like_it_is_named(
 
 
 @pytest.mark.virtual_time
+async def test_a_slow_topic(capsys: pytest.CaptureFixture[str]) -> None:
+    """It pauses between two messages for longer than a report takes, and is not silent for that."""
+
+    async def slow(node: r2p.Node) -> None:
+        publisher = node.advertise("slow", Led, latch=True)
+        async for _ in node.every(4.0):
+            await publisher.publish(Led())
+
+    async with robot(slow), tool() as session:
+        await hz(session, "slow", count=3)
+    captured = capsys.readouterr()
+    assert [json.loads(line)["rate"] for line in captured.out.splitlines()] == [0.25] * 3
+    assert captured.err.count("waiting for the second message of slow") == 1
+    assert "no new messages" not in captured.err
+
+
+@pytest.mark.virtual_time
 async def test_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "200")
     async with robot(leds), tool() as session:
         await hz(session, "leds", once=True)
         await bw(session, "leds", once=True)
