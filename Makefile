@@ -20,7 +20,8 @@ test-lowest: $(LOWEST)/stamp system
 	$(LOWEST)/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS)
 
 # The tests with other Pythons, of those that this machine has: `make test-pythons PYTHONS=3.13 TESTS=tests/tools`.
-test-pythons: $(PYTHONS:%=test-python-%)
+test-pythons:
+	@$(MAKE) --no-print-directory --keep-going $(PYTHONS:%=test-python-%)
 
 # The names of its versions let the shims of pyenv find all of them.
 test-python-%: export PYENV_VERSION = $(shell pyenv versions --bare 2>/dev/null | paste -sd :)
