@@ -64,8 +64,8 @@ class Check(msgspec.Struct, frozen=True):
         return {"check": self.what, "ok": self.ok, "found": self.found, "do": self.do or None}
 
     def text(self, yes: str = "has", no: str = "lacks") -> str:
-        line = f"{yes if self.ok else no:<6} {self.what:<11} {self.found}"
-        return line + "".join(f"\n{'':18} > {step}" for step in self.do.split("\n") if step)
+        line = f"{yes if self.ok else no:<6} {self.what:<13} {self.found}"
+        return line + "".join(f"\n{'':20} > {step}" for step in self.do.split("\n") if step)
 
 
 @standalone

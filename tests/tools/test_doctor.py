@@ -201,11 +201,11 @@ async def test_the_measurement_on_real_loops() -> None:
 def test_text_names_each_step() -> None:
     check = Check("serial", False, "not yours", "do this\nand that")
     assert check.text().splitlines() == [
-        "lacks  serial      not yours",
-        "                   > do this",
-        "                   > and that",
+        "lacks  serial        not yours",
+        "                     > do this",
+        "                     > and that",
     ]
-    assert Check("python", True, "3.11").text() == "has    python      3.11"
+    assert Check("python", True, "3.11").text() == "has    python        3.11"
 
 
 # A link
