@@ -197,7 +197,7 @@ class Link(abc.ABC):
         """The name for texts."""
         self.up = False
         self.unreachable_reason = ""
-        """Why its other end can't be reached, once that has been reported; empty while it is up."""
+        """The reported reason why the other end can't be reached; empty while the link is up."""
         self.admits_gateways = True
         """True if a gateway at the other end joins the mesh of this module's gateway; else the link is for clients."""
         self.gateway_hooks: GatewayHooks | None = None
