@@ -7,6 +7,7 @@ from typing import Annotated
 import pytest
 
 import r2p
+from r2p.codecs import management
 from r2p.modules import watchdog
 from r2p.msg import Led
 from r2p.sim.modules import FirmwareModule, Powered
@@ -52,6 +53,15 @@ async def test_two_modules_with_one_name(r2p_network: Network, caplog: pytest.Lo
     conflicts = [text for text in caplog.messages if "carry the name" in text]
     assert conflicts
     assert all(map(_told, conflicts))
+
+
+@pytest.mark.virtual_time
+async def test_two_versions_of_r2p(r2p_network: Network, caplog: pytest.LogCaptureFixture) -> None:
+    newer = management.Hello("MOTOR2", 7, wire=management.WIRE_VERSION + 1, release="0.9.0")
+    async with r2p_network.module("PC1") as pc1:
+        pc1.links[0].manage(management.encode(newer), 9)
+    (warning,) = [text for text in caplog.messages if "wire version" in text]
+    assert _told(warning)
 
 
 @pytest.mark.virtual_time
