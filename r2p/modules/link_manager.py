@@ -266,7 +266,8 @@ class LinkManager:
         self._other_versions.add(info.name)
         text = (
             f"module {info.name} has wire version {info.wire} (r2p {info.release or 'unknown'}), this one "
-            f"{WIRE_VERSION} (r2p {__version__}): what only one of them knows is ignored; install the same r2p on both"
+            f"{WIRE_VERSION} (r2p {__version__}): what only one of them knows is ignored; "
+            "install the same release on both"
         )
         self._log_limited(link, logging.WARNING, "version", text)
 

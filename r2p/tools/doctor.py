@@ -406,7 +406,7 @@ def _module(view: r2p.ModuleView) -> Check:
     kind = "firmware" if view.instance is None else f"r2p {view.release or 'of unknown version'}"
     found = f"{view.name}: {kind}, {view.state}" + (f", wire version {view.wire}" if view.wire else "")
     if view.wire not in {None, WIRE_VERSION}:
-        do = f"install the same r2p on both: this one is {r2p.__version__} with wire version {WIRE_VERSION}"
+        do = f"install the same release on both: this one is {r2p.__version__} with wire version {WIRE_VERSION}"
         return Check("module", False, found, do)
     return Check("module", True, found, "" if view.state == "running" else f"r2p module reboot {view.name}")
 

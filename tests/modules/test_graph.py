@@ -115,7 +115,7 @@ async def test_another_wire_version_is_reported_once(caplog: pytest.LogCaptureFi
     assert (view.wire, view.release) == (2, "9.9")
     (line,) = [each.getMessage() for each in caplog.records if "wire version" in each.getMessage()]
     assert "module X has wire version 2 (r2p 9.9), this one 1" in line
-    assert "install the same r2p on both" in line
+    assert "install the same release on both" in line
 
 
 def test_a_mismatch_is_described_with_what_to_do() -> None:
