@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from r2p.log_lines import wrapped
 from r2p.tools.output import abandon_stdout, notify
 
 GROUPS = {
@@ -49,7 +50,15 @@ class LazyGroup(TyperGroup):
             return super().invoke(ctx)
         except typer.BadParameter as error:
             error.message = error.message.removeprefix("Value error, ")  # added by pydantic, through Typer
+            error.message = _wrapped_behind(f"Error: {error.format_message()}", error.message)
             raise
+
+
+def _wrapped_behind(shown: str, message: str) -> str:
+    """Return an error's message with the line breaks that all of what is shown needs at a terminal."""
+    begin = shown.removesuffix(message).rstrip()
+    text = wrapped(shown, sys.stderr)
+    return text.removeprefix(begin).removeprefix(" ") if text.startswith(begin) else message
 
 
 app = typer.Typer(

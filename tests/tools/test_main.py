@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from r2p.tools.main import COMMANDS, GROUPS, app
@@ -56,6 +57,17 @@ def test_a_wrong_url_is_a_usage_error(arguments: list[str]) -> None:
     result = CliRunner().invoke(app, [*arguments, "--via", "nonsense:b"])
     assert result.exit_code == 2
     assert "unknown transport 'nonsense'" in result.stderr
+
+
+def test_a_usage_error_at_a_terminal_breaks_between_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    with pytest.raises(typer.BadParameter) as caught:
+        app(["topic", "echo", "a/b/c"], standalone_mode=False)
+    lines = f"Error: {caught.value.format_message()}".splitlines()
+    assert len(lines) > 2
+    assert max(map(len, lines)) <= 40
+    assert " ".join(line.strip() for line in lines).startswith("Error: Invalid value for 'TOPIC...")
 
 
 def test_so_is_one_of_a_bus() -> None:
