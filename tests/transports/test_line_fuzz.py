@@ -30,8 +30,9 @@ KNOWN = {
     "topic": ["leds", "text", "R2P", "R2P_PC1", "R2P_IMU1"],
     "alias": ["PC1", module_alias("robot1/MOTOR1")],
     "piece": ["robot1/", "MOTOR1", "robot1/MOTOR1"],
+    "release": ["", "0.1.0"],
 }
-LENGTHS = {"module": 7, "gateway": 7, "node": 8, "topic": 16, "alias": 7, "piece": 22}
+LENGTHS = {"module": 7, "gateway": 7, "node": 8, "topic": 16, "alias": 7, "piece": 22, "release": 14}
 LETTERS = "abcdefghijklmnopqrstuvwxyzABC0123456789_"
 
 
