@@ -376,7 +376,7 @@ class LinkManager:
 
 def describe_mismatch(event: Mismatched) -> str:
     """Describe how the types differ, and what to do about it."""
-    role = "publish" if event.role == ROLE_PUBLISHES else "subscribe"
+    role = "publish" if event.role == ROLE_PUBLISHES else "subscribe to"
     if event.ours.size != event.theirs.size:
         what = f"messages of {event.theirs.size} bytes, here they have {event.ours.size}"
     else:

@@ -87,12 +87,13 @@ class _Printer:
 
     async def run(self, count: int | None, timeout: float | None) -> None:
         """Print `count` records (None: until cancelled). Raises TimedOut if there is none for `timeout` seconds."""
-        what = f"a log record of {self._wanted}" if self._wanted else "a log record"
+        what = f"log record of {self._wanted}" if self._wanted else "log record"
+        missing = f"no {what}"
         self._left = count
         try:
-            async with self._output.while_read(), patience(what, timeout) as received, asyncio.TaskGroup() as tasks:
+            async with self._output.while_read(), patience(missing, timeout) as received, asyncio.TaskGroup() as tasks:
                 looking = tasks.create_task(self._subscribe_to_all(tasks, received))
-                with self._session.waiting(f"{what} (old ones are not kept)"):
+                with self._session.waiting(f"a {what} (old ones are not kept)"):
                     await self._first.wait()
                 await self._last.wait()
                 looking.cancel()

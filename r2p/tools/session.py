@@ -98,8 +98,8 @@ def call_after(seconds: float, call: Callable[[], object]) -> Iterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def patience(what: str, timeout: float | None) -> AsyncIterator[Callable[[], None]]:
-    """Raise TimedOut in the block if nothing is received on `what` for `timeout` seconds.
+async def patience(missing: str, timeout: float | None) -> AsyncIterator[Callable[[], None]]:
+    """Raise TimedOut in the block if nothing is received for `timeout` seconds; `missing` says so: "no message of x".
 
     The block gets a function to call for each message.
     """
@@ -113,7 +113,7 @@ async def patience(what: str, timeout: float | None) -> AsyncIterator[Callable[[
 
             yield received
     except TimeoutError:
-        raise TimedOut(f"nothing received on {what} for {timeout:g} s") from None
+        raise TimedOut(f"{missing} for {timeout:g} s") from None
 
 
 async def wait_until(condition: Callable[[], bool], timeout: float) -> bool:
@@ -235,7 +235,8 @@ class Session:
         start = changed_at = loop.time()
         known = 0
         while (now := loop.time()) - start < _SETTLE_MAX:
-            if now - changed_at > quiet and (now - start > _FIRMWARE or not self._expects_more()):
+            complete = now - start > _FIRMWARE or not (self._expects_more() or self._lacks_nodes())
+            if now - changed_at > quiet and complete:
                 return True
             await asyncio.sleep(_SETTLE_POLL)
             if (count := self._known()) != known:
@@ -258,6 +259,16 @@ class Session:
             return True
         complete = self._links_with_r2p() & self._links_with_topics()
         return any(link.up and link.name not in complete for link in self.module.links)
+
+    def _lacks_nodes(self) -> bool:
+        """Return whether r2p modules, which announce the nodes of their topics, have only announced a topic so far."""
+        modules = self.module.network.modules()
+        firmware = {view.link for view in modules if view.instance is None}
+        for view in self.module.network.topics().values():
+            for known, links in ((view.publishers, view.published_on), (view.subscribers, view.subscribed_on)):
+                if set(links) & self._links_with_r2p() - {each.link for each in known} - firmware:
+                    return True
+        return False
 
     def _has_firmware(self) -> bool:
         """Return whether there are announcements of modules that do not answer queries."""

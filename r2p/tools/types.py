@@ -12,13 +12,14 @@ from typing import Any
 
 import r2p
 from r2p.tools.run import load_module
-from r2p.tools.session import Session, Settings, UsageError
+from r2p.tools.session import Session, Settings, UsageError, wait_until
 
 STANDARD = "r2p.msg"
 LEARNT = "r2p.messages.schemas"
 """The `__module__` of classes that were made from the fields of another module's type."""
 
 _ANSWERS = 1.0  # seconds to wait for the types of a list
+_ANNOUNCED = 2.0  # seconds to wait for a topic that others have not announced with the rest
 _AT_ONCE = 16  # queries
 
 
@@ -142,6 +143,18 @@ def complete_type(incomplete: str) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
 
 
+async def _announced(session: Session, topic: str) -> r2p.TopicView:
+    """Return what is announced of a topic; wait a little for it, because a busy gateway answers late and in parts."""
+
+    def view() -> r2p.TopicView:
+        return session.module.network.topics().get(topic, r2p.TopicView(topic))
+
+    if session.settings.via:
+        with session.waiting(f"the type of {topic}"):
+            await wait_until(lambda: view().size > 0, _ANNOUNCED)
+    return view()
+
+
 async def find(session: Session, topic: str, given: str | None) -> type[r2p.Message]:
     """Return the type to publish a topic with: stated, or a subscriber's. Raises UsageError if it is unknown."""
     types = Types(session.settings)
@@ -149,7 +162,7 @@ async def find(session: Session, topic: str, given: str | None) -> type[r2p.Mess
     if stated is not None:
         return stated
     await session.settle()
-    view = session.module.network.topics().get(topic, r2p.TopicView(topic))
+    view = await _announced(session, topic)
     found = await types.learn(session, view)
     if found is None:
         names = ", ".join(of_size(view.size)) or "none in r2p.msg"

@@ -67,7 +67,8 @@ def parse(text: str) -> Url:
     """Parse a URL. Raises TransportError if it has no scheme or an option without `=`."""
     scheme, colon, rest = text.partition(":")
     if not colon or not scheme:
-        hint = f"did you mean rtcan:{text}?" if _CAN.match(text) else "for example tcp:192.168.0.10:23"
+        meant = f"rtcan:{text}" if _CAN.match(text) else f"serial:{text}" if text.startswith("/dev/") else ""
+        hint = f"did you mean {meant}?" if meant else "for example tcp:192.168.0.10:23"
         raise TransportError(f"transport {text!r}: give it as SCHEME:ADDRESS, {hint}")
     address, *pairs = _OPTIONS.split(rest)
     options: dict[str, str] = {}
@@ -112,10 +113,11 @@ def _factory(url: Url) -> Callable[[Url], Transport]:
         if entry.name == url.scheme:
             return cast("Callable[[Url], Transport]", entry.load())
     known = schemes()
-    hint = "".join(
-        f"; did you mean {scheme}:{url.address}?"
-        for scheme in difflib.get_close_matches(url.scheme, known, n=1, cutoff=_CLOSE)
-    )
+    close = difflib.get_close_matches(url.scheme, known, n=1, cutoff=_CLOSE)
+    if not close and url.address.isdecimal():  # HOST:PORT alone
+        hint = f"; did you mean tcp:{url}?"
+    else:
+        hint = "".join(f"; did you mean {scheme}:{url.address}?" for scheme in close)
     raise TransportError(f"unknown transport {url.scheme!r}: use one of {', '.join(known)}{hint}")
 
 

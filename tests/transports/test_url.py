@@ -49,7 +49,15 @@ def test_an_unknown_scheme_lists_the_known_ones() -> None:
 
 @pytest.mark.parametrize(
     ("text", "meant"),
-    [("can0", "rtcan:can0"), ("vcan1", "rtcan:vcan1"), ("can:can0", "rtcan:can0"), ("tpc:a", "tcp:a")],
+    [
+        ("can0", "rtcan:can0"),
+        ("vcan1", "rtcan:vcan1"),
+        ("can:can0", "rtcan:can0"),
+        ("tpc:a", "tcp:a"),
+        ("10.0.0.5:23", "tcp:10.0.0.5:23"),
+        ("robot:2323", "tcp:robot:2323"),
+        ("/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
+    ],
 )
 def test_what_was_meant(text: str, meant: str) -> None:
     with pytest.raises(TransportError, match=rf"did you mean {meant}\?$"):

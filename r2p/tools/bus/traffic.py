@@ -48,7 +48,7 @@ async def load(
     """
     output, reports = Output(format), 0
     count = 1 if once else count
-    async with output.while_read(), patience("the bus", timeout) as received:
+    async with output.while_read(), patience("nothing received on the bus", timeout) as received:
         async for report in bus.loads(_PERIOD):
             if report.tallies:
                 received()
@@ -127,7 +127,7 @@ async def dump(
     """
     kinds = set(kind or FrameKind)
     output, printed = Output(format), 0
-    async with output.while_read(), patience("the bus", timeout) as received:
+    async with output.while_read(), patience("nothing received on the bus", timeout) as received:
         async for seen in bus:
             if seen.kind in kinds and (not topic or seen.topic in topic):
                 received()

@@ -73,9 +73,9 @@ async def echo(
                     for task in tasks:
                         task.cancel()
 
-    what = ", ".join(names) + (" that passes the filter" if filter else "")
+    missing = f"{'no message passed the filter' if filter else 'nothing received'} on {', '.join(names)}"
     try:
-        async with output.while_read(), patience(what, timeout) as received, asyncio.TaskGroup() as group:
+        async with output.while_read(), patience(missing, timeout) as received, asyncio.TaskGroup() as group:
             if selection.labelled:
                 if not all(each.typed for each in readers):
                     await session.settle()

@@ -99,7 +99,7 @@ def _command(name: str, kind: type[_Meter]) -> Callable[..., Coroutine[Any, Any,
 
         async with (
             output.while_read(),
-            patience(topic, timeout) as received,
+            patience(f"nothing received on {topic}", timeout) as received,
             while_publishers_fit(session, subscriber, cls),
             asyncio.TaskGroup() as tasks,
         ):

@@ -200,7 +200,7 @@ async def test_a_filter(capsys: pytest.CaptureFixture[str], caplog: pytest.LogCa
 @pytest.mark.virtual_time
 async def test_a_filter_that_nothing_passes(capsys: pytest.CaptureFixture[str]) -> None:
     async with robot(leds), tool() as session:
-        with pytest.raises(TimedOut, match="nothing received on leds that passes the filter for 5 s"):
+        with pytest.raises(TimedOut, match="no message passed the filter on leds for 5 s"):
             await echo(session, ["leds"], filter="value > 1", timeout=5)
     assert capsys.readouterr().err == "r2p: messages of leds arrive, but none has passed the filter yet\n"
 
