@@ -55,7 +55,9 @@ Or: {r2p} demo line, and with your own robot: {r2p} doctor"""
 def command(
     what: Annotated[
         Literal["robot", "line"],
-        typer.Argument(help="robot: on a simulated CAN bus; line: the debug line, on TCP and on a serial port."),
+        typer.Argument(
+            metavar="WHAT", help="robot: on a simulated CAN bus; line: the debug line, on TCP and on a serial port."
+        ),
     ] = "robot",
     duration: Annotated[
         float | None, time_option("--duration", "How long; default: 20 s (robot), 10 s (line).")

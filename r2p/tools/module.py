@@ -138,12 +138,13 @@ class _CommandSender:
     async def repeat_until_confirmed(self) -> None:
         """Send the command until the module confirms it.
 
-        Raises r2p.Error if there is no such module, and TimedOut if a gateway denies the command.
+        Raises r2p.Error if there is no such module or it can't obey, and TimedOut if a gateway denies the command.
         """
         await wait_until(lambda: bool(self._flags) or self._is_unknown(), _FIRST_STATE)
         while True:
             if self._is_unknown():
                 raise r2p.Error(_unknown_text(self._session, self._name))
+            self._check_has_loader()
             if not self._flags:
                 self._session.module.query()  # again: a gateway may not have heard the first one
             self._session.module.command(self._command, self._name)
@@ -152,6 +153,12 @@ class _CommandSender:
                 break
         if self._denied:
             raise TimedOut(self._denied)
+
+    def _check_has_loader(self) -> None:
+        """Raise r2p.Error if the command needs a boot loader, and the module has none."""
+        view = _find(self._session, self._name)
+        if self._command is r2p.Command.BOOTLOAD and view is not None and view.instance is not None:
+            raise r2p.Error(f"{self._name} is an r2p module, a program without a boot loader: it would refuse BOOTLOAD")
 
     def _is_over(self) -> bool:
         return bool(self._denied) or self._confirmed() or self._is_unknown()
@@ -216,9 +223,7 @@ def _timeout_text(session: Session, command: r2p.Command, name: str, timeout: fl
     if view is None:
         return f"{_unknown_text(session, name)}; gave up after {timeout:g} s"
     text = f"{name} did not confirm {command.name} in {timeout:g} s: it is {view.state}, last seen {view.age:.1f} s ago"
-    if command is r2p.Command.BOOTLOAD and view.instance is not None:
-        text += "; it is a program on a PC, which has no boot loader and refuses"
-    elif command is r2p.Command.REBOOT and view.rebooted:
+    if command is r2p.Command.REBOOT and view.rebooted:
         text += "; it had been rebooted before, so its ALIVE may not show it"
     elif view.link.partition(":")[0] in {"tcp", "zenoh"}:
         text += "; a gateway in between must have --allow-control"

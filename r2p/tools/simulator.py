@@ -62,7 +62,9 @@ _ARROWS = ">^<v"
 
 
 def command(
-    robot: Annotated[Literal["triskar2"], typer.Argument(help="The omnidirectional robot of the thesis.")] = "triskar2",
+    robot: Annotated[
+        Literal["triskar2"], typer.Argument(metavar="ROBOT", help="The omnidirectional robot of the thesis.")
+    ] = "triskar2",
     fast: Annotated[
         bool, typer.Option("--fast", help="As fast as possible, in virtual time; other programs can't connect.")
     ] = False,

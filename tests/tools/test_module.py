@@ -229,11 +229,11 @@ async def test_a_lost_order_is_repeated() -> None:
         assert bot.stopped
 
 
-async def test_a_program_refuses_to_enter_a_boot_loader() -> None:
+async def test_a_program_has_no_boot_loader_and_gets_no_command() -> None:
     async with robot(hold) as bot, tool() as session:
-        with pytest.raises(TimedOut, match=r"it is running, last seen .* program on a PC, which has no boot loader"):
-            await bootload(session, "BOT", timeout=3.0)
-        assert bot.refused["BOOTLOAD"] == 3
+        with pytest.raises(r2p.Error, match="BOT is an r2p module, a program without a boot loader"):
+            await bootload(session, "BOT")
+        assert "BOOTLOAD" not in bot.refused
         assert bot.nodes["hold"].running
 
 
