@@ -138,7 +138,7 @@ class _CommandSender:
     async def repeat_until_confirmed(self) -> None:
         """Send the command until the module confirms it.
 
-        Raises r2p.Error if there is no such module or it can't obey, and TimedOut if a gateway denies the command.
+        Raises r2p.Error if there is no such module or it can't obey, and if a gateway denies the command.
         """
         await wait_until(lambda: bool(self._flags) or self._is_unknown(), _FIRST_STATE)
         while True:
@@ -152,7 +152,7 @@ class _CommandSender:
             if await wait_until(self._is_over, _REPEAT) and not self._is_unknown():
                 break
         if self._denied:
-            raise TimedOut(self._denied)
+            raise r2p.Error(self._denied)
 
     def _check_has_loader(self) -> None:
         """Raise r2p.Error if the command needs a boot loader, and the module has none."""
@@ -213,8 +213,9 @@ def _find(session: Session, name: str) -> r2p.ModuleView | None:
 
 def _unknown_text(session: Session, name: str) -> str:
     found = sorted({view.name for view in session.module.network.modules() if view.link and view.state != "observer"})
-    close = difflib.get_close_matches(name, found, n=1, cutoff=0.5)
-    question = f"; did you mean {close[0]}?" if close else ""
+    close = [each for each in found if each.rpartition("/")[2] == name]  # one of each robot: none is likelier
+    close = close or difflib.get_close_matches(name, found, n=1, cutoff=0.5)
+    question = f"; did you mean {' or '.join(close)}?" if close else ""
     return f"there is no module {name} on {session.network_name}; modules found: {', '.join(found) or 'none'}{question}"
 
 

@@ -136,7 +136,7 @@ async def test_a_gateway_that_refuses_an_order_says_so_at_once(monkeypatch: pyte
     async with gateway, r2p.Module("IMU1", via="memory:bus"), tool() as session:
         await asyncio.sleep(3)
         started = asyncio.get_running_loop().time()
-        with pytest.raises(TimedOut, match="gateway GW does not let REBOOT of IMU1 through: it lacks --allow-control"):
+        with pytest.raises(r2p.Error, match="gateway GW does not let REBOOT of IMU1 through: it lacks --allow-control"):
             await reboot(session, "IMU1")
         assert asyncio.get_running_loop().time() - started < 0.1
 
@@ -243,6 +243,23 @@ async def test_an_unknown_module_is_reported_as_soon_as_all_have_answered() -> N
         with pytest.raises(r2p.Error, match=r"no module ARMS on memory:lab; modules found: ARM; did you mean ARM\?$"):
             await stop(session, "ARMS")
         assert asyncio.get_running_loop().time() - started < 0.5
+
+
+def robot_of_two(number: int) -> tuple[r2p.Module, r2p.Module]:
+    """A robot's module ARM, and its gateway to the lab."""
+    own = f"memory:robot{number}"
+    prefixed = r2p.BridgeOptions(prefix=f"robot{number}/", prefix_on=("memory:lab",))
+    return r2p.Module("ARM", via=own), r2p.Module(f"GW{number}", via=[own, "memory:lab"], bridge=prefixed)
+
+
+async def test_a_name_that_each_robot_has_suggests_all_of_them() -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        for module in robot_of_two(1) + robot_of_two(2):
+            await stack.enter_async_context(module)
+        await asyncio.sleep(5.0)
+        session = await stack.enter_async_context(tool())
+        with pytest.raises(r2p.Error, match=r"did you mean robot1/ARM or robot2/ARM\?$"):
+            await stop(session, "ARM")
 
 
 async def test_firmware_is_waited_for_as_it_announces_itself_seldom(capsys: pytest.CaptureFixture[str]) -> None:

@@ -154,7 +154,7 @@ def suggest_topics(session: Session, topic: str, fits: Callable[[r2p.TopicView],
 
     A name that is the same except for its namespace counts as similar.
     """
-    known = [name for name, view in session.module.network.topics().items() if fits(view) and name != topic]
+    known = sorted(name for name, view in session.module.network.topics().items() if fits(view) and name != topic)
     close = difflib.get_close_matches(topic, known)
     bare = topic.rpartition("/")[2]
     close += [name for name in known if name.rpartition("/")[2] == bare and name not in close]
