@@ -70,8 +70,10 @@ def _named(
 ) -> list[tuple[str, NodeFunction]]:
     """Return the functions with the names of their nodes. Raises Error or InvalidName for those that can't run."""
     named = [_pair(each, name) for each in functions]
+    if not named:
+        raise Error("r2p.run has no function to run: pass at least one, as in r2p.run(blink)")
     if name is not None and len(named) != 1:
-        raise Error(f"name={name!r} is for one function, here are {len(named)}: write (name, function) for each")
+        raise Error(f"name={name!r} names one function, not {len(named)}: write (name, function) for each")
     return [(node_name(node), function) for node, function in named]
 
 

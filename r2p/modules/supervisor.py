@@ -33,8 +33,16 @@ def check_function(function: NodeFunction) -> Any:
     """Return the function, or the one in its `functools.partial`. Raises Error unless it is a coroutine function."""
     bare = function.func if isinstance(function, functools.partial) else function
     if not (inspect.iscoroutinefunction(bare) or inspect.iscoroutinefunction(getattr(bare, "__call__", None))):  # noqa: B004 - looked into, not called
-        raise Error(f"{function!r} is not a coroutine function: write `async def name(node: r2p.Node) -> None`")
+        raise Error(_not_a_coroutine_function(bare))
     return bare
+
+
+def _not_a_coroutine_function(function: object) -> str:
+    """Return what to write instead of this function or class: classes are what programs for ROS would pass."""
+    if isinstance(function, type):
+        return f"class {function.__name__} is not a coroutine function: pass a method, {function.__name__}().METHOD"
+    name = getattr(function, "__name__", None) if inspect.isroutine(function) else None
+    return f"{name or repr(function)} is not a coroutine function: write `async def {name or 'blink'}(node: r2p.Node)`"
 
 
 def name_of(function: NodeFunction) -> str:

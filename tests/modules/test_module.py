@@ -161,7 +161,7 @@ async def test_what_start_refuses() -> None:
             module.start(hold, name="much_too_long")
         with pytest.raises(r2p.InvalidName):
             module.start(hold, name="a/b")
-        with pytest.raises(r2p.Error, match="is not a coroutine function: write `async def name"):
+        with pytest.raises(r2p.Error, match="is not a coroutine function: write `async def plain"):
             module.start(plain)  # type: ignore[arg-type]
         assert list(module.nodes) == ["hold"]
 

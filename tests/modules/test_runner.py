@@ -260,9 +260,12 @@ def test_nodes_get_their_names(capsys: pytest.CaptureFixture[str]) -> None:
         ([wink, ("too_long_for_it", wink)], None, r2p.NameTooLong, "has 15 characters, the wire carries 8: shorten it"),
         ([wink], "", r2p.InvalidName, "node name ''"),
         ([wink, wink], None, r2p.Error, "already has a node wink"),
-        ([wink, line_follower], "x", r2p.Error, "name='x' is for one function, here are 2: write (name, function)"),
+        ([wink, line_follower], "x", r2p.Error, "name='x' names one function, not 2: write (name, function)"),
+        ([], None, r2p.Error, "has no function to run"),
+        ([mock.Mock], None, r2p.Error, "class Mock is not a coroutine function: pass a method, Mock().METHOD"),
+        ([lambda node: None], None, r2p.Error, "<lambda> is not a coroutine function: write `async def "),
         ([(wink, "x")], None, r2p.Error, "is not a node: write a function, or (name, function)"),
-        ([print], None, r2p.Error, "is not a coroutine function"),
+        ([print], None, r2p.Error, "print is not a coroutine function: write `async def print(node: r2p.Node)`"),
     ],
 )
 def test_what_can_not_run_is_one_line(
