@@ -214,7 +214,7 @@ def _find(session: Session, name: str) -> r2p.ModuleView | None:
 def _unknown_text(session: Session, name: str) -> str:
     found = sorted({view.name for view in session.module.network.modules() if view.link and view.state != "observer"})
     close = [each for each in found if each.rpartition("/")[2] == name]  # one of each robot: none is likelier
-    close = close or difflib.get_close_matches(name, found, n=1, cutoff=0.5)
+    close = close or difflib.get_close_matches(name, found, cutoff=0.5)
     question = f"; did you mean {' or '.join(close)}?" if close else ""
     return f"there is no module {name} on {session.network_name}; modules found: {', '.join(found) or 'none'}{question}"
 

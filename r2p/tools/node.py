@@ -3,6 +3,7 @@
 Firmware announces its topics, but not which of its nodes have them: they are listed under `MODULE/?`.
 """
 
+import difflib
 from typing import Annotated
 
 import typer
@@ -83,7 +84,11 @@ def _find(wanted: str, nodes: Table) -> tuple[str, str]:
     paths = ", ".join(f"{module}/{node}" for module, node in found or nodes)
     if found:
         raise r2p.Error(f"there are several nodes {wanted}: choose one of {paths}")
-    raise r2p.Error(f"there is no node {wanted}; nodes found: {paths or 'none'}")
+    names = {name: f"{module}/{name}" for module, name in nodes} if not module else {}
+    names |= {f"{module}/{name}": f"{module}/{name}" for module, name in nodes}
+    close = difflib.get_close_matches(wanted, names, n=1)
+    question = f"; did you mean {names[close[0]]}?" if close else ""
+    raise r2p.Error(f"there is no node {wanted}; nodes found: {paths or 'none'}{question}")
 
 
 def _class(view: r2p.TopicView, node: str) -> str | None:

@@ -8,8 +8,9 @@ A command is a coroutine function whose first parameter is a `Session`:
     async def list_(session: Session, ..., format: Format = None) -> None:
         "One line of help."
 
-`command` adds --via, -v and -q, joins as an observer, and maps the end to an exit code: 0 for success (also Ctrl-C,
-SIGTERM and a closed pipe), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`. The function itself is
+`command` adds --via, -v and -q, joins as an observer, and maps the end to an exit code: 0 for success (also a closed
+pipe, and a signal for commands that would go on for ever), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`,
+130 for `Interrupted`. The function itself is
 unchanged, so tests call it under virtual time, inside `async with join(Settings(via=["memory:lab"])) as session`.
 Commands of the bus get a `BusMonitor` instead of a Session (`opening`). Commands that make a module of their own, such
 as `run`, are `standalone`, with the option `Via` and `settings()`. What commands need of `config` is here, too.
@@ -47,6 +48,7 @@ Opening = Callable[[Settings], contextlib.AbstractAsyncContextManager[Any]]
 REPORT_WAITING_AFTER = 1.0
 """Seconds that a command waits before it reports what it waits for."""
 
+_INTERRUPTED = 130  # the exit code that shells have for SIGINT
 _DESCRIPTORS = 12  # free file descriptors that are needed: an event loop, its wake-ups, and a link
 _TOO_MANY_FILES = (errno.EMFILE, errno.ENFILE)  # of this process, or of the computer
 _SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer has announced everything
@@ -61,6 +63,10 @@ _GIVE_UP_AFTER = 0.9  # seconds after which a tool ends if it is known of each l
 
 class TimedOut(Exception):
     """Something did not happen in time: exit code 3."""
+
+
+class Interrupted(Exception):
+    """A signal ended a command before it was done: exit code 130, so that `r2p wait ... && ...` does not go on."""
 
 
 def check_urls(via: list[str]) -> None:
@@ -339,9 +345,22 @@ def joined(
                 else:
                     await _while_connected(opened, body(opened, **given))
 
-        execute(main, verbose=verbose, quiet=quiet)
+        endless = "count" in given and given["count"] is None and not given.get("once")
+        execute(main if endless else _to_its_end(main), verbose=verbose, quiet=quiet)
 
     return _with_options(run, body, session=True)
+
+
+def _to_its_end(main: Callable[[], Awaitable[object]]) -> Callable[[], Awaitable[object]]:
+    """Raise Interrupted if a signal cancels this command, which has an end of its own."""
+
+    async def run() -> None:
+        try:
+            await main()
+        except asyncio.CancelledError:
+            raise Interrupted from None
+
+    return run
 
 
 def standalone(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
@@ -414,6 +433,8 @@ def _explain(error: BaseException) -> None:
             return
         if isinstance(leaf, UsageError | r2p.InvalidName):  # invalid names always come from the command line
             raise typer.BadParameter(printable(str(leaf), "\n")) from leaf
+        if isinstance(leaf, Interrupted):
+            raise typer.Exit(_INTERRUPTED) from leaf
         if isinstance(leaf, TimedOut):
             notify(str(leaf))
             raise typer.Exit(3) from leaf

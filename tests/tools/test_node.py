@@ -80,6 +80,8 @@ async def test_names_that_are_not_one_node() -> None:
             await info(session, "drive")
         with pytest.raises(r2p.Error, match="no node ARM/show; nodes found: ARM/drive, ARM/log, BOT/drive, BOT/log"):
             await info(session, "ARM/show")
+        with pytest.raises(r2p.Error, match=r"no node ARM/driver; .* did you mean ARM/drive\?$"):
+            await info(session, "ARM/driver")
 
 
 async def test_nobody_but_tools(capsys: pytest.CaptureFixture[str]) -> None:

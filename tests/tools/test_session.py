@@ -9,6 +9,7 @@ import itertools
 import logging
 import os
 import re
+import signal
 from typing import TYPE_CHECKING, Annotated
 
 import pytest
@@ -289,3 +290,22 @@ def test_log_records_go_to_stderr(verbose: int, quiet: int, shown: str, capsys: 
 def test_a_time_is_more_than_nothing(text: str) -> None:
     with pytest.raises(typer.BadParameter):
         options.seconds(text)
+
+
+@pytest.mark.parametrize(
+    ("given", "code"), [({}, 130), ({"count": None}, 0), ({"count": 3}, 130), ({"count": None, "once": True}, 130)]
+)
+def test_a_signal_fails_a_command_that_was_not_done(given: dict[str, object], code: int) -> None:
+    """So `r2p wait ... && ...` does not go on; a command without `count`, like `wait`, has an end of its own."""
+
+    async def body(session: Session, **given: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        await asyncio.Event().wait()
+
+    run = session.joined(body)
+    if code:
+        with pytest.raises(typer.Exit) as ended:
+            run(via=["memory:lab"], verbose=0, quiet=0, **given)
+        assert ended.value.exit_code == code
+    else:
+        run(via=["memory:lab"], verbose=0, quiet=0, **given)
