@@ -444,7 +444,7 @@ _CONNECTING = {
     "tcp-listen": "on the other computer: r2p topic list --via tcp:THIS_COMPUTER:PORT",
     "serial": "ls -l DEVICE; groups\nls /dev/serial/by-id",
     "rtcan": "r2p doctor\nip -details -statistics link show DEVICE",
-    "zenoh": "is a zenoh 1 router or an r2p program running there? ss -ltn | grep 7447",
+    "zenoh": "on the other computer: is a zenoh 1 router or an r2p program running? ss -ltnp lists the ports",
 }
 """Remedies if a link does not come up, by scheme."""
 
