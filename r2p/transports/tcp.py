@@ -320,7 +320,7 @@ def _explain(error: Exception) -> str:
 
 
 _HINTS = {
-    errno.ECONNREFUSED: "nothing listens there; is the program running, is the port the right one?",
+    errno.ECONNREFUSED: "nothing listens there: check the port, and that the program runs",
     errno.EHOSTUNREACH: "is the computer on, is it on this network?",
     errno.ENETUNREACH: "is this computer on that network?",
     errno.EADDRINUSE: "another program listens there; end it, or use another port",

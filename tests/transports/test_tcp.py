@@ -208,7 +208,7 @@ async def test_why_there_is_no_connection_yet_is_told_once() -> None:
     module = r2p.Module("A", via=f"tcp:127.0.0.1:{port}", watchdog=False)
     events = module.events()
     async with asyncio.timeout(GUARD), module:
-        reason = "Connection refused: nothing listens there; is the program running, is the port the right one?"
+        reason = "Connection refused: nothing listens there: check the port, and that the program runs"
         assert await anext(events) == r2p.LinkWaits(f"tcp:127.0.0.1:{port}", reason)
         server = await asyncio.start_server(_ignore, "127.0.0.1", port)
         up = await anext(events)
