@@ -123,4 +123,4 @@ def test_a_mismatch_is_described_with_what_to_do() -> None:
     by_size = describe_mismatch(Mismatched("leds", None, ROLE_PUBLISHES, ours, longer))
     assert by_size.startswith("others publish messages of 9 bytes, here they have 5; use one message type")
     by_type = describe_mismatch(Mismatched("leds", None, ROLE_SUBSCRIBES, ours, other))
-    assert by_type.startswith("others subscribe another layout of the same 5 bytes")
+    assert by_type.startswith("others subscribe to another layout of the same 5 bytes")
