@@ -362,7 +362,7 @@ def check_seconds(what: str, value: object, *, least: float) -> None:
 
 
 def check_timeout(what: str, value: object) -> None:
-    """Raise MessageError unless the value is None (for ever) or a number of seconds; 0 or less is over at once."""
+    """Raise MessageError for a time-out that is neither None (no limit) nor in seconds; 0 or less expires at once."""
     if value is not None and (not _is_number(value) or not value <= LONGEST):
         raise MessageError(f"{what} is in seconds, or None to wait for ever, not {value!r}{_hint(value)}")
 

@@ -161,7 +161,7 @@ class MultihomedModule:
         return self._unable[key]
 
     def _drop_filter(self, topic: Topic) -> Callable[[str], bool]:
-        """Return a function that decides whether a message came from a link that is no longer used.
+        """Return a predicate for messages: whether one came from a link that is no longer used.
 
         It is asked before each message while gateways consent to the use of several links for a while only: a module
         that was stopped must not go on with them.

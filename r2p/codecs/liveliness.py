@@ -55,7 +55,7 @@ _ROLE_NAMES = {role: name for name, role in _ROLES.items()}
 
 
 class ModuleToken(msgspec.Struct, frozen=True):
-    """A module that is running. `flags` are FLAG_... of ALIVE, `instance` is None for firmware behind a gateway."""
+    """A running module. `flags` are the FLAG_... bits of ALIVE; `instance` is None for firmware behind a gateway."""
 
     session: int
     name: str

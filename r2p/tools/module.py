@@ -227,7 +227,7 @@ def _timeout_text(session: Session, command: r2p.Command, name: str, timeout: fl
     if command is r2p.Command.REBOOT and view.rebooted:
         text += "; it had been rebooted before, so its ALIVE may not show it"
     elif view.link.partition(":")[0] in {"tcp", "zenoh"}:
-        text += "; a gateway in between must have --allow-control"
+        text += "; if a gateway is in between, it must have --allow-control"
     return text
 
 

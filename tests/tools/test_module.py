@@ -149,7 +149,8 @@ async def test_an_order_that_a_gateway_may_have_refused_says_so(monkeypatch: pyt
         far = msgspec.structs.replace(seen, link="zenoh:tcp/10.0.0.5:7447")
         monkeypatch.setattr("r2p.tools.module._find", lambda _session, _name: far)
         with pytest.raises(
-            TimedOut, match=r"did not confirm REBOOT in 4 s: .* a gateway in between must have --allow-control"
+            TimedOut,
+            match=r"did not confirm REBOOT in 4 s: .* gateway is in between, it must have --allow-control",
         ):
             await reboot(session, "BOT", timeout=4.0)
 

@@ -223,7 +223,7 @@ class MeshMap:
         return known if known.changes < CHANGES else None
 
     def _make_room(self, gateway: int) -> bool:
-        """Make room for a relevant gateway by forgetting an irrelevant one; return False if there is no room."""
+        """Forget an irrelevant gateway in favor of a relevant one; return False if none can be forgotten."""
         if not self.concerns(gateway):
             return False
         idle = next((each for each in self._records if not self.concerns(each)), None)

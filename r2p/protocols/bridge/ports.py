@@ -266,9 +266,10 @@ class TreePort(msgspec.Struct, eq=False):
         return True
 
     def receive_probe(self, now: int, sender: PortId, mesh: MeshMap) -> bool:
-        """Enter a probe of a gateway that is not on this network itself; False: there is no room.
+        """Record a probe of a gateway that is on another network; return False if the table is full.
 
-        There always is for one of the mesh. Others may be forged, or join later: STRANGE_PROBES_MAX of theirs are kept.
+        Probes of the mesh's gateways always fit. Others may be forged, or come from a gateway that joins later: at most
+        STRANGE_PROBES_MAX of them are kept.
         """
         known = sender in self.probes or sender[0] in mesh.members
         if not known and sum(each not in mesh.members for each, _ in self.probes) >= STRANGE_PROBES_MAX:

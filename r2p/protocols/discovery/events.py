@@ -149,7 +149,7 @@ class Mismatched(msgspec.Struct, frozen=True):
 
 
 class NameConflict(msgspec.Struct, frozen=True):
-    """Two modules have one name; the instance of a firmware module is None."""
+    """Two modules have the same name; `instance_a` or `instance_b` is None for firmware."""
 
     module: str
     instance_a: int | None

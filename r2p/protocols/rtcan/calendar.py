@@ -140,7 +140,7 @@ class Calendar:
         return reservation
 
     def _wanted(self, message: int, period: int, round_down: bool) -> int:
-        """Return the longest period up to this one that is harmonic with all others; this one if there is none."""
+        """Return the longest period up to `period` that is harmonic with all others, else `period` itself."""
         if not round_down or not 1 < period <= PERIOD_MAX:
             return period
         others = {each.period for each in self._entries.values() if each.message != message} | {self.slots}

@@ -241,7 +241,7 @@ class SlotRequests:
             self.schedule(now, each)
 
     def pause(self, now: int, reason: str) -> None:
-        """Note that there is no master, so that no slots may be used."""
+        """Suspend all slots, as there is no master."""
         self.has_master = False
         for each in self._periodics.values():
             self.suspend(now, each, reason)

@@ -18,8 +18,7 @@ import r2p
 from r2p.bridge import BridgeOptions
 from r2p.clock import Ticker
 from r2p.modules.supervisor import NodeFunction
-from r2p.msg import IMU, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
-from r2p.msg import Battery as BatteryMessage
+from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
 from r2p.sim.physics.inertial import (
     ACCELEROMETER,
     BAROMETER_NOISE,
@@ -32,7 +31,7 @@ from r2p.sim.physics.inertial import (
     altitude_at,
     pressure_at,
 )
-from r2p.sim.physics.motor import Battery, Drive
+from r2p.sim.physics.motor import Drive, LeadBattery
 from r2p.sim.physics.world import ADC_MAX, ADC_REFERENCE, RangeFinder, RangeSpec, adc_counts
 from r2p.transports.link import Transport
 from r2p.units import SECOND
@@ -382,9 +381,9 @@ class IoModule(Board):
         super().__init__(name, via=via, remap=remap, nodes=programs)
 
 
-def measured(battery: Battery) -> BatteryMessage:
+def measured(battery: LeadBattery) -> Battery:
     """Return the readings of the A/D converter, with a resolution of 9 mV and 12 mA; the charge is not calibrated."""
-    return BatteryMessage(
+    return Battery(
         voltage=round(round(battery.voltage * 1000 / _VOLTAGE_COUNT) * _VOLTAGE_COUNT),
         current=max(-32768, min(32767, round(round(battery.current * 1000 / _CURRENT_COUNT) * _CURRENT_COUNT))),
         charge=255,
@@ -392,9 +391,9 @@ def measured(battery: Battery) -> BatteryMessage:
     )
 
 
-async def power(node: r2p.Node, battery: Battery, topic: str, period: float) -> None:
+async def power(node: r2p.Node, battery: LeadBattery, topic: str, period: float) -> None:
     """Publish the measurements."""
-    measurements = node.advertise(topic, BatteryMessage)
+    measurements = node.advertise(topic, Battery)
     async for _ in node.every(period):
         await measurements.publish(measured(battery))
 
@@ -409,7 +408,7 @@ class PowerModule(Board):
         self,
         name: str = "PS",
         *,
-        battery: Battery,
+        battery: LeadBattery,
         topic: str = "battery",
         period: float = 0.5,
         via: Via = None,

@@ -209,7 +209,7 @@ class BatterySpec(msgspec.Struct, frozen=True, kw_only=True):
     """Internal, milliohm."""
 
 
-class Battery:
+class LeadBattery:
     """A battery whose voltage falls with its charge and with the current; a negative current charges it."""
 
     def __init__(self, spec: BatterySpec | None = None, *, charge: float = 1.0) -> None:

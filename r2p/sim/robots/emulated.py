@@ -33,7 +33,7 @@ from r2p.sim.modules.boards import (
     ProximityModule,
     RangeArray,
 )
-from r2p.sim.physics.motor import Battery, Drive, Gains, Motor, speed_gains
+from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Motor, speed_gains
 from r2p.sim.physics.world import OmniBody, Triple, World
 from r2p.sim.robots import triskar2
 from r2p.transports.link import Transport
@@ -69,7 +69,7 @@ class Hardware:
         self.body = OmniBody(triskar2.BODY, self.motors, self.noise("body"))
         self.gains: Gains = speed_gains(triskar2.MOTOR, self.body.own, frequency=FREQUENCY, damping=DAMPING)
         self.drives = [Drive(motor, self.gains) for motor in self.motors]
-        self.battery = Battery(triskar2.BATTERY)
+        self.battery = LeadBattery(triskar2.BATTERY)
         self.plant = Plant([*self.drives, self.body, self], dt=STEP)
 
     def step(self, dt: float) -> None:

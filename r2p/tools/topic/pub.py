@@ -15,7 +15,7 @@ import typer
 import r2p
 from r2p.bridge import ClassOf
 from r2p.names import topic_name
-from r2p.tools.options import Count, Once, Rate, Timeout, class_choice
+from r2p.tools.options import Count, Once, Rate, class_choice, time_option
 from r2p.tools.output import notify, wait_ready, waitable
 from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError, wait_until
 from r2p.tools.topic.watching import (
@@ -65,7 +65,9 @@ async def pub(
             help="nrt (non real-time, the default), periodic:10ms or sporadic:20ms.",
         ),
     ] = None,
-    timeout: Timeout = None,
+    timeout: Annotated[
+        float | None, time_option("--timeout", "Give up (exit code 3) without a subscriber for this long: 2, 500ms.")
+    ] = None,
 ) -> None:
     """Publish a message, by default once a second.
 
@@ -76,6 +78,8 @@ async def pub(
     choice = choice or ClassOf(r2p.PublisherClass.NON_REAL_TIME)
     periodic = choice.publisher_class is r2p.PublisherClass.PERIODIC
     from_stdin = message == [STDIN]
+    if timeout is not None and not (once or count or from_stdin):
+        raise UsageError("--timeout limits the wait for a subscriber: add --once, -n or -, which wait for one")
     if periodic and (from_stdin or rate is not None):
         raise UsageError("--class periodic:TIME sets when to publish: leave out --rate, and don't read from stdin")
     message_class = await find(session, topic, type)

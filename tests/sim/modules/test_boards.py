@@ -28,8 +28,7 @@ from r2p.sim.modules.boards import (
     leds,
     sample,
 )
-from r2p.sim.physics.motor import Axle, Drive, Gains, Motor, MotorSpec, speed_gains
-from r2p.sim.physics.motor import Battery as Cells
+from r2p.sim.physics.motor import Axle, Drive, Gains, LeadBattery, Motor, MotorSpec, speed_gains
 from r2p.sim.physics.world import NOTHING
 from tests.sim.physics.theory import step_response
 
@@ -72,7 +71,7 @@ async def test_names_topics_and_rates_by_default(r2p_network: Network) -> None:
     boards = [
         Bench().module(r2p_network),
         ProximityModule(sensors=RangeArray(lambda _: math.inf, random.Random(1)), via=r2p_network.transport()),
-        PowerModule(battery=Cells(), via=r2p_network.transport()),
+        PowerModule(battery=LeadBattery(), via=r2p_network.transport()),
         ImuModule(unit=InertialUnit(Motion, random.Random(2)), via=r2p_network.transport()),
         IoModule(pins=Pins(), via=r2p_network.transport()),
         GatewayModule(via=r2p_network.transport()),
@@ -190,7 +189,7 @@ async def test_the_proximity_module_tells_millimetres(r2p_network: Network) -> N
 
 
 async def test_the_power_supply_tells_voltage_and_current(r2p_network: Network) -> None:
-    cells = Cells(charge=0.5)
+    cells = LeadBattery(charge=0.5)
     cells.current = 2.0
     async with r2p_network.node("PC1") as node, PowerModule(battery=cells, via=r2p_network.transport()):
         reading = await node.subscribe("battery", Battery).fetch(2)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from r2p.sim.physics.motor import Axle, Battery, BatterySpec, Gains, Motor, MotorSpec, Pid, speed_gains
+from r2p.sim.physics.motor import Axle, BatterySpec, Gains, LeadBattery, Motor, MotorSpec, Pid, speed_gains
 from tests.sim.physics.theory import step_response
 
 DT = 1e-4
@@ -140,7 +140,7 @@ def test_reset_forgets() -> None:
 
 
 def test_a_battery_empties_with_the_charge_that_it_gives() -> None:
-    battery = Battery()
+    battery = LeadBattery()
     battery.current = 7.2
     for _ in range(1800):
         battery.step(1.0)
@@ -152,7 +152,7 @@ def test_a_battery_empties_with_the_charge_that_it_gives() -> None:
 
 
 def test_a_charger_fills_it_and_no_more() -> None:
-    battery = Battery(charge=0.9)
+    battery = LeadBattery(charge=0.9)
     battery.current = -7.2
     assert battery.voltage > BatterySpec().full
     for _ in range(1000):

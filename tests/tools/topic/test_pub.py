@@ -53,6 +53,14 @@ class Listener:
 
 
 @pytest.mark.virtual_time
+async def test_a_timeout_needs_something_to_wait_for() -> None:
+    """Without a count nothing waits for a subscriber, so a time-out that was ignored would never end the command."""
+    async with tool() as session:
+        with pytest.raises(UsageError, match="add --once, -n or -, which wait for one"):
+            await pub(session, "cmd", [], type="Led", timeout=2)
+
+
+@pytest.mark.virtual_time
 async def test_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", "r2p.pub")
     listener = Listener()
