@@ -87,7 +87,7 @@ async def echo(
 
 
 class _Selection(msgspec.Struct):
-    """What is printed of a message: the `fields` that the user chose, and where it comes from."""
+    """The printed part of a message: the `fields` that the user chose, and where it comes from."""
 
     fields: list[str] | None
     meta: bool
@@ -96,7 +96,7 @@ class _Selection(msgspec.Struct):
 
     @property
     def labelled(self) -> bool:
-        """Whether a column names the topic of each row: CSV has one header for all topics."""
+        """True if a column names the topic of each row: CSV has one header for all topics."""
         return self.csv and self.several
 
     def of(self, topic: str, record: dict[str, Any], sample: r2p.Sample | None) -> dict[str, Any]:

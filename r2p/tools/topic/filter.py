@@ -93,7 +93,7 @@ class Filter:
 
     @property
     def summary(self) -> str:
-        """How many messages passed."""
+        """The number of messages that passed."""
         text = f"{self.passed} of {self.seen} messages passed the filter"
         return f"{text}; it was undefined for {self.undefined}: {self.reason}" if self.undefined else text
 

@@ -58,7 +58,7 @@ class _Meter(ABC):
 
     @property
     def alone(self) -> bool:
-        """Whether there is only one message since the start or the last silence."""
+        """Return whether there is only one message since the start or the last silence."""
         return len(self._arrivals) == 1
 
     def is_silent(self, now: int) -> bool:
