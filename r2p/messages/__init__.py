@@ -18,8 +18,8 @@ is rounded to its 24 bits; NaN and infinities pass. A bool has to be a bool, an 
 instance of exactly its class. When a message is unpacked, any byte but 0 is True, and a text ends at its first NUL:
 firmware leaves garbage after it.
 
-`shapes` has the parts of layouts and fields, `packing` generates the functions, `layouts` has the classes and compiles
-them, and `schemas` builds a class from its schema.
+`shapes` has the parts of layouts and fields, `packing` generates the functions, `definition` explains class statements
+that fail, `layouts` has the classes and compiles them, and `schemas` builds a class from its schema.
 """
 
 from r2p.messages.layouts import SIZE_MAX, ClockOffset, Message, Timestamp, layout

@@ -6,6 +6,7 @@ A layout is kept in its class, not in a table: so a class built from a schema ca
 import keyword
 import re
 from collections.abc import Iterator
+from enum import Enum
 from hashlib import blake2b
 from types import UnionType
 from typing import (
@@ -24,7 +25,8 @@ from typing import (
 import msgspec
 
 from r2p.errors import DecodeError, MessageError
-from r2p.messages.packing import functions
+from r2p.messages.definition import MessageMeta
+from r2p.messages.packing import check, functions
 from r2p.messages.shapes import BOOL, Array, Chars, Field, Layout, Len, Nested, Scalar, Shape, show, u32
 from r2p.units import SECOND
 
@@ -34,10 +36,11 @@ SIZE_MAX = 1024
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _METHODS = frozenset({"encode", "decode"})  # a field of that name would hide the method
 _KINDS: dict[type, str] = {bool: "bool", int: "r2p.i32", float: "r2p.f32"}  # what to write for a type of Python
+_MUTABLE = (list, dict, set, bytearray)  # an empty one as a default becomes a factory
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
-class Message(msgspec.Struct, frozen=True, gc=False):
+class Message(msgspec.Struct, metaclass=MessageMeta, frozen=True, gc=False):
     """The base of all messages: subclass it, and annotate the fields."""
 
     # gc=False: values of this kind form no cycles, and garbage collection need not look at each message in a queue.
@@ -46,12 +49,18 @@ class Message(msgspec.Struct, frozen=True, gc=False):
 
     def encode(self) -> bytes:
         """Pack the message; raises MessageError."""
-        return layout(type(self)).encode(self)
+        try:
+            return layout(type(self)).encode(self)
+        except MessageError as error:
+            raise error.with_traceback(None) from None  # without frames that have no source
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
         """Unpack a message; raises DecodeError."""
-        return layout(cls).decode(data)
+        try:
+            return layout(cls).decode(data)
+        except DecodeError as error:
+            raise error.with_traceback(None) from None
 
 
 M = TypeVar("M", bound=Message)
@@ -118,9 +127,9 @@ def check_field_name(path: str, name: str) -> None:
 def _find_or_compile(cls: Any, outer: tuple[type, ...]) -> Layout[Any]:
     """Compile the layout of a class; `outer` are the classes that contain it, to find one that contains itself."""
     found: Layout[Any] | None = vars(cls).get("_layout") if isinstance(cls, type) else None  # not a base class's
-    if found is None:
+    if not isinstance(found, Layout):
         if not (isinstance(cls, type) and issubclass(cls, Message)):
-            raise MessageError(f"{show(cls)} is not a message class: subclass r2p.Message")
+            raise MessageError(_not_a_class(cls))
         cls._layout = found = _compile(cls, outer)
     return found
 
@@ -130,11 +139,14 @@ def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
         raise MessageError(f"{cls.__name__} contains itself: a message has a fixed size")
     if not cls.__struct_config__.frozen:
         raise MessageError(f"{cls.__name__} is not frozen, but subscribers share one object: remove frozen=False")
-    fields = tuple(Field(name, _shape(hint, f"{cls.__name__}.{name}", (*outer, cls))) for name, hint in _hints(cls))
+    hints = _hints(cls)
+    _check_constants(cls, hints)
+    fields = tuple(_field(cls, name, hint, outer) for name, hint in hints.items() if name in cls.__struct_fields__)
     if not fields:
         raise MessageError(f"{cls.__name__} has no fields: annotate them, as in `{_example(cls)}`")
     size = sum(field.shape.size for field in fields)
     _check_size(cls.__name__, size)
+    _check_defaults(cls, {field.name: field.shape for field in fields})
     encode, decode = functions(cls, fields)
     try:
         decode(bytes(size))
@@ -146,19 +158,44 @@ def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
     return Layout(cls, fields, size, schema, fingerprint_of(schema), encode, decode)
 
 
-def _hints(cls: type[Message]) -> Iterator[tuple[str, Any]]:
-    """Return field names and annotations in wire order: `get_type_hints` begins with the base classes."""
+def _hints(cls: type[Message]) -> dict[str, Any]:
+    """Return names and annotations in wire order: `get_type_hints` begins with the base classes."""
     try:
-        hints = get_type_hints(cls, include_extras=True)
+        return get_type_hints(cls, include_extras=True)
     except (NameError, AttributeError, SyntaxError, TypeError) as error:
-        raise MessageError(
-            f"{cls.__name__}: {error}: import the names in its annotations at run time, not under TYPE_CHECKING; "
+        unknown = (
+            ": import the names in its annotations at run time, not under TYPE_CHECKING; "
             "under `from __future__ import annotations` they must be names of its module, not of a function"
-        ) from error
-    for name, hint in hints.items():
-        if name in cls.__struct_fields__:
-            check_field_name(f"{cls.__name__}.{name}", name)
-            yield name, hint
+        )
+        raise MessageError(f"{cls.__name__}: {error}{unknown if isinstance(error, NameError) else ''}") from error
+
+
+def _field(cls: type[Message], name: str, hint: Any, outer: tuple[type, ...]) -> Field:
+    check_field_name(f"{cls.__name__}.{name}", name)
+    return Field(name, _shape(hint, f"{cls.__name__}.{name}", (*outer, cls)))
+
+
+def _check_constants(cls: type[Message], hints: dict[str, Any]) -> None:
+    """Refuse a field without its annotation, which is a constant to Python, and hides a field of a base class."""
+    fields = cls.__struct_fields__
+    for name, value in vars(cls).items():
+        constant = name.startswith("_") or name.isupper() or (name in hints and name not in fields)
+        if type(value) in _KINDS and not constant and fields:
+            raise MessageError(
+                f"{cls.__name__}.{name} has no annotation: write `{_annotated(name, value)}` for a field, or "
+                f"`{name}: ClassVar = {show(value)}` for a constant"
+            )
+
+
+def _check_defaults(cls: type[Message], shapes: dict[str, Shape]) -> None:
+    """Refuse a default that no message could be packed with."""
+    for each in msgspec.structs.fields(cls):
+        default = each.default_factory() if each.default_factory in _MUTABLE else each.default
+        if default is not msgspec.NODEFAULT:
+            try:
+                check(shapes[each.name], default, f"{cls.__name__}.{each.name}")
+            except MessageError as error:
+                raise MessageError(f"{error}: change the default") from None
 
 
 def _shape(hint: Any, path: str, outer: tuple[type, ...]) -> Shape:
@@ -208,6 +245,8 @@ def _spell(hint: Any) -> str:
         text = f"r2p.{scalar.kind}"
     elif base is ...:
         text = "..."
+    elif isinstance(base, tuple | list):  # as in `x: (r2p.u8, r2p.u8)`
+        text = ("({})" if isinstance(base, tuple) else "[{}]").format(", ".join(map(_spell, base)))
     elif origin in (Union, UnionType):
         text = " | ".join(map(_spell, items)).replace("NoneType", "None")
     elif isinstance(origin, type):
@@ -222,13 +261,27 @@ def _example(cls: type[Message]) -> str:
     """A field as it is to be written: the first of the class that lacks only its annotation."""
     for name, value in vars(cls).items():
         if type(value) in _KINDS and not name.startswith("_"):
-            return f"{name}: {_KINDS[type(value)]} = {show(value)}"
+            return _annotated(name, value)
     return "speed: r2p.f32 = 0.0"
+
+
+def _annotated(name: str, value: object) -> str:
+    return f"{name}: {_KINDS[type(value)]} = {show(value)}"
+
+
+def _not_a_class(value: object) -> str:
+    """Return what to pass instead of a value that is not a message class."""
+    if isinstance(value, Message):
+        return f"{show(value)} is a message, not its class: pass {type(value).__name__}"
+    if isinstance(value, type) and get_origin(value) is None:
+        return f"{value.__name__} is not a message class: write `class {value.__name__}(r2p.Message)`"
+    return f"{show(value)} is not a message class: subclass r2p.Message"
 
 
 def _instead(base: Any) -> str:
     item = _item(base)
     array = f"tuple[{item}, {item}] or Annotated[tuple[{item}, ...], r2p.Len(16)]"
+    optional = f"{item}, and a bool beside it that says whether it is set"
     texts = {
         int: "one of r2p.u8 .. r2p.u64, r2p.i8 .. r2p.i64",
         float: "r2p.f32 or r2p.f64",
@@ -236,14 +289,21 @@ def _instead(base: Any) -> str:
         bytes: "Annotated[tuple[r2p.u8, ...], r2p.Len(16)]",
         list: array,
         tuple: array,
+        dict: "a Message with a field for each key",
+        Union: optional,
+        UnionType: optional,
     }
+    if isinstance(base, tuple | list):
+        return array
+    if isinstance(base, type) and issubclass(base, Enum):
+        return "r2p.u8, which takes the members of an IntEnum"
     others = "r2p.u8 .. r2p.f64, bool, a Message, a tuple of one of these, or Annotated[str, r2p.Len(16)]"
     return next((text for kind, text in texts.items() if kind is (get_origin(base) or base)), others)
 
 
 def _item(base: Any) -> str:
     """The type of the items of an array, as it is to be written: what `base` has, or the nearest to it."""
-    item = next(iter(get_args(base)), float)
+    item = next(iter(base if isinstance(base, tuple | list) else get_args(base)), float)
     scalar = get_origin(item) is Annotated and any(isinstance(mark, Scalar) for mark in get_args(item))
     if scalar or (isinstance(item, type) and issubclass(item, Message)):
         return _spell(item)

@@ -53,8 +53,10 @@ def functions(cls: type[Any], fields: tuple[Field, ...]) -> tuple[Callable[[Any]
         "misfit": misfit,
         "unreadable": unreadable,
         "StructError": struct.error,
+        "__tracebackhide__": True,  # pytest's: a frame without source is of no use
     }
-    exec(compile(text, f"<packing of {cls.__name__}>", "exec"), names)  # noqa: S102 - holds nothing but checked names
+    file = f"{__file__}, {cls.__name__}"  # in this folder, as for all frames that short tracebacks leave out
+    exec(compile(text, file, "exec"), names)  # noqa: S102 - holds nothing but checked names
     return names["encode"], names["decode"]
 
 
@@ -135,13 +137,13 @@ def _misfit(cls: type[Any], fields: tuple[Field, ...], message: object) -> Messa
         return MessageError(f"{show(message)} is not a {cls.__name__}")
     for field in fields:
         try:
-            _check(field.shape, getattr(message, field.name), f"{cls.__name__}.{field.name}")
+            check(field.shape, getattr(message, field.name), f"{cls.__name__}.{field.name}")
         except MessageError as error:
-            return error
+            return error.with_traceback(None)
     return MessageError(f"{show(message)} can't be packed")
 
 
-def _check(shape: Shape, value: Any, path: str) -> None:
+def check(shape: Shape, value: Any, path: str) -> None:
     """Raise MessageError for the first part that does not fit."""
     parts: Iterable[tuple[Shape, Any, str]] = ()
     match shape:
@@ -156,4 +158,4 @@ def _check(shape: Shape, value: Any, path: str) -> None:
     if not fits:
         raise MessageError(f"{path} ({shape.kind}) takes {shape.allowed}, not {show(value)}")
     for part in parts:
-        _check(*part)
+        check(*part)

@@ -13,9 +13,8 @@ import keyword
 import re
 from typing import Annotated, Any, TypeAlias, cast
 
-import msgspec
-
 from r2p.errors import MessageError
+from r2p.messages.definition import MessageMeta
 from r2p.messages.layouts import Message, Timestamp, check_field_name, layout
 from r2p.messages.shapes import HINTS, Len, show
 
@@ -73,9 +72,9 @@ class _SchemaReader:
             fields.setdefault(head, []).append((parts[1:], kind))
         for field in fields:
             check_field_name(f"{name}.{show(field)}", field)
-        hints = [(field, self._field_type(f"{name}_{field}", tuple(inner))) for field, inner in fields.items()]
-        made: Any = msgspec.defstruct(name, hints, bases=(Message,), module=__name__, frozen=True, gc=False)
-        return cast("type[Message]", made)
+        hints = {field: self._field_type(f"{name}_{field}", tuple(inner)) for field, inner in fields.items()}
+        namespace = {"__annotations__": hints, "__module__": __name__}  # not by defstruct, which knows no metaclass
+        return cast("type[Message]", MessageMeta(name, (Message,), namespace))
 
     def _field_type(self, name: str, leaves: tuple[_Leaf, ...]) -> Any:
         """Return the annotation of a field with these leaves; `name` is for its class, if it is a message."""

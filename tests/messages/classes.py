@@ -1,8 +1,15 @@
 """Message classes that hold every kind of field."""
 
-from typing import Annotated
+import types
+from typing import Annotated, Any
 
 from r2p.messages import Len, Message, Timestamp, f32, f64, i8, i16, i32, i64, u8, u16, u32, u64
+
+
+def define(name: str, fields: list[tuple[str, Any]]) -> Any:
+    """A message class with these names and annotations, all required."""
+    namespace = {"__annotations__": dict(fields), "__module__": __name__}
+    return types.new_class(name, (Message,), {}, lambda empty: empty.update(namespace))
 
 
 class Numbers(Message):

@@ -3,6 +3,7 @@
 import gc
 import weakref
 from collections.abc import Callable
+from enum import IntEnum
 from hashlib import blake2b
 from typing import Annotated, Any, Literal, assert_type
 
@@ -32,7 +33,7 @@ from r2p.messages import (
 )
 from r2p.msg import Led, Velocity3
 from tests.messages import text_annotations
-from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot, Wheel
+from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot, Wheel, define
 
 WHEELS = " ".join(f"wheels[{i}].speed:f32 wheels[{i}].ok:bool wheels[{i}].name:char[4]" for i in range(2))
 NAMES = "names[0]:char[3] names[1]:char[3]"
@@ -41,7 +42,7 @@ REST = "serial:u8[16] best.speed:f32 best.ok:bool best.name:char[4]"
 
 def made(hint: object) -> type[Message]:
     """A message class with one field of that annotation."""
-    return msgspec.defstruct("Made", [("x", hint)], bases=(Message,), frozen=True)  # type: ignore[return-value]
+    return define("Made", [("x", hint)])  # type: ignore[no-any-return]
 
 
 @pytest.mark.parametrize(
@@ -144,8 +145,12 @@ def test_text_that_names_nothing_at_run_time(build: Callable[[], type[Message]])
         (list[Led], r": list\[Led\] has no fixed size, use tuple\[Led, Led\]"),
         (list, r"use tuple\[r2p.f32"),
         (tuple, r"use tuple\[r2p.f32"),
-        (dict[str, int], r"use r2p.u8 .. r2p.f64, bool, a Message, a tuple"),
-        (u8 | None, r": r2p.u8 \| None has no fixed size, use r2p.u8 .. r2p.f64, bool"),
+        (dict[str, int], r"use a Message with a field for each key"),
+        (u8 | None, r": r2p.u8 \| None has no fixed size, use r2p.u8, and a bool beside it"),
+        ((u8, u8), r": \(r2p.u8, r2p.u8\) has no fixed size, use tuple\[r2p.u8, r2p.u8\]"),
+        ([f32], r": \[r2p.f32\] has no fixed size, use tuple\[r2p.f32, r2p.f32\]"),
+        (IntEnum, "use r2p.u8, which takes the members of an IntEnum"),
+        (set[u8], "has no fixed size, use r2p.u8 .. r2p.f64, bool, a Message, a tuple"),
         (Any, "use r2p.u8 .. r2p.f64, bool"),
         (Literal[1, 2], "use r2p.u8 .. r2p.f64, bool"),
         (msgspec.Struct, "use r2p.u8 .. r2p.f64, bool"),
@@ -210,9 +215,9 @@ def test_a_class_that_holds_itself() -> None:
 
 @pytest.mark.parametrize("name", ["encode", "decode", "_x", "größe", "class"])
 def test_field_names_that_are_refused(name: str) -> None:
-    cls = msgspec.defstruct("Made", [(name, u8)], bases=(Message,), frozen=True)
+    cls = define("Made", [(name, u8)])
     with pytest.raises(MessageError, match=f"Made.{name}: a field name has letters, digits and _ of ASCII"):
-        layout(cls)  # type: ignore[type-var]
+        layout(cls)
 
 
 def test_a_message_is_frozen() -> None:
@@ -237,9 +242,19 @@ def test_a_class_that_refuses_zero() -> None:
         layout(Picky)
 
 
-@pytest.mark.parametrize("what", [int, msgspec.Struct, Led(), None, "Led", tuple[u8, u8]])
-def test_no_message_class(what: Any) -> None:
-    with pytest.raises(MessageError, match=r"is not a message class: subclass r2p.Message"):
+@pytest.mark.parametrize(
+    ("what", "instead"),
+    [
+        (int, r"int is not a message class: write `class int\(r2p.Message\)`"),
+        (msgspec.Struct, "Struct is not a message class: write"),
+        (Led(), r"Led\(led=0, value=0\) is a message, not its class: pass Led"),
+        (None, "None is not a message class: subclass r2p.Message"),
+        ("Led", "'Led' is not a message class: subclass r2p.Message"),
+        (tuple[u8, u8], "is not a message class: subclass r2p.Message"),
+    ],
+)
+def test_no_message_class(what: Any, instead: str) -> None:
+    with pytest.raises(MessageError, match=instead):
         layout(what)
 
 

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import Field, Len, Message, Timestamp, f32, i64, layout, u8, u64
-from r2p.messages.packing import _check
+from r2p.messages.packing import check
 from r2p.messages.shapes import HINTS
 from r2p.msg import Led, Speed3, StampedIMURaw9, StampedVelocity3, Text, Velocity3
 from r2p.tools.types import standard_types
-from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot, Wheel
+from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot, Wheel, define
 from tests.messages.strategies import messages
 
 STANDARD = standard_types()
@@ -27,7 +27,7 @@ BASE = Robot()
 
 def one(kind: str) -> type[Any]:
     """A message class with one field of that scalar kind."""
-    return msgspec.defstruct("One", [("x", HINTS[kind])], bases=(Message,), frozen=True)
+    return define("One", [("x", HINTS[kind])])  # type: ignore[no-any-return]
 
 
 @settings(max_examples=30)  # of each class
@@ -171,7 +171,7 @@ def test_arrays_are_tuples_of_their_length(value: Any) -> None:
 
 def test_lengths_do_not_make_up_for_each_other() -> None:
     """Two arrays whose lengths are wrong, but right together, would pack into each other's places."""
-    cls: Any = msgspec.defstruct("Two", [("a", tuple[u8, u8]), ("b", tuple[u8, u8])], bases=(Message,), frozen=True)
+    cls: Any = define("Two", [("a", tuple[u8, u8]), ("b", tuple[u8, u8])])
     with pytest.raises(MessageError, match=r"^Two.a \(u8\[2\]\) takes a tuple of 2, not \(1, 2, 3\)"):
         cls((1, 2, 3), (4,)).encode()
 
@@ -264,7 +264,7 @@ def outcome(call: Callable[[], object]) -> str:
 def test_packing_and_explaining_agree(field: Field, value: Any) -> None:
     """The generated code and the walk that explains hold the same values for right."""
     message = msgspec.structs.replace(BASE, **{field.name: value})
-    assert outcome(message.encode) == outcome(lambda: _check(field.shape, value, f"Robot.{field.name}"))
+    assert outcome(message.encode) == outcome(lambda: check(field.shape, value, f"Robot.{field.name}"))
 
 
 def test_nothing_is_hidden_when_no_field_is_wrong() -> None:
@@ -288,6 +288,6 @@ def test_stamped_imu_packs_in_definition_order() -> None:
 
 def test_large_arrays() -> None:
     hints = [("a", Annotated[tuple[Timestamp, ...], Len(120)]), ("b", u64), ("c", i64)]
-    cls: Any = msgspec.defstruct("Large", hints, bases=(Message,), frozen=True)
+    cls: Any = define("Large", hints)
     message = cls(tuple(Timestamp(i, i + 1) for i in range(120)), 2**64 - 1, -(2**63))
     assert cls.decode(message.encode()) == message

@@ -1,0 +1,83 @@
+"""The metaclass of messages: its errors name the class, the field and what to write, where msgspec's name neither.
+
+It works when a class is defined, and on assignments to a message, which always fail. Packing does not pass here.
+"""
+
+import re
+from typing import Any
+
+import msgspec
+
+from r2p.errors import MessageError
+from r2p.messages.shapes import show
+
+_REQUIRED = re.compile(r"Required field '(\w+)' cannot follow optional fields")
+_OPTION = re.compile(r"'(\w+)' is an invalid keyword argument for StructMeta")
+_TWO_BASES = "multiple bases have instance lay-out conflict"
+
+
+class MessageMeta(msgspec.StructMeta):
+    """Makes message classes. Raises MessageError for a class that can't be one."""
+
+    def __new__(mcls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **options: Any) -> "MessageMeta":
+        """Make the class of a `class` statement."""
+        try:
+            cls = super().__new__(mcls, name, bases, namespace, **options)
+        except (TypeError, ValueError) as error:
+            text = _explained(name, bases, namespace, str(error))
+            if text is None:
+                raise MessageError(f"{name}: {error}") from error
+            raise MessageError(text) from None
+        if cls.__struct_config__.frozen:  # msgspec's own methods, set in each class, do not say what to write
+            cls.__setattr__ = cls.__delattr__ = _refuse_assignment  # type: ignore[assignment, method-assign]
+        return cls
+
+    def __setattr__(cls, name: str, value: object) -> None:
+        """Refuse what the decorator `dataclass` sets first; its own error would say `readonly attribute`."""
+        if name in ("__dataclass_params__", "__dataclass_fields__"):
+            raise MessageError(f"{cls.__name__}: remove @dataclass, a message class needs no decorator")
+        super().__setattr__(name, value)
+
+
+def _refuse_assignment(message: msgspec.Struct, name: str, _value: object = None) -> None:
+    kind, fields = type(message).__name__, message.__struct_fields__
+    if name not in fields:
+        raise AttributeError(f"{kind} has no field {name}: it has {', '.join(fields)}")
+    raise AttributeError(
+        f"{kind} is frozen, because all subscribers share it: make a new one, {kind}(...), or change a copy with "
+        f"msgspec.structs.replace(message, {name}=...)"
+    )
+
+
+def _explained(name: str, bases: tuple[type, ...], namespace: dict[str, Any], text: str) -> str | None:
+    """Return what to write instead of this class, which msgspec refused with this text; None if that is unknown."""
+    others = [base for base in bases if not isinstance(base, MessageMeta)]
+    if required := _REQUIRED.match(text):
+        return (
+            f"{name}.{required[1]}: a field without a default can't follow one that has a default: give it a default, "
+            f"or write `class {name}(..., kw_only=True)`"
+        )
+    if "mutable collection" in text:
+        return _mutable_default(name, namespace)
+    if text == _TWO_BASES:
+        return (
+            f"{name}: a message can't inherit the fields of {' and '.join(base.__name__ for base in bases)}: "
+            "inherit from one, and make the others fields"
+        )
+    if "gc=False" in text and others:
+        return f"{name}: {others[0].__name__} is not a message: give it `__slots__ = ()` and no fields"
+    if "__init__" in text:
+        return f"{name}: remove __init__, a message has one: check values in __post_init__, or add a class method"
+    if "__slots__" in text:
+        return f"{name}: remove __slots__, a message has them (from msgspec.defstruct? use a class statement)"
+    option = _OPTION.match(text)
+    return f"{name}: {option[1]}= is not an option of a message class" if option else None
+
+
+def _mutable_default(name: str, namespace: dict[str, Any]) -> str | None:
+    for field, value in namespace.items():
+        if isinstance(value, list | set | bytearray) and value:
+            return f"{name}.{field}: all messages would share the default {show(value)}: write {show(tuple(value))}"
+        if isinstance(value, dict) and value and not field.startswith("__"):
+            return f"{name}.{field}: a message can't hold a dict: nest a Message with a field for each key"
+    return None
