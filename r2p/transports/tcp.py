@@ -7,6 +7,7 @@ take of the last piece, and the others wait in the link. A client without a plac
 import abc
 import array
 import asyncio
+import contextlib
 import errno
 import ipaddress
 import os
@@ -24,6 +25,7 @@ from r2p.clock import Backoff
 from r2p.codecs import debug, management
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT
+from r2p.transports.identify import ServerKind, identify_server
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url, yes_or_no
@@ -39,6 +41,7 @@ _REFUSED_S = 0.5  # seconds for a refused client to read the reason and close
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
 _CONNECT_TIMEOUT_S = 5.0  # seconds; the kernel itself would try for two minutes where nothing answers
 _STABLE_S = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
+_SILENT_S = 0.7  # seconds: r2p sends something at once, firmware every 0.5 s
 _DEAD_AFTER_S = 5  # seconds without an answer to the kernel until a peer counts as gone
 
 
@@ -160,6 +163,7 @@ class TcpTransport(Transport):
         self._host, self._port = _host_port(url)
         if not self._host:
             raise TransportError(f"{url}: give the other end's address: tcp:HOST:PORT")
+        self._identified = False
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         link = LineLink(f"tcp:{_address(self._host, self._port)}", hub)
@@ -168,7 +172,7 @@ class TcpTransport(Transport):
         opened()
         try:
             while True:
-                if await self._connect(link) >= _STABLE_S:
+                if await self._connect(link, hub) >= _STABLE_S:
                     backoff.reset()
                 if link.denied:
                     backoff.slow_down()
@@ -177,7 +181,7 @@ class TcpTransport(Transport):
             link.close()
             hub.detach(link)
 
-    async def _connect(self, link: LineLink) -> float:
+    async def _connect(self, link: LineLink, hub: Hub) -> float:
         """Run one connection from beginning to end; return how many seconds it lasted."""
         loop = asyncio.get_running_loop()
         connection = _ClientConnection(link)
@@ -189,6 +193,11 @@ class TcpTransport(Transport):
                 connection.mark_ended()
                 raise
             began = loop.time()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_SILENT_S):
+                    await connection.ended.wait()
+            if not link.stats.bytes_received:
+                await self._identify(link, hub)
             await connection.ended.wait()
             return loop.time() - began
         except OSError as error:
@@ -199,6 +208,24 @@ class TcpTransport(Transport):
             raise
         finally:
             await connection.aclose()
+
+    async def _identify(self, link: LineLink, hub: Hub) -> None:
+        """Report what the silent other end is if it is known, once: some adapters serve one connection at a time."""
+        if self._identified:
+            return
+        self._identified = True
+        with contextlib.suppress(OSError):
+            async with asyncio.timeout(_CONNECT_TIMEOUT_S):
+                server = await identify_server(self._host, self._port)
+            if text := _NO_LINE.get(server.kind):
+                address = _address(self._host, self._port)
+                hub.link_notice(link, "no debug line", text.format(address), trouble=True)
+
+
+_NO_LINE = {
+    ServerKind.ZENOH: "{0} is zenoh, not a debug line: connect by zenoh:tcp/{0}",
+    ServerKind.TLS: "{0} speaks TLS, not the debug line; if it is zenoh, connect by zenoh:tls/{0}",
+}
 
 
 class _ClientConnection(_TcpConnection):
@@ -238,7 +265,7 @@ class TcpListenTransport(Transport):
         try:
             server = await loop.create_server(lambda: _ServerConnection(self, hub), self._host, self._port)
         except OSError as error:
-            raise TransportError(f"{self.url}: can't listen: {_explain(error)}") from error
+            raise cannot_listen(str(self.url), error) from error
         try:
             self.port = server.sockets[0].getsockname()[1]
             hub.listening(str(self.url), _address(self._host, self.port))
@@ -306,6 +333,11 @@ class _ServerConnection(_TcpConnection):
         await self.aclose()
 
 
+def cannot_listen(where: str, error: OSError) -> TransportError:
+    """Return an error that says why a server does not listen, and a remedy if there is a known one."""
+    return TransportError(f"{where}: can't listen: {_explain(error)}")
+
+
 def _explain(error: Exception) -> str:
     """Return what went wrong, and a remedy if there is a known one."""
     if isinstance(error, TimeoutError) and not error.errno:
@@ -323,7 +355,7 @@ _HINTS = {
     errno.ECONNREFUSED: "nothing listens there: check the port, and that the program runs",
     errno.EHOSTUNREACH: "is the computer on, is it on this network?",
     errno.ENETUNREACH: "is this computer on that network?",
-    errno.EADDRINUSE: "another program listens there; end it, or use another port",
+    errno.EADDRINUSE: "another program listens there (ss -ltnp names it): end it, or use another port",
     errno.EADDRNOTAVAIL: "this machine does not have that address",
     errno.EACCES: "ports below 1024 are for root; use another",
 }

@@ -17,6 +17,7 @@ from r2p.messages import Message
 from r2p.sim.modules.firmware import FirmwareModule
 from r2p.transports.line import Carrier, LineLink
 from r2p.transports.link import Hub, Transport
+from r2p.transports.tcp import cannot_listen
 
 BUFFER = 64 * 1024
 """Bytes kept for a peer that does not read; it loses any more."""
@@ -70,8 +71,14 @@ class Powered:
     # Lines
 
     async def listen(self, host: str = "127.0.0.1", port: int = 0) -> tuple[str, int]:
-        """Serve the line on TCP to any number of clients, and return the address (port 0: any free one)."""
-        server = await self._loop.create_server(lambda: _Client(self), host, port)
+        """Serve the line on TCP to any number of clients, and return the address (port 0: any free one).
+
+        Raises TransportError if another program listens there.
+        """
+        try:
+            server = await self._loop.create_server(lambda: _Client(self), host, port)
+        except OSError as error:
+            raise cannot_listen(f"{host}:{port}", error) from error
         self._servers.append(server)
         bound: tuple[str, int] = server.sockets[0].getsockname()[:2]
         return bound

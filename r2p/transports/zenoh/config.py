@@ -236,9 +236,10 @@ def connection_settings(config: "zenoh.Config") -> ConnectionSettings:
         tls["verify_name_on_connect"] is not False,
     )
     connects, listens = (json.loads(config.get_json(f"{what}/endpoints")) for what in ("connect", "listen"))
+    mode = json.loads(config.get_json("mode")) or "peer"
     if isinstance(listens, dict):
-        listens = listens.get(json.loads(config.get_json("mode")) or "peer", [])
-    return ConnectionSettings(_texts(connects), names, user["user"], _texts(listens))
+        listens = listens.get(mode, [])
+    return ConnectionSettings(_texts(connects), names, user["user"], _texts(listens), client=mode == "client")
 
 
 def _from_file(options: ZenohOptions) -> "zenoh.Config":

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import msgspec
 
+from r2p.transports.identify import Server, ServerKind, identify_server
+
 _STEP_TIMEOUT_S = 2.0  # seconds for an endpoint to answer
 _ALERT_TIMEOUT_S = 0.5  # seconds for a server to refuse a client's certificate: with TLS 1.3 after the handshake
 _HANDSHAKE_TIMEOUT_S = 1.0  # seconds for a server that speaks TLS to answer in it
@@ -31,6 +33,12 @@ class Tls(msgspec.Struct, frozen=True):
     key: str | None = None
     check_name: bool = True
 
+    def check_files(self) -> None:
+        """Raise FileNotFoundError for a file that is not there."""
+        for path in (self.root, self.certificate, self.key):
+            if path is not None and not Path(path).is_file():
+                raise FileNotFoundError(f"there is no file {path}, which the configuration names")
+
 
 class ConnectionSettings(msgspec.Struct, frozen=True):
     """The endpoints that a session connects to and listens at, and its credentials."""
@@ -39,6 +47,8 @@ class ConnectionSettings(msgspec.Struct, frozen=True):
     tls: Tls = Tls()
     user: str | None = None
     listens: list[str] = []
+    client: bool = False
+    """Whether there is no session without a connection to an endpoint."""
 
 
 class _ParsedEndpoint(msgspec.Struct, frozen=True):
@@ -57,10 +67,41 @@ class _ParsedEndpoint(msgspec.Struct, frozen=True):
             return ""
         return f"there is no network interface {self.interface} here: there are {', '.join(there)}"
 
+    @property
+    def identifiable(self) -> bool:
+        """Whether the server's first bytes tell what it is."""
+        return self.protocol in {"tcp", "tls"} and bool(self.port)
+
 
 def diagnose_listening(settings: ConnectionSettings) -> str:
     """Return what keeps a session from listening, and a remedy, or an empty string. Blocks to look names up."""
     return next(filter(None, map(_diagnose_listener, settings.listens)), "")
+
+
+async def find_wrong_server(settings: ConnectionSettings) -> str:
+    """Return what answers at a client's endpoints, if it is not zenoh at any of them, or else an empty string.
+
+    zenoh itself would take seconds to give up.
+    """
+    endpoints = [_parse_endpoint(each) for each in settings.endpoints]
+    if not settings.client or not all(each.identifiable for each in endpoints):
+        return ""
+    found = await asyncio.gather(*(_find_wrong_server(each, settings.tls) for each in endpoints))
+    return "; ".join(found) if all(found) else ""
+
+
+async def _find_wrong_server(endpoint: _ParsedEndpoint, tls: Tls) -> str:
+    try:
+        return _wrong_server_text(endpoint, await _identify(endpoint, tls))
+    except (OSError, OverflowError):  # explained when zenoh has failed, too
+        return ""
+
+
+async def _identify(endpoint: _ParsedEndpoint, tls: Tls) -> Server:
+    if endpoint.protocol == "tls":
+        tls.check_files()
+    async with asyncio.timeout(_STEP_TIMEOUT_S):
+        return await identify_server(endpoint.host, int(endpoint.port))
 
 
 async def diagnose_connection(settings: ConnectionSettings) -> str:
@@ -71,14 +112,16 @@ async def diagnose_connection(settings: ConnectionSettings) -> str:
 async def _diagnose_endpoint(text: str, settings: ConnectionSettings) -> str:
     endpoint = _parse_endpoint(text)
     protocol, address = endpoint.protocol, endpoint.address
-    if protocol not in {"tcp", "tls"} or not endpoint.port:
+    if not endpoint.identifiable:
         return f"{text}: no answer; check the endpoint, and that a router listens there"
     if problem := endpoint.interface_error():
         return problem
     try:
-        async with asyncio.timeout(_STEP_TIMEOUT_S), _connection(endpoint.host, int(endpoint.port)) as (reader, writer):
-            if protocol == "tls":
-                await _start_tls(reader, writer, endpoint.host, settings.tls)
+        server = await _identify(endpoint, settings.tls)
+        if wrong := _wrong_server_text(endpoint, server):
+            return wrong
+        if protocol == "tls":
+            await _try_tls(endpoint, settings.tls)
     except TimeoutError:
         return f"{address} does not answer: is the computer on, is there a firewall?"
     except socket.gaierror:
@@ -89,7 +132,7 @@ async def _diagnose_endpoint(text: str, settings: ConnectionSettings) -> str:
         return f"no program listens at {address}: is the router running, is the port the right one?"
     except (OSError, OverflowError) as error:
         return f"{address}: {error}"
-    return f"{address} {NOT_ADMITTED}: {_not_admitted_text(protocol, settings)}"
+    return f"{address} {NOT_ADMITTED}: {_not_admitted_text(server.kind, settings)}"
 
 
 def _parse_endpoint(text: str) -> _ParsedEndpoint:
@@ -149,6 +192,11 @@ async def _connection(host: str, port: int) -> AsyncIterator[tuple[asyncio.Strea
         writer.transport.abort()
 
 
+async def _try_tls(endpoint: _ParsedEndpoint, tls: Tls) -> None:
+    async with asyncio.timeout(_STEP_TIMEOUT_S), _connection(endpoint.host, int(endpoint.port)) as (reader, writer):
+        await _start_tls(reader, writer, endpoint.host, tls)
+
+
 async def _start_tls(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, host: str, tls: Tls) -> None:
     """Start TLS as zenoh does; raise the error that zenoh does not report."""
     context = _context(tls)
@@ -163,9 +211,6 @@ async def _start_tls(reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
 
 
 def _context(tls: Tls) -> ssl.SSLContext:
-    for path in (tls.root, tls.certificate, tls.key):
-        if path is not None and not Path(path).is_file():
-            raise FileNotFoundError(f"there is no file {path}, which the configuration names")
     context = ssl.create_default_context(cafile=tls.root)
     context.check_hostname = tls.check_name
     if tls.certificate is not None:
@@ -192,9 +237,26 @@ def _tls_text(error: ssl.SSLError, tls: Tls) -> str:
     return f"TLS fails ({reason})"
 
 
-def _not_admitted_text(protocol: str, settings: ConnectionSettings) -> str:
+def _wrong_server_text(endpoint: _ParsedEndpoint, server: Server) -> str:
+    """Return what answers at an endpoint, and a remedy, if that is surely no zenoh; otherwise an empty string."""
+    address = endpoint.address
+    match server.kind:
+        case ServerKind.DEBUG_LINE:
+            return f"{address} is a debug line, not zenoh: connect by tcp:{address}, or to the router's port"
+        case ServerKind.TLS if endpoint.protocol == "tcp":
+            return f"{address} speaks TLS: connect to tls/ instead of tcp/, or correct the router's listen endpoint"
+        case ServerKind.ZENOH if endpoint.protocol == "tls":
+            return f"{address}: {_NO_TLS}"
+        case ServerKind.UNKNOWN if server.first_line:
+            return f"{address} is not zenoh, its first line is {server.first_line!r}: is the port the right one?"
+        case _:
+            return ""
+
+
+def _not_admitted_text(kind: ServerKind, settings: ConnectionSettings) -> str:
+    is_zenoh = kind is not ServerKind.UNKNOWN
     if settings.user is not None:
-        asks = f"check the password of user {settings.user} (transport/auth/usrpwd), and that it"
-        return f"{asks} is a zenoh 1 router that does not hang"
-    checks = "it may require a user and a password (transport/auth/usrpwd), hang, or not be a zenoh 1 router"
-    return checks if protocol == "tls" else f"{checks}, or want TLS (tls/ instead of tcp/)"
+        check = f"check the password of user {settings.user} (transport/auth/usrpwd)"
+        return check if is_zenoh else f"{check}, and that it is a zenoh 1 router that does not hang"
+    other = "be of another version than zenoh 1" if is_zenoh else "hang, or not be a zenoh 1 router"
+    return f"it may require a user and a password (transport/auth/usrpwd), or {other}"

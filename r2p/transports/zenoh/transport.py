@@ -18,7 +18,7 @@ from r2p.transports.zenoh.config import (
     open_endpoints,
     use_any_port,
 )
-from r2p.transports.zenoh.diagnose import NOT_ADMITTED, diagnose_connection, diagnose_listening
+from r2p.transports.zenoh.diagnose import NOT_ADMITTED, diagnose_connection, diagnose_listening, find_wrong_server
 
 if TYPE_CHECKING:
     import zenoh
@@ -80,6 +80,11 @@ class ZenohTransport(Transport):
         from r2p.transports.zenoh.session import Unreachable, open_session
 
         while True:
+            if wrong := await find_wrong_server(connection_settings(config)):
+                opened()
+                link.unreachable(wrong)
+                await asyncio.sleep(backoff.delay())
+                continue
             try:
                 return await open_session(config, link.stats.lost.internal_error)
             except TransportError as error:
