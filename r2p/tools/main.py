@@ -34,12 +34,22 @@ COMMANDS = {
     "demo": ("r2p.tools.demo", "Show r2p at work, without hardware."),
 }
 
+_COMPLETION_OPTIONS = ("--install-completion", "--show-completion")
+_SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
+
 LAUNCHER_VARIABLE = "R2P_LAUNCHER"
 """The environment variable by which `r2p launch` gives its process id to the commands that it starts."""
 
 
 class LazyGroup(TyperGroup):
     """A group that knows its commands by name and help line, and imports the one that is called."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        option, equals, value = args[0].partition("=") if args else ("", "", "")
+        shell = value if equals else next(iter(args[1:]), "")
+        if option in _COMPLETION_OPTIONS and shell and not shell.startswith("-"):
+            _complete_in(ctx, option, shell)
+        return super().parse_args(ctx, args)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, command, rest = super().resolve_command(ctx, args)
@@ -54,6 +64,17 @@ class LazyGroup(TyperGroup):
             raise
 
 
+def _complete_in(ctx: Any, option: str, shell: str) -> None:
+    """Install or print the completion of the given shell, and exit. Typer's own options only know the current one."""
+    from typer import completion
+
+    if shell not in _SHELLS:
+        raise typer.BadParameter(f"{shell!r} is not one of {', '.join(_SHELLS)}", ctx, param_hint=option)
+    call = completion.install_callback if option == "--install-completion" else completion.show_callback
+    parameter: Any = None  # they do not use it
+    call(ctx, parameter, shell)
+
+
 def _wrapped_behind(shown: str, message: str) -> str:
     """Return an error's message with the line breaks that all of what is shown needs at a terminal."""
     begin = shown.removesuffix(message).rstrip()
@@ -64,6 +85,7 @@ def _wrapped_behind(shown: str, message: str) -> str:
 app = typer.Typer(
     cls=LazyGroup,
     help="Typed topics from the microcontroller on the robot to the PC in the next town.",
+    epilog="Completion is that of the current shell, or of the one named behind the option, such as zsh.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,

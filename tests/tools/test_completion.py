@@ -51,6 +51,20 @@ def test_words_are_completed(line: str, found: list[str], tmp_path: Path, monkey
     assert completions(line) == found
 
 
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["--show-completion", "zsh"], 0, "#compdef r2p"),
+        (["--show-completion=fish"], 0, "complete --command r2p"),
+        (["--show-completion", "tcsh"], 2, "'tcsh' is not one of bash, zsh, fish"),
+    ],
+)
+def test_the_shell_may_be_named(arguments: list[str], code: int, text: str) -> None:
+    result = CliRunner().invoke(app, arguments, prog_name="r2p")
+    assert result.exit_code == code
+    assert text in result.output
+
+
 def test_without_a_valid_r2p_toml_there_are_no_topics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And no traceback between the keys of the user."""
     monkeypatch.chdir(tmp_path)
