@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import functools
 import inspect
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import pytest
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Generator, Iterator
 
     from r2p.testing.network import Network
 
@@ -36,6 +38,7 @@ def r2p_network() -> Network:
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """Run a marked async test; leave other tests to pytest."""
+    __tracebackhide__ = True
     marker = pyfuncitem.get_closest_marker("virtual_time")
     if marker is None:
         return None
@@ -46,7 +49,11 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
     @functools.wraps(test)
     def under_virtual_time(*positional: object, **named: object) -> None:
-        _run(functools.partial(test, *positional, **named), marker)
+        __tracebackhide__ = True
+        try:
+            _run(functools.partial(test, *positional, **named), marker)
+        except Exception as error:  # noqa: BLE001 - it is raised again
+            _raise_shown(error, pyfuncitem.config)
 
     if hypothesis is not None:
         hypothesis.inner_test = under_virtual_time  # a run of the loop for each example
@@ -54,6 +61,76 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     arguments = inspect.signature(test).parameters
     under_virtual_time(**{name: value for name, value in pyfuncitem.funcargs.items() if name in arguments})
     return True
+
+
+@pytest.hookimpl(specname="pytest_pyfunc_call", wrapper=True)
+def pytest_pyfunc_call_unmarked(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
+    """Name the mark that an async test of r2p lacks, where no plugin runs it and pytest would name other plugins."""
+    try:
+        return (yield)
+    except (pytest.fail.Exception, pytest.skip.Exception) as outcome:
+        if "async def function" not in str(outcome) or not _uses_r2p(pyfuncitem):
+            raise
+    pytest.fail(
+        f"{pyfuncitem.name} is an async test that nothing runs: mark it with @pytest.mark.virtual_time; for real "
+        "time and real devices, install pytest-asyncio or anyio, and use its mark",
+        pytrace=False,
+    )
+
+
+def _uses_r2p(test: pytest.Function) -> bool:
+    """Return whether the test uses the fixture of this plugin, or its module anything of r2p."""
+    names = (getattr(each, "__module__", None) or getattr(each, "__name__", "") for each in vars(test.module).values())
+    return "r2p_network" in test.fixturenames or any(str(name).partition(".")[0] == "r2p" for name in names)
+
+
+@pytest.hookimpl
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any], request: pytest.FixtureRequest) -> None:
+    """Fail a marked test with an async fixture that no other plugin runs; leave other fixtures to pytest."""
+    function = fixturedef.func
+    if not (inspect.iscoroutinefunction(function) or inspect.isasyncgenfunction(function)):
+        return
+    if request.node.get_closest_marker("virtual_time") is not None:
+        name = fixturedef.argname
+        pytest.fail(
+            f"the fixture {name} is async, but virtual time runs only during the test: make {name} a function with "
+            f"@contextlib.asynccontextmanager, and write `async with {name}(...)` in the test",
+            pytrace=False,
+        )
+
+
+def _raise_shown(error: Exception, config: pytest.Config) -> NoReturn:
+    """Raise the error of a test with a traceback that ends at the test's own code.
+
+    Not with --full-trace, and not for the tests of r2p itself.
+    """
+    import r2p
+
+    __tracebackhide__ = not isinstance(error, r2p.Deadlock)  # where all are hidden, pytest would add a line about it
+    if isinstance(error, r2p.Deadlock):  # it lists where each task waits, the test first
+        raise pytest.fail.Exception(f"r2p.Deadlock: {error}", pytrace=False) from None
+    if not config.getoption("fulltrace") and Path(r2p.__file__).parents[1] != config.rootpath:
+        _shorten(error)
+    raise error
+
+
+def _shorten(error: BaseException) -> None:
+    """Remove the frames of r2p and asyncio, unless there are no others."""
+    from r2p.log_lines import internal
+
+    kept = [each for each in _entries(error.__traceback__) if not internal(each.tb_frame.f_code.co_filename)]
+    trace = None
+    for each in reversed(kept):
+        trace = TracebackType(trace, each.tb_frame, each.tb_lasti, each.tb_lineno)
+    error.__traceback__ = trace or error.__traceback__
+    for part in error.exceptions if isinstance(error, BaseExceptionGroup) else ():
+        _shorten(part)
+
+
+def _entries(trace: TracebackType | None) -> Iterator[TracebackType]:
+    while trace is not None:
+        yield trace
+        trace = trace.tb_next
 
 
 def _async_function(function: object) -> AsyncFunction | None:
@@ -65,6 +142,7 @@ def _async_function(function: object) -> AsyncFunction | None:
 
 
 def _run(test: Callable[[], Coroutine[Any, Any, object]], marker: pytest.Mark) -> None:
+    __tracebackhide__ = True
     import asyncio
 
     from r2p.sim import run

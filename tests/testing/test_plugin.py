@@ -152,6 +152,90 @@ def anyio_backend():
     assert outcomes(project, tests) == {"passed": 1}
 
 
+def output(project: pytest.Pytester, tests: str, *options: str) -> str:
+    project.makepyfile("import asyncio, contextlib, pytest, r2p\n" + tests)
+    result = project.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:asyncio", "-p", "no:anyio", *options)
+    return "\n".join(result.outlines)
+
+
+def test_an_async_test_without_the_mark_gets_advice(project: pytest.Pytester) -> None:
+    tests = """
+async def test_network(r2p_network):
+    pass
+
+@pytest.mark.virtual_time
+async def test_marked():
+    pass
+"""
+    lines = output(project, tests)
+    assert "test_network is an async test that nothing runs: mark it with @pytest.mark.virtual_time" in lines
+    assert "1 failed, 1 passed" in lines or "1 passed, 1 failed" in lines
+
+
+def test_an_async_test_of_something_else_gets_the_advice_of_pytest(project: pytest.Pytester) -> None:
+    project.makepyfile("async def test_other(): ...")
+    result = project.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:asyncio", "-p", "no:anyio")
+    assert "virtual_time" not in "\n".join(result.outlines)
+    assert result.parseoutcomes().get("passed") is None
+
+
+def test_an_async_fixture_gets_advice(project: pytest.Pytester) -> None:
+    tests = """
+@pytest.fixture
+async def robot(r2p_network):
+    async with r2p_network.module("R1") as module:
+        yield module
+
+@pytest.mark.virtual_time
+async def test_robot(robot):
+    pass
+"""
+    assert "the fixture robot is async, but virtual time runs only during the test" in output(project, tests)
+
+
+MISTAKES = """
+from r2p.msg import Led
+
+@pytest.mark.virtual_time
+async def test_value(r2p_network):
+    async with r2p_network.node("PC1") as node:
+        await node.advertise("leds", Led).publish(Led(value=300))
+
+@pytest.mark.virtual_time
+async def test_group(r2p_network):
+    async with r2p_network.node("PC1") as node, asyncio.TaskGroup() as tasks:
+        tasks.create_task(publish(node))
+
+async def publish(node):
+    await node.advertise("leds", Led).publish(Led(value=301))
+
+@pytest.mark.virtual_time
+async def test_nothing(r2p_network):
+    async with r2p_network.node("PC1") as node:
+        await node.subscribe("leds", Led).fetch()
+"""
+
+
+def test_tracebacks_end_at_the_code_of_the_test(project: pytest.Pytester) -> None:
+    text = output(project, MISTAKES)
+    for line in (
+        "MessageError: Led.value (u8) takes an integer from 0 to 255, not 300",
+        "MessageError: Led.value (u8) takes an integer from 0 to 255, not 301",
+        "r2p.Deadlock: virtual time",
+        "test_nothing (test_tracebacks_end_at_the_code_of_the_test.py:",
+        "in publish",
+    ):
+        assert line in text
+    assert "def publish(self" not in text  # the source of r2p's methods
+    assert "taskgroups.py" not in text
+    assert "base_events.py" not in text
+    assert "traceback entries are hidden" not in text
+
+
+def test_a_full_trace_has_all_frames(project: pytest.Pytester) -> None:
+    assert "def publish(self" in output(project, MISTAKES, "--full-trace")
+
+
 @pytest.mark.processes
 def test_loading_the_plugin_loads_nothing_else(pytester: pytest.Pytester) -> None:
     script = pytester.makepyfile(f"""
