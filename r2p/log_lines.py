@@ -5,7 +5,8 @@ loggers made by `get_logger` show each character that would move the cursor as a
 `printable`. Events that another module can cause any number of times a second are logged within a `LineLimit`.
 
 A traceback ends at what the user wrote: `short_traceback` leaves out the frames of r2p and asyncio. Programs that don't
-configure logging get `default_logging` from `r2p.run`; the commands use the same `LineFormatter`.
+configure logging get `default_logging` from `r2p.run`; the commands use the same `LineFormatter`, and `last_resort` for
+what is not r2p's.
 """
 
 import asyncio
@@ -95,6 +96,11 @@ def debugging() -> bool:
     return bool(os.environ.get(DEBUG)) or logging.getLogger("r2p").isEnabledFor(logging.DEBUG)
 
 
+def internal(filename: str) -> bool:
+    """Return whether a frame of this file is one of r2p or asyncio, which users did not write."""
+    return filename.startswith(_INTERNAL)
+
+
 def short_traceback(error: BaseException) -> str:
     """Format an exception with its traceback, without frames of r2p and asyncio unless there are no others.
 
@@ -110,7 +116,7 @@ def _shorten(report: traceback.TracebackException | None, error: BaseException |
     """Shorten the report of an error, and of those that led to it."""
     if report is None or error is None:
         return
-    own = [frame for frame in report.stack if not frame.filename.startswith(_INTERNAL)]
+    own = [frame for frame in report.stack if not internal(frame.filename)]
     if own:
         report.stack[:] = own
     if isinstance(error, TimeoutError) and isinstance(error.__cause__, asyncio.CancelledError):
@@ -170,7 +176,7 @@ def _width(stream: TextIO) -> int:
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as a short line that begins with `MODULE/NODE`, or with `r2p` where no node logs.
+    """Formats a record as a short line that begins with `MODULE/NODE`, with `r2p`, or with another logger's name.
 
     The level is shown from WARNING up. With `times` it is always shown, after the time.
     """
@@ -180,9 +186,9 @@ class LineFormatter(logging.Formatter):
         self._times = times
 
     def format(self, record: logging.LogRecord) -> str:
-        _, _, rest = record.name.partition(".")
+        top, _, rest = record.name.partition(".")
         module, _, node = rest.partition(".")
-        where = f"{module}/{node}" if node else "r2p"
+        where = record.name if top != "r2p" else f"{module}/{node}" if node else "r2p"
         text = printable(record.getMessage(), "\n\t")
         if not self._times:
             level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
@@ -222,23 +228,62 @@ class StderrHandler(logging.StreamHandler[Any]):
 
 
 @contextlib.contextmanager
-def default_logging() -> Iterator[None]:
-    """Log to stderr in the block, from INFO up, unless the root logger or `r2p` has handlers.
+def last_resort(handler: logging.Handler) -> Iterator[None]:
+    """Write the records that no handler takes by this one in the block, whichever library they are from.
 
-    A level that the program has set stays as it is; R2P_DEBUG makes the default DEBUG.
+    The root logger gets no handler, so a program can still call `logging.basicConfig` in the block. `logging.warning`
+    and its like call that by themselves: what it sets up then gets the format of `handler`.
+    """
+    root, before = logging.getLogger(), logging.lastResort
+    adopt = _AdoptImplicit(handler)
+    if before is not None:  # else the program does not want them
+        logging.lastResort = handler
+    root.addFilter(adopt)
+    handler.addFilter(adopt)
+    try:
+        yield
+    finally:
+        logging.lastResort = before
+        root.removeFilter(adopt)
+        handler.removeFilter(adopt)
+
+
+class _AdoptImplicit(logging.Filter):
+    """Gives the root logger's handler from `logging.warning(...)` a format; of records it lets all pass."""
+
+    def __init__(self, handler: logging.Handler) -> None:
+        super().__init__()
+        self._formatter = handler.formatter
+
+    def filter(self, _record: logging.LogRecord) -> bool:
+        root = logging.getLogger()
+        for each in root.handlers if root.level == logging.WARNING else ():  # as Python starts
+            format_ = getattr(each.formatter, "_fmt", None)  # the formatter's own; there is no other way to see it
+            if type(each) is logging.StreamHandler and format_ == logging.BASIC_FORMAT:
+                each.setFormatter(self._formatter)
+        return True
+
+
+@contextlib.contextmanager
+def default_logging() -> Iterator[None]:
+    """Log to stderr in the block, unless the root logger or `r2p` has handlers: of `r2p` from INFO up.
+
+    Of other loggers come the records that Python would print bare: from WARNING up, or from the level of the logger. A
+    level that the program has set stays as it is; R2P_DEBUG makes the default of `r2p` DEBUG.
     """
     logger, root = logging.getLogger("r2p"), logging.getLogger()
     if logger.handlers or root.handlers:
         yield
         return
     handler = StderrHandler(times=True)
-    handler.addFilter(lambda _record: not root.handlers)  # else a node that configures logging gets each line twice
     level = logger.level
     if level == logging.NOTSET and root.level == logging.WARNING:  # as Python starts
         logger.setLevel(logging.DEBUG if os.environ.get(DEBUG) else logging.INFO)
-    logger.addHandler(handler)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
+    with last_resort(handler):  # first its filter, then this one
+        handler.addFilter(lambda _record: not root.handlers)  # else a node that configures logging gets each line twice
+        logger.addHandler(handler)
+        try:
+            yield
+        finally:
+            logger.removeHandler(handler)
+            logger.setLevel(level)

@@ -63,6 +63,8 @@ def test_a_line_begins_with_its_node_and_may_have_a_time(monkeypatch: pytest.Mon
         "INFO    PC1/arm: up\\x1b",
         "WARNING r2p: down",
     ]
+    other = _record("robot.arm", logging.WARNING, "hot\x1b")
+    assert plain.format(other) == "robot.arm: warning: hot\\x1b"
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
@@ -116,6 +118,44 @@ def test_what_a_program_has_configured_stays(capsys: pytest.CaptureFixture[str])
             logging.getLogger().addHandler(logging.NullHandler())
             logger.error("error")
     assert capsys.readouterr().err == ""
+
+
+def test_other_loggers_print_readable_lines_from_warning_up(capsys: pytest.CaptureFixture[str]) -> None:
+    mine, before = logging.getLogger("test_log_lines.mine"), logging.lastResort
+    with unconfigured(), default_logging():
+        mine.info("too low")
+        mine.warning("warning")
+        mine.setLevel(logging.INFO)
+        mine.info("info")
+    mine.setLevel(logging.NOTSET)
+    assert logging.lastResort is before
+    lines = [line.partition(" ")[2] for line in capsys.readouterr().err.splitlines()]
+    assert lines == ["WARNING test_log_lines.mine: warning", "INFO    test_log_lines.mine: info"]
+
+
+@pytest.mark.parametrize("level", [logging.INFO, logging.WARNING])
+def test_functions_of_the_module_logging_change_no_format(level: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """They call `logging.basicConfig()`, even for a record that is not printed."""
+    root = logging.getLogger()
+    with unconfigured() as logger, default_logging():
+        logging.log(level, "root")
+        logging.getLogger("r2p.PC1.arm").info("node")
+        logger.info("r2p")
+        assert root.filters
+        lines = [line.partition(" ")[2] for line in capsys.readouterr().err.splitlines()]
+    assert lines == ["WARNING root: root"] * (level == logging.WARNING) + ["INFO    PC1/arm: node", "INFO    r2p: r2p"]
+    assert not root.filters
+
+
+def test_a_node_may_configure_logging(capsys: pytest.CaptureFixture[str]) -> None:
+    root = logging.getLogger()
+    with unconfigured() as logger, default_logging():
+        before = root.level
+        logging.basicConfig(level=logging.INFO)
+        logger.info("once")
+        logging.getLogger("test_log_lines.mine").info("mine")
+        root.setLevel(before)
+    assert capsys.readouterr().err.splitlines() == ["INFO:r2p:once", "INFO:test_log_lines.mine:mine"]
 
 
 class TerminalStream(io.StringIO):

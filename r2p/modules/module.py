@@ -268,13 +268,14 @@ class Module:
         node is started again after a crash, after a pause that grows from 0.5 to 30 s.
 
         Raises NameTooLong or InvalidName for the name; Error if another node has the name, if `function` is not a
-        coroutine function, or if the module is stopped; and Closed if the module is not open.
+        coroutine function or does not take these arguments, or if the module is stopped; and Closed if the module is
+        not open.
         """
         tasks = self._running()
         if self.stopped:
             raise Error(f"module {self.name} is stopped: call its reboot() first")
-        check_function(function)
-        name = node_name(name) if name is not None else name_of(function)
+        check_function(function, *args)
+        name = node_name(name) if name is not None else name_of(function, *args)
         if name in self._supervisors and self._supervisors[name].running:
             raise Error(f"module {self.name} already has a node {name}: give this one another name=")
         names = self._remap | _checked_remap(remap)

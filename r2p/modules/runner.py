@@ -21,7 +21,7 @@ from typing import Any, Self, TypeVar
 from r2p.errors import Error, NodeCrashed
 from r2p.log_lines import debugging, default_logging, printable
 from r2p.modules.module import Module
-from r2p.modules.supervisor import NodeFunction, name_of
+from r2p.modules.supervisor import NodeFunction, check_function, name_of
 from r2p.names import node_name
 from r2p.transports.link import Transport
 
@@ -45,7 +45,8 @@ def run(
     of several `run(blink, ("follower", line_follower))`. `module` is the module's name; `via` and `remap` are as for
     `Module`, `restart` as for `Module.start`.
 
-    Meanwhile the logger `r2p` writes to stderr, from INFO up, unless it or the root logger has handlers.
+    Meanwhile logging writes to stderr, unless the root logger or the logger `r2p` has handlers: `r2p` from INFO up, all
+    other loggers from WARNING up.
 
     Raises NodeCrashed at the end if a node crashed, and the errors of `Module` and `Module.start`. Where the program
     does not catch that, it prints one line instead of a traceback (R2P_DEBUG=1: all of it), and the exit code is 1.
@@ -70,6 +71,8 @@ def _named(
 ) -> list[tuple[str, NodeFunction]]:
     """Return the functions with the names of their nodes. Raises Error or InvalidName for those that can't run."""
     named = [_pair(each, name) for each in functions]
+    for _, function in named:
+        check_function(function)
     if not named:
         raise Error("r2p.run has no function to run: pass at least one, as in r2p.run(blink)")
     if name is not None and len(named) != 1:

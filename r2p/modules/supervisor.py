@@ -29,12 +29,37 @@ _CLEANUP_POLL = 0.01  # seconds until it is checked again whether clean-up is ov
 _HANDLER_GRACE = 1.0  # seconds for which an `except` counts as clean-up after a crash; then the node goes on in it
 
 
-def check_function(function: NodeFunction) -> Any:
-    """Return the function, or the one in its `functools.partial`. Raises Error unless it is a coroutine function."""
+def check_function(function: NodeFunction, *args: object) -> Any:
+    """Return the function, or the one in its `functools.partial`.
+
+    Raises Error unless it is a coroutine function that can be called with a node and `args`.
+    """
     bare = function.func if isinstance(function, functools.partial) else function
     if not (inspect.iscoroutinefunction(bare) or inspect.iscoroutinefunction(getattr(bare, "__call__", None))):  # noqa: B004 - looked into, not called
         raise Error(_not_a_coroutine_function(bare))
+    try:  # without what a decorator wraps: it may add arguments, or leave some out
+        inspect.signature(function, follow_wrapped=False).bind(None, *args)
+    except (TypeError, ValueError) as error:
+        raise Error(_uncallable(bare, args, str(error))) from None
     return bare
+
+
+def _uncallable(function: Any, args: tuple[object, ...], reason: str) -> str:
+    """Return what to write instead of a function that can't be called with its node and these arguments."""
+    name: str = getattr(function, "__name__", type(function).__name__)
+    parameters = list(inspect.signature(function, follow_wrapped=False).parameters)
+    owner = str(getattr(function, "__qualname__", name)).rpartition(".")[0].rpartition(".")[2]
+    if parameters[:1] == ["self"]:
+        return f"{name} is a method of a class: pass that of an object, {owner}().{name}"
+    if not parameters:
+        method = owner not in ("", "<locals>")
+        return f"{name}() does not take its node: write `async def {name}({'self, ' * method}node: r2p.Node)`"
+    if args:
+        return f"{name}({', '.join(parameters)}) can't be called with its node and {len(args)} more: {reason}"
+    return (
+        f"{name}({', '.join(parameters)}) can't be called with only its node: {reason}; pass more with "
+        "functools.partial, or behind the function to Module.start"
+    )
 
 
 def _not_a_coroutine_function(function: object) -> str:
@@ -45,12 +70,13 @@ def _not_a_coroutine_function(function: object) -> str:
     return f"{name or repr(function)} is not a coroutine function: write `async def {name or 'blink'}(node: r2p.Node)`"
 
 
-def name_of(function: NodeFunction) -> str:
+def name_of(function: NodeFunction, *args: object) -> str:
     """Return the default name of a function's node: the function's own name.
 
-    Raises NameTooLong or InvalidName if that is not a valid node name, and Error if it is not a coroutine function.
+    Raises NameTooLong or InvalidName if that is not a valid node name, and Error if it is not a coroutine function that
+    takes a node and `args`.
     """
-    bare = check_function(function)
+    bare = check_function(function, *args)
     name = getattr(bare, "__name__", type(bare).__name__)
     if len(name) > NODE_MAX:
         short = name[:NODE_MAX].rstrip("_")
@@ -154,7 +180,7 @@ class Supervisor:
         """Run the function to its end; return its exception, if any."""
         task = asyncio.current_task()
         assert task is not None
-        try:  # wrong arguments raise here, before there is a coroutine
+        try:  # wrong arguments that `check_function` could not see raise here, before there is a coroutine
             # Only coroutine functions get here (check_function), and those return coroutines.
             body = cast("Coroutine[Any, Any, object]", self._function(self.node, *self._args))
         except Exception as error:  # noqa: BLE001 - the user's code may raise anything

@@ -24,7 +24,7 @@ import textwrap
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, TextIO
 
-from r2p.log_lines import StderrHandler, printable, wrapped
+from r2p.log_lines import StderrHandler, last_resort, printable, wrapped
 
 Record = Mapping[str, Any]
 
@@ -304,14 +304,18 @@ _HANDLER = StderrHandler()
 
 @contextlib.contextmanager
 def log_to_stderr(level: int) -> Iterator[None]:
-    """Log to stderr in the block: INFO and up, and each -v or -q moves that by one level."""
+    """Log to stderr in the block: INFO and up, and each -v or -q moves that by one level.
+
+    Of other libraries, and of the nodes of `r2p run`, come the records that Python would print bare: WARNING and up.
+    """
     logger = logging.getLogger("r2p")
     propagate, before = logger.propagate, logger.level
     logger.addHandler(_HANDLER)
     logger.propagate = False
     logger.setLevel(max(logging.DEBUG, min(logging.INFO - 10 * level, logging.CRITICAL)))
     try:
-        yield
+        with last_resort(_HANDLER):
+            yield
     finally:
         logger.removeHandler(_HANDLER)
         logger.propagate = propagate

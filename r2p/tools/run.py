@@ -4,6 +4,7 @@
 tracebacks without the frames of r2p.
 """
 
+import asyncio
 import contextlib
 import difflib
 import importlib
@@ -14,13 +15,14 @@ import sys
 import traceback
 from collections.abc import Iterable
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, FrameType, ModuleType
 from typing import Annotated
 
 import msgspec
 import typer
 
 import r2p
+from r2p.log_lines import internal
 from r2p.names import NODE_MAX, node_name, topic_name
 from r2p.tools.options import Via
 from r2p.tools.session import UsageError, check_urls, settings, standalone
@@ -81,7 +83,7 @@ async def command(
 def load(targets: Iterable[str]) -> list[Program]:
     """Return the functions of targets: `FILE:FUNCTION[=NAME]` or `package.module:FUNCTION[=NAME]`.
 
-    Raises UsageError, which says what to do, and r2p.Error with a traceback if a file can't be executed.
+    Raises UsageError, which says what to do, and r2p.Error with a traceback for an error in a file.
     """
     programs: list[Program] = []
     for target in targets:
@@ -118,6 +120,8 @@ def _function(path: str, attribute: str, module: ModuleType) -> r2p.NodeFunction
         with contextlib.suppress(r2p.InvalidName):  # the target may give it another name
             r2p.name_of(function)
     except r2p.Error as error:
+        if inspect.iscoroutinefunction(function):  # but its arguments are wrong
+            raise UsageError(f"{path}: {error}") from error
         raise UsageError(f"{path}:{attribute} is not a node: write `async def {attribute}(node: r2p.Node)`") from error
     return function
 
@@ -166,7 +170,8 @@ def load_module(where: str) -> ModuleType:
     """Import `FILE.py` or `package.module`, once.
 
     A file can import its neighbours, a package what is in the working directory, as with `python` itself. Raises
-    UsageError if it does not exist, and r2p.Error with the traceback if it can't be executed.
+    UsageError if it does not exist, for what r2p refuses in it, and if it runs a program; r2p.Error with the traceback
+    for other errors in it.
     """
     if where.endswith(".py") or "/" in where:
         return _load_file(where)
@@ -214,9 +219,46 @@ def _add_to_path(directory: Path) -> None:
         sys.path.insert(0, str(directory))
 
 
-def _broken(where: str, error: Exception) -> r2p.Error:
-    frame, loaders = error.__traceback__, (__file__, str(importlib.__file__), "<frozen importlib")
-    while frame is not None and frame.tb_frame.f_code.co_filename.startswith(loaders):
-        frame = frame.tb_next
-    text = "".join(traceback.format_exception(type(error), error, frame))
+def _broken(where: str, error: Exception) -> Exception:
+    """Return what to raise for an error of the user's code while it is loaded.
+
+    An error of r2p says what to do, so its place is enough. Others come with their traceback.
+    """
+    frames = list(traceback.walk_tb(error.__traceback__))
+    own = [(frame.f_code, line) for frame, line in frames if not _loads(frame) and not internal(_file(frame))]
+    if own and frames[-1][0].f_code in _RUNNERS:
+        _close_coroutines(frames[-1][0])
+        place = _place(*next(each for each in reversed(own) if each[0].co_name == "<module>"))
+        return UsageError(f'{place} runs as soon as the file is loaded: put it under `if __name__ == "__main__":`')
+    if own and isinstance(error, r2p.Error):
+        return UsageError(f"{_place(*own[-1])}: {error}")
+    trace = error.__traceback__
+    while trace is not None and _loads(trace.tb_frame):
+        trace = trace.tb_next
+    text = "".join(traceback.format_exception(type(error), error, trace))
     return r2p.Error(f"can't load {where}:\n{text.rstrip()}")
+
+
+_RUNNERS = (r2p.run_main.__code__, asyncio.run.__code__, asyncio.Runner.run.__code__)
+"""What raises where an event loop runs already: that of this command."""
+
+
+def _loads(frame: FrameType) -> bool:
+    return _file(frame).startswith((__file__, str(importlib.__file__), "<frozen importlib"))
+
+
+def _file(frame: FrameType) -> str:
+    return frame.f_code.co_filename
+
+
+def _place(code: CodeType, line: int) -> str:
+    """Return `FILE, line N`, relative to the working directory where the file is in it."""
+    path = Path(code.co_filename)
+    return f"{path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}, line {line}"
+
+
+def _close_coroutines(frame: FrameType) -> None:
+    """Close what the program would have run: otherwise Python warns that it was never awaited."""
+    for value in frame.f_locals.values():
+        if inspect.iscoroutine(value):
+            value.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 import re
 import signal
@@ -253,6 +254,18 @@ def test_nodes_get_their_names(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.split() == ["follower", "wink", "left", "follow"]
 
 
+async def talk() -> None:
+    """Lack the node."""
+
+
+class Robot:
+    async def drive(self, node: r2p.Node) -> None:
+        """Be a node."""
+
+    async def stop(self) -> None:
+        """Lack the node."""
+
+
 @pytest.mark.parametrize(
     ("functions", "name", "kind", "text"),
     [
@@ -265,6 +278,16 @@ def test_nodes_get_their_names(capsys: pytest.CaptureFixture[str]) -> None:
         ([mock.Mock], None, r2p.Error, "class Mock is not a coroutine function: pass a method, Mock().METHOD"),
         ([lambda node: None], None, r2p.Error, "<lambda> is not a coroutine function: write `async def "),
         ([(wink, "x")], None, r2p.Error, "is not a node: write a function, or (name, function)"),
+        ([talk], None, r2p.Error, "talk() does not take its node: write `async def talk(node: r2p.Node)`"),
+        ([("talk", talk)], None, r2p.Error, "talk() does not take its node"),
+        ([wink, functools.partial(talk)], None, r2p.Error, "talk() does not take its node"),
+        ([Robot.drive], None, r2p.Error, "drive is a method of a class: pass that of an object, Robot().drive"),
+        (
+            [Robot().stop],
+            None,
+            r2p.Error,
+            "stop() does not take its node: write `async def stop(self, node: r2p.Node)`",
+        ),
         ([print], None, r2p.Error, "print is not a coroutine function: write `async def print(node: r2p.Node)`"),
     ],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import inspect
 import itertools
 import logging
 import re
@@ -99,6 +100,8 @@ async def test_a_crash_is_logged_with_the_frames_of_the_program_only(
 async def test_a_node_with_wrong_arguments_ends_alone(restart: bool) -> None:
     async def needy(node: r2p.Node, number: int) -> None:
         raise AssertionError(number)  # pragma: no cover
+
+    needy.__signature__ = inspect.signature(hold)  # type: ignore[attr-defined]  # not its own, as decorators may do it
 
     async def main() -> None:
         async with local() as module:
@@ -613,5 +616,16 @@ async def test_partials_and_objects_are_node_functions() -> None:
         module.start(Blink(), name="blink")
         module.start(functools.partial(wink, number=3))
         module.start(functools.partial(Blink()), name="again")
+        for function, args, text in (
+            (
+                wink,
+                (),
+                r"wink\(node, number\) can't be called with only its node: missing a required argument: 'number'",
+            ),
+            (wink, (1, 2), r"wink\(node, number\) can't be called with its node and 2 more: too many positional"),
+            (functools.partial(wink, numbr=1), (), "has incorrect arguments"),  # type: ignore[call-arg]
+        ):
+            with pytest.raises(r2p.Error, match=text):
+                module.start(function, *args)
         await module.wait()
     assert ran == ["blink", "wink3", "again"]

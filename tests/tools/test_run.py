@@ -12,6 +12,7 @@ import pytest
 import r2p
 from r2p.tools.run import load
 from r2p.tools.session import UsageError
+from r2p.tools.types import load_type
 from tests.tools.rig import listening, process
 
 if TYPE_CHECKING:
@@ -63,6 +64,9 @@ async def a_long_name(node: r2p.Node) -> None:
 
 def plain(node: r2p.Node) -> None:
     pass
+
+async def bare() -> None:
+    pass
 """
 
 
@@ -107,11 +111,15 @@ def test_a_file_may_be_named_like_a_module_that_is_there(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("target", "what_to_do"),
     [
-        ("nodes.py", "which function? it has blink, watch, once, crash, motor, stubborn, blocks, a_long_name: r2p run"),
+        (
+            "nodes.py",
+            "which function? it has blink, watch, once, crash, motor, stubborn, blocks, a_long_name, bare: r2p run",
+        ),
         ("nodes.py:blnk", "nodes.py has no function blnk; did you mean blink?"),
         ("nodes.py:xyz", "nodes.py has no function xyz; it has blink, "),
         ("nodes.py:plain", "nodes.py:plain is not a node: write `async def plain"),
         ("nodes.py:Led", "nodes.py:Led is not a node"),
+        ("nodes.py:bare", "nodes.py: bare() does not take its node: write `async def bare(node: r2p.Node)`"),
         ("nodes.py:a_long_name", "at most 8 characters; use another name: nodes.py:a_long_name=NAME"),
         ("nodes.py:blink=much_too_long", "at most 8 characters; use another name: nodes.py:blink=NAME"),
         ("other.py:blink", "there is no file other.py"),
@@ -154,6 +162,30 @@ def test_errors_in_the_file_come_with_its_lines_and_none_of_ours(
     files = [line for line in lines if line.strip().startswith("File ")]
     assert files
     assert all(str(file) in line for line in files)
+
+
+GUARD = 'runs as soon as the file is loaded: put it under `if __name__ == "__main__":`'
+
+
+@pytest.mark.virtual_time  # with an event loop, as commands load files
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("import nodes, r2p\n\nr2p.run(nodes.once)", f"robot.py, line 3 {GUARD}"),
+        ("import nodes, r2p\ndef main():\n  r2p.run(nodes.once)\nmain()", f"robot.py, line 4 {GUARD}"),
+        ("import asyncio, nodes\nasyncio.run(nodes.once(None))", f"robot.py, line 2 {GUARD}"),
+        ("import r2p\nclass M(r2p.Message):\n  a: r2p.u8 = 0\n  b: r2p.u8", "robot.py, line 2: M.b: a field without"),
+        ("import r2p\ndef f():\n  r2p.layout(3)\nf()", "robot.py, line 3: 3 is not a message class"),
+    ],
+)
+async def test_what_r2p_refuses_in_a_file_is_one_line_with_its_place(tmp_path: Path, text: str, error: str) -> None:
+    (tmp_path / "robot.py").write_text(text, encoding="ascii")
+    for target in ("robot.py:blink", "robot:blink"):
+        with pytest.raises(UsageError) as raised:
+            load([target])
+        assert str(raised.value).startswith(error)
+    with pytest.raises(UsageError, match=re.escape(error)):
+        load_type("robot.py:M")
 
 
 # As a process
