@@ -5,6 +5,7 @@ without a name. The faults come from one seeded generator, so under virtual time
 """
 
 import asyncio
+import math
 import random
 import weakref
 from collections import Counter, deque
@@ -310,10 +311,19 @@ def from_url(url: Url) -> MemoryTransport:
 
 
 def _probability(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not 0.0 <= value <= 1.0:
         raise ValueError("a probability lies between 0 and 1")
     return value
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise ValueError("give a whole number")
+    return int(text)
 
 
 _OPTIONS: dict[str, Callable[[str], float]] = {
@@ -322,5 +332,5 @@ _OPTIONS: dict[str, Callable[[str], float]] = {
     "reorder": _probability,
     "delay": duration,
     "jitter": duration,
-    "seed": int,
+    "seed": _seed,
 }

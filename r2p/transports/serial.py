@@ -219,10 +219,9 @@ def _pyserial() -> Any:
 
 
 def _baud(text: str) -> int:
-    baud = int(text)
-    if baud <= 0:
-        raise ValueError("give bits per second, more than 0")
-    return baud
+    if not text.isdecimal() or int(text) == 0:
+        raise ValueError("give bits per second, such as 115200")
+    return int(text)
 
 
 def _end_differs_from_silence(fd: int) -> None:
@@ -251,5 +250,8 @@ def _explain(device: str, error: Exception) -> str:
     if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):
         return f"{device} is in use by another program: end that one (fuser -v {device} names it)"
     if not Path(device).exists():
-        return f"{device} is not there: plug it in (ls /dev/serial/by-id)"
+        meant = "" if "/" in device else f", and not in the working directory: is serial:/dev/{device} meant?"
+        return f"{device} is not there{meant or ': plug it in (ls /dev/serial/by-id)'}"
+    if not Path(device).is_char_device() or os.strerror(errno.ENOTTY) in str(error):
+        return f"{device} is not a serial port (ls /dev/serial/by-id lists those of adapters)"
     return re.sub(r"^\[Errno \d+\] ", "", str(error))

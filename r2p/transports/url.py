@@ -75,6 +75,8 @@ def parse(text: str) -> Url:
     for pair in filter(None, pairs):
         name, equals, value = pair.partition("=")
         if not equals:
+            if ":" in pair:
+                raise TransportError(f"transport {text!r}: is {pair} another URL? give each one its own --via")
             raise TransportError(f"transport {text!r}: option {pair!r} needs a value: {pair}=...")
         options[name] = value
     return Url(scheme, address, options)

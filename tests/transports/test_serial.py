@@ -232,15 +232,33 @@ async def test_a_device_that_is_no_serial_port(tmp_path: Path) -> None:
     module = r2p.Module("PC1", via=f"serial:{file}", watchdog=False)
     events = module.events()
     async with asyncio.timeout(GUARD), module:
-        assert isinstance(await anext(events), r2p.LinkWaits)
+        waits = await anext(events)
+        assert isinstance(waits, r2p.LinkWaits)
+        assert waits.reason == f"{file} is not a serial port (ls /dev/serial/by-id lists those of adapters)"
+
+
+@pytest.mark.parametrize(
+    ("device", "text"),
+    [
+        ("/dev/null", "/dev/null is not a serial port"),
+        ("ttyUSB97", "ttyUSB97 is not there, and not in the working directory: is serial:/dev/ttyUSB97 meant?"),
+    ],
+)
+async def test_the_name_of_another_device(device: str, text: str) -> None:
+    module = r2p.Module("PC1", via=f"serial:{device}", watchdog=False)
+    events = module.events()
+    async with asyncio.timeout(GUARD), module:
+        waits = await anext(events)
+        assert isinstance(waits, r2p.LinkWaits)
+        assert waits.reason.startswith(text)
 
 
 @pytest.mark.parametrize(
     ("url", "text"),
     [
         ("serial:", "give the device, for example serial:/dev/ttyUSB0"),
-        ("serial:/dev/x,baud=0", "baud=0: give bits per second, more than 0"),
-        ("serial:/dev/x,baud=fast", "baud=fast"),
+        ("serial:/dev/x,baud=0", "baud=0: give bits per second, such as 115200"),
+        ("serial:/dev/x,baud=fast", "baud=fast: give bits per second"),
         ("serial:/dev/x,speed=9600", "has no option 'speed'; it knows: baud"),
     ],
 )

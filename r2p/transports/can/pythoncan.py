@@ -7,6 +7,7 @@ python-can's own configuration file.
 
 import asyncio
 import concurrent.futures
+import errno
 import importlib
 import logging
 import threading
@@ -93,7 +94,10 @@ class PythonCanPort(InterfacePort["_PythonCanBus"]):
         except _PERMANENT_ERRORS as error:
             raise TransportError(f"rtcan:{self.name}: {_explain(error)}") from error
         except (self._can.CanError, OSError) as error:
-            return _explain(error)
+            return _explain_opening(self._channel, error)
+        except Exception as error:  # python-can's own, where the library of the driver is missing: kvaser's NameError
+            reason = f"the driver of {self._interface} does not work here: is it installed? ({_explain(error)})"
+            raise TransportError(f"rtcan:{self.name}: {reason}") from error
         return ""
 
     def _make(self) -> "can.BusABC":
@@ -257,6 +261,20 @@ def _library() -> Any:
     return library
 
 
+def _explain_opening(channel: str, error: Exception) -> str:
+    """Return why a channel can't be opened, and what to do if it is a serial port, such as an slcan adapter's."""
+    device = channel.partition("@")[0]  # slcan: DEVICE@BAUD
+    cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
+    match getattr(cause, "errno", None) if device.startswith("/dev/") else None:
+        case errno.ENOENT:
+            return f"{device} is not there: plug it in (ls /dev/serial/by-id)"
+        case errno.EACCES:
+            return f"{device}: permission denied; add yourself to its group: sudo usermod -aG dialout $USER"
+        case _:
+            return _explain(error)
+
+
 def _explain(error: BaseException) -> str:
     text, cause = str(error) or type(error).__name__, error.__cause__
-    return text if cause is None or str(cause) in text else f"{text} ({cause})"
+    text = text if cause is None or str(cause) in text else f"{text} ({cause})"
+    return text.removesuffix(".")

@@ -9,6 +9,7 @@ from unittest.mock import Mock
 
 import can
 import pytest
+import serial
 
 from r2p.codecs.can_bits import Frame, OtherFrame
 from r2p.errors import TransportError
@@ -193,6 +194,20 @@ async def test_it_waits_until_it_can_be_opened(channel: str, monkeypatch: pytest
         ]
 
 
+async def test_an_adapter_that_is_not_plugged_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyserial's text, which python-can repeats, has the device and the reason twice."""
+    missing = can.CanInitializationError("[Errno 2] could not open port /dev/ttyACM97: [Errno 2] No such file")
+    missing.__cause__ = serial.SerialException(2, "could not open port /dev/ttyACM97: [Errno 2] No such file")
+    denied = serial.SerialException(13, "could not open port /dev/ttyACM97: [Errno 13] Permission denied")
+    monkeypatch.setattr(can, "Bus", Broken(missing, denied))
+    async with using(PythonCanPort("slcan", "/dev/ttyACM97@115200", BITRATE)) as listener:
+        await listener.until(lambda: len(listener.states) == 2)
+        assert listener.states == [
+            "waits: /dev/ttyACM97 is not there: plug it in (ls /dev/serial/by-id)",
+            "waits: /dev/ttyACM97: permission denied; add yourself to its group: sudo usermod -aG dialout $USER",
+        ]
+
+
 @pytest.mark.parametrize("method", ["send", "recv"])
 async def test_it_is_opened_again_when_it_failed(method: str, channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = Broken((method, can.CanOperationError("unplugged")))
@@ -227,6 +242,13 @@ async def test_what_waiting_does_not_mend(error: Exception, channel: str, monkey
     with pytest.raises(TransportError, match=f"rtcan:virtual:{channel}: no ") as caught:
         await port_on(channel).run(RecordingListener(), lambda: None)
     assert caught.value.__cause__ is error
+
+
+async def test_a_driver_that_lacks_its_library(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """python-can's interface to Kvaser then lacks the functions that it calls."""
+    monkeypatch.setattr(can, "Bus", Broken(NameError("name 'canGetNumberOfChannels' is not defined")))
+    with pytest.raises(TransportError, match="the driver of virtual does not work here: is it installed?"):
+        await port_on(channel).run(RecordingListener(), lambda: None)
 
 
 def test_an_unknown_interface() -> None:
