@@ -247,7 +247,7 @@ async def test_what_waiting_does_not_mend(error: Exception, channel: str, monkey
 async def test_a_driver_that_lacks_its_library(channel: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """python-can's interface to Kvaser then lacks the functions that it calls."""
     monkeypatch.setattr(can, "Bus", Broken(NameError("name 'canGetNumberOfChannels' is not defined")))
-    with pytest.raises(TransportError, match="the driver of virtual does not work here: is it installed?"):
+    with pytest.raises(TransportError, match=r"the driver of virtual does not work here: is it installed\?"):
         await port_on(channel).run(RecordingListener(), lambda: None)
 
 
