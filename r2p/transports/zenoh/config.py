@@ -3,6 +3,7 @@
 The configuration consists of r2p's needs, then the user's file, then the URL. Later ones take precedence.
 """
 
+import contextlib
 import json
 import re
 import socket
@@ -127,6 +128,12 @@ def _network_name(text: str) -> str:
     return text
 
 
+def _file_name(text: str) -> str:
+    if not text:
+        raise ValueError("give the configuration's file, such as router.json5")
+    return text
+
+
 def _endpoint_text(text: str) -> str:
     protocol, _, address = text.partition("/")
     if not address:
@@ -148,7 +155,7 @@ _PARSERS: dict[str, Callable[[str], str]] = {
     "network": _network_name,
     "scouting": _one_of("on", "off"),
     "batching": _one_of("on", "off"),
-    "config": str,
+    "config": _file_name,
 }
 
 
@@ -177,6 +184,9 @@ _ANY_PORT: dict[str, object] = {  # for the other peers on the computer; without
     "listen/endpoints": ["tcp/[::]:0"],
     "listen/exit_on_failure": False,
 }
+
+_INVALID = "Invalid configuration: "
+"""How zenoh's text begins that contains a whole configuration."""
 
 _LOOPBACK = re.compile(r"(unix|serial|vsock)|[a-z]+/(localhost|127\.[0-9.]+|\[::1\]):")
 """Endpoints that other computers do not reach over a network."""
@@ -229,17 +239,21 @@ def connection_settings(config: "zenoh.Config") -> ConnectionSettings:
     """Return the endpoints that the session connects to and listens at, and its credentials."""
     tls = json.loads(config.get_json("transport/link/tls"))
     user = json.loads(config.get_json("transport/auth/usrpwd"))
-    names = Tls(
-        tls["root_ca_certificate"],
-        tls["connect_certificate"],
-        tls["connect_private_key"],
-        tls["verify_name_on_connect"] is not False,
-    )
+    root, check_name = tls["root_ca_certificate"], tls["verify_name_on_connect"] is not False
+    names = Tls(root, tls["connect_certificate"], tls["connect_private_key"], check_name)
     connects, listens = (json.loads(config.get_json(f"{what}/endpoints")) for what in ("connect", "listen"))
     mode = json.loads(config.get_json("mode")) or "peer"
     if isinstance(listens, dict):
         listens = listens.get(mode, [])
-    return ConnectionSettings(_texts(connects), names, user["user"], _texts(listens), client=mode == "client")
+    return ConnectionSettings(
+        _texts(connects),
+        names,
+        user["user"],
+        _texts(listens),
+        client=mode == "client",
+        listener_tls=Tls(root, tls["listen_certificate"], tls["listen_private_key"]),
+        users=user["dictionary_file"],
+    )
 
 
 def _from_file(options: ZenohOptions) -> "zenoh.Config":
@@ -286,8 +300,19 @@ def _may_choose(options: ZenohOptions) -> bool:
 def plain_text(error: Exception) -> str:
     """Return zenoh's text without positions in its source, and behind the position in the file, if it has one."""
     text = re.sub(r" at /\S+?\.rs:\d+\.?", "", str(error)).strip()
+    if text.startswith(_INVALID):
+        return _contradiction(text)
     found = re.search(r'msg: "(.*)", location: Some\(Location \{ line: (\d+), column: (\d+)', text, re.DOTALL)
     return f"line {found[2]}, column {found[3]}: {found[1]}" if found else text
+
+
+def _contradiction(text: str) -> str:
+    """Return which settings of a configuration contradict each other. zenoh prints all of it, but not which."""
+    with contextlib.suppress(ValueError, KeyError, TypeError):
+        user = json.loads(text.removeprefix(_INVALID))["transport"]["auth"]["usrpwd"]
+        if (user["user"] is None) != (user["password"] is None):
+            return "transport/auth/usrpwd needs both, a user and a password"
+    return "zenoh rejects the combination of its settings"
 
 
 def _texts(value: object) -> list[str]:

@@ -22,7 +22,14 @@ NOT_ADMITTED = "accepts the connection, but not this module"
 _STREAMS = {"tcp", "tls", "ws"}
 _DATAGRAMS = {"udp", "quic"}
 
+_WRONG_TIME = {9, 10}
+"""OpenSSL's codes for a certificate that is not valid yet, and for one that has expired."""
+
 _NO_TLS = "it does not speak TLS: connect to tcp/ instead of tls/, or correct the router's listen endpoint"
+
+
+class FilesUnusable(OSError):
+    """A file of zenoh's configuration does not contain what it should."""
 
 
 class Tls(msgspec.Struct, frozen=True):
@@ -35,9 +42,8 @@ class Tls(msgspec.Struct, frozen=True):
 
     def check_files(self) -> None:
         """Raise FileNotFoundError for a file that is not there."""
-        for path in (self.root, self.certificate, self.key):
-            if path is not None and not Path(path).is_file():
-                raise FileNotFoundError(f"there is no file {path}, which the configuration names")
+        for path in filter(None, (self.root, self.certificate, self.key)):
+            _check_exists(path)
 
 
 class ConnectionSettings(msgspec.Struct, frozen=True):
@@ -49,6 +55,9 @@ class ConnectionSettings(msgspec.Struct, frozen=True):
     listens: list[str] = []
     client: bool = False
     """Whether there is no session without a connection to an endpoint."""
+    listener_tls: Tls = Tls()
+    users: str | None = None
+    """The file of the users, and their passwords, that may connect."""
 
 
 class _ParsedEndpoint(msgspec.Struct, frozen=True):
@@ -75,7 +84,26 @@ class _ParsedEndpoint(msgspec.Struct, frozen=True):
 
 def diagnose_listening(settings: ConnectionSettings) -> str:
     """Return what keeps a session from listening, and a remedy, or an empty string. Blocks to look names up."""
-    return next(filter(None, map(_diagnose_listener, settings.listens)), "")
+    return _diagnose_files(settings) or next(filter(None, map(_diagnose_listener, settings.listens)), "")
+
+
+def _diagnose_files(settings: ConnectionSettings) -> str:
+    """Return what is wrong with the files that a listener needs, or an empty string."""
+    try:
+        settings.listener_tls.check_files()
+        _context(settings.listener_tls)
+        if settings.users is not None:
+            _check_exists(settings.users)
+            if not all(":" in line for line in Path(settings.users).read_text(encoding="utf-8").split()):
+                return f"{settings.users}: write a line USER:PASSWORD for each user, without blanks"
+    except (OSError, UnicodeError) as error:
+        return str(error)
+    return ""
+
+
+def _check_exists(path: str) -> None:
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no file {path}, which the configuration names")
 
 
 async def find_wrong_server(settings: ConnectionSettings) -> str:
@@ -211,21 +239,34 @@ async def _start_tls(reader: asyncio.StreamReader, writer: asyncio.StreamWriter,
 
 
 def _context(tls: Tls) -> ssl.SSLContext:
-    context = ssl.create_default_context(cafile=tls.root)
+    """Return a context with these files. Raises FilesUnusable."""
+    try:
+        context = ssl.create_default_context(cafile=tls.root)
+    except ssl.SSLError as error:
+        raise FilesUnusable(f"{tls.root} contains no certificate in PEM format") from error
     context.check_hostname = tls.check_name
     if tls.certificate is not None:
-        context.load_cert_chain(tls.certificate, tls.key)
+        _load_certificate(context, tls.certificate, tls.key)
     return context
+
+
+def _load_certificate(context: ssl.SSLContext, certificate: str, key: str | None) -> None:
+    try:
+        context.load_cert_chain(certificate, key)
+    except ssl.SSLError as error:
+        if "MISMATCH" in str(error):
+            raise FilesUnusable(f"{certificate} and {key} do not belong together: take the key of this one") from error
+        what = f"{certificate} has to contain a certificate, and {key or 'the same file'} its private key"
+        raise FilesUnusable(f"{what}, in PEM format") from error
 
 
 def _tls_text(error: ssl.SSLError, tls: Tls) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        check = (
-            f"{tls.root or 'root_ca_certificate'} has to be the authority that signed it, and the name in it the host's"
-        )
-        return f"its certificate is not accepted here ({error.verify_message}): {check}"
+        return f"its certificate is not accepted here ({error.verify_message}): {_verification_text(error, tls)}"
     reason = (error.reason or str(error)).replace("_", " ").lower()
     if "alert" in reason:  # the other end's
+        if "expired" in reason and tls.certificate:
+            return f"it does not accept our certificate: {tls.certificate} has expired; renew it"
         ours = (
             f"{tls.certificate} is not a certificate that it accepts"
             if tls.certificate
@@ -235,6 +276,13 @@ def _tls_text(error: ssl.SSLError, tls: Tls) -> str:
     if "wrong version" in reason or "record" in reason:
         return _NO_TLS
     return f"TLS fails ({reason})"
+
+
+def _verification_text(error: ssl.SSLCertVerificationError, tls: Tls) -> str:
+    if error.verify_code in _WRONG_TIME:
+        return "renew it, or set the clock of this computer (see: date)"
+    authority = tls.root or "root_ca_certificate"
+    return f"{authority} has to be the authority that signed it, and the name in it the host's"
 
 
 def _wrong_server_text(endpoint: _ParsedEndpoint, server: Server) -> str:

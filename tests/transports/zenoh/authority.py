@@ -18,14 +18,13 @@ class Authority:
         self.root = str(folder / "ca.pem")
         self._openssl("req", "-x509", "-newkey", "ec", *_EC, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=CA")
 
-    def sign(self, name: str, host: str = "localhost") -> tuple[str, str]:
-        """Certificate and key of a computer."""
+    def sign(self, name: str, host: str = "localhost", *, days: int = 30) -> tuple[str, str]:
+        """Certificate and key of a computer; with negative `days` it has expired."""
         key, request, certificate = f"{name}.key", f"{name}.csr", f"{name}.pem"
         (self._folder / "ext").write_text(f"subjectAltName=DNS:{host}\nbasicConstraints=CA:FALSE\n")
         self._openssl("req", "-newkey", "ec", *_EC, "-keyout", key, "-out", request, "-subj", f"/CN={name}")
-        self._openssl(
-            "x509", "-req", "-in", request, "-CA", "ca.pem", "-CAkey", "ca.key", "-out", certificate, "-extfile", "ext"
-        )
+        signed = ("-CA", "ca.pem", "-CAkey", "ca.key", "-out", certificate, "-extfile", "ext", "-days", str(days))
+        self._openssl("x509", "-req", "-in", request, *signed)
         return str(self._folder / certificate), str(self._folder / key)
 
     def _openssl(self, *args: str) -> None:

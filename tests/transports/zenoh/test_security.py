@@ -1,6 +1,7 @@
 """TLS, passwords and access control: they work, and who is refused is told why, and what to check."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,10 @@ class Secured:
 
 def tls(**names: str | bool) -> dict[str, Any]:
     return {"link": {"tls": names}}
+
+
+def auth(**values: str) -> dict[str, Any]:
+    return {"auth": {"usrpwd": values}}
 
 
 async def refused(url: str) -> str:
@@ -127,14 +132,69 @@ async def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 
 
 @guarded
+async def test_files_of_a_client_that_do_not_fit(tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "ca")
+    certificate, key = authority.sign("laptop")
+    other = authority.sign("other")[1]
+    net = Secured(tmp_path, "tls")
+    listener = tls(
+        listen_certificate=certificate,
+        listen_private_key=key,
+        root_ca_certificate=authority.root,
+        enable_mtls=True,
+    )
+    async with module("A", net.router(transport=listener)):
+        for root, mine, text in (
+            (authority.root, other, f"{certificate} and {other} do not belong together"),
+            (authority.root, certificate, f"{certificate} has to contain a certificate, and {certificate} its private"),
+            (key, key, f"{key} contains no certificate in PEM format"),
+        ):
+            files = {"root_ca_certificate": root, "connect_certificate": certificate, "connect_private_key": mine}
+            assert text in await refused(net.client(transport=tls(enable_mtls=True, **files)))
+
+
+@guarded
+async def test_certificates_that_have_expired(tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "ca")
+    certificate, key = authority.sign("router")
+    old, old_key = authority.sign("old", days=-1)
+    ours: dict[str, str | bool] = {"root_ca_certificate": authority.root, "enable_mtls": True}
+    net = Secured(tmp_path, "tls")
+    router = net.router(transport=tls(listen_certificate=certificate, listen_private_key=key, **ours))
+    async with module("A", router):
+        mine = tls(connect_certificate=old, connect_private_key=old_key, **ours)
+        assert f"{old} has expired; renew it" in await refused(net.client(transport=mine))
+    net = Secured(tmp_path, "tls")
+    async with module("A", net.router(transport=tls(listen_certificate=old, listen_private_key=old_key))):
+        text = await refused(net.client(transport=tls(root_ca_certificate=authority.root)))
+        assert "(certificate has expired): renew it, or set the clock" in text
+
+
+@guarded
+async def test_a_router_whose_files_do_not_fit(tmp_path: Path) -> None:
+    authority = Authority(tmp_path / "ca")
+    certificate, key = authority.sign("router")
+    other = authority.sign("other")[1]
+    blank = tmp_path / "users.txt"
+    blank.write_text("alice secret\n")
+    user = {"user": "robot", "password": "other"}
+    for scheme, transport, text in (
+        ("tls", tls(listen_certificate=certificate, listen_private_key=other), "do not belong together"),
+        ("tls", tls(listen_certificate="/nowhere.pem", listen_private_key=key), "there is no file /nowhere.pem"),
+        ("tcp", auth(**user, dictionary_file="/nowhere.txt"), "there is no file /nowhere.txt"),
+        ("tcp", auth(**user, dictionary_file=str(blank)), f"{blank}: write a line USER:PASSWORD for each user"),
+        ("tcp", auth(user="robot"), "transport/auth/usrpwd needs both, a user and a password"),
+    ):
+        with pytest.raises(r2p.TransportError, match=re.escape(text)):
+            async with module("A", Secured(tmp_path, scheme).router(transport=transport)):
+                pass
+
+
+@guarded
 async def test_passwords(tmp_path: Path) -> None:
     users = tmp_path / "users.txt"
     users.write_text("alice:secret\n")
     net = Secured(tmp_path)
-
-    def auth(**values: str) -> dict[str, Any]:
-        return {"auth": {"usrpwd": values}}
-
     router = net.router(transport=auth(dictionary_file=str(users), user="alice", password="secret"))
     await exchange(router, net.client(transport=auth(user="alice", password="secret")))
     async with module("A", router):
