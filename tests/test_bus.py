@@ -209,9 +209,17 @@ def test_an_invalid_topic_is_a_usage_error() -> None:
     assert "letters, digits and underscores" in result.stderr
 
 
-@pytest.mark.parametrize("via", [["memory:lab"], ["rtcan:can0", "rtcan:can1"]])
-async def test_the_commands_take_one_can_bus(via: list[str]) -> None:
-    with pytest.raises(UsageError, match="give one CAN bus"):
+@pytest.mark.parametrize(
+    ("via", "text"),
+    [
+        ([], "rtcan:can0$"),
+        (["memory:lab"], r"\(not memory:lab\)"),
+        (["rtcan:can0", "rtcan:can1"], r"\(not rtcan:can0 and rtcan:can1\)"),
+        (["sim:lab"], "sim: is a bus inside one program: r2p sim --bus"),
+    ],
+)
+async def test_the_commands_take_one_can_bus(via: list[str], text: str) -> None:
+    with pytest.raises(UsageError, match=rf"give one CAN bus, .*{text}"):
         async with listen(Settings(via=via)):
             pass
 

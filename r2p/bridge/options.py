@@ -32,6 +32,8 @@ _SURE = 8  # intervals after which a period counts as known
 
 _PREFIX = re.compile(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_")
 
+_TOPICS = re.compile(r"[A-Za-z0-9_*?\[\]!-]+(/[A-Za-z0-9_*?\[\]!-]+)?")
+
 IP = frozenset({"tcp", "tcp-listen", "zenoh"})
 """Schemes of links that any computer of an IP network may reach: REBOOT and the like need permission there."""
 
@@ -77,12 +79,17 @@ class BridgeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parse_rule(text: str) -> Rule:
-    """Read a rule `TOPIC[@FROM[>TO]]`. Raises Error for an empty part."""
+    """Read a rule `TOPIC[@FROM[>TO]]`. Raises Error for an empty part, and for a pattern that no topic can match."""
     topic, at, links = text.partition("@")
     source, arrow, target = links.partition(">")
-    if not topic or (at and not source) or (arrow and not target):
+    if not is_topic_pattern(topic) or (at and not source) or (arrow and not target):
         raise Error(f"{text!r}: write TOPIC, TOPIC@FROM or TOPIC@FROM>TO; * stands for anything")
     return Rule(topic, source or "*", target or "*")
+
+
+def is_topic_pattern(text: str) -> bool:
+    """Return whether topics can match a pattern: it has their characters or wildcards, and at most one `/`."""
+    return _TOPICS.fullmatch(text) is not None
 
 
 def check_prefix(text: str) -> str:

@@ -16,7 +16,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from r2p.names import module_name_from
+from r2p.errors import InvalidName
+from r2p.names import module_name, module_name_from, topic_name
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -63,6 +64,8 @@ class Settings(msgspec.Struct):
     module: str | None = None
     types: dict[str, str] = {}
     remap: dict[str, str] = {}
+    via_source: str = "--via"
+    """Where `via` is from, for errors."""
 
 
 class Setting(msgspec.Struct, frozen=True):
@@ -84,7 +87,7 @@ def settings(via: list[str] | None = None, path: Path | None = None, *, tool: bo
     urls, source = _choose_via(via, path, file)
     if tool and source != "--via":
         urls = [_local_peer(url) for url in urls]
-    return Settings(urls, file.module, _types(path, file), file.remap)
+    return Settings(urls, file.module, _types(path, file), file.remap, source)
 
 
 def list_settings(via: list[str] | None = None, path: Path | None = None) -> list[Setting]:
@@ -188,9 +191,18 @@ def _parse(path: Path, contents: dict[str, Any]) -> ConfigFile:
     try:
         file = _convert({key: value for key, value in contents.items() if key != "launch"}, ConfigFile, "")
         file.launch = dict(_entries(contents.get("launch", {})))
-    except ValueError as error:
+        _check_names(file)
+    except (ValueError, InvalidName) as error:
         raise UsageError(f"{path}: {error}") from error
     return file
+
+
+def _check_names(file: ConfigFile) -> None:
+    """Raise InvalidName for a name that no module or topic can have."""
+    if file.module is not None:
+        module_name(file.module)
+    for topic in (*file.types, *file.remap, *file.remap.values()):
+        topic_name(topic)
 
 
 def _entries(launch: Any) -> Iterator[tuple[str, LaunchTable]]:

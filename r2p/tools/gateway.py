@@ -19,7 +19,7 @@ import typer
 
 import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics
-from r2p.bridge.options import check_prefix, is_link, parse_rule
+from r2p.bridge.options import check_prefix, is_link, is_topic_pattern, parse_rule
 from r2p.msg import GatewayStatus
 from r2p.names import module_name_from
 from r2p.tools.options import Format, Via, class_choice, hertz
@@ -30,6 +30,9 @@ logger = logging.getLogger("r2p.gateway")
 
 TOPIC = "gateway"
 """The topic of a gateway's counters, as GatewayStatus."""
+
+_LINES = {"tcp", "tcp-listen", "serial"}
+"""Schemes of debug lines, which do not carry the class of a message."""
 
 _ROWS = 30  # routes that the table on a terminal shows at most
 _SUMMARY = 60  # seconds between two log lines, where there is no terminal
@@ -90,7 +93,7 @@ async def command(
     chosen = settings(via)
     if len(chosen.via) < 2 and not any(url.startswith("tcp-listen:") for url in chosen.via):
         raise UsageError("a gateway needs at least two links, as in --via rtcan:can0 --via zenoh:")
-    check_urls(chosen.via)
+    check_urls(chosen.via, chosen.via_source)
     if len(set(chosen.via)) < len(chosen.via):
         raise UsageError("the same link is given twice: a gateway joins different networks")
     options = BridgeOptions(
@@ -101,9 +104,10 @@ async def command(
         prefix=_prefix(prefix),
         prefix_on=_links(prefix_on, "--prefix-on", chosen.via) or ("zenoh",),
         classes={topic: class_choice(value) for topic, value in _pairs(class_, "--class", "TOPIC=CLASS")},
-        reserve=tuple(reserve or ()),
+        reserve=tuple(_topic(each, "--reserve") for each in reserve or ()),
         allow_control=allow_control,
     )
+    _check_effect(options, chosen.via)
     own = name or chosen.module or f"GW_{module_name_from(socket.gethostname())[:4]}"
     await serve(own, chosen.via, options, Output(format), quiet=format is None)
 
@@ -135,6 +139,21 @@ def _links(given: _Rules, option: str, via: list[str]) -> tuple[str, ...]:
     return tuple(given or ())
 
 
+def _check_effect(options: BridgeOptions, via: list[str]) -> None:
+    """Raise UsageError for an option that has no effect on any of the links."""
+    kinds = {url.partition(":")[0] for url in via}
+    if options.prefix and not any(_may_match(each, url) for each in options.prefix_on for url in via):
+        raise UsageError(
+            f"--prefix {options.prefix} is for zenoh links, and there is none: choose with --prefix-on LINK"
+        )
+    if options.prefix_on != ("zenoh",) and not options.prefix:
+        raise UsageError(f"--prefix-on {options.prefix_on[0]} needs a --prefix, such as robot1/")
+    if options.reserve and kinds <= {*_LINES, "zenoh", "memory"}:
+        raise UsageError("--reserve is for slots on RTCAN, and there is no such link: add --via rtcan:can0")
+    if options.classes and kinds.isdisjoint(_LINES):
+        raise UsageError(f"--class is for debug lines, and there is none: the links are {', '.join(via)}")
+
+
 def _may_match(pattern: str, url: str) -> bool:
     """Return whether a link of this URL can have such a name; that of a server's client is known only later."""
     name = _link_name(url)
@@ -159,7 +178,13 @@ def _pairs(given: _Rules, option: str, form: str) -> Iterable[tuple[str, str]]:
         topic, equals, value = text.partition("=")
         if not (topic and equals and value):
             raise UsageError(f"{option} {text}: write it as {form}")
-        yield topic, value
+        yield _topic(topic, option), value
+
+
+def _topic(pattern: str, option: str) -> str:
+    if not is_topic_pattern(pattern):
+        raise UsageError(f"{option}: no topic can match {pattern!r}: write a name, or a pattern such as enc*")
+    return pattern
 
 
 class Row(msgspec.Struct, frozen=True):

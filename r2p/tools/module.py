@@ -226,8 +226,10 @@ def _timeout_text(session: Session, command: r2p.Command, name: str, timeout: fl
     text = f"{name} did not confirm {command.name} in {timeout:g} s: it is {view.state}, last seen {view.age:.1f} s ago"
     if command is r2p.Command.REBOOT and view.rebooted:
         text += "; it had been rebooted before, so its ALIVE may not show it"
-    elif view.link.partition(":")[0] in {"tcp", "zenoh"}:
+    elif command is not r2p.Command.STOP and view.link.partition(":")[0] in {"tcp", "zenoh"}:
         text += "; if a gateway is in between, it must have --allow-control"
+    elif view.link.startswith("zenoh"):
+        text += "; does the access control of a zenoh router deny it?"
     return text
 
 

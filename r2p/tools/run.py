@@ -67,7 +67,7 @@ async def command(
     A crash ends only that node; the command then exits with 1.
     """
     chosen = settings(via)
-    check_urls(chosen.via)
+    check_urls(chosen.via, chosen.via_source)
     programs = load(functions)
     priorities = _parse_priorities(priority or (), programs)
     names = chosen.remap | _parse_remap(remap or ())

@@ -69,15 +69,18 @@ class Interrupted(Exception):
     """A signal ended a command before it was done: exit code 130, so that `r2p wait ... && ...` does not go on."""
 
 
-def check_urls(via: list[str]) -> None:
-    """Raise UsageError for a URL of an unknown transport or with invalid options; open nothing."""
+def check_urls(via: list[str], source: str = "--via") -> None:
+    """Raise UsageError for a URL of an unknown transport or with invalid options; open nothing.
+
+    The error names the `source` of the URLs, as a variable or a file is easily forgotten.
+    """
     for url in via:
         try:
             open_transport(url)
         except r2p.TransportError as error:
             if isinstance(error.__cause__, ImportError):  # the URL is valid, but this installation lacks a package
                 raise
-            raise UsageError(str(error)) from error
+            raise UsageError(str(error) if source == "--via" else f"{source}: {error}") from error
 
 
 def _check_descriptors() -> None:
@@ -308,7 +311,7 @@ async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> A
     if not settings.via:
         notify("no network: this tool sees only itself; give --via tcp:HOST:PORT or set R2P_VIA")
     alphabet = string.ascii_lowercase + string.digits
-    check_urls(settings.via)
+    check_urls(settings.via, settings.via_source)
     module_name = "_" + "".join(random_of(asyncio.get_running_loop()).choices(alphabet, k=6))
     async with r2p.Module(module_name, via=settings.via, observer=True, watchdog=False) as module:
         yield Session(module, settings, name=name, verbose=verbose)

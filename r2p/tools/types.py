@@ -67,8 +67,12 @@ class Types:
 
     def stated(self, topic: str, given: str | None) -> type[r2p.Message] | None:
         """Return the type that the user states: `given` by --type, or in r2p.toml. Raises UsageError."""
-        text = given or self._by_topic.get(topic)
-        return None if text is None else load_type(text)
+        if given:
+            return load_type(given)
+        try:
+            return load_type(self._by_topic[topic]) if topic in self._by_topic else None
+        except UsageError as error:
+            raise UsageError(f"[types] {topic}: {error}") from error
 
     def of(self, view: r2p.TopicView) -> type[r2p.Message] | None:
         """Return the type of a topic if it is stated or known. Raises UsageError for an invalid name in r2p.toml."""

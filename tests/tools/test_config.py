@@ -15,6 +15,7 @@ import pytest
 import r2p
 from r2p.tools.config import ConfigFile, LaunchTable, Settings, UsageError, check_owned, list_settings, settings
 from r2p.tools.run import load_module
+from r2p.tools.session import check_urls
 
 
 @pytest.fixture(autouse=True)
@@ -55,13 +56,37 @@ def test_a_tool_connects_to_where_the_program_of_the_same_file_listens(
     assert settings([listens], tool=True).via == [listens]
 
 
+@pytest.mark.parametrize(
+    ("contents", "text"),
+    [
+        ('module = "a_long_name"', "r2p.toml: module name 'a_long_name' has 11 characters"),
+        ('[remap]\nencoder = "a/b/c"', "r2p.toml: topic name 'a/b/c': use letters"),
+        ('[types]\n"my leds" = "Led"', "r2p.toml: topic name 'my leds': use letters"),
+    ],
+)
+def test_names_that_nothing_can_have(tmp_path: Path, contents: str, text: str) -> None:
+    (tmp_path / "r2p.toml").write_text(contents)
+    with pytest.raises(UsageError, match=text):
+        settings()
+
+
+def test_an_error_in_a_url_names_where_it_is_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "r2p.toml").write_text('via = "tpc:robot"')
+    with pytest.raises(UsageError, match=r"^r2p.toml: unknown transport 'tpc'"):
+        check_urls(settings().via, settings().via_source)
+    monkeypatch.setenv("R2P_VIA", "tcp:")
+    with pytest.raises(UsageError, match=r"^R2P_VIA: tcp:: give the other end's address"):
+        check_urls(settings().via, settings().via_source)
+    with pytest.raises(UsageError, match=r"^transport 'robot': give it as SCHEME:ADDRESS"):
+        check_urls(["robot"], settings(["robot"]).via_source)
+
+
 def test_what_the_file_holds(tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").write_text(
         'via = ["tcp:a", "tcp:b"]\nmodule = "PC1"\n[types]\nleds = "r2p.msg:Led"\n[remap]\nencoder = "enc1"\n'
     )
-    assert settings() == Settings(
-        via=["tcp:a", "tcp:b"], module="PC1", types={"leds": "r2p.msg:Led"}, remap={"encoder": "enc1"}
-    )
+    types, remap = {"leds": "r2p.msg:Led"}, {"encoder": "enc1"}
+    assert settings() == Settings(["tcp:a", "tcp:b"], "PC1", types, remap, via_source="r2p.toml")
 
 
 @pytest.mark.parametrize(
@@ -135,7 +160,7 @@ def test_a_working_directory_that_is_gone_has_no_file(tmp_path: Path) -> None:
     os.chdir(gone)
     gone.rmdir()
     try:
-        assert settings() == Settings()
+        assert settings() == Settings(via_source="default: local only")
         with pytest.raises(UsageError, match="the working directory does not exist any more"):
             load_module("robot")
         with pytest.raises(UsageError, match=re.escape("there is no file robot.py")):

@@ -154,5 +154,24 @@ def test_mistakes_are_told() -> None:
             Policy(BridgeOptions(prefix=prefix))
     with pytest.raises(UsageError, match="--rate-limit leds: write it as TOPIC=HZ"):
         list(gateway._pairs(["leds"], "--rate-limit", "TOPIC=HZ"))
+    with pytest.raises(UsageError, match="--rate-limit: no topic can match 'leds@tcp'"):
+        list(gateway._pairs(["leds@tcp=5"], "--rate-limit", "TOPIC=HZ"))
     with pytest.raises(typer.BadParameter, match="periodic:10ms"):
         class_choice("often")
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (BridgeOptions(prefix="robot1/"), "--prefix robot1/ is for zenoh links, and there is none"),
+        (BridgeOptions(prefix_on=("memory:lab",)), "--prefix-on memory:lab needs a --prefix"),
+        (BridgeOptions(reserve=("imu",)), "--reserve is for slots on RTCAN, and there is no such link"),
+        (BridgeOptions(classes={"imu": class_choice("nrt")}), "--class is for debug lines, and there is none"),
+    ],
+)
+def test_options_without_effect(options: BridgeOptions, text: str) -> None:
+    with pytest.raises(UsageError, match=text):
+        gateway._check_effect(options, ["memory:robot", "memory:lab"])
+    here = ["memory:lab", "tcp:robot", "sim:bus", "zenoh:"]
+    if options.prefix_on == ("zenoh",):
+        gateway._check_effect(options, here)

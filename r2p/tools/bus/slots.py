@@ -26,6 +26,7 @@ _UNUSED = "reserved but not used: no subscriber, or the owner is gone"
 _SYNC_TIMEOUT = 3.0  # s
 
 _MESSAGE = re.compile(r"(?P<name>[^:@]+):(?P<size>\d+)@(?P<rate>.+)")
+_RATE = re.compile(r"([-+.0-9e]*)(k?)hz")
 _CYCLE = 0.010  # s, as in the thesis
 _SHORTEST, _LONGEST = 1e-9, 1e9  # s; representable in ns, and above it surely a typing error
 
@@ -179,10 +180,8 @@ def parse(text: str) -> Wanted:
 def _period(text: str) -> float:
     """Return the period in seconds of a rate or a period; a number without a unit is ambiguous."""
     lower = text.lower()
-    if lower.endswith("khz"):
-        return 1e-3 / hertz(lower.removesuffix("khz"))
-    if lower.endswith("hz"):
-        return 1 / hertz(lower.removesuffix("hz"))
+    if rate := _RATE.fullmatch(lower):
+        return 1 / hertz(rate[1]) / (1000 if rate[2] else 1)
     if not lower.endswith("s"):
         raise typer.BadParameter(f"{text!r}: write a rate as in 200Hz, or a period as in 5ms")
     return seconds(text)

@@ -31,11 +31,16 @@ async def listen(settings: Settings) -> AsyncIterator[BusMonitor]:
     """Open the one `rtcan:` URL of the settings for listening. Raises UsageError unless there is exactly one."""
     urls = [url for url in settings.via if url.startswith("rtcan:")]
     if len(urls) != 1:
-        given = " and ".join(urls or settings.via) or "none"
-        raise UsageError(f"give one CAN bus, as in --via rtcan:can0 (not {given})")
-    check_urls(urls)
+        raise UsageError(f"give one CAN bus, as in --via rtcan:can0{_instead(urls or settings.via)}")
+    check_urls(urls, settings.via_source)
     async with BusMonitor(urls[0], on_status=notify) as bus:
         yield bus
+
+
+def _instead(urls: list[str]) -> str:
+    if any(url.startswith("sim:") for url in urls):
+        return "; sim: is a bus inside one program: r2p sim --bus reports its load"
+    return f" (not {' and '.join(urls)})" if urls else ""
 
 
 async def load(

@@ -132,7 +132,7 @@ def check_network(path: Path, entries: list[Entry], settings: Settings) -> None:
                 f"{path}: [launch.{entry.name}] ready: no network to look for {entry.condition} on; "
                 "set via at the top of the file, or R2P_VIA"
             )
-    check_urls(settings.via)
+    check_urls(settings.via, settings.via_source)
 
 
 async def wait_once(entries: list[Entry], name: str, settings: Settings) -> None:
