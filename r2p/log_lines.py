@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
+from r2p.errors import Error
 from r2p.units import SECOND
 
 
@@ -88,7 +89,7 @@ class LineLimit:
 DEBUG = "R2P_DEBUG"
 """The environment variable that, set to anything, makes tracebacks complete and the default level DEBUG."""
 
-_INTERNAL = tuple(str(Path(file).parent) + os.sep for file in (__file__, asyncio.__file__))
+_INTERNAL = (*(str(Path(file).parent) + os.sep for file in (__file__, asyncio.__file__)), "uvloop/")
 
 
 def debugging() -> bool:
@@ -102,7 +103,7 @@ def internal(filename: str) -> bool:
 
 
 def short_traceback(error: BaseException) -> str:
-    """Format an exception with its traceback, without frames of r2p and asyncio unless there are no others.
+    """Format an exception with its traceback, without frames of r2p and asyncio unless a bug leaves no others.
 
     While `debugging`, all frames stay.
     """
@@ -117,7 +118,7 @@ def _shorten(report: traceback.TracebackException | None, error: BaseException |
     if report is None or error is None:
         return
     own = [frame for frame in report.stack if not internal(frame.filename)]
-    if own:
+    if own or isinstance(error, Error):  # those of r2p say what to do
         report.stack[:] = own
     if isinstance(error, TimeoutError) and isinstance(error.__cause__, asyncio.CancelledError):
         report.__cause__ = None  # how asyncio.timeout works inside
@@ -189,7 +190,7 @@ class LineFormatter(logging.Formatter):
         top, _, rest = record.name.partition(".")
         module, _, node = rest.partition(".")
         where = record.name if top != "r2p" else f"{module}/{node}" if node else "r2p"
-        text = printable(record.getMessage(), "\n\t")
+        text = printable(_message(record), "\n\t")
         if not self._times:
             level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
             line = wrapped(f"{where}: {level}{text}", sys.stderr)
@@ -201,6 +202,15 @@ class LineFormatter(logging.Formatter):
         if record.exc_info:  # as it is: a traceback quotes code
             line += "\n" + printable(record.exc_text or self.formatException(record.exc_info), "\n\t")
         return line
+
+
+def _message(record: logging.LogRecord) -> str:
+    """Return the text of a record, also if its arguments do not fit: `logging` would print 40 lines about that."""
+    try:
+        return record.getMessage()
+    except (TypeError, ValueError, KeyError) as error:
+        place = f"{record.filename}, line {record.lineno}"
+        return f"{record.msg} {record.args} (these arguments do not fit the format: {error}; {place})"
 
 
 def _coloured(text: str, level: int) -> str:

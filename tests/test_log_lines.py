@@ -9,7 +9,18 @@ from collections.abc import Iterator
 
 import pytest
 
-from r2p.log_lines import LineFormatter, LineLimit, StderrHandler, default_logging, get_logger, printable, wrapped
+import r2p
+from r2p import log_lines
+from r2p.log_lines import (
+    LineFormatter,
+    LineLimit,
+    StderrHandler,
+    default_logging,
+    get_logger,
+    printable,
+    short_traceback,
+    wrapped,
+)
 
 
 @pytest.mark.parametrize(
@@ -72,6 +83,21 @@ def test_a_line_begins_with_its_node_and_may_have_a_time(monkeypatch: pytest.Mon
     assert "\x1b" not in timed.format(info)
     monkeypatch.setenv("NO_COLOR", "1")
     assert "\x1b" not in timed.format(warning)
+
+
+def test_arguments_that_do_not_fit_the_format_are_one_line() -> None:
+    record = logging.LogRecord("r2p.PC1.arm", logging.INFO, "/robot/arm.py", 7, "speed", (3,), None)
+    text = LineFormatter().format(record)
+    assert text.startswith("PC1/arm: speed (3,) (these arguments do not fit the format: not all arguments")
+    assert text.endswith("; arm.py, line 7)")
+
+
+def test_an_error_of_r2p_needs_no_frames_of_r2p_and_a_bug_does() -> None:
+    for error, frames in ((r2p.Error("what to do"), 0), (ValueError("a bug"), 1)):
+        with pytest.raises(type(error)) as caught:
+            exec(compile("raise error", log_lines.__file__, "exec"), {"error": error})  # noqa: S102 - the line above
+        caught.value.__traceback__ = caught.tb.tb_next  # without that of the test
+        assert short_traceback(caught.value).count("File ") == frames
 
 
 @contextlib.contextmanager

@@ -275,6 +275,8 @@ def _not_a_class(value: object) -> str:
         return f"{show(value)} is a message, not its class: pass {type(value).__name__}"
     if isinstance(value, type) and get_origin(value) is None:
         return f"{value.__name__} is not a message class: write `class {value.__name__}(r2p.Message)`"
+    if isinstance(value, str):
+        return f"{show(value)} is not a message class: the topic comes first, then its class"
     return f"{show(value)} is not a message class: subclass r2p.Message"
 
 

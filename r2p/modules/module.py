@@ -141,8 +141,14 @@ class Module:
         """End the nodes, then the links. Raises NodeCrashed if nodes crashed; another error on its way gets a note of
         each crash.
         """
+        never_ran = [name for name, each in self._supervisors.items() if each.never_ran]
         if self._tasks is not None:
             await self._close(self._tasks)
+        if never_ran and error is None:
+            names, them = ", ".join(never_ran), f"module {self.name}"
+            logger.warning(
+                "%s closed before %s ran: end its `async with` block with `await module.wait()`", them, names
+            )
         crashed = list(self._crashes.values())
         if crashed and (error is None or isinstance(error, asyncio.CancelledError)):
             nodes = f"node{'s'[: len(crashed) - 1]} {', '.join(self._crashes)}"

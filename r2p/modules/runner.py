@@ -4,12 +4,14 @@ The first SIGINT or SIGTERM cancels the program: it ends its nodes, says good-by
 one ends the process at once, as does the first one if the program is still running GRACE seconds later.
 
 A program that `run` starts logs to stderr unless it has configured logging. Where nothing catches what `run` raises,
-Python prints it as one line: what crashed is in the log already, and a wrong name or URL is not in the stack.
+Python prints it as one line: what crashed is in the log already, and a wrong name or URL is not in the stack. What
+`run_main` raises is printed without the frames of r2p and asyncio.
 """
 
 import asyncio
 import contextlib
 import functools
+import inspect
 import os
 import signal
 import sys
@@ -19,7 +21,7 @@ from types import FrameType, TracebackType
 from typing import Any, Self, TypeVar
 
 from r2p.errors import Error, NodeCrashed
-from r2p.log_lines import debugging, default_logging, printable
+from r2p.log_lines import debugging, default_logging, printable, short_traceback
 from r2p.modules.module import Module
 from r2p.modules.supervisor import NodeFunction, check_function, name_of
 from r2p.names import node_name
@@ -62,7 +64,7 @@ def run(
     try:
         run_main(main)
     except Error as error:
-        _print_in_one_line(error)
+        _print_shortly(error, one_line=True)
         raise
 
 
@@ -89,28 +91,39 @@ def _pair(each: NodeFunction | tuple[str, NodeFunction], name: str | None) -> tu
     return each
 
 
-def _print_in_one_line(error: Error) -> None:
-    """Let Python print this error, if it ends the program, as one line; hooks of the program stay as they are."""
+def _print_shortly(error: Exception, *, one_line: bool) -> None:
+    """Let Python print this error, if it ends the program, as one line, or without the frames of r2p and asyncio.
+
+    Hooks of the program stay as they are.
+    """
     if sys.excepthook is sys.__excepthook__ and not debugging():
         sys.excepthook = _excepthook
-    error.__r2p_one_line__ = True  # type: ignore[attr-defined]  # of this error only: others are the program's
+    with contextlib.suppress(AttributeError):  # of this error only: others are the program's
+        error.__r2p_one_line__ = one_line  # type: ignore[attr-defined]
 
 
 def _excepthook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    if not hasattr(error, "__r2p_one_line__"):
+    one_line = getattr(error, "__r2p_one_line__", None)
+    if one_line is None:
         sys.__excepthook__(kind, error, trace)
         return
-    text = error.message if isinstance(error, NodeCrashed) else str(error)
+    text = f"r2p: {error.message if isinstance(error, NodeCrashed) else error}" if one_line else short_traceback(error)
     with contextlib.suppress(OSError):  # stderr is closed
-        print(printable(f"r2p: {text}", "\n\t"), file=sys.stderr, flush=True)  # noqa: T201 - as Python itself
+        print(printable(text, "\n\t"), file=sys.stderr, flush=True)  # noqa: T201 - as Python itself
 
 
 def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
     """Run `main()` on the fastest event loop, and return its result; None if SIGINT or SIGTERM ended it.
 
-    Use it instead of `asyncio.run` for programs that open modules themselves: it logs as `run` does, and a NodeCrashed
-    that nothing catches is one line. Raises Error where an event loop runs already.
+    Use it instead of `asyncio.run` for programs that open modules themselves: it logs as `run` does, a NodeCrashed that
+    nothing catches is one line, and tracebacks end at the program's own code. Raises Error where an event loop runs
+    already, and for the coroutine `main()` instead of the function.
     """
+    if inspect.iscoroutine(main):
+        main.close()  # else Python warns that it was never awaited
+        error = Error(f"r2p.run_main takes the function itself: write r2p.run_main({main.__name__}), without ()")
+        _print_shortly(error, one_line=False)
+        raise error
     if asyncio._get_running_loop() is not None:  # noqa: SLF001 - as get_running_loop, without its RuntimeError
         raise Error(
             'an event loop runs already: in a file for `r2p run`, call r2p.run under `if __name__ == "__main__":`; '
@@ -130,8 +143,8 @@ def run_main(main: Callable[[], Awaitable[T]]) -> T | None:
     try:
         with default_logging(), _Signals() as signals, asyncio.Runner(loop_factory=loop_factory()) as runner:
             return runner.run(guarded())
-    except NodeCrashed as error:  # what crashed is in the log already
-        _print_in_one_line(error)
+    except Exception as error:
+        _print_shortly(error, one_line=isinstance(error, NodeCrashed))  # what crashed is in the log already
         raise
 
 

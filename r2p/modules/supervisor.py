@@ -64,6 +64,13 @@ def _uncallable(function: Any, args: tuple[object, ...], reason: str) -> str:
 
 def _not_a_coroutine_function(function: object) -> str:
     """Return what to write instead of this function or class: classes are what programs for ROS would pass."""
+    if inspect.iscoroutine(function):
+        function.close()  # else Python warns that it was never awaited
+        return f"{function.__name__}() was called: pass the function itself, {function.__name__} without ()"
+    if inspect.isasyncgenfunction(function):
+        return f"{function.__name__} contains `yield`: a node publishes messages, it does not yield them"
+    if isinstance(function, list):
+        return "a list is not a coroutine function: pass the functions one by one, or *functions"
     if isinstance(function, type):
         return f"class {function.__name__} is not a coroutine function: pass a method, {function.__name__}().METHOD"
     name = getattr(function, "__name__", None) if inspect.isroutine(function) else None
@@ -105,6 +112,12 @@ class Supervisor:
         self._task: asyncio.Task[None] | None = None
         self._attempt: _Attempt | None = None
         self._stopping = False
+        self._begun = False
+
+    @property
+    def never_ran(self) -> bool:
+        """Return whether the node was started, but did not get to its first step."""
+        return self._task is not None and not self._begun
 
     @property
     def running(self) -> bool:
@@ -158,6 +171,7 @@ class Supervisor:
         ended(self)
 
     async def _run(self) -> None:
+        self._begun = True
         loop = asyncio.get_running_loop()
         backoff = Backoff(random_of(loop), first=_FIRST_RESTART, longest=_LONGEST_RESTART)
         while True:

@@ -249,7 +249,7 @@ def test_a_class_that_refuses_zero() -> None:
         (msgspec.Struct, "Struct is not a message class: write"),
         (Led(), r"Led\(led=0, value=0\) is a message, not its class: pass Led"),
         (None, "None is not a message class: subclass r2p.Message"),
-        ("Led", "'Led' is not a message class: subclass r2p.Message"),
+        ("Led", "'Led' is not a message class: the topic comes first"),
         (tuple[u8, u8], "is not a message class: subclass r2p.Message"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import socket
@@ -408,3 +409,24 @@ async def test_crashes_do_not_disturb_links() -> None:
             assert await leds.fetch(1.0) == led(1)
 
     assert len(await crashes(main)) == 1
+
+
+@pytest.mark.virtual_time
+async def test_a_module_that_closes_before_its_nodes_run_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    async def ran(node: r2p.Node) -> None:
+        await asyncio.Event().wait()
+
+    async with r2p.Module("PC1") as module:
+        module.start(ran)
+        await asyncio.sleep(0)
+    assert not caplog.messages
+    async with r2p.Module("PC1") as module:
+        module.start(ran)
+        module.start(ran, name="other")
+    (text,) = caplog.messages
+    assert text == "module PC1 closed before ran, other ran: end its `async with` block with `await module.wait()`"
+    with contextlib.suppress(LookupError):
+        async with r2p.Module("PC1") as module:
+            module.start(ran)
+            raise LookupError
+    assert caplog.messages == [text]

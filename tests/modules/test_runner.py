@@ -20,6 +20,7 @@ import r2p
 from r2p.modules.runner import loop_factory, run_main
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
@@ -258,6 +259,11 @@ async def talk() -> None:
     """Lack the node."""
 
 
+async def silent(node: r2p.Node) -> AsyncIterator[None]:
+    """Yield, as a node can't."""
+    yield
+
+
 class Robot:
     async def drive(self, node: r2p.Node) -> None:
         """Be a node."""
@@ -288,6 +294,8 @@ class Robot:
             r2p.Error,
             "stop() does not take its node: write `async def stop(self, node: r2p.Node)`",
         ),
+        ([[wink, line_follower]], None, r2p.Error, "a list is not a coroutine function: pass the functions one by one"),
+        ([silent], None, r2p.Error, "silent contains `yield`: a node publishes messages"),
         ([print], None, r2p.Error, "print is not a coroutine function: write `async def print(node: r2p.Node)`"),
     ],
 )
@@ -307,6 +315,28 @@ def test_what_can_not_run_is_one_line(
     assert capsys.readouterr().err == f"r2p: {caught.value}\n"
     sys.excepthook(LookupError, LookupError("other"), None)
     assert capsys.readouterr().err == "LookupError: other\n"
+
+
+def test_a_function_that_was_called_is_passed_without_brackets() -> None:
+    with pytest.raises(r2p.Error, match=r"talk\(\) was called: pass the function itself, talk without \(\)"):
+        r2p.run(talk())  # type: ignore[arg-type]
+    with pytest.raises(r2p.Error, match=r"takes the function itself: write r2p.run_main\(talk\), without \(\)"):
+        run_main(talk())  # type: ignore[arg-type]
+
+
+def test_a_traceback_of_run_main_ends_at_the_code_of_the_program(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def main() -> None:
+        r2p.Module("PC1").start(wink)
+
+    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+    with pytest.raises(r2p.Closed) as caught:
+        run_main(main)
+    sys.excepthook(caught.type, caught.value, caught.tb)
+    lines = capsys.readouterr().err.splitlines()
+    assert all(__file__ in line for line in lines if "File " in line)
+    assert lines[-1] == "r2p.errors.Closed: module PC1 is not open: use it in an `async with` block"
 
 
 def test_a_hook_of_the_program_stays_and_debugging_keeps_the_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

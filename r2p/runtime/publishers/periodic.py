@@ -14,6 +14,7 @@ Reports of a miss, all by `_miss` or `_report` of the base:
 from typing import Generic
 
 from r2p.clock import Ticker
+from r2p.errors import MessageError
 from r2p.messages import Layout
 from r2p.runtime.backpressure import GIVEN_UP, NO_ROOM, PendingDelivery, Sink
 from r2p.runtime.publishers.base import BasePublisher, M, where
@@ -134,6 +135,10 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
         elif late > self.period * SECOND / _LATE_SHARE:
             self.late += 1
             self._report(Missed(self.topic, "sent late", where([sink]), late / SECOND), self._on_late)
+
+    def _wrong_type(self, message: object) -> MessageError:
+        error = super()._wrong_type(message)
+        return MessageError(f"{error}: its fill has to return a {self.type.__name__}, or None to skip a period")
 
     def _give_up(self, reason: str) -> None:
         """Withdraw messages that still wait from the period before: they are stale."""
