@@ -340,6 +340,8 @@ class Log(Message):
     """Time of the record, UTC."""
     level: u8 = 0
     """As in Python's logging: 10 debug, 20 info, 30 warning, 40 error, 50 critical."""
+    module: Annotated[str, Len(7)] = ""
+    """The module of the node, as a debug line does not say who sent a message."""
     node: Annotated[str, Len(8)] = ""
     """The node that logged it."""
     text: Annotated[str, Len(128)] = ""

@@ -23,6 +23,8 @@ MODULE_PATH = r"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,24}"
 
 MANAGEMENT = "R2P"
 """The topic of management messages."""
+LOG = "log"
+"""The topic on which each r2p module publishes the log records of its nodes."""
 LOADER_PREFIX = "BOOT_"
 """The topics of boot loaders begin with this; the module's name follows."""
 

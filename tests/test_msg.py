@@ -50,7 +50,7 @@ SIZES = {
     "Odometry": 24,
     "StampedOdometry": 32,
     "Text": 64,
-    "Log": 145,
+    "Log": 152,
     "GatewayStatus": 96,
     "Timestamp": 8,
 }
@@ -90,7 +90,7 @@ def test_is_documented(cls: type[Message]) -> None:
         (Velocity3, "c9e1a1a464f51d66"),
         (StampedIMURaw9, "44137799cf5d0152"),
         (Odometry, "075f2f25b6e57f3e"),
-        (Log, "53518cff02425b99"),
+        (Log, "13c1319ee84036c3"),
     ],
 )
 def test_fingerprints_are_the_same_for_ever(cls: type[Message], fingerprint: str) -> None:
@@ -121,7 +121,7 @@ def test_recorded_payloads(message: Message, payload: str) -> None:
         (StampedQEI(Timestamp(1, 2), -3), "0100000002000000fdff"),
         (Proximity((1, 2, 3, 65535)), "010002000300ffff"),
         (Odometry(Pose3(1.0, 0.0, 0.0), Velocity3(w=2.0)), "0000803f" + "00" * 16 + "00000040"),
-        (Log(Timestamp(1, 0), 20, "blink", "hi"), "010000000000000014" + b"blink\0\0\0hi".hex() + "00" * 126),
+        (Log(Timestamp(1, 0), 20, "PC1", "blink", "hi"), "010000000000000014" + b"PC1\0\0\0\0blink\0\0\0hi".hex() + "00" * 126),
     ],
 )
 def test_packed(message: Message, payload: str) -> None:

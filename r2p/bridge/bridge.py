@@ -128,6 +128,7 @@ class Bridge:
         port = BridgePort(link, number, self.policy.kind(link.name), self._clock.now)
         self.ports[link.name] = self._by_number[number] = port
         link.gateway_hooks = _PortHooks(self, port)
+        link.discovery.announce_gateway()
         if link.admits_gateways and number >= FIRST_CLIENT:
             port.state = port.tree_port.state = PortState.REFUSED
             self._notify(link, "too many links", f"a gateway joins {PORTS_MAX} links: this one is not", True)

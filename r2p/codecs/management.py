@@ -103,6 +103,7 @@ FLAG_BOOT = 4
 HELLO_QUERY = 1  # asks all modules to repeat what they have: this one is new
 HELLO_TOOL = 2  # an observer, which sends no ALIVE
 HELLO_LEAVING = 4
+HELLO_GATEWAY = 8  # forwards messages of others: of what it sends, not all is its own
 
 LEASE_MS_MAX = 0xFFFF
 """The longest lease that a Hello can carry (ms)."""

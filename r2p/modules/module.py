@@ -28,7 +28,7 @@ from r2p.modules.link_manager import LinkManager
 from r2p.modules.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.modules.watchdog import Watchdog, watch
 from r2p.msg import Log
-from r2p.names import NODE_MAX, module_name, module_name_from, module_path, node_name, topic_name
+from r2p.names import LOG, NODE_MAX, module_name, module_name_from, module_path, node_name, topic_name
 from r2p.protocols.discovery.events import Command
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.node import Node, no_log
@@ -386,8 +386,8 @@ class LogTopic:
         self.suppressed = 0
         self._space = space
         self._thread = threading.get_ident()
-        self._node = Node("log", space, remap=remap)
-        self._publisher = self._node.advertise("log", Log)
+        self._node = Node(LOG, space, remap=remap)
+        self._publisher = self._node.advertise(LOG, Log)
         self._credit = float(LOG_RATE)
         self._credited_at = space.clock.monotonic()
 
@@ -414,7 +414,9 @@ class LogTopic:
         text = line.encode("ascii", "replace").replace(b"\0", b"?")[:_LOG_TEXT_MAX].decode()  # as firmware reads it
         stamp = Timestamp.from_ns(self._space.clock.now())
         level = min(max(level, 0), 255)
-        self._publisher.publish_nowait(Log(stamp=stamp, level=level, node=node[:NODE_MAX], text=text))
+        module = self._space.module
+        record = Log(stamp=stamp, level=level, module=module, node=node[:NODE_MAX], text=text)
+        self._publisher.publish_nowait(record)
 
     def _within_rate(self) -> bool:
         now = self._space.clock.monotonic()

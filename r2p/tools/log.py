@@ -14,6 +14,7 @@ import typer
 
 import r2p
 from r2p.msg import Log
+from r2p.names import LOG
 from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, joined, patience
@@ -22,7 +23,6 @@ from r2p.units import MILLISECOND, SECOND
 QUEUE = 1024
 """Records that wait for a slow terminal or pipe; beyond that the oldest are lost, and counted."""
 
-_TOPIC = "log"
 _LOOK = 0.5  # seconds between two looks for the log topics of further namespaces
 
 
@@ -106,13 +106,13 @@ class _Printer:
 
     async def _subscribe_to_all(self, tasks: asyncio.TaskGroup, received: Callable[[], None]) -> None:
         """Subscribe to the log, and to that of each namespace as soon as it is known."""
-        self._session.module.query()  # for the names of nodes and modules
+        self._session.module.query()  # for the log topics of namespaces
         while True:
-            known = {_TOPIC, *(name for name in self._session.module.network.topics() if name.endswith(f"/{_TOPIC}"))}
+            known = {LOG, *(name for name in self._session.module.network.topics() if name.endswith(f"/{LOG}"))}
             for name in known - self._subscribers.keys():
                 subscriber = self._session.node.subscribe(name, Log, queue=QUEUE, lossy=True)
                 self._subscribers[name] = subscriber
-                tasks.create_task(self._print(subscriber, name.removesuffix(_TOPIC), received))
+                tasks.create_task(self._print(subscriber, name.removesuffix(LOG), received))
             await asyncio.sleep(_LOOK)
 
     async def _print(self, subscriber: r2p.Subscriber[Log], namespace: str, received: Callable[[], None]) -> None:
@@ -120,26 +120,19 @@ class _Printer:
             record = sample.message
             if not isinstance(record, Log):
                 continue
-            modules = self._modules(sample.source.module, namespace, record.node)
-            if self._left == 0 or record.level < self._level.number or not self._is_wanted(modules, record.node):
+            module = _module_of(record, sample.source.module, namespace)
+            if self._left == 0 or record.level < self._level.number or not self._is_wanted(module, record.node):
                 continue
             received()
             self._first.set()
             if self._left is not None:
                 self._left -= 1
-            await self._put(modules[0] if len(modules) == 1 else "", record, record.stamp.ns or sample.stamp)
+            await self._put(module, record, record.stamp.ns or sample.stamp)
             if self._left == 0:
                 self._last.set()
 
-    def _modules(self, module: str, namespace: str, node: str) -> list[str]:
-        """Return the modules that a record may come from: a debug line carries no names, but nodes are announced."""
-        if not module:
-            return [each for each, name in self._session.module.network.nodes() if name == node and each]
-        return [namespace + module if namespace and "/" not in module else module]
-
-    def _is_wanted(self, modules: list[str], node: str) -> bool:
-        paths = (f"{module}/{node}" for module in modules)
-        return self._wanted in {"", node, *modules, *paths}
+    def _is_wanted(self, module: str, node: str) -> bool:
+        return self._wanted in {"", node, module, f"{module}/{node}"}
 
     async def _put(self, module: str, record: Log, stamp: int) -> None:
         level = _level_of(record.level)
@@ -153,6 +146,15 @@ class _Printer:
         where = "/".join(part for part in (module or "?", record.node) if part)
         text = f"{_clock_text(stamp)} {level.name:<8} {where}: {record.text}"
         await self._output.put(values, text, colour=_COLOURS.get(level), wrap=True)
+
+
+def _module_of(record: Log, sender: str, namespace: str) -> str:
+    """Return the name of a record's module on this network; empty: unknown.
+
+    The record has its name on the robot. `sender` has the robot's prefix, where the link carries who sent a message.
+    """
+    module = sender if sender.endswith(record.module) else record.module
+    return namespace + module if module and "/" not in module else module
 
 
 def _level_of(number: int) -> Level:

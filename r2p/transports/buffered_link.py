@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Protocol
 import msgspec
 
 from r2p.codecs.management import ROLE_PUBLISHES
-from r2p.names import MANAGEMENT
-from r2p.protocols.discovery.events import PeerAddress, SubscriberJoined
+from r2p.names import LOG, MANAGEMENT
+from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import Sample, Source
@@ -306,9 +306,11 @@ class BufferedSubscriber(LinkSubscriber):
 class SenderLookup:
     """The source of messages by topic and address, looked up anew after changes in discovery.
 
-    Lines and CAN frames do not name their sender, so it follows from discovery: r2p modules announce which of their
-    nodes publish a topic. A topic that no module has announced comes from the only possible sender, if there is only
-    one. `shared` are addresses that several modules may have.
+    Lines and CAN frames do not name their sender, so it follows from discovery: r2p modules announce themselves, and
+    which of their nodes publish a topic. A topic that no module has announced comes from the only possible sender, if
+    there is only one. Behind a gateway there may always be modules whose announcements are late: there only a publisher
+    that was announced has a name, and of the log, which all modules publish, none has. `shared` are addresses that
+    several modules may have.
     """
 
     def __init__(self, discovery: DiscoveryProtocol, link: str, shared: tuple[PeerAddress, ...] = ()) -> None:
@@ -332,10 +334,7 @@ class SenderLookup:
         return source
 
     def _find(self, topic: str, address: PeerAddress) -> Source:
-        modules = list(self._discovery.modules.values())
-        if address is not None:
-            direct = [info for info in modules if info.source == address]
-            modules = direct or [info for info in modules if info.source in self._shared]
+        modules = self._modules_at(address)
         names = {info.instance: info.name for info in modules if info.r2p}
         # Without an address, a publisher of a module that is not known yet may be the sender; its module has no name.
         publishers = {
@@ -343,7 +342,23 @@ class SenderLookup:
             for each in self._discovery.endpoints.values()
             if each.topic == topic and each.role == ROLE_PUBLISHES and (address is None or each.instance in names)
         }
+        forwarded = any(info.gateway or info.hops for info in modules)
+        possible = set() if forwarded else {info.name for info in modules if not info.observer}
+        if _is_published_by_all(topic) and len(possible) != 1:
+            return Source(link=self._link)  # the first that announces it need not have sent this message
         if len(publishers) == 1:
             return Source(*publishers.pop(), self._link)
-        candidates = {module for module, _ in publishers} or {info.name for info in modules if not info.observer}
+        candidates = {module for module, _ in publishers} or possible
         return Source(candidates.pop() if len(candidates) == 1 else "", "", self._link)
+
+    def _modules_at(self, address: PeerAddress) -> list[ModuleInfo]:
+        modules = list(self._discovery.modules.values())
+        if address is None:
+            return modules
+        direct = [info for info in modules if info.source == address]
+        return direct or [info for info in modules if info.source in self._shared]
+
+
+def _is_published_by_all(topic: str) -> bool:
+    """Return whether all r2p modules publish the topic."""
+    return topic.rpartition("/")[2] == LOG

@@ -271,7 +271,8 @@ async def test_a_node_logs_under_its_own_name_and_on_the_topic_log(caplog: pytes
         node.log.debug("hidden")
         node.log.info("at %d%%", 50)
         message = await records.fetch(1.0)
-        assert message == Log(stamp=r2p.Timestamp.from_ns(node.now()), level=20, node="arm", text="at 50%")
+        stamp = r2p.Timestamp.from_ns(node.now())
+        assert message == Log(stamp=stamp, level=20, module="PC1", node="arm", text="at 50%")
         assert not records.queue
     record = next(each for each in caplog.records if each.getMessage() == "at 50%")
     assert (record.name, record.funcName) == (

@@ -83,21 +83,24 @@ async def test_a_namespace_has_a_log_of_its_own(capsys: pytest.CaptureFixture[st
     assert [each["module"] for each in printed(capsys)] == ["robot1/ARM"]
 
 
-async def test_a_line_carries_no_names_but_nodes_have_modules(capsys: pytest.CaptureFixture[str]) -> None:
+async def test_records_on_a_line_have_the_right_names_while_announcements_are_late(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     script = Script()
     async with r2p.Module("_tool01", via=script, observer=True, watchdog=False) as module:
         session, size = Session(module, Settings(via=["tcp:robot1"])), r2p.layout(Log).size
-        nodes = [("BOT", 7, "drive"), ("BOT", 7, "motor"), ("ARM", 8, "motor")]
-        for name, instance, node in nodes:
-            endpoint = management.Endpoint(management.ROLE_PUBLISHES, instance, node, "leds", 1)
-            script.hear(manage(management.Hello(name, instance)) + manage(endpoint))
-        printing = asyncio.create_task(log(session, "BOT", count=2))
+        printing = asyncio.create_task(log(session, count=3))
         await asyncio.sleep(0.1)
+        script.hear(manage(management.Hello("GW", 7, management.HELLO_GATEWAY)))  # nothing else yet
         script.hear(manage(management.Advertise("log", size)) + manage(management.SubscribeResponse("log", size)))
-        for node in ("plan", "drive", "motor"):
-            script.hear(line("log", Log(level=20, node=node, text="x").encode()))
+        script.hear(line("log", Log(level=20, module="MOTOR1", node="motor", text="late").encode()))
+        endpoint = management.Endpoint(management.ROLE_PUBLISHES, 8, "motor", "encoder3", 1)
+        script.hear(manage(management.Hello("MOTOR3", 8, hops=1)) + manage(endpoint))
+        script.hear(line("log", Log(level=20, module="MOTOR1", node="motor", text="late").encode()))
+        script.hear(line("log", Log(level=20, node="motor", text="of a program that does not name it").encode()))
         await printing
-    assert [(each["module"], each["node"]) for each in printed(capsys)] == [("BOT", "drive"), (None, "motor")]
+    names = [(each["module"], each["node"]) for each in printed(capsys)]
+    assert names == [("MOTOR1", "motor"), ("MOTOR1", "motor"), (None, "motor")]
 
 
 async def test_silence_is_explained_and_ends_at_the_time_out(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,10 +6,12 @@ And who is named as the source of what comes in.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import msgspec
 import pytest
 
+import r2p
 from r2p.codecs import management as m
 from r2p.msg import Led
 from r2p.names import MANAGEMENT
@@ -20,9 +22,6 @@ from r2p.transports.buffered_link import SenderLookup
 from r2p.transports.memory import Datagram
 from tests.bench import led, settle
 from tests.protocols.discovery.wire import PC2, PEER, S, hear, run
-
-if TYPE_CHECKING:
-    import r2p
 
 pytestmark = pytest.mark.virtual_time
 
@@ -150,6 +149,29 @@ def test_what_is_only_repeated_is_not_worked_out_again() -> None:
     found = sources.source("leds")
     hear(discovery, 2 * S, PC2, m.Alive("PC2"), publisher("blink"))
     assert sources.source("leds") is found
+
+
+def test_behind_a_gateway_only_an_announced_publisher_has_a_name() -> None:
+    discovery = Discovery("PC1", 1)
+    discovery.link_up(0)
+    sources, unknown = SenderLookup(discovery, "lab"), Source("", "", "lab")
+    hear(discovery, S, m.Hello("GW", 5, m.HELLO_GATEWAY), m.Alive("GW"))
+    assert [sources.source(topic) for topic in ("leds", "log")] == [unknown, unknown], "others are announced late"
+    hear(discovery, S, m.Endpoint(m.ROLE_PUBLISHES, 5, "log", "log", m.CLASS_NRT))
+    hear(discovery, S, m.Alive("IMU1"), msgspec.structs.replace(PC2, hops=1), publisher("blink"))
+    assert sources.source("leds") == Source("PC2", "blink", "lab")
+    assert [sources.source(topic) for topic in ("imu", "log")] == [unknown, unknown]
+
+
+async def test_a_gateway_announces_itself_as_one() -> None:
+    options = r2p.BridgeOptions()
+    async with r2p.Module("GW", via=["memory:a", "memory:b"], bridge=options), r2p.Module("PC1", via="memory:a") as one:
+        async with r2p.Module("PC2", via="memory:b") as two:
+            while len(two.links[0].discovery.modules) < 2 or len(one.links[0].discovery.modules) < 2:
+                await asyncio.sleep(0.1)
+            for module, other in ((one, "PC2"), (two, "PC1")):
+                known = module.links[0].discovery.modules
+                assert (known["GW"].gateway, known[other].gateway) == (True, False)
 
 
 def test_firmware_is_known_where_it_is_alone() -> None:

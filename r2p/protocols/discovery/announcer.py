@@ -59,6 +59,7 @@ class Announcer:
         self.subscriber_counts: Counter[str] = Counter()
         """The same for published topics, and peers that subscribe to them."""
         self._observer = observer
+        self.is_gateway = False
         self.outbox = outbox
         self._directory = directory
         self._schedule = schedule
@@ -153,10 +154,11 @@ class Announcer:
 
     def hello(self, flags: int = 0) -> management.Hello:
         """Return this module's HELLO. Its lease outlasts two lost rounds of repetition."""
-        tool = management.HELLO_TOOL if self._observer else 0
+        flags |= management.HELLO_TOOL if self._observer else 0
+        flags |= management.HELLO_GATEWAY if self.is_gateway else 0
         lease = min(max(LEASE, 3 * self._schedule.round_time), FOR_EVER) // MILLISECOND
         release = __version__[: management.RELEASE_MAX]
-        return management.Hello(self.module, self.instance, flags | tool, 0, lease, management.WIRE_VERSION, release)
+        return management.Hello(self.module, self.instance, flags, 0, lease, management.WIRE_VERSION, release)
 
     def requests(self, topic: str, own: LocalTopic, size: int = 0) -> list[management.Management]:
         """Return the request for a topic with this announced `size` (0: unknown), if it may be sent.

@@ -164,6 +164,7 @@ class Directory:
             last_heard=now,
             instance=message.instance,
             observer=bool(message.flags & management.HELLO_TOOL),
+            gateway=bool(message.flags & management.HELLO_GATEWAY),
             lease=max(LEASE, message.lease_ms * MILLISECOND),
             hops=message.hops,
             source=source,

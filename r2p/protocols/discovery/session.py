@@ -136,6 +136,9 @@ class DiscoveryProtocol(ABC):
     def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
         """Announce that a node's publisher or subscriber has ended."""
 
+    def announce_gateway(self) -> None:
+        """Announce from now on that this module is a gateway; for networks where messages do not name their sender."""
+
     # What users and gateways ask for
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
@@ -300,6 +303,9 @@ class Discovery(DiscoveryProtocol):
     def remove_endpoint(self, now: int, node: str, topic: str, role: int) -> list[Event]:
         self._announcer.remove_endpoint(node, topic, role)
         return self._flush(now)
+
+    def announce_gateway(self) -> None:
+        self._announcer.is_gateway = True
 
     # What users and gateways ask for
 

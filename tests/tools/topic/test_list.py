@@ -37,7 +37,7 @@ async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     captured = printed(capsys)
     assert by_topic(captured) == {
         "leds": {"type": "r2p.msg:Led", "size": 5, "publishers": ["BOT/blink"], "subscribers": ["BOT/watch"]},
-        "log": {"type": "r2p.msg:Log", "size": 145, "publishers": ["BOT/log"], "subscribers": []},
+        "log": {"type": "r2p.msg:Log", "size": 152, "publishers": ["BOT/log"], "subscribers": []},
         "speed": {"type": "r2p.msg:Velocity3", "size": 12, "publishers": ["BOT/blink"], "subscribers": []},
     }
 
