@@ -24,7 +24,7 @@ from r2p.msg import GatewayStatus
 from r2p.names import module_name_from
 from r2p.tools.options import Format, Via, class_choice, hertz
 from r2p.tools.output import Output, aligned
-from r2p.tools.session import UsageError, check_urls, settings, standalone
+from r2p.tools.session import UsageError, check_urls, service, settings
 
 logger = logging.getLogger("r2p.gateway")
 
@@ -70,7 +70,7 @@ _AllowControl = Annotated[
 ]
 
 
-@standalone
+@service
 async def command(
     via: Via = None,
     name: _Name = None,

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from r2p.log_lines import wrapped
-from r2p.tools.output import abandon_stdout, notify
+from r2p.tools.output import INTERRUPTED, abandon_stdout, notify
 
 GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
@@ -103,7 +103,7 @@ def main() -> None:
             raise
         _exit_unwritable(error)
     except KeyboardInterrupt:  # before the command handles signals itself
-        raise SystemExit(0) from None
+        raise SystemExit(INTERRUPTED) from None
     except SystemExit as error:
         if isinstance(error.__context__, BrokenPipeError):
             abandon_stdout()

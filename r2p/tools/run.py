@@ -25,7 +25,7 @@ import r2p
 from r2p.log_lines import internal
 from r2p.names import NODE_MAX, node_name, topic_name
 from r2p.tools.options import Via
-from r2p.tools.session import UsageError, check_urls, settings, standalone
+from r2p.tools.session import UsageError, check_urls, service, settings
 
 logger = logging.getLogger("r2p.runner")
 
@@ -37,7 +37,7 @@ class Program(msgspec.Struct, frozen=True):
     name: str
 
 
-@standalone
+@service
 async def command(
     functions: Annotated[
         list[str],

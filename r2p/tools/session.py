@@ -9,11 +9,13 @@ A command is a coroutine function whose first parameter is a `Session`:
         "One line of help."
 
 `command` adds --via, -v and -q, joins as an observer, and maps the end to an exit code: 0 for success (also a closed
-pipe, and a signal for commands that would go on for ever), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`,
-130 for `Interrupted`. The function itself is
-unchanged, so tests call it under virtual time, inside `async with join(Settings(via=["memory:lab"])) as session`.
-Commands of the bus get a `BusMonitor` instead of a Session (`opening`). Commands that make a module of their own, such
-as `run`, are `standalone`, with the option `Via` and `settings()`. What commands need of `config` is here, too.
+pipe), 1 for an error of r2p, 2 for `UsageError`, 3 for `TimedOut`. A signal is a success for a command that is
+`endless`, as it can't end in another way, and 130 for all others. The function itself is unchanged, so tests call it
+under virtual time, inside `async with join(Settings(via=["memory:lab"])) as session`.
+
+Commands of the bus get a `BusMonitor` instead of a Session (`opening`). Commands that join no network as a tool are
+`standalone`, with the option `Via` and `settings()`, or a `service`, such as `run`. What commands need of `config` is
+here, too.
 
 Commands wait here: `Session.settle` for announcements, `Session.waiting` with a report, `patience` for messages,
 `wait_until` for a condition, and `moments` for the time.
@@ -26,7 +28,7 @@ import functools
 import inspect
 import os
 import string
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import typer
@@ -38,17 +40,18 @@ from r2p.tools.config import Settings as Settings
 from r2p.tools.config import UsageError as UsageError
 from r2p.tools.config import settings as settings
 from r2p.tools.options import Quiet, Verbose, Via
-from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout, log_to_stderr, notify
+from r2p.tools.output import INTERRUPTED, PipeClosed, Unwritable, abandon_stdout, log_to_stderr, notify
 from r2p.transports.url import open_transport
 
 B = TypeVar("B", bound=Callable[..., Awaitable[None]])
 Opening = Callable[[Settings], contextlib.AbstractAsyncContextManager[Any]]
 """Opens what a command works on instead of a Session."""
+Endless = Callable[[Mapping[str, Any]], bool]
+"""Says of the arguments and options of a command whether it goes on until a signal ends it."""
 
 REPORT_WAITING_AFTER = 1.0
 """Seconds that a command waits before it reports what it waits for."""
 
-_INTERRUPTED = 130  # the exit code that shells have for SIGINT
 _DESCRIPTORS = 12  # free file descriptors that are needed: an event loop, its wake-ups, and a link
 _TOO_MANY_FILES = (errno.EMFILE, errno.ENFILE)  # of this process, or of the computer
 _SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer has announced everything
@@ -63,10 +66,6 @@ _GIVE_UP_AFTER = 0.9  # seconds after which a tool ends if it is known of each l
 
 class TimedOut(Exception):
     """Something did not happen in time: exit code 3."""
-
-
-class Interrupted(Exception):
-    """A signal ended a command before it was done: exit code 130, so that `r2p wait ... && ...` does not go on."""
 
 
 def check_urls(via: list[str], source: str = "--via") -> None:
@@ -317,21 +316,35 @@ async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> A
         yield Session(module, settings, name=name, verbose=verbose)
 
 
-def command(app: typer.Typer, name: str, *, opening: Opening | None = None) -> Callable[[B], B]:
+def counts_without_end(given: Mapping[str, Any]) -> bool:
+    """Return whether a command with these arguments and options goes on for ever: it takes -n or --once, but got none.
+
+    All commands that watch or repeat something take -n; those without it have an end of their own.
+    """
+    return "count" in given and given["count"] is None and not given.get("once")
+
+
+def command(
+    app: typer.Typer, name: str, *, opening: Opening | None = None, endless: Endless = counts_without_end
+) -> Callable[[B], B]:
     """Make a command of `app` from the coroutine function that this decorates, and return the function unchanged.
 
     The function takes a Session first, or what `opening` opens, then its own arguments and options.
     """
 
     def register(body: B) -> B:
-        app.command(name)(joined(body, opening=opening))
+        app.command(name)(joined(body, opening=opening, endless=endless))
         return body
 
     return register
 
 
 def joined(
-    body: Callable[..., Awaitable[None]], *, opening: Opening | None = None, keep_trying: bool = False
+    body: Callable[..., Awaitable[None]],
+    *,
+    opening: Opening | None = None,
+    endless: Endless = counts_without_end,
+    keep_trying: bool = False,
 ) -> Callable[..., None]:
     """Make a command for `main.COMMANDS` of a coroutine function that takes a Session, or what `opening` opens.
 
@@ -348,31 +361,23 @@ def joined(
                 else:
                     await _while_connected(opened, body(opened, **given))
 
-        endless = "count" in given and given["count"] is None and not given.get("once")
-        execute(main if endless else _to_its_end(main), verbose=verbose, quiet=quiet)
+        execute(main, verbose=verbose, quiet=quiet, endless=endless(given))
 
     return _with_options(run, body, session=True)
 
 
-def _to_its_end(main: Callable[[], Awaitable[object]]) -> Callable[[], Awaitable[object]]:
-    """Raise Interrupted if a signal cancels this command, which has an end of its own."""
-
-    async def run() -> None:
-        try:
-            await main()
-        except asyncio.CancelledError:
-            raise Interrupted from None
-
-    return run
-
-
-def standalone(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+def standalone(body: Callable[..., Awaitable[None]], *, endless: bool = False) -> Callable[..., None]:
     """Make a command for `main.COMMANDS` of a coroutine function that joins no network as a tool; it adds -v and -q."""
 
     def run(*, verbose: int, quiet: int, **given: Any) -> None:
-        execute(functools.partial(body, **given), verbose=verbose, quiet=quiet)
+        execute(functools.partial(body, **given), verbose=verbose, quiet=quiet, endless=endless)
 
     return _with_options(run, body, session=False)
+
+
+def service(body: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Make a command as `standalone` does, which goes on until a signal ends it."""
+    return standalone(body, endless=True)
 
 
 def _with_options(run: Callable[..., None], body: Callable[..., object], *, session: bool) -> Callable[..., None]:
@@ -416,13 +421,31 @@ def execute(
     *,
     verbose: int = 0,
     quiet: int = 0,
+    endless: bool = False,
     run: Callable[[Callable[[], Awaitable[object]]], object] | None = None,
 ) -> None:
-    """Run a command until it ends or a signal ends it, and exit with its code. `run` replaces `r2p.run_main`."""
+    """Run a command until it ends or a signal ends it, and exit with its code. `run` replaces `r2p.run_main`.
+
+    A signal means success only for an `endless` command. All others exit with 130, as they were not done: so
+    `r2p wait ... && ...` does not go on.
+    """
+    done = False
+
+    async def to_its_end() -> None:
+        nonlocal done
+        await main()
+        done = True
+
     with log_to_stderr(verbose - quiet):
         try:
             _check_descriptors()
-            (run or r2p.run_main)(main)
+            (run or r2p.run_main)(to_its_end)
+            if not (done or endless):  # `run_main` returns after a signal
+                raise typer.Exit(INTERRUPTED)
+        except KeyboardInterrupt:  # from a `run` that leaves signals to Python
+            raise typer.Exit(0 if endless else INTERRUPTED) from None
+        except typer.Exit:
+            raise
         except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - sorted out by _explain, or raised again
             _explain(error)
 
@@ -436,8 +459,6 @@ def _explain(error: BaseException) -> None:
             return
         if isinstance(leaf, UsageError | r2p.InvalidName):  # invalid names always come from the command line
             raise typer.BadParameter(printable(str(leaf), "\n")) from leaf
-        if isinstance(leaf, Interrupted):
-            raise typer.Exit(_INTERRUPTED) from leaf
         if isinstance(leaf, TimedOut):
             notify(str(leaf))
             raise typer.Exit(3) from leaf

@@ -12,7 +12,7 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -102,11 +102,12 @@ def command(
             allow_control=allow_control,
         )
 
-    def virtually(_main: object) -> None:
+    def virtually(main: Callable[[], Awaitable[object]]) -> None:
         sim.run(main, seed=seed)
 
     # Only errors are logged: any other line would tear the display apart.
-    execute(main, verbose=verbose, quiet=quiet + 2, run=virtually if fast else None)
+    endless = duration is None and not fast
+    execute(main, verbose=verbose, quiet=quiet + 2, endless=endless, run=virtually if fast else None)
 
 
 def default_links() -> list[str]:

@@ -126,7 +126,7 @@ def test_a_signal_ends_it_well() -> None:
         child.stdout.readline()
         child.send_signal(signal.SIGINT)
         _, err = child.communicate()
-    assert (child.returncode, err) == (0, "")
+    assert (child.returncode, err) == (130, "")
 
 
 @pytest.mark.processes

@@ -10,6 +10,7 @@ import logging
 import os
 import re
 import signal
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import pytest
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 import r2p
 from r2p.msg import Led
 from r2p.tools import options, session
+from r2p.tools import main as command_line
 from r2p.tools.output import PipeClosed
 from r2p.tools.session import Session, Settings, TimedOut, UsageError, execute, join
 from tests.ports import free_port
@@ -26,7 +28,6 @@ from tests.tools.rig import Firmware, process, robot, tool
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 
 @pytest.fixture(autouse=True)
@@ -309,3 +310,33 @@ def test_a_signal_fails_a_command_that_was_not_done(given: dict[str, object], co
         assert ended.value.exit_code == code
     else:
         run(via=["memory:lab"], verbose=0, quiet=0, **given)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "body", "code"),
+    [
+        (["doctor"], "doctor.measure", 130),
+        (["doctor", "--via", "tcp:robot"], "doctor.try_links", 130),
+        (["launch", "--ready", "imu"], "launch.wait_once", 130),
+        (["demo"], "demo.simulate", 130),
+        (["sim", "--fast"], "simulator.simulate", 130),
+        (["sim", "--duration", "1"], "simulator.simulate", 130),
+        (["sim"], "simulator.simulate", 0),
+        (["gateway", "--via", "memory:a", "--via", "memory:b"], "gateway.serve", 0),
+        (["topic", "pub", "leds", "-", "--type", "Led"], "topic.pub._Publication.publish_lines", 130),
+        (["topic", "pub", "leds", "led=1", "--type", "Led"], "topic.pub._Publication.publish", 0),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_signal_is_a_success_only_for_commands_without_an_end(
+    arguments: list[str], body: str, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The end comes from within: a function of the command sends the signal, and waits."""
+
+    async def interrupted(*_: object, **__: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        await asyncio.Event().wait()
+
+    Path("r2p.toml").write_text('[launch.imu]\ncommand = "sim"', encoding="ascii")
+    monkeypatch.setattr(f"r2p.tools.{body}", interrupted)
+    assert CliRunner().invoke(command_line.app, arguments).exit_code == code

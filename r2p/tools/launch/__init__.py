@@ -58,7 +58,8 @@ def command(
         else:
             codes.append(await launch(path, entries, chosen, via))
 
-    execute(main, verbose=verbose, quiet=quiet, run=_run)
+    starts = ready is None and not systemd  # only then the group handles signals itself
+    execute(main, verbose=verbose, quiet=quiet, endless=starts, run=_run if starts else None)
     if any(codes):
         raise typer.Exit(codes[0])
 

@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from typing import Annotated, Any, TextIO
 
 import msgspec
@@ -17,7 +17,7 @@ from r2p.bridge import ClassOf
 from r2p.names import topic_name
 from r2p.tools.options import Count, Once, Rate, class_choice, time_option
 from r2p.tools.output import notify, wait_ready, waitable
-from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError, wait_until
+from r2p.tools.session import REPORT_WAITING_AFTER, Session, TimedOut, UsageError, counts_without_end, wait_until
 from r2p.tools.topic.watching import (
     AnyPublisher,
     Topic,
@@ -95,6 +95,11 @@ async def pub(
         await publication.publish_periodically(value)
     else:
         await publication.publish(value, DEFAULT_RATE if rate is None else rate)
+
+
+def goes_on(given: Mapping[str, Any]) -> bool:
+    """Return whether `pub` with these arguments and options publishes until a signal ends it; stdin has an end."""
+    return counts_without_end(given) and given["message"] != [STDIN]
 
 
 class _Publication(msgspec.Struct):
