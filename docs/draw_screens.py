@@ -47,6 +47,7 @@ _OUTSIDE = "memory:lab"  # where the emulated robot is looked at; the picture sh
 _ADDRESS = "tcp:127.0.0.1:45123"
 _PLAN = ("imu:18@200Hz", "encoder:8@1ms", "motor:12@5ms", "battery:8@25Hz")
 _WIDE = 100  # columns for `doctor`
+_UNWRAPPED = 1000  # columns of its terminal: paths are longer there than in the picture
 _COLOURED = {"force_terminal": True, "color_system": "standard", "legacy_windows": False, "_environ": {}}
 
 # Pictures of terminals
@@ -231,7 +232,7 @@ _CAN0 = Interface("can0", "can", up=True, state="error-active", bitrate=1_000_00
 
 def _doctor() -> Screen:
     """A computer on a robot that is nearly ready: no package for CAN adapters, and a clock rate that changes."""
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as computer, _terminal(_WIDE) as terminal:
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as computer, _terminal(_UNWRAPPED) as terminal:
         root = Path(folder)
         _write(root, {"dev/ttyUSB0": "", "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "ondemand"})
         for name, kind in (("lo", 772), ("eth0", 1), ("wlan0", 1), ("can0", 280)):

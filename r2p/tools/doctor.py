@@ -13,6 +13,7 @@ import platform
 import socket
 import statistics
 import sys
+import textwrap
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Iterator
 from importlib import metadata
@@ -37,6 +38,7 @@ EXTRAS = {"can": "python-can", "serial": "pyserial", "zenoh": "eclipse-zenoh"}
 
 _ROOT = Path("/")
 _UP = 1  # IFF_UP
+_COMMANDS = ("sudo ", "echo ", "pip ", "ip ", "ls ", "r2p ")  # steps that begin like this are for the shell
 _PORTS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttyS*", "rfcomm*", "cu.usb*")
 _TICK = MILLISECOND  # ns
 _SAMPLE = 0.2  # seconds
@@ -63,9 +65,28 @@ class Check(msgspec.Struct, frozen=True):
     def record(self) -> dict[str, Any]:
         return {"check": self.what, "ok": self.ok, "found": self.found, "do": self.do or None}
 
-    def text(self, yes: str = "has", no: str = "lacks") -> str:
-        line = f"{yes if self.ok else no:<6} {self.what:<13} {self.found}"
-        return line + "".join(f"\n{'':20} > {step}" for step in self.do.split("\n") if step)
+    def text(self, yes: str = "has", no: str = "lacks", *, width: int | None = None) -> str:
+        """Return lines for people; those that are wider than `width` break between words, within their column."""
+        steps = [step for step in self.do.split("\n") if step]
+        lines = [(f"{yes if self.ok else no:<6} {self.what:<13} ", self.found), *((f"{'':20} > ", step) for step in steps)]
+        return "\n".join(_wrapped(head, text, width) for head, text in lines)
+
+
+def _wrapped(head: str, text: str, width: int | None) -> str:
+    """Wrap a text behind a head. A command continues in the way of shells, so that it can be copied."""
+    if width is None or len(head) + len(text) <= width:
+        return head + text
+    indent = " " * min(len(head), width // 2)
+    continued = " \\" if text.startswith(_COMMANDS) else ""
+    wrapped = textwrap.wrap(
+        text,
+        width - len(continued),
+        initial_indent=head,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return f"{continued}\n".join(wrapped)
 
 
 @standalone
@@ -79,9 +100,9 @@ async def command(*, via: Try = None, format: Format = None) -> None:
         await try_links(via, output)
         return
     for check in checks():
-        await output.put(check.record(), check.text())
+        await output.put(check.record(), check.text(width=output.width))
     check = lateness(await measure())
-    await output.put(check.record(), check.text())
+    await output.put(check.record(), check.text(width=output.width))
 
 
 def checks(root: Path = _ROOT) -> Iterator[Check]:
@@ -300,7 +321,7 @@ async def try_links(urls: list[str], output: Output) -> None:
     for url in urls:
         async with contextlib.aclosing(_try_url(url)) as checks:
             async for check in checks:
-                await output.put({"via": url} | check.record(), check.text("ok", "fails"))
+                await output.put({"via": url} | check.record(), check.text("ok", "fails", width=output.width))
                 if not check.ok:
                     failed.append(url)
     if failed:

@@ -16,12 +16,14 @@ import itertools
 import json
 import logging
 import os
+import re
 import select
 import shutil
 import stat
 import sys
 import textwrap
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from types import UnionType
 from typing import Any, Literal, TextIO
 
 from r2p.log_lines import StderrHandler, last_resort, printable, wrapped
@@ -29,6 +31,8 @@ from r2p.log_lines import StderrHandler, last_resort, printable, wrapped
 Record = Mapping[str, Any]
 
 _NONE: Mapping[str, str] = {}
+
+_PART = re.compile(r"[^/?&,:]*[/?&,:]+|[^/?&,:]+")  # of a URL or a path, with the marks behind it
 
 _ATOMIC = 4096  # bytes that a writable pipe accepts without blocking (POSIX: at least 512)
 
@@ -58,6 +62,11 @@ class Output:
         self._columns: list[str] | None = None  # of CSV
         self._omitted = False  # values that have no column
         self._lock = asyncio.Lock()
+
+    @property
+    def width(self) -> int | None:
+        """The columns of the terminal; None where the output is for programs."""
+        return shutil.get_terminal_size().columns if self.format == "text" else None
 
     @contextlib.asynccontextmanager
     async def while_read(self) -> AsyncIterator[None]:
@@ -118,7 +127,7 @@ class Output:
         match self.format:
             case "text":
                 rows = [{**row, **{name: f"{row[name]} {unit}" for name, unit in units.items()}} for row in rows]
-                text = aligned(rows, columns, shutil.get_terminal_size().columns) if rows else ""
+                text = aligned(rows, columns, self.width) if rows else ""
             case "csv":
                 text = _csv(columns) + "".join(_csv([_cell(row[name]) for name in columns]) for row in rows)
             case _:
@@ -243,37 +252,66 @@ def _yaml_dumper() -> Callable[[Any, bool], str]:
 def aligned(rows: Iterable[Record], columns: list[str], width: int | None = None) -> str:
     """Return a table with aligned columns: lists joined by blanks, None as an empty cell, all cells printable.
 
-    Where it is wider than `width` characters, lists are folded between their items.
+    Where it is wider than `width` characters, lists are folded between their items, and if that is not enough, all
+    texts between words and inside of URLs.
     """
     rows = list(rows)
     lines = [[printable(name.upper()) for name in columns], *([_cell(row[name]) for name in columns] for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
-    if width is not None and sum(widths) + 2 * (len(widths) - 1) > width:
-        lists = [i for i, name in enumerate(columns) if any(isinstance(row[name], list | tuple) for row in rows)]
-        widths = _narrowed(widths, lists, width - 2 * (len(widths) - 1))
-        lines = [folded for line in lines for folded in _folded(line, lists, widths)]
-        widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    whole, widths = lines, _widths(lines)
+    room = sys.maxsize if width is None else width - 2 * (len(columns) - 1)
+    lists, texts = _columns_of(rows, columns, list | tuple), _columns_of(rows, columns, str)
+    for cut in ([], texts):
+        if sum(widths) > room:
+            chosen = sorted({*lists, *cut})
+            narrowed = _narrowed(_widths(whole), chosen, room)
+            lines = [folded for line in whole for folded in _folded(line, chosen, narrowed, cut)]
+            widths = _widths(lines)
     return "".join(
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() + "\n" for line in lines
     )
 
 
-def _narrowed(widths: list[int], lists: list[int], room: int) -> list[int]:
-    """Return widths such that the columns of lists share what the others leave, the narrowest served first."""
-    left = room - sum(width for i, width in enumerate(widths) if i not in lists)
+def _columns_of(rows: list[Record], columns: list[str], kind: UnionType | type) -> list[int]:
+    return [i for i, name in enumerate(columns) if any(isinstance(row[name], kind) for row in rows)]
+
+
+def _widths(lines: list[list[str]]) -> list[int]:
+    return [max(map(len, column)) for column in zip(*lines, strict=True)]
+
+
+def _narrowed(widths: list[int], chosen: list[int], room: int) -> list[int]:
+    """Return widths such that the chosen columns share what the others leave, the narrowest served first."""
+    left = room - sum(width for i, width in enumerate(widths) if i not in chosen)
     narrowed = list(widths)
-    for served, i in enumerate(sorted(lists, key=widths.__getitem__)):
-        narrowed[i] = max(1, min(widths[i], left // (len(lists) - served)))
+    for served, i in enumerate(sorted(chosen, key=widths.__getitem__)):
+        narrowed[i] = max(1, min(widths[i], left // (len(chosen) - served)))
         left -= narrowed[i]
     return narrowed
 
 
-def _folded(line: list[str], lists: list[int], widths: list[int]) -> Iterator[list[str]]:
-    """Yield the lines of a folded row; an item that is wider than its column stays whole."""
+def _folded(line: list[str], chosen: list[int], widths: list[int], cut: list[int]) -> Iterator[list[str]]:
+    """Yield the lines of a row with the chosen columns folded. A word wider than its column stays whole, except where
+    it may be `cut` after a mark.
+    """
     wrap = functools.partial(textwrap.wrap, break_long_words=False, break_on_hyphens=False)
-    cells = [(wrap(cell, widths[i]) or [""]) if i in lists else [cell] for i, cell in enumerate(line)]
+    cells = [[cell] for cell in line]
+    for i in chosen:
+        words = (_cut(word, widths[i]) if i in cut else word for word in line[i].split(" "))
+        cells[i] = wrap(" ".join(words), widths[i]) or [""]
     for each in itertools.zip_longest(*cells, fillvalue=""):
         yield list(each)
+
+
+def _cut(word: str, width: int) -> str:
+    """Put blanks into a word that is wider than `width`, after the marks of URLs and paths."""
+    if len(word) <= width:
+        return word
+    pieces = [""]
+    for part in _PART.findall(word):
+        if pieces[-1] and len(pieces[-1]) + len(part) > width:
+            pieces.append("")
+        pieces[-1] += part
+    return " ".join(pieces)
 
 
 def _cell(value: Any) -> str:

@@ -167,17 +167,23 @@ class Session:
 
     def report_none(self, things: str, *, hidden: bool = False) -> None:
         """Report that there are no topics, nodes or modules; `hidden`: only those of tools, which are not shown."""
-        hint = "; use --all to include tools" if hidden else f": {self._heard()}" if self.settings.via else ""
-        notify(f"no {things} found on {self.network_name}{hint}")
+        if hidden:
+            notify(f"no {things} yet on {self.network_name}, except for those of tools; use --all to include these")
+        else:
+            notify(self.none_yet(things))
 
-    def _heard(self) -> str:
-        """Say what was heard on the network, and what to try."""
+    def none_yet(self, things: str) -> str:
+        """Say that there are no such things on the network, which modules were heard, and what to try."""
+        text = f"no {things} yet on {self.network_name}"
+        if not self.settings.via:
+            return text
         names = sorted({view.name for view in self.module.network.modules() if view.link and view.state != "observer"})
+        heard = f"heard {len(names)} {'module' if len(names) == 1 else 'modules'}"
         if names:
-            return f"heard {', '.join(names)}; listen longer with --wait 5"
+            return f"{text} ({heard}: {', '.join(names)}); listen longer with --wait 5"
         received = sum(link.stats.bytes_received for link in self.module.links)
-        what = f"received {received} bytes, but no module's name" if received else "heard no module"
-        return f"{what}; try r2p doctor --via {self.settings.via[0]}"
+        heard += f", received {received} bytes" if received else ""
+        return f"{text} ({heard}); try r2p doctor --via {self.settings.via[0]}"
 
     @contextlib.contextmanager
     def waiting(self, what: str | Callable[[], str]) -> Iterator[None]:

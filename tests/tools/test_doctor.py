@@ -208,6 +208,20 @@ def test_text_names_each_step() -> None:
     assert Check("python", True, "3.11").text() == "has    python        3.11"
 
 
+def test_a_row_at_a_terminal_breaks_between_words_and_a_command_so_that_it_can_be_copied() -> None:
+    command = "sudo ip link set can0 up type can bitrate 1000000 one-shot on"
+    check = Check("CAN", True, "can0 is up, 1000 kbit/s, error-active: --via rtcan:can0", f"{command}\nthen try again")
+    assert check.text(width=60).splitlines() == [
+        "has    CAN           can0 is up, 1000 kbit/s, error-active:",
+        "                     --via rtcan:can0",
+        "                     > sudo ip link set can0 up type can \\",
+        "                       bitrate 1000000 one-shot on",
+        "                     > then try again",
+    ]
+    assert check.text(width=120) == check.text()
+    assert max(map(len, check.text(width=30).splitlines())) <= 30
+
+
 # A link
 
 

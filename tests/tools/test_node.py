@@ -90,8 +90,8 @@ async def test_nobody_but_tools(capsys: pytest.CaptureFixture[str]) -> None:
         await list_(session)
         await modules(session)
     no_node, *_, no_module = capsys.readouterr().err.splitlines()
-    assert no_node == "r2p: no nodes found on memory:lab; use --all to include tools"
-    assert no_module == "r2p: no modules found on memory:lab; use --all to include tools"
+    assert no_node == "r2p: no nodes yet on memory:lab, except for those of tools; use --all to include these"
+    assert no_module == "r2p: no modules yet on memory:lab, except for those of tools; use --all to include these"
 
 
 async def test_a_node_is_listed_when_its_module_is_known(capsys: pytest.CaptureFixture[str]) -> None:
@@ -108,7 +108,7 @@ async def test_modules_without_nodes_are_named(capsys: pytest.CaptureFixture[str
     async with tool() as session:
         Firmware("IMU1").alive()
         await list_(session)
-    assert "no nodes found on memory:lab: heard IMU1; listen longer with --wait 5" in capsys.readouterr().err
+    assert "no nodes yet on memory:lab (heard 1 module: IMU1); listen longer with --wait 5" in capsys.readouterr().err
 
 
 async def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
@@ -116,4 +116,4 @@ async def test_nobody_there(capsys: pytest.CaptureFixture[str]) -> None:
         await list_(session)
         with pytest.raises(r2p.Error, match="nodes found: none"):
             await info(session, "drive")
-    assert "no nodes found on memory:lab" in capsys.readouterr().err
+    assert "no nodes yet on memory:lab" in capsys.readouterr().err

@@ -145,6 +145,19 @@ leds   PC1/blink
     assert "MOTOR/log\n" in aligned(rows, ["topic", "publishers"], 5)  # no item is cut
 
 
+def test_a_table_that_is_still_too_wide_folds_its_texts_between_words_and_inside_of_urls() -> None:
+    link = "zenoh:tcp/192.168.0.10:7447?network=lab"
+    rows = [{"module": "MOTOR1", "wire": "2, not 1", "seen": ["A/b", "C/d"], "link": link, "age": "0.1 s"}]
+    columns = list(rows[0])
+    folded = """\
+MODULE  WIRE      SEEN     LINK                     AGE
+MOTOR1  2, not 1  A/b C/d  zenoh:tcp/192.168.0.10:  0.1 s
+                           7447?network=lab
+"""
+    assert aligned(rows, columns, 60) == folded
+    assert aligned(rows, columns, 120) == aligned(rows, columns)
+
+
 def test_flatten() -> None:
     assert flatten({"a": {"b": [{"c": 1}]}, "d": []}) == {"a.b[0].c": 1}
 

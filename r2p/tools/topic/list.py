@@ -72,7 +72,7 @@ async def find(
     rows = [_row(session, view, types) | {"match": match} for view, match in found]
     await output.table(rows, [*_COLUMNS, "match"])
     if not rows:
-        raise r2p.Error(f"no topics of type {what} found on {session.network_name}")
+        raise r2p.Error(session.none_yet(f"topics of type {what}"))
 
 
 def _wanted(what: str) -> tuple[int, bytes | None]:

@@ -70,7 +70,7 @@ async def test_list_of_nothing(capsys: pytest.CaptureFixture[str]) -> None:
         await list_(session)
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err.startswith(f"r2p: no topics found on {VIA}: heard no module")
+    assert captured.err.startswith(f"r2p: no topics yet on {VIA} (heard 0 modules)")
 
 
 @pytest.mark.virtual_time
