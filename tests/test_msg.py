@@ -121,7 +121,10 @@ def test_recorded_payloads(message: Message, payload: str) -> None:
         (StampedQEI(Timestamp(1, 2), -3), "0100000002000000fdff"),
         (Proximity((1, 2, 3, 65535)), "010002000300ffff"),
         (Odometry(Pose3(1.0, 0.0, 0.0), Velocity3(w=2.0)), "0000803f" + "00" * 16 + "00000040"),
-        (Log(Timestamp(1, 0), 20, "PC1", "blink", "hi"), "010000000000000014" + b"PC1\0\0\0\0blink\0\0\0hi".hex() + "00" * 126),
+        (
+            Log(Timestamp(1, 0), 20, "PC1", "blink", "hi"),
+            "010000000000000014" + b"PC1\0\0\0\0blink\0\0\0hi".hex() + "00" * 126,
+        ),
     ],
 )
 def test_packed(message: Message, payload: str) -> None:

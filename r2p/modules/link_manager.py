@@ -278,7 +278,10 @@ class LinkManager:
             what = f"{event.command.name} of {name}"
             reason = _DENIED.get(event.reason, "it lacks --allow-control")
             text = f"gateway {event.gateway} does not let {what} through: {reason}"
-            self.link_notice(link, f"{event.command.name} denied", text, trouble=True)
+            notice = LinkNotice(link.name, f"{event.command.name} denied", text)
+            if not self.observer:  # a tool ends with this text
+                logger.warning("link %s: %s", link.title, text)
+            self._events.emit(notice)
 
     def _report_gone(self, link: Link, event: ModuleGone) -> None:
         """Report that a module on the link itself is gone, while the link is up; without a good-bye, as trouble."""

@@ -68,8 +68,9 @@ class Check(msgspec.Struct, frozen=True):
     def text(self, yes: str = "has", no: str = "lacks", *, width: int | None = None) -> str:
         """Return lines for people; those that are wider than `width` break between words, within their column."""
         steps = [step for step in self.do.split("\n") if step]
-        lines = [(f"{yes if self.ok else no:<6} {self.what:<13} ", self.found), *((f"{'':20} > ", step) for step in steps)]
-        return "\n".join(_wrapped(head, text, width) for head, text in lines)
+        head = f"{yes if self.ok else no:<6} {self.what:<13} "
+        lines = [_wrapped(head, self.found, width), *(_wrapped(f"{'':20} > ", step, width) for step in steps)]
+        return "\n".join(lines)
 
 
 def _wrapped(head: str, text: str, width: int | None) -> str:

@@ -28,7 +28,7 @@ import functools
 import inspect
 import os
 import string
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import typer
@@ -428,7 +428,7 @@ def execute(
     verbose: int = 0,
     quiet: int = 0,
     endless: bool = False,
-    run: Callable[[Callable[[], Awaitable[object]]], object] | None = None,
+    run: Callable[[Callable[[], Coroutine[Any, Any, None]]], object] | None = None,
 ) -> None:
     """Run a command until it ends or a signal ends it, and exit with its code. `run` replaces `r2p.run_main`.
 

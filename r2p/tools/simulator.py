@@ -12,9 +12,9 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import typer
 from rich.console import Console, Group, RenderableType
@@ -102,7 +102,7 @@ def command(
             allow_control=allow_control,
         )
 
-    def virtually(main: Callable[[], Awaitable[object]]) -> None:
+    def virtually(main: Callable[[], Coroutine[Any, Any, None]]) -> None:
         sim.run(main, seed=seed)
 
     # Only errors are logged: any other line would tear the display apart.

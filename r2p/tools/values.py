@@ -113,7 +113,30 @@ def _yaml(text: str) -> Any:
                 raise _too_deep(text)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, UnicodeError) as error:
-        raise MessageError(f"{_excerpt(text)} is not valid YAML: {getattr(error, 'problem', None) or error}") from error
+        raise MessageError(f"{_excerpt(text)} is not valid {_problem(text, error)}") from error
+
+
+def _problem(text: str, error: Exception) -> str:
+    """Say what is wrong with a text that is neither YAML nor JSON, and where."""
+    if text.lstrip().startswith('{"'):  # as JSON is written
+        try:
+            json.loads(text)
+        except json.JSONDecodeError as problem:
+            return f"JSON: {problem.msg[:1].lower()}{problem.msg[1:]}{_place(text, problem.pos)}"
+        except RecursionError:
+            pass
+    mark = getattr(error, "problem_mark", None)
+    place = "" if mark is None else _place(text, mark.index)
+    return f"YAML: {getattr(error, 'problem', None) or error}{place}"
+
+
+def _place(text: str, index: int) -> str:
+    """Return the place of a character in a text, for the end of an error."""
+    if index >= len(text.rstrip()):
+        return " at its end"
+    before = text[:index].split("\n")
+    line = f" in line {len(before)}" if "\n" in text.strip() else ""
+    return f" at character {len(before[-1]) + 1}{line}"
 
 
 def _excerpt(text: str) -> str:

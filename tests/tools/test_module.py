@@ -130,7 +130,9 @@ async def test_a_reboot_is_confirmed_by_what_happens_not_by_old_flags(monkeypatc
             await reboot(session, "BOT", timeout=4.0)
 
 
-async def test_a_gateway_that_refuses_an_order_says_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_gateway_that_refuses_an_order_says_so_at_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr("r2p.bridge.options.IP", frozenset({"memory"}))
     gateway = r2p.Module("GW", via=["memory:lab", "memory:bus"], bridge=True)
     async with gateway, r2p.Module("IMU1", via="memory:bus"), tool() as session:
@@ -139,6 +141,7 @@ async def test_a_gateway_that_refuses_an_order_says_so_at_once(monkeypatch: pyte
         with pytest.raises(r2p.Error, match="gateway GW does not let REBOOT of IMU1 through: it lacks --allow-control"):
             await reboot(session, "IMU1")
         assert asyncio.get_running_loop().time() - started < 0.1
+    assert "lacks --allow-control" not in caplog.text, "the command ends with the reason: once is enough"
 
 
 async def test_an_order_that_a_gateway_may_have_refused_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 
 import r2p
 from r2p.msg import Led
-from r2p.tools import options, session
 from r2p.tools import main as command_line
+from r2p.tools import options, session
 from r2p.tools.output import PipeClosed
 from r2p.tools.session import Session, Settings, TimedOut, UsageError, execute, join
 from tests.ports import free_port

@@ -164,14 +164,12 @@ def test_behind_a_gateway_only_an_announced_publisher_has_a_name() -> None:
 
 
 async def test_a_gateway_announces_itself_as_one() -> None:
-    options = r2p.BridgeOptions()
-    async with r2p.Module("GW", via=["memory:a", "memory:b"], bridge=options), r2p.Module("PC1", via="memory:a") as one:
-        async with r2p.Module("PC2", via="memory:b") as two:
-            while len(two.links[0].discovery.modules) < 2 or len(one.links[0].discovery.modules) < 2:
-                await asyncio.sleep(0.1)
-            for module, other in ((one, "PC2"), (two, "PC1")):
-                known = module.links[0].discovery.modules
-                assert (known["GW"].gateway, known[other].gateway) == (True, False)
+    gateway = r2p.Module("GW", via=["memory:a", "memory:b"], bridge=True)
+    async with gateway, r2p.Module("PC1", via="memory:a") as one, r2p.Module("PC2", via="memory:b") as two:
+        await asyncio.sleep(10)
+        for module, other in ((one, "PC2"), (two, "PC1")):
+            known = module.links[0].discovery.modules
+            assert (known["GW"].gateway, known[other].gateway) == (True, False)
 
 
 def test_firmware_is_known_where_it_is_alone() -> None:

@@ -56,9 +56,9 @@ class ModuleInfo(msgspec.Struct, frozen=True):
     """A module on the link.
 
     `flags` are those of its ALIVE, `last_heard` is in monotonic ns. Only an r2p module has an `instance` (the random
-    number of its start), a `lease` (ns that it may be silent), and may be an `observer`, a tool that sends no ALIVE, or a
-    `gateway`, which is only known of one on the link itself.
+    number of its start), a `lease` (ns that it may be silent), and may be an `observer`, a tool that sends no ALIVE.
     `hops` is the number of gateways in between. `wire` and `release` are those of its HELLO (0 and empty: not known).
+    `gateway` is known only of modules on the link itself.
     """
 
     name: str
@@ -66,12 +66,12 @@ class ModuleInfo(msgspec.Struct, frozen=True):
     last_heard: int = 0
     instance: int | None = None
     observer: bool = False
-    gateway: bool = False
     lease: int = 0
     hops: int = 0
     source: PeerAddress = None
     wire: int = 0
     release: str = ""
+    gateway: bool = False
 
     @property
     def r2p(self) -> bool:

@@ -56,7 +56,7 @@ async def echo(
     names = list(dict.fromkeys(map(topic_name, topics)))
     types = Types(session.settings)
     readers = [_TopicReader(session, name, types, type, filter) for name in names]
-    selection = _Selection(field, meta=meta, several=len(names) > 1, csv=output.format == "csv")
+    selection = _Selection(names, field or [], meta=meta, csv=output.format == "csv")
     left = 1 if once else count
 
     async def print_all(reader: _TopicReader) -> None:
@@ -77,45 +77,72 @@ async def echo(
     try:
         async with output.while_read(), patience(missing, timeout) as received, asyncio.TaskGroup() as group:
             if selection.labelled:
-                if not all(each.typed for each in readers):
-                    await session.settle()
-                await output.header([path for each in readers for path in await each.columns(selection)])
+                await _print_header(session, output, readers, selection)
+            for reader in readers:
+                reader.check_fields(selection)
             tasks = [group.create_task(print_all(reader)) for reader in readers]
     finally:
         for reader in readers:
             reader.report()
 
 
-class _Selection(msgspec.Struct):
-    """The printed part of a message: the `fields` that the user chose, and where it comes from."""
+async def _print_header(
+    session: Session, output: Output, readers: "list[_TopicReader]", selection: "_Selection"
+) -> None:
+    """Print the header of CSV with several topics, whose types must be known as far as possible."""
+    if not all(each.typed for each in readers):
+        await session.settle()
+    await output.header([path for each in readers for path in await each.columns(selection)])
 
-    fields: list[str] | None
+
+class _Selection(msgspec.Struct):
+    """The printed part of a message: the `fields` that the user chose, and where it comes from.
+
+    Of several `topics` only one needs to have a field: `lacking` are the topics without it, by field.
+    """
+
+    topics: list[str]
+    fields: list[str]
     meta: bool
-    several: bool
     csv: bool
+    lacking: dict[str, set[str]] = {}
 
     @property
     def labelled(self) -> bool:
         """True if a column names the topic of each row: CSV has one header for all topics."""
-        return self.csv and self.several
+        return self.csv and len(self.topics) > 1
 
     def of(self, topic: str, record: dict[str, Any], sample: r2p.Sample | None) -> dict[str, Any]:
-        """Return the record to print. Raises UsageError if it lacks a field."""
-        row = _chosen(record, self.fields)
+        """Return the record to print. Raises UsageError for a field that no topic has."""
+        return self.label(topic, self._chosen(topic, record) if self.fields else record, sample)
+
+    def label(self, topic: str, row: dict[str, Any], sample: r2p.Sample | None) -> dict[str, Any]:
+        """Return a row with the topic, and with what else --meta adds."""
         if self.labelled:
             row = {"topic": topic} | {"topic_" if name == "topic" else name: value for name, value in row.items()}
-        if self.meta or (self.several and not self.csv):
+        if self.meta or (len(self.topics) > 1 and not self.csv):
             row[META] = _meta(topic, sample)
         return row
 
+    def _chosen(self, topic: str, record: dict[str, Any]) -> dict[str, Any]:
+        row = {}
+        for path in self.fields:
+            lacking = self.lacking.setdefault(path, set())
+            try:
+                row[path] = pick(record, path)
+                lacking.discard(topic)  # its type was not known before
+            except KeyError as error:
+                self._note_lacking(topic, path, lacking, error.args[0])
+        return row
 
-def _chosen(record: dict[str, Any], fields: list[str] | None) -> dict[str, Any]:
-    if not fields:
-        return record
-    try:
-        return {path: pick(record, path) for path in fields}
-    except KeyError as error:
-        raise UsageError(error.args[0]) from error
+    def _note_lacking(self, topic: str, path: str, lacking: set[str], problem: str) -> None:
+        """Report once that a topic lacks a field. Raises UsageError if none of them has it."""
+        is_new = topic not in lacking
+        lacking.add(topic)
+        if len(lacking) == len(self.topics):
+            raise UsageError(problem if len(lacking) == 1 else f"no topic has a field {path}; of {topic}: {problem}")
+        if is_new:
+            notify(f"{topic} has no field {path}: left out there")
 
 
 class _TopicReader:
@@ -154,8 +181,14 @@ class _TopicReader:
         """Return the columns of CSV that the messages will have, as far as their type is known by now."""
         if not self.typed:
             await self._learn()
-        record = {_HEX: ""} if self._cls is None else to_plain(r2p.layout(self._cls).zero)
-        return list(flatten(selection.of(self.topic, record, None)))
+        if self._cls is None:  # its messages are in hex, or have these fields once their type is known
+            return list(flatten(selection.label(self.topic, dict.fromkeys(selection.fields or [_HEX], ""), None)))
+        return list(flatten(selection.of(self.topic, to_plain(r2p.layout(self._cls).zero), None)))
+
+    def check_fields(self, selection: _Selection) -> None:
+        """Raise UsageError for a field that no topic has, as far as their types are known by now."""
+        if self._cls is not None:
+            selection.of(self.topic, to_plain(r2p.layout(self._cls).zero), None)
 
     def report(self) -> None:
         """Report what is missing in the output."""

@@ -99,6 +99,23 @@ async def test_an_unknown_field_is_a_mistake() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_a_field_that_only_some_topics_have(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(leds, poses), tool() as session:
+        await echo(session, ["leds", "poses"], count=6, field=["x"], format="csv")
+        captured = capsys.readouterr()
+        header, *rows = captured.out.splitlines()
+        assert (header, set(rows)) == ("topic,x", {"leds,", "poses,0.1"})
+        assert captured.err.count("leds has no field x: left out there") == 1
+        await echo(session, ["leds", "poses"], count=6, field=["x", "led"])
+        fields = [set(record) - {"_"} for record in printed(capsys)]
+        assert all(each in fields for each in ({"x"}, {"led"}))
+        with pytest.raises(ExceptionGroup) as caught:
+            await echo(session, ["leds", "poses"], field=["x", "z"])
+    problem = r"no topic has a field z; of (leds: there is no field z; the fields are led|poses: there is)"
+    assert caught.group_contains(UsageError, match=problem)
+
+
+@pytest.mark.virtual_time
 async def test_csv_of_several_topics_has_a_column_for_the_topic(capsys: pytest.CaptureFixture[str]) -> None:
     async def gateway(node: r2p.Node) -> None:
         publisher = node.advertise("gateway", GatewayStatus, latch=True)

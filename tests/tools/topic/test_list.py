@@ -157,7 +157,7 @@ async def test_find(what: str, found: dict[str, str], capsys: pytest.CaptureFixt
 @pytest.mark.virtual_time
 async def test_find_nothing() -> None:
     async with robot(blink), tool() as session:
-        with pytest.raises(r2p.Error, match="no topics of type StampedPose3 found"):
+        with pytest.raises(r2p.Error, match="no topics of type StampedPose3 yet on"):
             await find(session, "StampedPose3")
 
 

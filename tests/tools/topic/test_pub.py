@@ -245,6 +245,15 @@ async def test_a_bad_line_on_stdin_is_told_by_its_number(monkeypatch: pytest.Mon
             await pub(session, "cmd", ["-"], type="Led")
 
 
+@pytest.mark.virtual_time
+async def test_bad_json_on_stdin_is_told_by_its_line_and_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO('{"led": 1}\n{"led": 1 "value": 0}\n'))
+    problem = r"""line 2: '{"led": 1 "value": 0}' is not valid JSON: expecting ',' delimiter at character 11"""
+    async with robot(Listener().listen), tool() as session:
+        with pytest.raises(r2p.MessageError, match=problem):
+            await pub(session, "cmd", ["-"], type="Led")
+
+
 @pytest.mark.parametrize("regular", [True, False], ids=["file", "pipe"])
 def test_lines_are_read_alike_from_files_and_pipes(regular: bool, tmp_path: Path) -> None:
     async def lines(data: bytes) -> list[str]:
