@@ -196,12 +196,11 @@ class Session:
             yield
 
     def unannounced(self, known: Iterable[r2p.Endpoint], links: Iterable[str]) -> dict[str, str]:
-        """Return the links without a known endpoint, each with the only module at its other end, or `?`."""
-        modules = [view for view in self.module.network.modules() if view.state != "observer"]
+        """Return the links without a known endpoint, each with the only module that may be meant, or `?`."""
         covered, found = {each.link for each in known}, {}
-        for link in (each for each in links if each not in covered):
-            names = {view.name for view in modules if view.link == link}
-            found[link] = names.pop() if len(names) == 1 else "?"
+        for link in (each for each in self.module.links if each.name in set(links) - covered):
+            names = link.possible_senders()
+            found[link.name] = names.pop() if len(names) == 1 else "?"
         return found
 
     async def settle(self, wait: float | None = None, *, of: str = "topics") -> None:

@@ -16,7 +16,7 @@ import msgspec
 
 from r2p.codecs.management import ROLE_PUBLISHES
 from r2p.names import LOG, MANAGEMENT
-from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined
+from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined, possible_senders
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import Sample, Source
@@ -342,8 +342,7 @@ class SenderLookup:
             for each in self._discovery.endpoints.values()
             if each.topic == topic and each.role == ROLE_PUBLISHES and (address is None or each.instance in names)
         }
-        forwarded = any(info.gateway or info.hops for info in modules)
-        possible = set() if forwarded else {info.name for info in modules if not info.observer}
+        possible = possible_senders(modules)
         if _is_published_by_all(topic) and len(possible) != 1:
             return Source(link=self._link)  # the first that announces it need not have sent this message
         if len(publishers) == 1:

@@ -39,6 +39,7 @@ from r2p.protocols.discovery.events import (
     SubscriberJoined,
     SubscribersGone,
     TopicType,
+    possible_senders,
 )
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
@@ -270,6 +271,10 @@ class Link(abc.ABC):
         self.up = False
         self._alarm.close()
         self._release_topics()
+
+    def possible_senders(self) -> set[str]:
+        """Return the modules that may have what none of them has announced, by name; empty: there may be others."""
+        return possible_senders(self.discovery.modules.values())
 
     def manage(self, data: bytes, source: Hashable) -> None:
         """Handle a management message from this address."""

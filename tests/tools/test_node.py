@@ -104,6 +104,16 @@ async def test_a_node_is_listed_when_its_module_is_known(capsys: pytest.CaptureF
     assert [row["node"] for row in printed(capsys)] == ["BOT/drive"]
 
 
+async def test_a_topic_behind_a_gateway_is_not_the_gateways(capsys: pytest.CaptureFixture[str]) -> None:
+    """The module that publishes it may be announced late."""
+    async with tool() as session:
+        gateway = Firmware()
+        gateway.send(management.Hello("GW", 7, management.HELLO_GATEWAY))
+        gateway.advertise("tilt", 4)
+        await list_(session)
+    assert [row["node"] for row in printed(capsys)] == ["?/?"]
+
+
 async def test_modules_without_nodes_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     async with tool() as session:
         Firmware("IMU1").alive()

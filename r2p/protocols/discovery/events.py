@@ -7,7 +7,7 @@ which has one other end.
 
 import enum
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 
 import msgspec
 
@@ -80,6 +80,16 @@ class ModuleInfo(msgspec.Struct, frozen=True):
     def differs(self, other: "ModuleInfo") -> bool:
         """Return whether anything but the time of the last message differs."""
         return msgspec.structs.replace(other, last_heard=self.last_heard) != self
+
+
+def possible_senders(modules: Iterable[ModuleInfo]) -> set[str]:
+    """Return the modules that may send what none of them has announced, by name; empty: there may be others.
+
+    Behind a gateway there may always be modules whose announcements are late. Tools announce all that they publish.
+    """
+    modules = list(modules)
+    forwarded = any(info.gateway or info.hops for info in modules)
+    return set() if forwarded else {info.name for info in modules if not info.observer}
 
 
 class Send(msgspec.Struct, frozen=True):
