@@ -22,6 +22,9 @@ File = Annotated[
 @app.command("show")
 @standalone
 async def show(file: File = None, *, via: Via = None, format: Format = None) -> None:
-    """Show each setting and its source: an option, an environment variable, the file, or a default."""
+    """Show each setting and its source.
+
+    That is an option, an environment variable, the file, or a default.
+    """
     rows = [{"key": each.key, "value": each.value, "source": each.source} for each in list_settings(via, file)]
     await Output(format).table(rows, ["key", "value", "source"])

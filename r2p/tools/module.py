@@ -34,7 +34,10 @@ Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
 
 @session.command(app, "list")
 async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
-    """List the modules: state, kind (r2p or firmware), versions, link, and seconds since the last message from each."""
+    """List the modules and their state.
+
+    The kind is r2p or firmware, and the age is the time since the last message from the module.
+    """
     output = Output(format)
     await session.settle(wait, of="modules")
     if wait is None:

@@ -44,7 +44,10 @@ async def info(
     wait: Wait = None,
     format: Format = None,
 ) -> None:
-    """Show what a node publishes and subscribes: types, and the classes of its publishers."""
+    """Show what a node publishes and subscribes to.
+
+    It includes the types, and the classes of the publishers.
+    """
     output = Output(format)
     await session.settle(wait)
     nodes = _nodes(session)

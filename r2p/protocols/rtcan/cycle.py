@@ -50,7 +50,9 @@ def timing(slots: int = 60, nominal: int = 10_000_000, bit_rate: int = 1_000_000
     bit = SECOND // bit_rate
     longest = (frame_bits_max(FRAME_MAX) + INTERMISSION) * bit
     if slot < longest:
-        raise ValueError(f"slots of {slot // 1000} us are too short for frames of up to {longest // 1000} us")
+        short = f"slots of {slot // 1000} us are too short for frames of up to {longest // 1000} us"
+        fitting = nominal // (-(-longest // _MICROSECOND) * _MICROSECOND)
+        raise ValueError(f"{short}; at most {fitting} fit in this cycle, alike for all nodes")
     return Timing(slots, slot, bit)
 
 

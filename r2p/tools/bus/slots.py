@@ -60,7 +60,10 @@ async def schedule(
     svg: Svg = None,
     format: Format = None,
 ) -> None:
-    """Draw the slots of a CAN bus: owners, free slots, and slots that were reserved but not used. Sends nothing."""
+    """Draw the slots of a CAN bus.
+
+    It shows their owners, the free ones, and those that were reserved but not used. It sends nothing.
+    """
     output = Output(format)
     if not await bus.cycles(cycles, timeout=_SYNC_TIMEOUT):
         raise TimedOut(
@@ -129,7 +132,7 @@ def admit(
     messages: Annotated[
         list[str],
         typer.Argument(
-            metavar="NAME:BYTES@RATE...", show_default=False, help="imu:18@200Hz or imu:18@5ms, in this order."
+            metavar="NAME:BYTES@RATE", show_default=False, help="imu:18@200Hz or imu:18@5ms, in this order."
         ),
     ],
     *,
@@ -143,7 +146,9 @@ def admit(
     svg: Svg = None,
     format: Format = None,
 ) -> None:
-    """Check whether periodic messages fit on a bus, in which slots, and what is left. Opens and sends nothing.
+    """Check whether periodic messages fit on a bus.
+
+    It shows in which slots, and what is left. It opens no bus.
 
     Messages are admitted in this order, as the master does it; a period is rounded down to one compatible with the
     others. The exit code is 1 if one is refused.

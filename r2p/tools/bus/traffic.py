@@ -46,7 +46,9 @@ def _instead(urls: list[str]) -> str:
 async def load(
     bus: BusMonitor, *, count: Count = None, once: Once = False, timeout: Timeout = None, format: Format = None
 ) -> None:
-    """Print the load of a CAN bus once a second: all bits, including stuff bits, by topic and module. Sends nothing.
+    """Print the load of a CAN bus once a second.
+
+    It counts all bits, including stuff bits, by topic and module, and sends nothing.
 
     `free slots used` is the load of the unreserved slots: above 80 % events wait long. Frames that RTCAN does not use
     (11-bit identifiers, remote frames) are of kind `other`.
@@ -126,7 +128,9 @@ async def dump(
     timeout: Timeout = None,
     format: Format = None,
 ) -> None:
-    """Print the frames on a CAN bus: time, slot, kind, topic, module, laxity, fragment, data. Sends nothing.
+    """Print the frames on a CAN bus, and send nothing.
+
+    A line has time, slot, kind, topic, module, laxity, fragment and data.
 
     Topics and modules appear as numbers until they have announced their names.
     """

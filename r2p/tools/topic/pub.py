@@ -49,7 +49,7 @@ async def pub(
     topic: Topic,
     message: Annotated[
         list[str] | None,
-        typer.Argument(metavar="MESSAGE...", help="'{x: 1.5}', x=1.5 w=0.25, or - for JSON lines from stdin."),
+        typer.Argument(metavar="MESSAGE", help="'{x: 1.5}', x=1.5 w=0.25, or - for JSON lines from stdin."),
     ] = None,
     *,
     type: TypeName = None,

@@ -33,7 +33,7 @@ Topic = Annotated[
 ]
 Topics = Annotated[
     list[str],
-    typer.Argument(metavar="TOPIC...", autocompletion=_complete_topic, parser=valid_topic, show_default=False),
+    typer.Argument(metavar="TOPIC", autocompletion=_complete_topic, parser=valid_topic, show_default=False),
 ]
 TypeName = Annotated[
     str | None,

@@ -24,7 +24,7 @@ def slave() -> Cycle:
 def test_the_timing_of_the_thesis() -> None:
     assert (TIMING.slot, TIMING.cycle, TIMING.bit) == (166_000, 9_960_000, 1_000)
     assert timing(10, 20_000_000, 125_000).bit == 8_000
-    with pytest.raises(ValueError, match="slots of 158 us are too short for frames of up to 160 us"):
+    with pytest.raises(ValueError, match="slots of 158 us are too short for frames of up to 160 us; at most 62 fit"):
         timing(63)
 
 
