@@ -8,7 +8,7 @@ import asyncio
 import logging
 import sys
 from collections.abc import AsyncIterator, Callable
-from typing import Any, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar, overload
 
 from r2p.clock import SHORTEST, Alarm, Ticker, check_seconds, check_timeout
 from r2p.errors import Closed, Error, InvalidName, TransportError
@@ -27,6 +27,18 @@ M = TypeVar("M", bound=Message)
 
 QUEUE = 16
 """Messages in a subscriber's queue, by default."""
+
+
+_OF_ROS = {
+    "create_publisher": "node.advertise(topic, type)",
+    "create_subscription": "node.subscribe(topic, type)",
+    "create_timer": "async for tick in node.every(seconds):",
+    "create_rate": "async for tick in node.every(seconds):",
+    "get_logger": "node.log",
+    "get_clock": "node.now()",
+    "get_name": "node.name",
+}
+"""What to write here for the methods that a node of ROS 2 has."""
 
 
 class Tick(NamedTuple):
@@ -362,6 +374,12 @@ class Node:
 
     def _log_crash(self, error: Exception) -> None:
         self.log.error("node %s, which does not run: %r", self.name, error, exc_info=error)
+
+    if not TYPE_CHECKING:  # checkers report any unknown attribute
+
+        def __getattr__(self, name: str) -> NoReturn:
+            instead = f": write `{_OF_ROS[name]}`" if name in _OF_ROS else ""
+            raise AttributeError(f"a node has no {name}{instead}", name=name, obj=self)
 
     def _resolve(self, topic: str) -> str:
         if self.closed:

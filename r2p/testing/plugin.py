@@ -46,6 +46,8 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     test = _async_function(pyfuncitem.obj if hypothesis is None else hypothesis.inner_test)
     if test is None:
         return None
+    if marker.args or not marker.kwargs.keys() <= {"seed", "limit"}:
+        pytest.fail("@pytest.mark.virtual_time takes seed= and limit=, by name, and nothing else", pytrace=False)
 
     @functools.wraps(test)
     def under_virtual_time(*positional: object, **named: object) -> None:
@@ -158,6 +160,6 @@ def _run(test: Callable[[], Coroutine[Any, Any, object]], marker: pytest.Mark) -
         asyncio.get_running_loop().set_exception_handler(keep)
         await test()
 
-    run(main, *marker.args, **marker.kwargs)
+    run(main, **marker.kwargs)
     if unhandled:
         raise ExceptionGroup("exceptions in callbacks, or in tasks that were not awaited", unhandled)

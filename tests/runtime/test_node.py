@@ -6,6 +6,7 @@ import asyncio
 import logging
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -51,6 +52,16 @@ async def test_spin_serves_callbacks_and_says_false_on_time_out() -> None:
         assert got == [("a", 1), ("b", 2), ("a", 3)]
         assert [yes for yes, _ in served] == [True, True, False, False]
         assert [(at - start) // MS for _, at in served] == pytest.approx([600, 1000, 2000, 3000], abs=2)
+
+
+@pytest.mark.virtual_time
+async def test_what_a_node_of_ros_has_says_what_to_write_here() -> None:
+    async with local() as module:
+        node: Any = module.start(hold)
+        with pytest.raises(AttributeError, match=r"no create_publisher: write `node.advertise\(topic, type\)`"):
+            node.create_publisher(Led, "leds", 10)
+        with pytest.raises(AttributeError, match=r"a node has no subscrib$"):
+            node.subscrib("leds", Led)
 
 
 @pytest.mark.virtual_time

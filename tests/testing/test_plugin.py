@@ -193,6 +193,11 @@ async def test_robot(robot):
     assert "the fixture robot is async, but virtual time runs only during the test" in output(project, tests)
 
 
+def test_a_mark_with_other_arguments_gets_advice(project: pytest.Pytester) -> None:
+    tests = "@pytest.mark.virtual_time(5)\nasync def test_limit(): ..."
+    assert "@pytest.mark.virtual_time takes seed= and limit=, by name" in output(project, tests)
+
+
 MISTAKES = """
 from r2p.msg import Led
 
