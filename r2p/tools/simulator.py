@@ -11,6 +11,7 @@ import importlib.util
 import math
 import os
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterable
 from pathlib import Path
@@ -103,7 +104,11 @@ def command(
         )
 
     def virtually(main: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        sim.run(main, seed=seed)
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, which Python raises itself
+        try:
+            sim.run(main, seed=seed)
+        finally:
+            signal.signal(signal.SIGTERM, before)
 
     # Only errors are logged: any other line would tear the display apart.
     endless = duration is None and not fast

@@ -334,7 +334,7 @@ def test_a_signal_is_a_success_only_for_commands_without_an_end(
     """The end comes from within: a function of the command sends the signal, and waits."""
 
     async def interrupted(*_: object, **__: object) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGTERM)
         await asyncio.Event().wait()
 
     Path("r2p.toml").write_text('[launch.imu]\ncommand = "sim"', encoding="ascii")
