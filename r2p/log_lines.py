@@ -159,7 +159,11 @@ def wrapped(text: str, stream: TextIO) -> str:
 
     A terminal would break them inside of words. Words that are longer than a line, such as URLs, stay whole.
     """
-    width = _width(stream) if stream.isatty() else 0
+    return wrapped_at(text, _width(stream) if stream.isatty() else 0)
+
+
+def wrapped_at(text: str, width: int) -> str:
+    """Return text whose lines have at most `width` characters, broken between words; 0: as it is."""
     return "\n".join(_wrapped_line(line, width) if 0 < width < len(line) else line for line in text.split("\n"))
 
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
+from r2p.log_lines import wrapped_at
 from r2p.tools.config import CONFIG_VARIABLE, VIA_VARIABLE
 from r2p.tools.launch.entries import Entry
 from r2p.tools.launch.group import SIGNALLED, RunningCommand
@@ -26,6 +27,7 @@ _STDOUT, _STDERR = 1, 2
 _LONGEST = 1 << 16  # bytes of a line; what is longer is shown in several
 _ATOMIC = 4096  # bytes that a writable pipe accepts without blocking (POSIX: at least 512)
 _DRAIN = 1.0  # seconds in which the last lines of a command that has ended are shown
+_BAR = " | "  # between the name of a command and its line
 _COLOURS = (36, 33, 32, 35, 34)  # of names at a terminal; not red, as that means an error
 
 
@@ -46,13 +48,22 @@ class LinePrinter:
         prefix = self._prefix(name, coloured=os.isatty(sink))
         with source:
             for line in iter(lambda: source.readline(_LONGEST), b""):
-                self._write(sink, prefix + line.rstrip(b"\r\n") + b"\n")
+                pieces = self._fitting(line.rstrip(b"\r\n"), sink)
+                self._write(sink, b"".join(prefix + each + b"\n" for each in pieces))
+
+    def _fitting(self, line: bytes, sink: int) -> list[bytes]:
+        """Break a line between words where it is too long for a terminal, so that each piece gets the prefix."""
+        width = _columns(sink) - self._width - len(_BAR)
+        if not 0 < width < len(line) or b"\x1b" in line:  # an escape sequence is not as wide as it is long
+            return [line]
+        text = wrapped_at(line.decode(errors="surrogateescape"), width)
+        return text.encode(errors="surrogateescape").split(b"\n")
 
     def _prefix(self, name: str, *, coloured: bool) -> bytes:
         text = name.ljust(self._width)
         if coloured and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":
             text = f"\x1b[{_COLOURS[self._names.index(name) % len(_COLOURS)]}m{text}\x1b[0m"
-        return f"{text} | ".encode()
+        return f"{text}{_BAR}".encode()
 
     def _write(self, sink: int, line: bytes) -> None:
         left = memoryview(line)
@@ -64,6 +75,14 @@ class LinePrinter:
                 except OSError as error:
                     self.error = error
                     self._on_error()
+
+
+def _columns(sink: int) -> int:
+    """Return the columns of a terminal; 0: it is none."""
+    try:
+        return os.get_terminal_size(sink).columns
+    except OSError:
+        return 0
 
 
 def make_environment(path: Path, via: list[str] | None) -> dict[str, str]:

@@ -8,6 +8,7 @@ import os
 import select
 import signal
 import sys
+import termios
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -186,6 +187,16 @@ def test_names_have_colours_at_a_terminal(
     terminal, sink = os.openpty()
     LinePrinter(["imu"], lambda: None).copy("imu", io.BytesIO(b"x\n"), sink)
     assert os.read(terminal, 100) == (b"\x1b[36mimu\x1b[0m | x\r\n" if coloured else b"imu | x\r\n")
+    os.close(terminal)
+    os.close(sink)
+
+
+def test_long_lines_break_between_words_at_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    terminal, sink = os.openpty()
+    termios.tcsetwinsize(sink, (24, 30))
+    LinePrinter(["imu"], lambda: None).copy("imu", io.BytesIO(b"a warning that is too long for\xff it\n"), sink)
+    assert os.read(terminal, 200) == b"imu | a warning that is too\r\nimu |   long for\xff it\r\n"
     os.close(terminal)
     os.close(sink)
 
