@@ -103,7 +103,8 @@ async def test_nobody_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert captured.out == ""
     assert captured.err == (
         "r2p: waiting for ALIVE of firmware on memory:lab\n"
-        "r2p: no modules yet on memory:lab (heard 0 modules); try r2p doctor --via memory:lab\n"
+        "r2p: no modules yet on memory:lab (heard 0 modules): such a network is inside one program; "
+        "tcp-listen: and tcp: join two\n"
     )
 
 
