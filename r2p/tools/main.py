@@ -7,6 +7,7 @@ function `command` for Typer. `r2p.tools.session` has how they join the network,
 import errno
 import importlib
 import os
+import re
 import sys
 from typing import Any, NoReturn
 
@@ -37,6 +38,14 @@ COMMANDS = {
 _COMPLETION_OPTIONS = ("--install-completion", "--show-completion")
 _SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
 
+_PYDANTIC = {
+    r"^Value error, ": "",
+    r"Input should be a valid integer.*": "write a whole number",
+    r"Input should be greater than or equal to (\S+)": r"write a number of at least \1",
+    r"Input should be less than or equal to (\S+)": r"write a number of at most \1",
+}
+"""Texts of pydantic, which checks values for Typer, as patterns, and what r2p says instead."""
+
 LAUNCHER_VARIABLE = "R2P_LAUNCHER"
 """The environment variable by which `r2p launch` gives its process id to the commands that it starts."""
 
@@ -59,9 +68,16 @@ class LazyGroup(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ")  # added by pydantic, through Typer
+            error.message = _without_pydantic(error.message)
             error.message = _wrapped_behind(f"Error: {error.format_message()}", error.message)
             raise
+
+
+def _without_pydantic(text: str) -> str:
+    """Return what is wrong with a value, in r2p's words."""
+    for pattern, plain in _PYDANTIC.items():
+        text = re.sub(pattern, plain, text)
+    return text
 
 
 def _complete_in(ctx: Any, option: str, shell: str) -> None:

@@ -37,6 +37,10 @@ def test_every_command_has_help(name: str) -> None:
         (["topic", "echo"], "Missing"),
         (["topic", "echo", "a/b/c"], "topic name 'a/b/c': use letters, digits and underscores, and at most one `/`"),
         (["topic", "list", "--format", "xml"], "Invalid value for '--format': 'xml' is not one of 'yaml'"),
+        (["topic", "hz", "leds", "-n", "x"], "Invalid value for '--count' / '-n': write a whole number\n"),
+        (["topic", "hz", "leds", "-n", "0"], "Invalid value for '--count' / '-n': write a number of at least 1\n"),
+        (["bus", "admit", "imu:1@1s", "--slots", "65"], "'--slots': write a number of at most 64\n"),
+        (["bus", "admit", "imu:1@1MHz"], "'1MHz': write a rate as in 200Hz"),
     ],
 )
 def test_mistakes_are_usage_errors(arguments: list[str], hint: str) -> None:
