@@ -13,7 +13,7 @@ import msgspec
 
 from r2p.codecs import debug
 
-_TIMEOUT_S = 0.6  # seconds for a server to send something: firmware announces an item every 0.5 s
+_TIMEOUT_S = 1.2  # seconds for a server to send something: idle firmware announces an item each half or whole second
 
 _ZENOH_INIT = b"\x04\x00\x01\x09\x02\x11"  # 4 bytes: InitSyn, version 9, a client with the 1-byte identifier 0x11
 _ZENOH_LENGTH = 2  # bytes of the length before each zenoh message, little-endian
@@ -49,7 +49,7 @@ class Server(msgspec.Struct, frozen=True):
 async def identify_server(host: str, port: int) -> Server:
     """Connect, and return what the server speaks. Raises OSError if there is no connection.
 
-    The connection is closed again. It takes up to 0.6 s where the server sends nothing.
+    The connection is closed again. It takes up to 1.2 s where the server sends nothing.
     """
     reader, writer = await asyncio.open_connection(host, port)
     try:

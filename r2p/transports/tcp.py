@@ -41,7 +41,7 @@ _REFUSED_S = 0.5  # seconds for a refused client to read the reason and close
 _CHUNK = 16 * 1024  # bytes read at once: what one turn of the loop can decode without making others wait long
 _CONNECT_TIMEOUT_S = 5.0  # seconds; the kernel itself would try for two minutes where nothing answers
 _STABLE_S = 3.0  # seconds; a connection that lived as long was a good one: the next is tried at once
-_SILENT_S = 0.7  # seconds: r2p sends something at once, firmware every 0.5 s
+_SILENT_S = 1.2  # seconds: r2p sends something at once, idle firmware each half or whole second
 _DEAD_AFTER_S = 5  # seconds without an answer to the kernel until a peer counts as gone
 
 
