@@ -1,7 +1,8 @@
 """`r2p config`: the settings of commands in this directory, and where each comes from."""
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -26,5 +27,24 @@ async def show(file: File = None, *, via: Via = None, format: Format = None) -> 
 
     That is an option, an environment variable, the file, or a default.
     """
-    rows = [{"key": each.key, "value": each.value, "source": each.source} for each in list_settings(via, file)]
-    await Output(format).table(rows, ["key", "value", "source"])
+    output = Output(format)
+    written = _as_in_file if output.format == "text" else _unchanged
+    rows = [{"key": each.key, "value": written(each.value), "source": each.source} for each in list_settings(via, file)]
+    await output.table(rows, ["key", "value", "source"])
+
+
+def _as_in_file(value: Any) -> Any:
+    """Write a value as one would in the file: conditions that contain spaces stay apart, and times have their unit."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case float():
+            return f"{value:g}s"
+        case list() | tuple() if any(" " in str(each) for each in value):
+            return ", ".join(json.dumps(str(each)) for each in value)
+        case _:
+            return value
+
+
+def _unchanged(value: Any) -> Any:
+    return value

@@ -14,6 +14,7 @@ import pytest
 
 import r2p
 from r2p.tools.config import ConfigFile, LaunchTable, Settings, UsageError, check_owned, list_settings, settings
+from r2p.tools.config_show import _as_in_file
 from r2p.tools.run import load_module
 from r2p.tools.session import check_urls
 
@@ -209,3 +210,8 @@ def test_the_file_itself_is_looked_at(tmp_path: Path) -> None:
     (tmp_path / "r2p.toml").chmod(0o666)
     with pytest.raises(UsageError, match="is writable by other users"):
         settings()
+
+
+def test_values_are_shown_as_in_the_file() -> None:
+    shown = map(_as_in_file, (True, 30.0, ["port 2350", "node WHEELS/drive"], ["gateway"], "started", None))
+    assert list(shown) == ["true", "30s", '"port 2350", "node WHEELS/drive"', ["gateway"], "started", None]
