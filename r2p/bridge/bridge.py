@@ -19,6 +19,7 @@ from r2p.clock import Alarm
 from r2p.codecs import UnknownType, management, probes
 from r2p.codecs.management import ManagementType
 from r2p.errors import DecodeError
+from r2p.names import module_alias
 from r2p.protocols.bridge.ports import (
     PORTS_MAX,
     Action,
@@ -103,6 +104,7 @@ class Bridge:
         self.directory = DirectoryRelay(instance, self.ports, space, self.policy, self.routing.check_types)
         self.names = ModuleNames(self.policy, self.directory)
         self._name = space.module
+        self._alias = module_alias(space.module)
         self._instance = instance
         self._clock = space.clock
         self._notify = notify
@@ -214,7 +216,7 @@ class Bridge:
             return False
         if isinstance(message, management.Hello):
             return message.instance == self._instance and message.hops == 0
-        return isinstance(message, management.Alive) and message.module == self._name
+        return isinstance(message, management.Alive) and message.module == self._alias
 
     def _receive_probe(self, port: BridgePort, gateway: int, its_port: int) -> None:
         if not port.is_client:
@@ -317,7 +319,7 @@ class Bridge:
         if state in _FORWARDS:
             port.link.query()
         if state is PortState.REFUSED:
-            denied = management.Denied(self._name, self._name, 0, management.DENIED_GATEWAYS)
+            denied = management.Denied(self._alias, self._alias, 0, management.DENIED_GATEWAYS)
             port.link.write_management(management.encode(denied))
 
     # For users

@@ -19,6 +19,7 @@ from r2p.bridge.options import Policy
 from r2p.clock import Alarm
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_GONE, ROLE_PUBLISHES
+from r2p.names import module_alias
 from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
@@ -119,6 +120,8 @@ class DirectoryRelay:
         self._links: dict[str, _LinkDirectory] = {}
         self._sources: dict[_Key, dict[str, _Fact]] = {}
         """All facts by key, then by link."""
+        self._by_alias: dict[str, dict[str, None]] = {}
+        """The canonical names of modules that travel as an alias, by alias."""
         self._alarm = Alarm(space.loop, self._poll, background=True)
         self._rounds: deque[int] = deque(maxlen=ROUNDS)
         self._next_round_at = 0
@@ -163,6 +166,10 @@ class DirectoryRelay:
             return ""
         link = min(facts, key=lambda each: facts[each].rank)
         return link if facts[link].rank[0] else ""
+
+    def modules_behind(self, alias: str) -> list[str]:
+        """Return the canonical names of known modules that have this alias, and are longer."""
+        return list(self._by_alias.get(alias, ()))
 
     # When
 
@@ -298,10 +305,27 @@ class DirectoryRelay:
             self._sources[key].pop(name)
             if not self._sources[key]:
                 del self._sources[key]
+                self._index_alias(key, known=False)
         for key, fact in link.facts.items():
             if before.get(key) != fact:
                 changed[key] = None
-            self._sources.setdefault(key, {})[name] = fact
+            if key not in self._sources:
+                self._sources[key] = {}
+                self._index_alias(key, known=True)
+            self._sources[key][name] = fact
+
+    def _index_alias(self, key: _Key, *, known: bool) -> None:
+        """Enter the alias of a module that is known now, or remove it."""
+        kind, name, *_ = key
+        if kind != "module" or not isinstance(name, str) or (alias := module_alias(name)) == name:
+            return
+        if known:
+            self._by_alias.setdefault(alias, {})[name] = None
+        else:
+            names = self._by_alias[alias]
+            del names[name]
+            if not names:
+                del self._by_alias[alias]
 
     def _facts_of(self, port: BridgePort) -> dict[_Key, _Fact]:
         facts: dict[_Key, _Fact] = {}

@@ -32,7 +32,7 @@ _SURE = 8  # intervals after which a period counts as known
 
 _PREFIX = re.compile(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_")
 
-_TOPICS = re.compile(r"[A-Za-z0-9_*?\[\]!-]+(/[A-Za-z0-9_*?\[\]!-]+)?")
+_TOPICS = re.compile(r"[A-Za-z0-9_*?\[\]!-]+(/[A-Za-z0-9_*?\[\]!-]+)*")
 
 IP = frozenset({"tcp", "tcp-listen", "zenoh"})
 """Schemes of links that any computer of an IP network may reach: REBOOT and the like need permission there."""
@@ -88,7 +88,7 @@ def parse_rule(text: str) -> Rule:
 
 
 def is_topic_pattern(text: str) -> bool:
-    """Return whether topics can match a pattern: it has their characters or wildcards, and at most one `/`."""
+    """Return whether topics can match a pattern: it has their characters or wildcards."""
     return _TOPICS.fullmatch(text) is not None
 
 

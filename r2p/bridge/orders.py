@@ -1,8 +1,8 @@
 """Orders for modules (STOP, REBOOT, BOOTLOAD) across a gateway: whether each passes, and to which module.
 
-An order names a module by its alias of 7 characters. On links with a prefix this is the alias of the name with the
-prefix, so `ModuleNames` finds the module, or reports that there are two. Refused orders are logged, and their sender
-gets a DENIED.
+An order names a module by its alias of 7 characters, on links with a prefix by the alias of the name with the prefix.
+So `ModuleNames` finds the module, or reports that there are two. Refused orders are logged, and their sender gets a
+DENIED.
 """
 
 import msgspec
@@ -40,14 +40,17 @@ class ModuleNames:
     def to_canonical(self, alias: str, link: str) -> str | None:
         """Return the module that an order on this link names; None if it is not the robot's, or ambiguous."""
         prefix = self._policy.prefix(link)
-        if not prefix:
-            return alias
-        found = [name for name in self._directory.own_modules() if module_alias(prefix + name) == alias]
+        if prefix:
+            found = [name for name in self._directory.own_modules() if module_alias(prefix + name) == alias]
+        else:
+            found = self._directory.modules_behind(alias)
         if len(found) > 1:
             self._log_ambiguous(alias, prefix, found)
             return None
         if found:
             return found[0]
+        if not prefix:
+            return alias
         return alias.removeprefix(prefix) if alias.startswith(prefix) else None
 
     def to_link_name(self, name: str, link: str) -> str | None:
@@ -86,7 +89,7 @@ class OrderRelay:
     def forward(self, port: BridgePort, order: management.Order) -> bool:
         """Forward an order; return True if it is for this module, which does not obey it."""
         harmless = isinstance(order, management.Stop)
-        if order.module == self._module:
+        if order.module == module_alias(self._module):
             reason = self._policy.order_denied(port.name, None, harmless=harmless)
             if reason:
                 self._refuse(port, order, reason, known=True)
@@ -159,5 +162,5 @@ class OrderRelay:
             )
         if known and now >= port.denied_at + _DENIED_APART:
             port.denied_at = now
-            denied = management.Denied(self._module, order.module, management.order_type(order), reason)
+            denied = management.Denied(module_alias(self._module), order.module, management.order_type(order), reason)
             port.link.write_management(management.encode(denied))

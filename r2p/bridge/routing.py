@@ -19,7 +19,7 @@ from r2p.bridge.forwarding import BridgedTopic, BridgePort, PortsByKind, Relayed
 from r2p.bridge.options import Policy, RelayedPeriodic, Shaper
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.log_lines import LineLimit, get_logger
-from r2p.names import LOADER_PREFIX
+from r2p.names import LOADER_PREFIX, TOPIC
 from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.link import NOTHING, Announcement
@@ -27,7 +27,7 @@ from r2p.transports.stats import count_internal_error
 
 logger = get_logger("r2p.bridge")
 
-_NAME = re.compile(r"[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)?")
+_NAME = re.compile(TOPIC)
 LONG_NAMES = 64
 """Remembered names that are too long for a link, each logged once; beyond that, one a second is logged."""
 
@@ -305,7 +305,7 @@ class RoutingTable:
         """Return whether the topic's name fits the link."""
         name = self._policy.to_link_name(topic, port.name)
         if not _NAME.fullmatch(name):
-            return False  # a namespace within that of a prefix
+            return False
         if len(name) <= port.link.max_name:
             return True
         if name not in self._too_long:

@@ -32,7 +32,7 @@ import msgspec
 from r2p.codecs import PublisherClass, UnknownType
 from r2p.errors import DecodeError
 from r2p.messages import ClockOffset
-from r2p.names import MODULE_PATH, MODULE_PATH_MAX, module_alias
+from r2p.names import MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC, TOPIC_MAX, module_alias
 
 T = TypeVar("T")
 
@@ -58,8 +58,8 @@ _pack_start = struct.Struct("<IIQqq").pack  # as _FIXED, with the first four byt
 PACKET_MAX = 256
 """Messages in one payload."""
 
-_TOPIC = re.compile(rb"(?:[A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}")
-_NAMES = re.compile(rf"((?:{MODULE_PATH})?)/([A-Za-z0-9_]{{0,8}})".encode())
+_TOPIC = re.compile(TOPIC.encode())
+_NAMES = re.compile(rf"((?:{MODULE_PATH})?)/((?:{NODE})?)".encode())
 _MODULE = re.compile(MODULE_PATH)
 _REMEMBERED_MAX = 4096  # origins that a reader keeps, in two halves; forged ones can't fill more memory
 _SHOWN_MAX = 40  # bytes of a wrong name that an error shows
@@ -234,7 +234,7 @@ def decode_credit(data: bytes) -> Credit:
     _check_version(data, "credit")
     if len(data) < _CREDIT.size:
         raise _too_short("credit", data, _CREDIT.size + 1)
-    if _TOPIC.fullmatch(data, _CREDIT.size) is None:
+    if len(data) - _CREDIT.size > TOPIC_MAX or _TOPIC.fullmatch(data, _CREDIT.size) is None:
         raise DecodeError(f"credit for {data[_CREDIT.size :][:_SHOWN_MAX]!r}, which is not a valid topic")
     _, publisher_class, session, serial = _CREDIT.unpack_from(data)
     leaving = bool(publisher_class & _LEAVING)

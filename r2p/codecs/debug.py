@@ -16,7 +16,7 @@ from collections.abc import Callable
 import msgspec
 
 from r2p.errors import MessageError
-from r2p.names import TOPIC_MAX
+from r2p.names import TOPIC_FIELD
 
 PAYLOAD_MAX = 255
 
@@ -56,8 +56,8 @@ def encode(topic: bytes, data: bytes, deadline: int) -> bytes:
 
 def encoder(topic: bytes) -> Callable[[bytes, int], bytes]:
     """Return a function of payload and deadline that encodes many messages of one topic faster than `encode`."""
-    if not 1 <= len(topic) <= TOPIC_MAX or topic.strip(_PRINTABLE):
-        raise MessageError(f"topic {topic!r}: a line carries 1 to {TOPIC_MAX} printable characters")
+    if not 1 <= len(topic) <= TOPIC_FIELD or topic.strip(_PRINTABLE):
+        raise MessageError(f"topic {topic!r}: a line carries 1 to {TOPIC_FIELD} printable characters")
     name = b":%02X%b:" % (len(topic), topic)  # what all messages of the topic share is worked out once
     name_sum = len(topic) + sum(topic)
 
@@ -173,7 +173,7 @@ class _Fields:
         deadline = self._hex(4)
         self._separator()
         name_size = self._hex(1)
-        if not 1 <= name_size[0] <= TOPIC_MAX:
+        if not 1 <= name_size[0] <= TOPIC_FIELD:
             raise _Wrong("topic length")
         topic = self._accept(name_size[0], _PRINTABLE, "bad name")
         self._separator()

@@ -9,8 +9,8 @@ Each is a key that zenoh keeps while the session that declared it lives.
 The first part is the version; tokens of another version are ignored. The last token was added later: with a 2, modules
 that know the first two only ignore it. `SESSION` is the instance of the r2p module that declares the token, in hex;
 `INSTANCE` is that of the module concerned, another one behind gateways (`HOPS` counts them), and `-` for firmware. `-`
-stands also for a node, a fingerprint or a release that is not known; `%` for the slash of a topic or a module in a
-namespace. `SIZE` is that of a message, so 1024 at most.
+stands also for a node, a fingerprint or a release that is not known; `%` for each slash of a topic or a module. Names
+are whole. `SIZE` is that of a message, so 1024 at most.
 
 In front of each token stands `live/*`, behind the name of the network; `live` alone is accepted, too. Every session
 numbers the keys that zenoh passes on to it, up to their first wildcard, and keeps these numbers for as long as it
@@ -25,7 +25,7 @@ from r2p.codecs import UnknownType
 from r2p.codecs.management import ANY_TYPE, RELEASE_MAX, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 from r2p.messages import SIZE_MAX
-from r2p.names import MODULE_PATH, MODULE_PATH_MAX
+from r2p.names import MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC, TOPIC_MAX
 
 VERSION = "1"
 _SOFTWARE_VERSION = "2"
@@ -41,7 +41,7 @@ _MODULE = re.compile(
     rf"({_HEX32})/module/({MODULE_PATH.replace('/', '%')})/({_HEX32}|-)/([0-9a-f]{{1,2}})/([0-9]{{1,2}})"
 )
 _TOPIC = re.compile(
-    rf"({_HEX32})/(pub|sub)/([A-Za-z0-9_]{{1,16}}(?:%[A-Za-z0-9_]{{1,16}})?)/({_HEX32}|-)/([A-Za-z0-9_]{{1,8}}|-)"
+    rf"({_HEX32})/(pub|sub)/({TOPIC.replace('/', '%')})/({_HEX32}|-)/({NODE}|-)"
     r"/([0-9]{1,3})/([0-9]{1,6})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
 )
 _SOFTWARE = re.compile(rf"({_HEX32})/version/({_HEX32})/([0-9]{{1,3}})/([A-Za-z0-9.+_-]{{1,{RELEASE_MAX}}})")
@@ -132,7 +132,8 @@ def decode(key: str) -> Token:
             bool(bits & _OBSERVER),
             int(hops),
         )
-    if (found := _TOPIC.fullmatch(rest)) and int(found[6]) <= _BYTE_MAX and int(found[7]) <= SIZE_MAX:
+    found = _TOPIC.fullmatch(rest)
+    if found and len(found[3]) <= TOPIC_MAX and int(found[6]) <= _BYTE_MAX and int(found[7]) <= SIZE_MAX:
         session, role, topic, instance, node, publisher_class, size, fingerprint, window, hops = found.groups()
         return TopicToken(
             int(session, 16),

@@ -44,9 +44,15 @@ from r2p.codecs._gateway_fields import leaf_port as leaf_port
 from r2p.codecs._gateway_fields import make_part as make_part
 from r2p.codecs._gateway_fields import next_serial as next_serial
 from r2p.codecs._gateway_fields import split_part as split_part
+from r2p.codecs._long_names import KIND_NODE as KIND_NODE
+from r2p.codecs._long_names import KIND_TOPIC as KIND_TOPIC
+from r2p.codecs._long_names import LongName as LongName
+from r2p.codecs._long_names import Name as Name
+from r2p.codecs._long_names import alias_messages as alias_messages
+from r2p.codecs._long_names import long_name_messages as long_name_messages
+from r2p.codecs._long_names import long_name_number as long_name_number
 from r2p.codecs._records import Codec, Record
 from r2p.errors import MessageError
-from r2p.names import module_alias
 
 SIZE = 32
 """Bytes of a message."""
@@ -78,6 +84,7 @@ class ManagementType(enum.IntEnum):
     CONFLICT = 0x54
     DENIED = 0x55
     NAME = 0x56
+    LONG_NAME = 0x57
     BRIDGE = 0x60
     MESH = 0x61
     LEAF = 0x62
@@ -104,11 +111,12 @@ HELLO_QUERY = 1  # asks all modules to repeat what they have: this one is new
 HELLO_TOOL = 2  # an observer, which sends no ALIVE
 HELLO_LEAVING = 4
 HELLO_GATEWAY = 8  # forwards messages of others: of what it sends, not all is its own
+HELLO_ALIAS = 16  # `module` is the alias of a longer name, which NAME has
 
 LEASE_MS_MAX = 0xFFFF
 """The longest lease that a Hello can carry (ms)."""
 
-WIRE_VERSION = 1
+WIRE_VERSION = 2
 """Hello.wire: the version of PROTOCOL.md, which grows when modules of before can't understand all of what is new."""
 RELEASE_MAX = 14
 """Characters of Hello.release."""
@@ -174,7 +182,6 @@ RENEW_MAX = 24  # high bytes in a Renew
 NO_UTC = 0xFFFF  # Network.utc_error: the offset is unknown
 
 _VERSION = 1
-_PIECE = 22  # characters of Name.piece
 BRIDGE_ACKS = 2  # acks in a Bridge
 LEAF_ACKS = 3  # acks in a Leaf
 _MARK = b"r2p"
@@ -309,14 +316,6 @@ class Denied(msgspec.Struct, frozen=True, gc=False):
     module: str
     order: int
     reason: int
-
-
-class Name(msgspec.Struct, frozen=True, gc=False):
-    """A piece of the name that an alias stands for. `part` has its number and that of the last one: see `make_part`."""
-
-    alias: str
-    part: int
-    piece: str
 
 
 class Bridge(msgspec.Struct, frozen=True, gc=False):
@@ -455,7 +454,7 @@ class Renewed(msgspec.Struct, frozen=True, gc=False):
 
 FirmwareMessage = Alive | Order | Advertise | SubscribeRequest | SubscribeResponse | Path
 RtcanMessage = Network | Claim | Reserve | Grant | Refuse | Release | Renew | Renewed
-R2pMessage = Hello | TypeInfo | Unsubscribe | Endpoint | Conflict | Denied | Name
+R2pMessage = Hello | TypeInfo | Unsubscribe | Endpoint | Conflict | Denied | Name | LongName
 GatewayMessage = Bridge | Mesh | Leaf
 Management = FirmwareMessage | RtcanMessage | R2pMessage | GatewayMessage
 
@@ -485,6 +484,7 @@ _CODEC = Codec[Management](
     Record(Conflict, ManagementType.CONFLICT, "7s I I", version=_VERSION),
     Record(Denied, ManagementType.DENIED, "7s 7s B B", version=_VERSION),
     Record(Name, ManagementType.NAME, "7s B 22s", version=_VERSION),
+    Record(LongName, ManagementType.LONG_NAME, "B B I 24s", version=_VERSION),
     Record(Bridge, ManagementType.BRIDGE, "I B H I I 12s", version=_VERSION),
     Record(Mesh, ManagementType.MESH, "I H B 18s", version=_VERSION),
     Record(Leaf, ManagementType.LEAF, "I B H 18s", version=_VERSION),
@@ -527,15 +527,6 @@ def order_type(order: Order) -> int:
 def queue_length(size: int, wanted: int = QUEUE) -> int:
     """Return the queue to request from firmware for messages of `size` bytes: 1 to 16 entries, 1024 bytes at most."""
     return max(1, min(wanted, QUEUE_MAX, QUEUE_BYTES_MAX // (size + QUEUE_ENTRY)))
-
-
-def alias_messages(name: str) -> list[Name]:
-    """Return the messages that announce the name behind a module's alias; none if the name fits into a message."""
-    alias = module_alias(name)
-    if alias == name:
-        return []
-    pieces = [name[at : at + _PIECE] for at in range(0, len(name), _PIECE)]
-    return [Name(alias, make_part(number, len(pieces) - 1), piece) for number, piece in enumerate(pieces)]
 
 
 # Contents of params: on RTCAN a message id and the mark, and in the last byte the state of an r2p subscription.

@@ -12,11 +12,13 @@ import msgspec
 
 from r2p.bridge import Bridge, BridgeOptions, MultihomedModule
 from r2p.clock import in_background, random_of
-from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY, ROLE_PUBLISHES, WIRE_VERSION
+from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY, KIND_NODE, ROLE_PUBLISHES, WIRE_VERSION
 from r2p.errors import Error
 from r2p.log_lines import LineLimit, get_logger
 from r2p.names import module_alias
 from r2p.protocols.discovery.events import (
+    AliasConflict,
+    AliasesDiffer,
     Command,
     CommandDenied,
     CommandReceived,
@@ -210,10 +212,8 @@ class LinkManager:
                 self._report_command_denied(link, event)
             case ConnectionDenied():
                 self._connection_denied(link, event)
-            case NameConflict():
-                text = f"two modules carry the name {event.module}: rename one (--module)"
-                self._log_limited(link, logging.ERROR, "names", text)
-                self._events.emit(event)
+            case NameConflict() | AliasConflict() | AliasesDiffer():
+                self._report_names(link, event)
             case EchoDetected():
                 logger.error(
                     "link %s returns this module's own messages: switch off local echo at the other end", link.title
@@ -270,6 +270,18 @@ class LinkManager:
             "install the same release on both"
         )
         self._log_limited(link, logging.WARNING, "version", text)
+
+    def _report_names(self, link: Link, event: NameConflict | AliasConflict | AliasesDiffer) -> None:
+        """Report that two modules have one name, or two names one alias."""
+        if isinstance(event, NameConflict):
+            text = f"two modules carry the name {event.module}: rename one (--module)"
+            self._log_limited(link, logging.ERROR, "names", text)
+            self._events.emit(event)
+        elif not self.observer or (isinstance(event, AliasConflict) and event.refused):
+            # Other conflicts are for programs to report: the user of a tool may well ask for a topic by its alias.
+            text = describe_alias(event)
+            self._log_limited(link, logging.ERROR, "aliases", text)
+            self._events.emit(LinkNotice(link.name, "alias conflict", text))
 
     def _report_command_denied(self, link: Link, event: CommandDenied) -> None:
         """Report that a gateway does not pass on a command of this module."""
@@ -375,6 +387,23 @@ class LinkManager:
                 name_there = self.bridge.names.translate(name, link.name, other.name)
             if name_there is not None and (info := other.discovery.modules.get(name_there)) is not None:
                 yield other, info
+
+
+def describe_alias(event: AliasConflict | AliasesDiffer) -> str:
+    """Describe why aliases of names can't be used, and what to do about it."""
+    choose = "in [alias] of r2p.toml, or with aliases= of Module"
+    if isinstance(event, AliasesDiffer):
+        return (
+            f"topic {event.name} travels as {event.alias} here and as {event.other_alias} in another module, so "
+            f"nothing passes between them: choose the same alias for both, {choose}"
+        )
+    if event.kind == KIND_NODE:
+        return f"nodes {event.name} and {event.other} have one alias, {event.alias}: rename one"
+    refused = f"; until then, {event.refused} is not carried" if event.refused else ""
+    return (
+        f"topics {event.name} and {event.other} have one alias, {event.alias}: choose another one for either, {choose}"
+        f"{refused}"
+    )
 
 
 def describe_mismatch(event: Mismatched) -> str:

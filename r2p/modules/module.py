@@ -28,7 +28,17 @@ from r2p.modules.link_manager import LinkManager
 from r2p.modules.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.modules.watchdog import Watchdog, watch
 from r2p.msg import Log
-from r2p.names import LOG, NODE_MAX, module_name, module_name_from, module_path, node_name, topic_name
+from r2p.names import (
+    LOG,
+    check_aliases,
+    module_alias,
+    module_name,
+    module_name_from,
+    module_path,
+    node_alias,
+    node_name,
+    topic_name,
+)
 from r2p.protocols.discovery.events import Command
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.node import Node, no_log
@@ -57,10 +67,11 @@ class Module:
             module.start(blink, priority=10)
             await module.wait()
 
-    `name` has at most 7 characters (default: from the host name). `via` are the URLs of its transports, one or several;
-    None uses the environment variable R2P_VIA (URLs separated by blanks), and without it the module is local only.
-    `remap` renames topics for all its nodes. An `observer` is a tool that only looks: it sends no ALIVE and has no
-    `log` topic. The `watchdog` logs code that blocks the event loop.
+    `name` has at most 64 characters (default: from the host name). `via` are the URLs of its transports, one or
+    several; None uses the environment variable R2P_VIA (URLs separated by blanks), and without it the module is local
+    only. `remap` renames topics for all its nodes. `aliases` has, by name, what travels on RTCAN and debug lines for
+    topics and services with more than 16 characters, instead of an alias made from the name. An `observer` is a tool
+    that only looks: it sends no ALIVE and has no `log` topic. The `watchdog` logs code that blocks the event loop.
 
     With `bridge` the module is a gateway: it joins its links, and forwards on each network what the gateways there have
     agreed on. BridgeOptions restrict that. Raises InvalidName or NameTooLong.
@@ -72,6 +83,7 @@ class Module:
         *,
         via: str | Transport | Iterable[str | Transport] | None = None,
         remap: dict[str, str] | None = None,
+        aliases: dict[str, str] | None = None,
         observer: bool = False,
         watchdog: bool = True,
         bridge: bool | BridgeOptions = False,
@@ -89,6 +101,7 @@ class Module:
         """The network as this module knows it."""
         self._via = _urls(via)
         self._remap = _checked_remap(remap)
+        self._aliases = check_aliases(aliases or {})
         self._with_watchdog = watchdog
         self._bridge_options = BridgeOptions() if bridge is True else bridge or None
         self._supervisors: dict[str, Supervisor] = {}
@@ -111,7 +124,7 @@ class Module:
         loop = asyncio.get_running_loop()
         clock = clock_of(loop)
         self._link_manager = LinkManager(
-            TopicSpace(self.name, loop, clock),
+            TopicSpace(self.name, loop, clock, self._aliases),
             self._events,
             self._commands.handle,
             observer=self.observer,
@@ -268,7 +281,7 @@ class Module:
         remap: dict[str, str] | None = None,
         restart: bool = False,
     ) -> Node:
-        """Run `function(node, *args)` as a node. Its name, at most 8 characters, is the function's unless given.
+        """Run `function(node, *args)` as a node. Its name, at most 64 characters, is the function's unless given.
 
         Nodes of higher `priority` get their messages first. `remap` renames topics for this node. With `restart` the
         node is started again after a crash, after a pause that grows from 0.5 to 30 s.
@@ -414,8 +427,8 @@ class LogTopic:
         text = line.encode("ascii", "replace").replace(b"\0", b"?")[:_LOG_TEXT_MAX].decode()  # as firmware reads it
         stamp = Timestamp.from_ns(self._space.clock.now())
         level = min(max(level, 0), 255)
-        module = self._space.module
-        record = Log(stamp=stamp, level=level, module=module, node=node[:NODE_MAX], text=text)
+        module = module_alias(self._space.module)
+        record = Log(stamp=stamp, level=level, module=module, node=node_alias(node), text=text)
         self._publisher.publish_nowait(record)
 
     def _within_rate(self) -> bool:

@@ -43,7 +43,7 @@ def run(
 ) -> None:
     """Run functions as the nodes of one module, until all have ended or a signal ends them.
 
-    A node has the name of its function, of at most 8 characters, or another: `run(line_follower, name="follower")`, and
+    A node has the name of its function, or another: `run(line_follower, name="follower")`, and
     of several `run(blink, ("follower", line_follower))`. `module` is the module's name; `via` and `remap` are as for
     `Module`, `restart` as for `Module.start`.
 

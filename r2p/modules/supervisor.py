@@ -88,7 +88,7 @@ def name_of(function: NodeFunction, *args: object) -> str:
     if len(name) > NODE_MAX:
         short = name[:NODE_MAX].rstrip("_")
         raise NameTooLong(
-            f"node name {name!r} has {len(name)} characters, the wire carries {NODE_MAX}: pass name={short!r}, or "
+            f"node name {name!r} has {len(name)} characters, at most {NODE_MAX} are possible: pass name={short!r}, or "
             f"({short!r}, {name}) to r2p.run"
         )
     return node_name(name)

@@ -6,7 +6,7 @@ waits: full sinks worth waiting for are returned to the publisher, whose class d
 
 import abc
 import asyncio
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 from weakref import WeakValueDictionary
 
@@ -273,10 +273,14 @@ class LinkView(Protocol):
 class TopicSpace:
     """The topics of one module, by name; its links are informed of changes by `changed`."""
 
-    def __init__(self, module: str, loop: asyncio.AbstractEventLoop, clock: Clock) -> None:
+    def __init__(
+        self, module: str, loop: asyncio.AbstractEventLoop, clock: Clock, aliases: Mapping[str, str] | None = None
+    ) -> None:
         self.module = module
         self.loop = loop
         self.clock = clock
+        self.aliases = aliases or {}
+        """Aliases chosen for topics whose names are too long for some links."""
         self.wake_scheduler = WakeScheduler(loop)
         self.topics: dict[str, Topic] = {}
         self.links: list[LinkView] = []

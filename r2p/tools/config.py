@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from r2p.errors import InvalidName
-from r2p.names import module_name, module_name_from, topic_name
+from r2p.names import check_aliases, module_name, module_name_from, topic_name
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -54,16 +54,18 @@ class ConfigFile(msgspec.Struct):
     module: str | None = None
     types: dict[str, str] = {}
     remap: dict[str, str] = {}
+    alias: dict[str, str] = {}
     launch: dict[str, LaunchTable] = {}
 
 
 class Settings(msgspec.Struct):
-    """Settings of a command. `types`: "package.module:Class" by topic."""
+    """Settings of a command. `types`: "package.module:Class" by topic; `aliases` of topics and services, by name."""
 
     via: list[str] = []
     module: str | None = None
     types: dict[str, str] = {}
     remap: dict[str, str] = {}
+    aliases: dict[str, str] = {}
     via_source: str = "--via"
     """Where `via` is from, for errors."""
 
@@ -87,7 +89,7 @@ def settings(via: list[str] | None = None, path: Path | None = None, *, tool: bo
     urls, source = _choose_via(via, path, file)
     if tool and source != "--via":
         urls = [_local_peer(url) for url in urls]
-    return Settings(urls, file.module, _types(path, file), file.remap, source)
+    return Settings(urls, file.module, _types(path, file), file.remap, file.alias, source)
 
 
 def list_settings(via: list[str] | None = None, path: Path | None = None) -> list[Setting]:
@@ -103,6 +105,7 @@ def list_settings(via: list[str] | None = None, path: Path | None = None) -> lis
         Setting("module", *module),
         *(Setting(f"types.{topic}", text, name) for topic, text in _types(path, file).items()),
         *(Setting(f"remap.{topic}", text, name) for topic, text in file.remap.items()),
+        *(Setting(f"alias.{topic}", text, name) for topic, text in file.alias.items()),
         *(each for entry, table in file.launch.items() for each in _launch_settings(name, entry, table, contents)),
     ]
 
@@ -191,6 +194,7 @@ def _parse(path: Path, contents: dict[str, Any]) -> ConfigFile:
     try:
         file = _convert({key: value for key, value in contents.items() if key != "launch"}, ConfigFile, "")
         file.launch = dict(_entries(contents.get("launch", {})))
+        file.alias = _aliases(file.alias)
         _check_names(file)
     except (ValueError, InvalidName) as error:
         raise UsageError(f"{path}: {error}") from error
@@ -214,6 +218,13 @@ def _entries(launch: Any) -> Iterator[tuple[str, LaunchTable]]:
         if "command" not in table:
             raise ValueError(f'{where}has no command: add one, such as command = "run robot.py:blink"')
         yield name, _convert(table, LaunchTable, where)
+
+
+def _aliases(given: dict[str, str]) -> dict[str, str]:
+    try:
+        return check_aliases(given)
+    except InvalidName as error:
+        raise ValueError(f"[alias] {error}") from error
 
 
 def _convert(table: dict[str, Any], cls: type[T], where: str) -> T:

@@ -21,10 +21,10 @@ import r2p
 from r2p.bridge import BridgeOptions, GatewayStatistics
 from r2p.bridge.options import check_prefix, is_link, is_topic_pattern, parse_rule
 from r2p.msg import GatewayStatus
-from r2p.names import module_name_from
+from r2p.names import module_name_from, topic_alias
 from r2p.tools.options import Format, Via, class_choice, hertz
 from r2p.tools.output import Output, aligned
-from r2p.tools.session import UsageError, check_urls, service, settings
+from r2p.tools.session import Settings, UsageError, check_urls, service, settings
 
 logger = logging.getLogger("r2p.gateway")
 
@@ -109,13 +109,13 @@ async def command(
     )
     _check_effect(options, chosen.via)
     own = name or chosen.module or f"GW_{module_name_from(socket.gethostname())[:4]}"
-    await serve(own, chosen.via, options, Output(format), quiet=format is None)
+    await serve(own, chosen, options, Output(format), quiet=format is None)
 
 
-async def serve(name: str, via: list[str], options: BridgeOptions, output: Output, *, quiet: bool = False) -> None:
-    """Run a gateway until cancelled. `quiet`: print nothing where there is no terminal."""
-    async with r2p.Module(name, via=via, bridge=options) as module:
-        logger.info("gateway %s joins %s; Ctrl-C ends it", name, ", ".join(via))
+async def serve(name: str, settings: Settings, options: BridgeOptions, output: Output, *, quiet: bool = False) -> None:
+    """Run a gateway on the links of `settings` until cancelled. `quiet`: print nothing where there is no terminal."""
+    async with r2p.Module(name, via=settings.via, aliases=settings.aliases, bridge=options) as module:
+        logger.info("gateway %s joins %s; Ctrl-C ends it", name, ", ".join(settings.via))
         module.start(_report, module, None if quiet and output.format != "text" else output, name="gateway")
         await module.wait()
 
@@ -204,7 +204,7 @@ class Row(msgspec.Struct, frozen=True):
     def status(self) -> GatewayStatus:
         """Return the line as a message."""
         return GatewayStatus(
-            topic=self.topic[:16],
+            topic=topic_alias(self.topic),
             source=self.source[:24],
             target=self.target[:24],
             state=self.state,

@@ -13,11 +13,11 @@ import typer
 
 import r2p
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, WIRE_VERSION
-from r2p.names import module_path
+from r2p.names import module_alias, module_path
 from r2p.tools import session
 from r2p.tools.options import All, Format, Timeout, Wait
 from r2p.tools.output import Output, notify
-from r2p.tools.session import Session, TimedOut, UsageError, wait_until
+from r2p.tools.session import Session, TimedOut, UsageError, alias_or_none, wait_until
 
 TIMEOUT = 10.0
 """Seconds in which a command must be confirmed: firmware with many topics sends ALIVE that rarely."""
@@ -36,7 +36,8 @@ Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
 async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
     """List the modules and their state.
 
-    The kind is r2p or firmware, and the age is the time since the last message from the module.
+    The kind is r2p or firmware, and the age is the time since the last message from the module. With -v also the alias
+    of each long name, which travels on RTCAN and debug lines.
     """
     output = Output(format)
     await session.settle(wait, of="modules")
@@ -44,7 +45,7 @@ async def list_(session: Session, *, all: All = False, wait: Wait = None, format
         await _wait_for_firmware(session)
     known = [view for view in session.module.network.modules() if view.link]
     views = [view for view in known if all or not view.name.startswith("_")]
-    columns = ["module", "state", "rebooted", "kind", "version", "wire", "link", "age"]
+    columns = session.columns("module", "state", "rebooted", "kind", "version", "wire", "link", "age")
     rows = [_row(view, for_people=output.format == "text") for view in views]
     await output.table(rows, columns, units={"age": "s"})
     if not views:
@@ -240,6 +241,7 @@ def _row(view: r2p.ModuleView, *, for_people: bool) -> dict[str, Any]:
     other = for_people and view.wire not in {None, WIRE_VERSION}
     return {
         "module": view.name,
+        "alias": alias_or_none(view.name, module_alias),
         "state": view.state,
         "rebooted": view.rebooted,
         "kind": "firmware" if view.instance is None else "r2p",

@@ -9,10 +9,11 @@ from typing import Annotated
 import typer
 
 import r2p
+from r2p.names import node_alias
 from r2p.tools import session
 from r2p.tools.options import CLASS_NAMES, All, Format, Wait
 from r2p.tools.output import Output
-from r2p.tools.session import Session
+from r2p.tools.session import Session, alias_or_none
 from r2p.tools.types import Types
 
 app = session.group("List and inspect nodes.")
@@ -22,16 +23,24 @@ Table = dict[tuple[str, str], tuple[list[str], list[str]]]
 
 @session.command(app, "list")
 async def list_(session: Session, *, all: All = False, wait: Wait = None, format: Format = None) -> None:
-    """List the nodes, and the topics that they publish and subscribe."""
+    """List the nodes, and the topics that they publish and subscribe.
+
+    With -v also the alias of each long name, which travels on RTCAN and debug lines.
+    """
     output = Output(format)
     await session.settle(wait)
     nodes = _nodes(session)
     rows = [
-        {"node": f"{module}/{node}", "publishes": publishes, "subscribes": subscribes}
+        {
+            "node": f"{module}/{node}",
+            "alias": alias_or_none(node, node_alias),
+            "publishes": publishes,
+            "subscribes": subscribes,
+        }
         for (module, node), (publishes, subscribes) in nodes.items()
         if all or not module.startswith("_")
     ]
-    await output.table(rows, ["node", "publishes", "subscribes"])
+    await output.table(rows, session.columns("node", "publishes", "subscribes"))
     if not rows:
         session.report_none("nodes", hidden=bool(nodes))
 
@@ -60,6 +69,7 @@ async def info(
     await output.put(
         {
             "node": f"{module}/{name}",
+            **({"alias": alias_or_none(name, node_alias)} if session.verbose else {}),
             "module": None if view is None else view.state,
             "link": None if view is None else view.link,
             "publishes": [types.describe(views[topic]) | {"class": _class(views[topic], node)} for topic in publishes],

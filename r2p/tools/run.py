@@ -71,7 +71,7 @@ async def command(
     programs = load(functions)
     priorities = _parse_priorities(priority or (), programs)
     names = chosen.remap | _parse_remap(remap or ())
-    async with r2p.Module(module or chosen.module, via=chosen.via, remap=names) as host:
+    async with r2p.Module(module or chosen.module, via=chosen.via, remap=names, aliases=chosen.aliases) as host:
         for program in programs:
             host.start(program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart)
         nodes = ", ".join(program.name for program in programs)

@@ -166,6 +166,10 @@ class Session:
         """The network that the command is on, for messages."""
         return ", ".join(self.settings.via) or "this tool alone"
 
+    def columns(self, first: str, *others: str) -> list[str]:
+        """Return the columns of a table of names; with -v also `alias`."""
+        return [first, "alias", *others] if self.verbose else [first, *others]
+
     def report_none(self, things: str, *, hidden: bool = False) -> None:
         """Report that there are no topics, nodes or modules; `hidden`: only those of tools, which are not shown."""
         if hidden:
@@ -307,6 +311,12 @@ class Session:
         return {link for view in views for link in view.published_on + view.subscribed_on if link}
 
 
+def alias_or_none(name: str, alias: Callable[[str], str]) -> str | None:
+    """Return what travels for a name on RTCAN and debug lines; None: the name itself."""
+    found = alias(name)
+    return None if found == name else found
+
+
 async def _idle(node: r2p.Node) -> None:
     """Run until cancelled: the command itself publishes and subscribes with this node."""
     await asyncio.get_running_loop().create_future()
@@ -320,7 +330,8 @@ async def join(settings: Settings, *, name: str = "tool", verbose: int = 0) -> A
     alphabet = string.ascii_lowercase + string.digits
     check_urls(settings.via, settings.via_source)
     module_name = "_" + "".join(random_of(asyncio.get_running_loop()).choices(alphabet, k=6))
-    async with r2p.Module(module_name, via=settings.via, observer=True, watchdog=False) as module:
+    aliases = settings.aliases
+    async with r2p.Module(module_name, via=settings.via, aliases=aliases, observer=True, watchdog=False) as module:
         yield Session(module, settings, name=name, verbose=verbose)
 
 

@@ -32,7 +32,7 @@ _NOT_SUBSCRIBED = "not subscribed"
 
 
 class Arrival(Protocol):
-    """A received message: the topic's name as it is on this link, and packed bytes."""
+    """A received message: the `BufferedLink.key` of its topic, and packed bytes."""
 
     @property
     def topic(self) -> bytes: ...
@@ -75,6 +75,10 @@ class BufferedLink(Link):
         """The last message of each publisher that is not announced yet, and its arrival (ns)."""
 
     # For subclasses to implement
+
+    def key(self, topic: str) -> bytes:
+        """Return `Arrival.topic` of a topic's messages: its name, or what travels for it."""
+        return topic.encode()
 
     @property
     @abc.abstractmethod
@@ -131,8 +135,8 @@ class BufferedLink(Link):
         super()._release_topics()
         self._arrivals.clear()
         self._backpressure.close()
-        for name in list(self._received):
-            self.remove_publishers(name.decode())
+        for received in list(self._received.values()):
+            self.remove_publishers(received.topic.name)
 
     def _subscriber_joined(self, event: SubscriberJoined) -> None:
         self._add_subscriber(event.topic)
@@ -151,7 +155,7 @@ class BufferedLink(Link):
     # In: topics and their senders
 
     def add_publisher(self, topic: Topic, size: int, source: Hashable) -> None:
-        key = topic.name.encode()
+        key = self.key(topic.name)
         received = self._received.get(key)
         if received is None:
             received = self._received[key] = _ReceivedTopic(topic, {})
@@ -164,7 +168,7 @@ class BufferedLink(Link):
                 queue.publisher_joined()
 
     def remove_publisher(self, name: str, source: Hashable) -> None:
-        received = self._received.get(name.encode())
+        received = self._received_topic(name)
         if received is not None and source in received.sizes:
             del received.sizes[source]
             received.topic.remote_publishers -= 1
@@ -172,14 +176,19 @@ class BufferedLink(Link):
                 self.remove_publishers(name)
 
     def remove_publishers(self, name: str) -> None:
-        received = self._received.pop(name.encode(), None)
+        received = self._received_topic(name)
         if received is not None:
+            del self._received[self.key(name)]
             received.topic.remote_publishers -= len(received.sizes)
             received.topic.latched_sources.remove(self)
 
+    def _received_topic(self, name: str) -> _ReceivedTopic | None:
+        received = self._received.get(self.key(name))
+        return received if received is not None and received.topic.name == name else None  # else it has its alias
+
     def latched_value(self, topic: Topic) -> Sample | None:
         """The last message, if its publisher latches it."""
-        last = self._received[topic.name.encode()].last
+        last = self._received[self.key(topic.name)].last
         return last if last is not None and self.latched(topic.name) else None
 
     # In: messages
@@ -263,8 +272,8 @@ class BufferedLink(Link):
 
     def _publisher_found(self, name: str, size: int, source: Hashable = None) -> None:
         super()._publisher_found(name, size, source)
-        if name.encode() in self._received:
-            self._receive_early(name.encode(), source)
+        if self._received_topic(name) is not None:
+            self._receive_early(self.key(name), source)
 
     def _receive_early(self, name: bytes, source: Hashable) -> None:
         arrival, at = self._early.pop((name, source), (None, 0))

@@ -207,6 +207,9 @@ class LineLink(BufferedLink):
 
     # For `BufferedLink`
 
+    def key(self, topic: str) -> bytes:
+        return self.discovery.alias(topic).encode()
+
     @property
     def full(self) -> bool:
         return self._buffered_bytes >= self._limit
@@ -222,7 +225,7 @@ class LineLink(BufferedLink):
         try:
             encode = self._encoders[topic]
         except KeyError:
-            encode = self._encoders[topic] = debug.encoder(topic.encode())
+            encode = self._encoders[topic] = debug.encoder(self.key(topic))
         try:
             line = encode(sample.data, deadline)
         except MessageError:  # only from another link, with a topic of any size

@@ -29,6 +29,8 @@ from r2p.messages import ClockOffset, Message
 from r2p.names import TOPIC_MAX
 from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.events import (
+    AliasConflict,
+    AliasFreed,
     Command,
     Event,
     ModuleChanged,
@@ -392,12 +394,16 @@ class Link(abc.ABC):
 
     def topic_changed(self, topic: Topic) -> None:
         """Announce a topic that this module publishes or subscribes to, after a possible change."""
-        known = self._announced.pop(topic.name, NOTHING)
         desired = _announcement_of(topic)
         if self.gateway_hooks is not None:
             desired = self.gateway_hooks.desired_state(topic, desired)
-        if len(topic.name) > self.max_name:
-            desired = NOTHING  # management messages have no place for longer names
+        is_used = bool(desired.publishes or desired.subscribes or desired.endpoints)
+        is_used = is_used and len(topic.name) <= self.max_name
+        # First, as it may change other topics: two can't have one alias.
+        self._apply(self.discovery.claim(topic.name) if is_used else self.discovery.release(topic.name))
+        if not is_used or self.discovery.rival(topic.name):
+            desired = NOTHING
+        known = self._announced.pop(topic.name, NOTHING)
         params = self.params(topic.name) if desired.publishes and not self.refusal(desired.size) else None
         queue = self.window(topic) if desired.subscribes else QUEUE
         desired = msgspec.structs.replace(
@@ -477,9 +483,16 @@ class Link(abc.ABC):
             case PublisherGone(topic, source):
                 self.remove_publisher(topic, source)
             case _:
-                if isinstance(event, ModuleChanged | ModuleGone):
-                    self.module_changed(event.info.name)
-                self._hub.discovered(self, event)
+                self._report(event)
+
+    def _report(self, event: Event) -> None:
+        """Adapt to an event that concerns no topic of the other end, and pass it on to the module."""
+        match event:
+            case ModuleChanged(info) | ModuleGone(info):
+                self.module_changed(info.name)
+            case AliasFreed(name) | AliasConflict(refused=name) if (topic := self._space.topics.get(name)) is not None:
+                self.topic_changed(topic)  # its alias is its own now, or not any more
+        self._hub.discovered(self, event)
 
     def _publisher_found(self, name: str, size: int, source: Hashable = None) -> None:
         topic = self._space.topics.get(name)
@@ -542,4 +555,7 @@ def _discovery(link: str, hub: Hub, rate: float) -> Discovery:
     """Make the discovery of a line or a bus; `rate` is in messages per second."""
     counts = LoggedCounter(link, hub.space.clock)
     burst = max(4, int(rate / 4))  # what a quarter of a second carries
-    return Discovery(hub.space.module, hub.instance, rate=rate, burst=burst, observer=hub.observer, counts=counts)
+    aliases = hub.space.aliases
+    return Discovery(
+        hub.space.module, hub.instance, rate=rate, burst=burst, observer=hub.observer, counts=counts, aliases=aliases
+    )

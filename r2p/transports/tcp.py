@@ -24,7 +24,7 @@ if sys.platform == "linux":
 from r2p.clock import Backoff
 from r2p.codecs import debug, management
 from r2p.errors import TransportError
-from r2p.names import MANAGEMENT
+from r2p.names import MANAGEMENT, module_alias
 from r2p.transports.identify import ServerKind, identify_server
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
@@ -313,7 +313,7 @@ class _ServerConnection(_TcpConnection):
 
     def _refuse(self, transport: asyncio.Transport) -> None:
         """Send an r2p client the reason (PROTOCOL.md 9), which then closes the connection."""
-        server, name = self._server, self._hub.space.module
+        server, name = self._server, module_alias(self._hub.space.module)
         self._hub.connection_refused(
             str(server.url), f"all {server.max_clients} connections are in use: see max_clients="
         )

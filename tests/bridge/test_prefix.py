@@ -80,6 +80,35 @@ async def test_a_module_that_goes_is_gone_under_its_long_name() -> None:
         assert seen(pc) == {"GW0"}
 
 
+async def test_long_names_behind_a_prefix() -> None:
+    """On each network a topic has the alias of its name there; programs and tools see names only."""
+    topic, name = "front_left/wheel/velocity", "front_left_wheel_controller"
+    async with (
+        robots("robot1") as (motor,),
+        r2p.Module(name, via="memory:robot1") as wheel,
+        r2p.Module("laptop_of_the_lab", via="memory:lab") as pc,
+        node_in(wheel, name="velocity_estimator") as estimator,
+        node_in(motor, name="watcher") as watcher,
+        node_in(pc, name="plot_the_velocity") as plot,
+    ):
+        out, back = estimator.advertise(topic, Led), plot.advertise(f"robot1/{topic}_command", Led)
+        here, there = watcher.subscribe(topic, Led), plot.subscribe(f"robot1/{topic}", Led)
+        commands = estimator.subscribe(f"{topic}_command", Led)
+        await asyncio.sleep(2)
+        await out.publish(Led(led=1))
+        await back.publish(Led(led=2))
+        assert [await each.fetch(1.0) for each in (here, there, commands)] == [Led(led=1), Led(led=1), Led(led=2)]
+        await out.publish(Led(led=3))
+        sample = await anext(there.samples())
+        assert (sample.source.module, sample.source.node) == (f"robot1/{name}", "velocity_estimator")
+        assert set(pc.network.topics()) == {f"robot1/{topic}", f"robot1/{topic}_command", "robot1/log", "log"}
+        assert (f"robot1/{name}", "velocity_estimator") in pc.network.nodes()
+        assert ("laptop_of_the_lab", "plot_the_velocity") in motor.network.nodes()
+        pc.command(Command.STOP, f"robot1/{name}")
+        await asyncio.sleep(0.1)
+        assert (wheel.stopped, motor.stopped) == (True, False)
+
+
 async def test_firmware_behind_a_prefix() -> None:
     async with robots("robot1"), r2p.Module("PC", via="memory:lab") as pc:
         imu = Tap("robot1")

@@ -46,10 +46,14 @@ async def scenario(seed: int) -> None:
 
 
 async def populate(world: World) -> None:
-    """2 to 7 networks, 1 to 6 gateways, 2 to 12 modules, some of them with two links, 1 to 3 topics."""
+    """2 to 7 networks, 1 to 6 gateways, 2 to 12 modules, some of them with two links, 1 to 3 topics; of half of the
+    topologies these have names that travel as aliases.
+    """
     chance = world.chance
     networks = "ABCDEFG"[: chance.randint(2, 7)]
     topics = ["t1", "t2", "t3"][: chance.randint(1, 3)]
+    if len(networks) % 2:
+        topics = [f"front_left/wheel/velocity_{each}" for each in topics]
     for _ in range(chance.randint(2, 12)):
         await world.speak(module_links(chance, networks), chance.choice(topics), chance.choice(topics))
     for _ in range(chance.randint(1, 6)):

@@ -67,7 +67,7 @@ def test_keys_as_people_see_them() -> None:
         "1/ab",
         "1/ab/module",
         "1/ab/module/a%b%c/ab/0/0",
-        "1/ab/module/abcdefgh%abcdefghabcdefgh/ab/0/0",
+        f"1/ab/module/{'a' * 16}%{'b' * 65}/ab/0/0",
         "1/ab/module/PC1/ab/0/0/more",
         "1/123456789/module/PC1/ab/0/0",
         "1/AB/module/PC1/ab/0/0",
@@ -104,13 +104,13 @@ def test_another_version_is_left_alone(key: str) -> None:
         liveliness.decode(key)
 
 
-@pytest.mark.parametrize("name", ["a#b", "a*b", "a//b", "$*", "a/b/c", "a-b", "a%b", "-", " ", "a?b", "a" * 25])
+@pytest.mark.parametrize("name", ["a#b", "a*b", "a//b", "$*", "a/b/c", "a-b", "a%b", "-", " ", "a?b", "a" * 82])
 def test_names_that_no_key_carries(name: str) -> None:
     assert not liveliness.is_representable(ModuleToken(7, name, 7))
     assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, "leds", 7, name))
 
 
-@pytest.mark.parametrize("topic", ["a#b", "a*b", "a//b", "$*", "a/b/c", "/a", "a-b", "a%b", "-", "a" * 17])
+@pytest.mark.parametrize("topic", ["a#b", "a*b", "a//b", "$*", "/a", "a/", "a-b", "a%b", "-", "a" * 256])
 def test_topics_that_no_key_carries(topic: str) -> None:
     assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, topic, 7))
 

@@ -108,13 +108,13 @@ async def test_an_endpoint_without_a_module_is_hidden_by_the_same_of_a_module() 
 async def test_another_wire_version_is_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     async with joined("A") as a:
         for flags in (0, 1, 0):
-            for message in (management.Hello("X", 8, wire=2, release="9.9"), management.Alive("X", flags)):
+            for message in (management.Hello("X", 8, wire=9, release="9.9"), management.Alive("X", flags)):
                 a.links[0].manage(management.encode(message), 9)
             await settle(1.5)
         view = next(each for each in a.network.modules() if each.name == "X")
-    assert (view.wire, view.release) == (2, "9.9")
+    assert (view.wire, view.release) == (9, "9.9")
     (line,) = [each.getMessage() for each in caplog.records if "wire version" in each.getMessage()]
-    assert "module X has wire version 2 (r2p 9.9), this one 1" in line
+    assert "module X has wire version 9 (r2p 9.9), this one 2" in line
     assert "install the same release on both" in line
 
 

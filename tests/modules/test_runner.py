@@ -249,6 +249,14 @@ async def wink(node: r2p.Node) -> None:
     print(node.name)  # noqa: T201
 
 
+async def too_long(node: r2p.Node) -> None: ...
+
+
+LONG = too_long
+LONG.__name__ = "line_follower_" * 5
+SHORT = ("line_follower_" * 5)[:64].rstrip("_")
+
+
 def test_nodes_get_their_names(capsys: pytest.CaptureFixture[str]) -> None:
     r2p.run(line_follower, name="follower", via=[])
     r2p.run(wink, ("left", wink), ("follow", line_follower), via=[])
@@ -275,8 +283,8 @@ class Robot:
 @pytest.mark.parametrize(
     ("functions", "name", "kind", "text"),
     [
-        ([line_follower], None, r2p.NameTooLong, "pass name='line_fol', or ('line_fol', line_follower) to r2p.run"),
-        ([wink, ("too_long_for_it", wink)], None, r2p.NameTooLong, "has 15 characters, the wire carries 8: shorten it"),
+        ([LONG], None, r2p.NameTooLong, f"pass name='{SHORT}', or ('{SHORT}', {LONG.__name__}) to r2p.run"),
+        ([wink, ("L" * 65, wink)], None, r2p.NameTooLong, "has 65 characters, at most 64 are possible: shorten it"),
         ([wink], "", r2p.InvalidName, "node name ''"),
         ([wink, wink], None, r2p.Error, "already has a node wink"),
         ([wink, line_follower], "x", r2p.Error, "name='x' names one function, not 2: write (name, function)"),
@@ -343,12 +351,12 @@ def test_a_hook_of_the_program_stays_and_debugging_keeps_the_traceback(monkeypat
     hook = mock.Mock()
     monkeypatch.setattr(sys, "excepthook", hook)
     with pytest.raises(r2p.NameTooLong):
-        r2p.run(line_follower)
+        r2p.run(LONG)
     assert sys.excepthook is hook
     monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
     monkeypatch.setenv("R2P_DEBUG", "1")
     with pytest.raises(r2p.NameTooLong):
-        r2p.run(line_follower)
+        r2p.run(LONG)
     assert sys.excepthook is sys.__excepthook__
 
 

@@ -27,6 +27,22 @@ def _no_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
 
 
+def test_aliases_of_long_names(tmp_path: Path) -> None:
+    file = tmp_path / "r2p.toml"
+    file.write_text('[alias]\n"/front_left/wheel/velocity" = "flw_vel"')
+    assert settings().aliases == {"front_left/wheel/velocity": "flw_vel"}
+    assert ("alias.front_left/wheel/velocity", "flw_vel", "r2p.toml") in [
+        (each.key, each.value, each.source) for each in list_settings()
+    ]
+    file.write_text('[alias]\nfront_left_wheel_velocity = "flw"\nfront_left_wheel_current = "flw"')
+    with pytest.raises(UsageError) as caught:
+        settings()
+    assert str(caught.value) == (
+        f"{file}: [alias] 'front_left_wheel_velocity' and 'front_left_wheel_current' have one alias, 'flw': choose "
+        "another one for either"
+    )
+
+
 def test_the_command_line_goes_before_the_environment_before_the_file(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -60,9 +76,9 @@ def test_a_tool_connects_to_where_the_program_of_the_same_file_listens(
 @pytest.mark.parametrize(
     ("contents", "text"),
     [
-        ('module = "a_long_name"', "r2p.toml: module name 'a_long_name' has 11 characters"),
-        ('[remap]\nencoder = "a/b/c"', "r2p.toml: topic name 'a/b/c': use letters"),
-        ('[types]\n"my leds" = "Led"', "r2p.toml: topic name 'my leds': use letters"),
+        (f'module = "{"a" * 65}"', "r2p.toml: module name 'a{65}' has 65 characters"),
+        ('[remap]\nencoder = "a//c"', "r2p.toml: topic name 'a//c': a part of it is empty"),
+        ('[types]\n"my leds" = "Led"', "r2p.toml: topic name 'my leds': ' ' can't be"),
     ],
 )
 def test_names_that_nothing_can_have(tmp_path: Path, contents: str, text: str) -> None:
@@ -103,7 +119,7 @@ def test_a_bad_file_is_named(text: str, tmp_path: Path) -> None:
     ("text", "problem"),
     [
         ('vai = "tcp:there"', "unknown key vai; did you mean via?"),
-        ("x = 1", "unknown key x; the keys are via, module, types, remap, launch"),
+        ("x = 1", "unknown key x; the keys are via, module, types, remap, alias, launch"),
         ("via = 5", "via: expected str | array, got int"),
         ("[launch.a]\ncomand = 'run'", "[launch.a] unknown key comand; did you mean command?"),
         ("[launch.a]\nready = 'started'", "[launch.a] has no command: add one"),

@@ -232,13 +232,13 @@ async def findings_of_link(session: Session) -> list[tuple[str, bool, str]]:
 @pytest.mark.virtual_time
 async def test_a_link_with_modules() -> None:
     async with robot(), robot(name="NEW") as new, tool() as session:
-        newer = management.encode(management.Hello("NEW", new.instance, wire=2, release="9.9"))
+        newer = management.encode(management.Hello("NEW", new.instance, wire=9, release="9.9"))
         await new.stop()
         asyncio.get_running_loop().call_later(0.1, session.module.links[0].manage, newer, 9)
         assert await findings_of_link(session) == [
             ("connects", True, "after 0.0 s"),
-            ("module", True, f"BOT: r2p {r2p.__version__}, running, wire version 1"),
-            ("module", False, "NEW: r2p 9.9, stopped, wire version 2"),
+            ("module", True, f"BOT: r2p {r2p.__version__}, running, wire version 2"),
+            ("module", False, "NEW: r2p 9.9, stopped, wire version 9"),
             ("losses", True, "none"),
         ]
 

@@ -19,7 +19,7 @@ from r2p.tools import gateway
 from r2p.tools.gateway import LiveTable, RateCounter, crop, serve, table
 from r2p.tools.options import class_choice
 from r2p.tools.output import Output
-from r2p.tools.session import UsageError
+from r2p.tools.session import Settings, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -97,7 +97,9 @@ async def test_the_table_stays_in_its_place_until_something_is_logged() -> None:
 @pytest.mark.virtual_time
 async def test_the_counters_are_on_a_topic_and_in_a_pipe() -> None:
     stream = io.StringIO()
-    serving = asyncio.create_task(serve("GW", ["memory:a", "memory:b"], BridgeOptions(), Output("json", stream)))
+    serving = asyncio.create_task(
+        serve("GW", Settings(["memory:a", "memory:b"]), BridgeOptions(), Output("json", stream))
+    )
     async with (
         r2p.Module("A", via="memory:a") as one,
         node_in(one) as a,

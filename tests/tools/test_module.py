@@ -58,15 +58,15 @@ async def test_versions_are_listed_also_behind_a_gateway(
 ) -> None:
     gateway = r2p.Module("GW", via=["memory:lab", "memory:bus"], bridge=True)
     async with gateway, r2p.Module("ARM", via="memory:bus"), tool() as session:
-        newer = management.encode(management.Hello("NEW", 7, 0, 0, 60_000, 2, "9.9"))
+        newer = management.encode(management.Hello("NEW", 7, 0, 0, 60_000, 9, "9.9"))
         network("bus").send(Datagram(99, b"R2P", newer))
         await asyncio.sleep(5)
         await list_(session)
         rows = {row["module"]: (row["version"], row["wire"]) for row in printed(capsys)}
-        assert rows == {"ARM": (r2p.__version__, 1), "GW": (r2p.__version__, 1), "NEW": ("9.9", 2)}
+        assert rows == {"ARM": (r2p.__version__, 2), "GW": (r2p.__version__, 2), "NEW": ("9.9", 9)}
         monkeypatch.setattr("sys.stdout.isatty", lambda: True)
         await list_(session)
-        assert re.search(r"NEW +running +False +r2p +9.9 +2, not 1 ", capsys.readouterr().out)
+        assert re.search(r"NEW +running +False +r2p +9.9 +9, not 2 ", capsys.readouterr().out)
 
 
 async def test_ages_have_a_unit_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,7 +286,7 @@ async def test_a_command_may_time_out_before_firmware_was_heard() -> None:
 async def test_usage() -> None:
     async with tool() as session:
         with pytest.raises(r2p.NameTooLong):
-            await stop(session, "TOOLONGNAME")
+            await stop(session, "TOOLONG" * 12)
     async with r2p.Module("_tool01", via=[], observer=True) as module:
         with pytest.raises(UsageError, match="give --via"):
             await stop(Session(module, Settings()), "BOT")

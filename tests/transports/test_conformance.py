@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import count
@@ -216,6 +217,41 @@ async def test_the_source_of_a_sample(cable: Cable) -> None:
             await publisher.publish(Led())
             source = (await anext(samples)).source
         assert source == r2p.Source("A", "blinker", b.links[0].name)
+
+
+def _knows(module: r2p.Module, nodes: set[tuple[str, str]]) -> bool:
+    """Whether a module knows these nodes by their names, and no other ones but those that log."""
+    found = {each for each in module.network.nodes() if each[1] != "log"}
+    assert found <= nodes | {("", name) for _, name in nodes}
+    return found == nodes
+
+
+@conforms
+async def test_names_that_are_too_long_for_firmware(cable: Cable) -> None:
+    """Of topics, nodes and modules, with the same first characters: all of them arrive whole, and are told apart."""
+    names = [f"front_left/wheel/{each}" for each in ("velocity", "current", "x" * 238)]
+    left, right = "front_left_wheel_controller", "front_right_wheel_controller"
+    async with (
+        module(left, cable.a()) as a,
+        module(right, cable.b()) as b,
+        node_in(a, name="velocity_estimator") as alice,
+        node_in(b, name="velocity_" + "e" * 55) as bob,
+    ):
+        publishers = [alice.advertise(name, Led) for name in names]
+        subscribers = [bob.subscribe(name, Led) for name in names]
+        for number, publisher in enumerate(publishers):
+            await publisher.wait_subscriber()
+            await publisher.publish(Led(led=number))
+        assert [await subscriber.fetch() for subscriber in subscribers] == [Led(led=each) for each in range(3)]
+        for here in (a, b):
+            await until(functools.partial(_knows, here, {(left, alice.name), (right, bob.name)}))
+            assert here.network.topics().keys() == {*names, "log"}
+        samples = subscribers[0].samples()
+        await publishers[0].publish(Led())
+        assert (await anext(samples)).source == r2p.Source(left, "velocity_estimator", b.links[0].name)
+        b.command(r2p.Command.STOP, left)
+        await until(lambda: a.stopped)
+        await until(lambda: (view := other(b, left)) and view.state == "stopped")
 
 
 @conforms

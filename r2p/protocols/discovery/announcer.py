@@ -8,8 +8,18 @@ from collections import Counter
 import msgspec
 
 from r2p.codecs import management
-from r2p.codecs.management import ANSWERED, NO_PARAMS, ROLE_GONE, ROLE_PUBLISHES, ROLE_SUBSCRIBES, UNANSWERED
-from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory
+from r2p.codecs.management import (
+    ANSWERED,
+    KIND_NODE,
+    KIND_TOPIC,
+    NO_PARAMS,
+    ROLE_GONE,
+    ROLE_PUBLISHES,
+    ROLE_SUBSCRIBES,
+    UNANSWERED,
+)
+from r2p.protocols.discovery.aliases import LinkNames
+from r2p.protocols.discovery.directory import FOR_EVER, LEASE, Directory, decrement
 from r2p.protocols.discovery.events import Outbox, TopicType
 from r2p.protocols.discovery.schedule import Item, ItemKind, Schedule
 from r2p.units import MILLISECOND
@@ -17,6 +27,9 @@ from r2p.version import __version__
 
 Relayed = management.Hello | management.Alive | management.Endpoint
 """Messages about other modules that a gateway passes on."""
+
+_KindName = tuple[int, str]
+"""KIND_TOPIC or KIND_NODE, and a name."""
 
 _KIND_OF_ROLE = {ROLE_PUBLISHES: ItemKind.PUBLISHER, ROLE_SUBSCRIBES: ItemKind.SUBSCRIBER}
 
@@ -36,6 +49,7 @@ class Announcer:
     """The announcements of one module, sent as fast as the schedule allows.
 
     While r2p modules are known on the link (`r2p`), a TYPE goes before each announcement, and endpoints are announced.
+    The names behind aliases are announced always, and before what travels as the alias.
     """
 
     def __init__(
@@ -45,6 +59,7 @@ class Announcer:
         schedule: Schedule,
         outbox: Outbox,
         directory: Directory,
+        names: LinkNames,
         *,
         observer: bool,
     ) -> None:
@@ -62,9 +77,14 @@ class Announcer:
         self.is_gateway = False
         self.outbox = outbox
         self._directory = directory
+        self._names = names
         self._schedule = schedule
         self._endpoints: dict[tuple[str, str, int], int] = {}
         self._relayed: dict[tuple[str | int, ...], Relayed] = {}
+        self._relayed_names: dict[tuple[str | int, ...], list[_KindName]] = {}
+        """The names in relayed endpoints, by the key of each."""
+        self._long_names: Counter[_KindName] = Counter()
+        """Names that travel as aliases, and how many announcements have each."""
 
     # The module's topics
 
@@ -72,6 +92,8 @@ class Announcer:
         """Announce that the module publishes or subscribes to a topic; return whether that is new, or has changed."""
         if self.topics[role].get(topic) == own:
             return False
+        if topic not in self.topics[role]:
+            self._add_name(KIND_TOPIC, topic)  # before the topic: an alias is of no use without its name
         self.topics[role][topic] = own
         self._add(_KIND_OF_ROLE[role], topic)
         return True
@@ -81,6 +103,7 @@ class Announcer:
         if self.topics[role].pop(topic, None) is None:
             return False
         self._drop(_KIND_OF_ROLE[role], topic)
+        self._drop_name(KIND_TOPIC, topic)
         if role == ROLE_SUBSCRIBES and self.r2p:  # firmware has no such message: it goes on sending
             self.announce_once(ItemKind.UNSUBSCRIBE, topic)
         return True
@@ -88,6 +111,9 @@ class Announcer:
     def add_endpoint(self, node: str, topic: str, role: int, publisher_class: int) -> None:
         key = (node, topic, role)
         if self._endpoints.get(key) != publisher_class:
+            if key not in self._endpoints:
+                self._names.claim(KIND_NODE, node)
+                self._add_name(KIND_NODE, node)
             self._endpoints[key] = publisher_class
             if self.r2p:
                 self._add(ItemKind.ENDPOINT, *key)
@@ -95,6 +121,9 @@ class Announcer:
     def remove_endpoint(self, node: str, topic: str, role: int) -> None:
         if self._endpoints.pop((node, topic, role), None) is not None:
             self._drop(ItemKind.ENDPOINT, node, topic, role)
+            self._drop_name(KIND_NODE, node)
+            if not any(each == node for each, _, _ in self._endpoints):
+                self._names.release(KIND_NODE, node)
             if self.r2p:
                 self.announce_once(ItemKind.ENDPOINT_GONE, node, topic, role)
 
@@ -123,6 +152,7 @@ class Announcer:
                 key: tuple[str | int, ...] = (type(message).__name__, module)
             case management.Endpoint(role, instance, node, topic):
                 key = (instance, node, topic, role & ~ROLE_GONE)
+                self._relay_names(key, [] if role & ROLE_GONE else [(KIND_TOPIC, topic), (KIND_NODE, node)])
         if isinstance(message, management.Hello):
             # On a slow link the next one is late: its module must not seem gone until then.
             lease = max(message.lease_ms, 3 * self._schedule.relay_time // MILLISECOND)
@@ -141,6 +171,43 @@ class Announcer:
                 self._add(ItemKind.ENDPOINT, *key)
             else:
                 self._drop(ItemKind.ENDPOINT, *key)
+
+    # Names that travel as aliases
+
+    def announce_name(self, kind: int, name: str) -> None:
+        """Announce once that this module has a topic of a short name, which is also the alias of another one."""
+        self.announce_once(ItemKind.LONG_NAME, kind, name, 0)
+
+    def _add_name(self, kind: int, name: str) -> None:
+        """Announce the name behind an alias for as long as anything announced has the alias."""
+        if self._names.alias(kind, name) == name:
+            return
+        self._long_names[kind, name] += 1
+        if self._long_names[kind, name] == 1:
+            self._schedule_name(kind, name, announced=True)
+
+    def _drop_name(self, kind: int, name: str) -> None:
+        """Note that one announcement less has the name."""
+        if (kind, name) in self._long_names and decrement(self._long_names, (kind, name)):
+            self._schedule_name(kind, name, announced=False)
+
+    def _relay_names(self, key: tuple[str | int, ...], names: list[_KindName]) -> None:
+        """Announce the names in the relayed message with this key, instead of those before."""
+        before = self._relayed_names.pop(key, [])
+        long = [(kind, name) for kind, name in names if self._names.alias(kind, name) != name]
+        if long:
+            self._relayed_names[key] = long
+        for each in long:
+            self._add_name(*each)
+        for each in before:
+            self._drop_name(*each)
+
+    def _schedule_name(self, kind: int, name: str, *, announced: bool) -> None:
+        for part in range(len(self._name_messages(kind, name))):
+            (self._add if announced else self._drop)(ItemKind.LONG_NAME, kind, name, part)
+
+    def _name_messages(self, kind: int, name: str) -> list[management.LongName]:
+        return management.long_name_messages(kind, self._names.text(kind, name))
 
     def flush(self, now: int) -> None:
         """Send due announcements."""
@@ -194,6 +261,8 @@ class Announcer:
                 return [management.Endpoint(role, self.instance, node, topic, publisher_class)]
             case ItemKind.ENDPOINT_GONE, (str(node), str(topic), int(role)):
                 return [management.Endpoint(role | ROLE_GONE, self.instance, node, topic)]
+            case ItemKind.LONG_NAME, (int(kind), str(name), int(part)):
+                return [self._name_messages(kind, name)[part]]
             case ItemKind.RELAY, key:  # the last that the module said, if it said more meanwhile
                 return _with_alias(self._relayed.pop(key))
             case kind, _:
@@ -206,7 +275,8 @@ class Announcer:
 
     def _presence(self, flags: int) -> list[management.Management]:
         hello = self.hello(flags)  # first: after an ALIVE alone the module would be taken for firmware
-        return [hello] if self._observer else [hello, management.Alive(self.module, self.flags)]
+        alive = [] if self._observer else [management.Alive(self.module, self.flags)]
+        return [*management.alias_messages(self.module), hello, *alive]
 
     # The schedule
 
@@ -218,8 +288,6 @@ class Announcer:
 
 
 def _with_alias(message: Relayed) -> list[management.Management]:
-    """Return a message; a module's name that is too long is replaced by its alias, after a NAME."""
-    if isinstance(message, management.Endpoint):
-        return [message]
-    names = management.alias_messages(message.module)
-    return [*names, msgspec.structs.replace(message, module=names[0].alias)] if names else [message]
+    """Return a message, after the name of a module that travels as an alias."""
+    names = [] if isinstance(message, management.Endpoint) else management.alias_messages(message.module)
+    return [*names, message]

@@ -8,13 +8,12 @@ messages pushes out true entries only until they are repeated.
 
 from collections import Counter
 from collections.abc import Hashable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
 from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.names import MODULE_PATH_MAX, module_alias
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, TopicType
 from r2p.protocols.discovery.schedule import SLOW_ROUNDS
 from r2p.protocols.timers import KeyedTimers
@@ -28,9 +27,6 @@ LEASE = 5 * SECOND
 
 FOR_EVER = management.LEASE_MS_MAX * MILLISECOND
 """The longest lease of a HELLO (ns): its subscriptions last as long as the module does."""
-
-_UNFINISHED_MAX = 256
-"""Incomplete aliases, of which some parts were received."""
 
 _TopicRole = tuple[str, int]
 K = TypeVar("K")
@@ -247,19 +243,35 @@ class Directory:
             self.forget_endpoint(key)
             return
         module = self.name_of(message.instance)
-        info = EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
+        self._keep_endpoint(
+            now, EndpointInfo(module, message.instance, message.node, message.topic, role, message.publisher_class)
+        )
+
+    def _keep_endpoint(self, now: int, info: EndpointInfo) -> None:
+        key = (info.instance, info.node, info.topic, info.role)
         self.generation += self.endpoints.get(key) != info
         old = self._put(self.endpoints, key, info, "endpoints forgotten")
-        self._endpoints_of.setdefault(message.instance, {})[key] = None
+        self._endpoints_of.setdefault(info.instance, {})[key] = None
         if old is not None:
             self._drop_endpoint((old.instance, old.node, old.topic, old.role))
-        known = self.modules.get(module)
+        known = self.modules.get(info.module)
         if known is None:  # the HELLO of its module may never come
             self.timers.set(("endpoint", key), now + LEASE)
         elif known.lease < FOR_EVER:
             self.timers.set(("endpoint", key), now + SLOW_ROUNDS * known.lease)
         else:
             self.timers.clear(("endpoint", key))
+
+    def rename(self, now: int, kind: int, old: str, new: str) -> None:
+        """Rename a topic or a node (KIND_...), as the name behind its alias is known now, or not any more."""
+        if kind == management.KIND_TOPIC and (info := self.topics.pop(old, None)) is not None:
+            info.name = new
+            self.topics.setdefault(new, info)
+        field = "topic" if kind == management.KIND_TOPIC else "node"
+        for key, endpoint in list(self.endpoints.items()):
+            if getattr(endpoint, field) == old:
+                self.forget_endpoint(key)
+                self._keep_endpoint(now, msgspec.structs.replace(endpoint, **{field: new}))
 
     def forget_endpoint(self, key: EndpointKey) -> None:
         if self.endpoints.pop(key, None) is not None:
@@ -311,39 +323,6 @@ class Directory:
         self._names.pop(instance, None)
         for key in list(self._endpoints_of.get(instance, ())):
             self.forget_endpoint(key)
-
-
-class Aliases:
-    """The names of modules that are too long for a message: an alias travels, which NAME explains."""
-
-    def __init__(self) -> None:
-        self._names: dict[str, str] = {}
-        self._parts: dict[str, dict[int, str]] = {}
-
-    def name_of(self, alias: str) -> str:
-        """Return the name; the alias itself if it is a name, or its name is unknown."""
-        return self._names.get(alias, alias)
-
-    def receive(self, message: management.Name) -> str | None:
-        """Read a part of a name; return the name if it is complete now, and new."""
-        parts = self._parts.setdefault(message.alias, {})
-        number, last = management.split_part(message.part)
-        parts[number] = message.piece
-        if not set(range(last + 1)) <= parts.keys():
-            _bound(self._parts, _UNFINISHED_MAX)
-            return None
-        del self._parts[message.alias]
-        name = "".join(parts[each] for each in range(last + 1))
-        if len(name) > MODULE_PATH_MAX or module_alias(name) != message.alias or self._names.get(message.alias) == name:
-            return None
-        self._names[message.alias] = name
-        _bound(self._names, TABLE_MAX)
-        return name
-
-
-def _bound(table: dict[str, Any], most: int) -> None:
-    while len(table) > most:
-        del table[next(iter(table))]
 
 
 def counterpart(role: int) -> int:
@@ -469,6 +448,13 @@ class LeasedDemand(Demand):
             self._permanent.get(source, {}).pop((topic, role), None)
         elif ("demand", topic, role, source) not in self._timers:
             self._permanent.setdefault(source, {})[topic, role] = None
+
+    def rename(self, now: int, old: str, new: str) -> None:
+        """Move the sources of a topic whose alias was understood, or is not any more."""
+        for role in (ROLE_PUBLISHES, ROLE_SUBSCRIBES):
+            for source in self.sources_of(old, role):
+                self.expired(old, role, source)
+                self._enter(now, new, role, source)
 
     def _start_leases(self, now: int, source: PeerAddress) -> None:
         """Make leases of a module's entries before its first HELLO, too."""

@@ -7,7 +7,7 @@ which has one other end.
 
 import enum
 from collections import deque
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 
 import msgspec
 
@@ -203,6 +203,35 @@ class ModuleGone(msgspec.Struct, frozen=True):
     silent: bool = False
 
 
+class AliasConflict(msgspec.Struct, frozen=True):
+    """Two names have one alias on a link. `refused` is the topic of this module that the link does not carry for that;
+    empty if there is none. `kind` is KIND_...
+    """
+
+    kind: int
+    alias: str
+    name: str
+    other: str
+    refused: str = ""
+
+
+class AliasesDiffer(msgspec.Struct, frozen=True):
+    """Another module on the link uses another alias for a topic of this module, so nothing flows between them."""
+
+    name: str
+    alias: str
+    other_alias: str
+
+
+class AliasFreed(msgspec.Struct, frozen=True):
+    """A topic that was refused has its alias for itself now."""
+
+    topic: str
+
+
+AliasEvent = AliasConflict | AliasesDiffer | AliasFreed
+
+
 class Declare(msgspec.Struct, frozen=True):
     """Declare this liveliness token."""
 
@@ -237,6 +266,7 @@ Event = (
     | Declare
     | Undeclare
     | QueryTokens
+    | AliasEvent
 )
 
 _SENT_MAX = 256
@@ -244,17 +274,21 @@ _SENT_MAX = 256
 
 
 class Outbox:
-    """The events of one call. While the link is not `up` nothing is sent."""
+    """The events of one call. While the link is not `up` nothing is sent.
 
-    def __init__(self) -> None:
+    `to_wire` replaces names that are too long for their fields.
+    """
+
+    def __init__(self, to_wire: Callable[[management.Management], management.Management]) -> None:
         self.up = False
+        self._to_wire = to_wire
         self._events: list[Event] = []
         self._sent: deque[bytes] = deque(maxlen=_SENT_MAX)
 
     def send(self, *messages: management.Management, urgent: bool = False) -> None:
         if self.up:
             for message in messages:
-                data = management.encode(message)
+                data = management.encode(self._to_wire(message))
                 self._sent.append(data)
                 self._events.append(Send(data, urgent))
 

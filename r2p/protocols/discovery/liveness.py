@@ -9,8 +9,10 @@ from typing import TypeVar
 import msgspec
 
 from r2p.codecs import management
+from r2p.names import module_alias
+from r2p.protocols.discovery.aliases import ModuleAliases
 from r2p.protocols.discovery.announcer import Announcer
-from r2p.protocols.discovery.directory import Aliases, Directory
+from r2p.protocols.discovery.directory import Directory
 from r2p.protocols.discovery.events import (
     EchoDetected,
     ModuleChanged,
@@ -24,6 +26,8 @@ from r2p.units import SECOND
 
 _REPORT_INTERVAL = 5 * SECOND
 """Ns between two reports of one conflict, or of an echo."""
+_UNNAMED_MAX = 256
+"""Remembered aliases of modules without a name."""
 _REPORTED_MAX = 64
 """Remembered names with a conflict; further ones are only counted."""
 _ECHO_INTERVAL = 10 * SECOND
@@ -46,7 +50,9 @@ class PeerLiveness:
         self._timers = directory.timers
         self._outbox = announcer.outbox
         self._counts = directory.counts
-        self._aliases = Aliases()
+        self._aliases = ModuleAliases(announcer.module)
+        self._unnamed: dict[str, None] = {}
+        """Aliases of modules whose names have not been received yet."""
         self._echoing_until = 0
         self._next_report: dict[str, int] = {}
 
@@ -55,6 +61,8 @@ class PeerLiveness:
     def name(self, now: int, message: management.Name, source: PeerAddress) -> None:
         """Handle NAME: a module known by its alias gets its name."""
         name = self._aliases.receive(message)
+        if self._aliases.name_of(message.alias) != message.alias:
+            self._unnamed.pop(message.alias, None)
         info = self._directory.modules.get(message.alias)
         if name is not None and info is not None and (info.hops or not info.r2p):
             self._remove(now, info)
@@ -64,7 +72,10 @@ class PeerLiveness:
         """Handle ALIVE: the state of any module."""
         if not self._is_possible(message.module):
             return
-        message = self._with_name(message)
+        if not self._is_short(message.module):
+            message = self._with_name(message)
+        if message.module in self._unnamed:
+            return
         if message.module.startswith("_"):
             return  # a gateway's probe for loops: only tools have such names, and they send no ALIVE
         if message.module == self._module and not self._report_namesake(now):
@@ -79,7 +90,12 @@ class PeerLiveness:
         """Handle HELLO: an r2p module, maybe this one."""
         if not self._is_possible(message.module):
             return
-        message = self._with_name(message)
+        is_alias = bool(message.flags & management.HELLO_ALIAS)
+        if is_alias or message.hops:  # r2p before the flag gave long names only to modules behind gateways
+            message = self._with_name(message)
+        if is_alias and message.module == module_alias(message.module):
+            self._wait_for_name(message.module)
+            return
         if (message.module, message.instance) == (self._module, self._instance):
             if not message.hops:  # else a gateway does not know yet that this module is on both sides of it
                 self._echoed(now)
@@ -98,8 +114,8 @@ class PeerLiveness:
     def conflict(self, now: int, message: management.Conflict, source: PeerAddress) -> None:
         """Handle CONFLICT: a peer that hears more modules found another one of this module's name."""
         instances = (message.instance_a, message.instance_b)
-        if message.module == self._module and self._instance in instances:
-            self._report_conflict(now, message.module, *instances)
+        if message.module == module_alias(self._module) and self._instance in instances:
+            self._report_conflict(now, self._module, *instances)
 
     # Time and the link
 
@@ -128,6 +144,10 @@ class PeerLiveness:
 
     # Names
 
+    def module_behind(self, alias: str) -> str:
+        """Return the name that an alias stands for; the alias itself if it is a name, or its name is unknown."""
+        return self._aliases.name_of(alias)
+
     def _is_possible(self, name: str) -> bool:
         if "/" not in name:
             return True
@@ -137,6 +157,17 @@ class PeerLiveness:
     def _with_name(self, message: _M) -> _M:
         name = self._aliases.name_of(message.module)
         return message if name == message.module else msgspec.structs.replace(message, module=name)
+
+    def _is_short(self, name: str) -> bool:
+        """Return whether a module on the link itself has this very name, whatever it may be the alias of."""
+        info = self._directory.modules.get(name)
+        return info is not None and info.r2p and not info.hops
+
+    def _wait_for_name(self, alias: str) -> None:
+        """Note a module whose name is lost, or on its way; it is repeated, as HELLO is."""
+        self._unnamed[alias] = None
+        if len(self._unnamed) > _UNNAMED_MAX:
+            del self._unnamed[next(iter(self._unnamed))]
 
     def _is_nearer(self, message: management.Hello) -> bool:
         """Return whether a module of this name is known to be nearer than a gateway says. The gateway may not have

@@ -1,8 +1,8 @@
 """The schedule of announcements: a ring of everything to repeat, step by step, never faster than the link's rate.
 
 New items go first (`_fresh`), then join the ring. A request for everything only raises the number of steps that don't
-wait (`_eager`) to one full turn, so that fifty requests at once cost one turn. Items that only describe, those of
-endpoints, leave the ring after two turns for one that turns more slowly (`_slow`), until a module is new.
+wait (`_eager`) to one full turn, so that fifty requests at once cost one turn. Items that only describe, endpoints and
+names, leave the ring after two turns for one that turns more slowly (`_slow`), until a module is new.
 """
 
 from collections import OrderedDict
@@ -44,9 +44,13 @@ class ItemKind(Enum):
     SUBSCRIBER = auto()
     ENDPOINT = auto()
     ENDPOINT_GONE = auto()
+    LONG_NAME = auto()
     UNSUBSCRIBE = auto()
     CONFLICT = auto()
     RELAY = auto()
+
+
+_DESCRIBING = (ItemKind.ENDPOINT, ItemKind.LONG_NAME)
 
 
 class Item(msgspec.Struct, frozen=True):
@@ -221,9 +225,12 @@ class Schedule:
         self._eager, self._lap = self._count, 2 * self._count
 
     def _include_slow(self) -> None:
-        """Announce everything in the next turn."""
+        """Announce everything in the next turn, first the names behind aliases, as all others travel as these."""
+        names = [item for item in self._slow if item.kind is ItemKind.LONG_NAME]
         self._ring.update(self._slow)
         self._slow.clear()
+        for item in reversed(names):
+            self._ring.move_to_end(item, last=False)
         self._lap = max(self._lap, self._count)
 
     def _repetition(self) -> Item:
@@ -242,8 +249,8 @@ class Schedule:
         return item
 
     def _slow_down(self) -> None:
-        """Move the endpoints to the slow ring, once everything was announced twice."""
-        for item in [item for item in self._ring if item.kind is ItemKind.ENDPOINT]:
+        """Move endpoints and names to the slow ring, once everything was announced twice."""
+        for item in [item for item in self._ring if item.kind in _DESCRIBING]:
             del self._ring[item]
             self._slow[item] = None
 

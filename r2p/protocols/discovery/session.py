@@ -7,19 +7,20 @@ and acts on the returned events.
 The protocol of management messages keeps no connections: everything is announced again and again, every request is
 answered every time, and no single message matters. `Announcer` announces this module's topics,
 `SubscriptionNegotiation` answers offers and requests of peers, `PeerLiveness` reports modules that join and leave, and
-`Directory` remembers their announcements. `Discovery` gives each received message to the part that handles it, and
-calls the parts at their deadlines.
+`Directory` remembers their announcements, and `LinkNames` translates names that are too long for messages. `Discovery`
+gives each received message to the part that handles it, and calls the parts at their deadlines.
 """
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, TypeVar
 
 from r2p.codecs import UnknownType, management
-from r2p.codecs.management import ANY_TYPE, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.codecs.management import ANY_TYPE, KIND_TOPIC, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 from r2p.names import module_alias
+from r2p.protocols.discovery.aliases import LinkNames
 from r2p.protocols.discovery.announcer import Announcer, LocalTopic, Relayed
 from r2p.protocols.discovery.directory import (
     Demand,
@@ -77,12 +78,12 @@ class DiscoveryProtocol(ABC):
     endpoints: dict[EndpointKey, EndpointInfo]
     """The publishers and subscribers of remote nodes, by instance, node, topic and role."""
 
-    def __init__(self, module: str, instance: int, counts: Counter[str] | None) -> None:
+    def __init__(self, module: str, instance: int, counts: Counter[str] | None, names: LinkNames) -> None:
         self.flags = 0
         self.counts = Counter() if counts is None else counts
         self._module = module
         self._instance = instance
-        self._outbox = Outbox()
+        self._outbox = Outbox(names.to_wire)
 
     @property
     def sole_peer(self) -> int | None:
@@ -97,6 +98,32 @@ class DiscoveryProtocol(ABC):
     @abstractmethod
     def demand(self) -> Demand:
         """Return what the other modules publish and subscribe to, for gateways."""
+
+    # Names
+
+    def alias(self, topic: str) -> str:
+        """Return what travels on this link for the name of a topic: the name itself, or its alias."""
+        return topic
+
+    def topic_behind(self, alias: str) -> str:
+        """Return the topic that an alias stands for; the alias itself if that is a name, or is not known."""
+        return alias
+
+    def module_behind(self, alias: str) -> str:
+        """Return the module that an alias stands for; the alias itself if that is a name, or is not known."""
+        return alias
+
+    def claim(self, topic: str) -> list[Event]:
+        """Use the name of a topic on this link, before anything is announced about it."""
+        return []
+
+    def release(self, topic: str) -> list[Event]:
+        """Stop using the name of a topic."""
+        return []
+
+    def rival(self, topic: str) -> str:
+        """Return the other name with the alias of this topic, so that the link can't carry it; empty: it can."""
+        return ""
 
     # What this module has
 
@@ -143,7 +170,7 @@ class DiscoveryProtocol(ABC):
 
     def command(self, now: int, command: Command, module: str) -> list[Event]:
         """Command a module to stop, to reboot or to enter its loader."""
-        self._outbox.send(MESSAGE_OF_COMMAND[command](module_alias(module)), urgent=True)
+        self._outbox.send(MESSAGE_OF_COMMAND[command](module), urgent=True)
         return self._outbox.drain()
 
     @abstractmethod
@@ -203,7 +230,7 @@ class DiscoveryProtocol(ABC):
         return None
 
     def _commanded(self, now: int, message: management.Order, source: PeerAddress) -> None:
-        if message.module == self._module:
+        if message.module == module_alias(self._module):
             self._outbox.emit(CommandReceived(COMMAND_OF_TYPE[management.order_type(message)]))
 
     def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
@@ -217,6 +244,7 @@ class Discovery(DiscoveryProtocol):
 
     `rate` is the most management messages a second that were not asked for, `burst` how many of them may go at once,
     `quiet` the time (s) without management traffic before something is repeated. An `observer` sends no ALIVE.
+    `aliases` are those chosen for topics.
     """
 
     def __init__(
@@ -229,15 +257,21 @@ class Discovery(DiscoveryProtocol):
         quiet: float = 0.0,
         observer: bool = False,
         counts: Counter[str] | None = None,
+        aliases: Mapping[str, str] | None = None,
     ) -> None:
-        super().__init__(module, instance, counts)
-        self._schedule = Schedule(rate, burst, round(quiet * SECOND))
+        self._observer = observer
         self._timers = KeyedTimers()
+        self._names = LinkNames(aliases, self._timers)
+        super().__init__(module, instance, counts, self._names)
+        self._names.emit = self._outbox.emit
+        self._schedule = Schedule(rate, burst, round(quiet * SECOND))
         self._directory = Directory(self._timers, self.counts)
         self.modules = self._directory.modules
         self.topics = self._directory.topics
         self.endpoints = self._directory.endpoints
-        self._announcer = Announcer(module, instance, self._schedule, self._outbox, self._directory, observer=observer)
+        self._announcer = Announcer(
+            module, instance, self._schedule, self._outbox, self._directory, self._names, observer=observer
+        )
         self._negotiation = SubscriptionNegotiation(self._announcer, self._directory)
         self._liveness = PeerLiveness(self._announcer, self._negotiation, self._directory)
         self._demand: LeasedDemand | None = None
@@ -254,6 +288,7 @@ class Discovery(DiscoveryProtocol):
             management.Unsubscribe: self._negotiation.unsubscribed,
             management.Endpoint: self._liveness.endpoint,
             management.Name: self._liveness.name,
+            management.LongName: self._long_name,
             management.Conflict: self._liveness.conflict,
             management.Denied: self._denied,
         }
@@ -273,6 +308,39 @@ class Discovery(DiscoveryProtocol):
         if self._demand is None:
             self._demand = LeasedDemand(self._directory)
         return self._demand
+
+    # Names
+
+    def alias(self, topic: str) -> str:
+        return self._names.alias(KIND_TOPIC, topic)
+
+    def topic_behind(self, alias: str) -> str:
+        return self._names.name(KIND_TOPIC, alias)
+
+    def module_behind(self, alias: str) -> str:
+        return self._liveness.module_behind(alias)
+
+    def claim(self, topic: str) -> list[Event]:
+        self._names.claim(KIND_TOPIC, topic)
+        return self._outbox.drain()
+
+    def release(self, topic: str) -> list[Event]:
+        self._names.release(KIND_TOPIC, topic)
+        return self._outbox.drain()
+
+    def rival(self, topic: str) -> str:
+        return self._names.rival(topic)
+
+    def _long_name(self, now: int, message: management.LongName, source: PeerAddress) -> None:
+        """Handle LONG_NAME: what was heard under an alias gets its name."""
+        short = self._names.receive(now, message, self.counts)
+        if short and not self._observer:  # the user of a tool may ask for a topic by its alias
+            self._announcer.announce_name(KIND_TOPIC, short)
+        renames, self._names.renames = self._names.renames, []
+        for change in renames:
+            self._directory.rename(now, change.kind, change.old, change.new)
+            if self._demand is not None and change.kind == KIND_TOPIC:
+                self._demand.rename(now, change.old, change.new)
 
     # What this module has
 
@@ -314,7 +382,7 @@ class Discovery(DiscoveryProtocol):
         return self._flush(now)
 
     def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
-        self._announcer.announce_once(ItemKind.CONFLICT, module_alias(module), instance_a, instance_b)
+        self._announcer.announce_once(ItemKind.CONFLICT, module, instance_a, instance_b)
         return self._flush(now)
 
     def relay(self, now: int, message: Relayed) -> list[Event]:
@@ -377,6 +445,7 @@ class Discovery(DiscoveryProtocol):
         message = self._decode(management.decode, data)
         handler = self._handlers.get(type(message))
         if message is not None and handler is not None and not self._liveness.drop_echo(now, data):
+            message = self._names.from_wire(message)
             handler(now, message, source)  # before demand, which looks up the leases that a HELLO has set
             if self._demand is not None:
                 self._demand.receive(now, message, source)
@@ -400,6 +469,8 @@ class Discovery(DiscoveryProtocol):
                 self._demand.expired(topic, role, source)
             case ("peer", source):
                 self._negotiation.linger_over(source)
+            case ("alias", int(kind), str(alias)):
+                self._names.expired(kind, alias)
             case ("endpoint", (int(instance), str(node), str(topic), int(role))):
                 self._directory.forget_endpoint((instance, node, topic, role))
 

@@ -13,8 +13,9 @@ import msgspec
 from r2p.codecs import liveliness, management
 from r2p.codecs.liveliness import ModuleToken, SoftwareToken, TopicToken
 from r2p.names import module_alias
+from r2p.protocols.discovery.aliases import LinkNames, ModuleAliases
 from r2p.protocols.discovery.announcer import LocalTopic, Relayed
-from r2p.protocols.discovery.directory import TABLE_MAX, Aliases, Demand
+from r2p.protocols.discovery.directory import TABLE_MAX, Demand
 from r2p.protocols.discovery.events import (
     Event,
     ModuleInfo,
@@ -46,7 +47,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
     def __init__(
         self, module: str, instance: int, *, observer: bool = False, counts: Counter[str] | None = None
     ) -> None:
-        super().__init__(module, instance, counts)
+        super().__init__(module, instance, counts, LinkNames())
         self._own = TokenSet(module, instance, observer=observer)
         self._matching = Matching(self._own, self._outbox)
         self._modules = ModuleRegistry(module, instance, self._outbox, self.counts)
@@ -55,7 +56,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         self.endpoints = self._modules.endpoints
         self._tokens: dict[str, liveliness.Token] = {}
         self._refused = RefusedTokens(TOKENS_MAX, instance)
-        self._aliases = Aliases()
+        self._aliases = ModuleAliases(module)
         self._mark_at: int | None = None
 
     @property
@@ -105,8 +106,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
                     token = msgspec.structs.replace(known, flags=flags & liveliness.FLAGS_MASK)
                     self._relay(("module", name), token, gone=False)
                 else:
-                    alive = management.Alive(module_alias(name), flags)
-                    self._outbox.send(*management.alias_messages(name), alive)
+                    self._outbox.send(*management.alias_messages(name), management.Alive(name, flags))
             case management.Endpoint(role, instance, node, topic, publisher_class):
                 key = (instance, node, topic, role & ~management.ROLE_GONE)
                 endpoint = TopicToken(self._instance, key[3], topic, instance, node, publisher_class, hops=1)
@@ -128,7 +128,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         return self._outbox.drain()
 
     def report_conflict(self, now: int, module: str, instance_a: int, instance_b: int) -> list[Event]:
-        self._outbox.send(management.Conflict(module_alias(module), instance_a, instance_b))
+        self._outbox.send(management.Conflict(module, instance_a, instance_b))
         return self._outbox.drain()
 
     # The link
@@ -271,7 +271,7 @@ class LivelinessDiscovery(DiscoveryProtocol):
         match message:
             case management.Stop() | management.Reboot() | management.Bootload():
                 self._commanded(now, message, source)
-            case management.Conflict(self._module, a, b) if self._instance in (a, b):
+            case management.Conflict(name, a, b) if name == module_alias(self._module) and self._instance in (a, b):
                 self._outbox.emit(NameConflict(self._module, a, b))
             case management.Denied():
                 self._denied(now, message, source)

@@ -9,6 +9,7 @@ repeated, and at once when the module announces another id for the topic, or ano
 """
 
 import zlib
+from collections.abc import Callable
 from typing import TypeVar
 
 import msgspec
@@ -35,9 +36,11 @@ class _AnnouncedId(msgspec.Struct, eq=False):
 class TopicIdAllocator:
     """The high bytes in use on one bus: this module's by topic, others' with at most one topic for each message id."""
 
-    def __init__(self) -> None:
+    def __init__(self, alias: Callable[[str], str] = str) -> None:
+        """`alias` returns what travels for the name of a topic; from that, the first byte to try follows."""
         self.refused: set[str] = set()
         """Topics of this module without a high byte."""
+        self._alias = alias
         self._lease = _LEASE
         self._ours: dict[str, int] = {}
         self._announced: dict[int, _AnnouncedId] = {}  # by message id; the lease that ends first comes first
@@ -55,7 +58,7 @@ class TopicIdAllocator:
         if high is not None:
             return high
         leader = self._leader(topic)
-        first = zlib.crc32(topic.encode())
+        first = zlib.crc32(self._alias(topic).encode())
         tried = [rtcan.FIRST_TOPIC + (first + step) % _COUNT for step in range(_COUNT)]
         for high in tried if leader is None else [rtcan.high_byte(leader), *tried]:
             if self._free(high, topic):

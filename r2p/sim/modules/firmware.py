@@ -20,7 +20,7 @@ from r2p.codecs import UnknownType, debug, management
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import DecodeError, Error
 from r2p.messages import Layout, Message, layout
-from r2p.names import MANAGEMENT, module_name, topic_name
+from r2p.names import MANAGEMENT, MODULE_FIELD, TOPIC_FIELD, module_name, topic_name
 from r2p.units import MILLISECOND, SECOND
 
 # All durations in ns, as measured in recordings of the firmware.
@@ -77,7 +77,7 @@ class FirmwareModule:
         behind_gateway: bool = False,
     ) -> None:
         """`heap`: bytes for queues. `behind_gateway`: behind firmware's gateway, data needs a second response."""
-        self.name = module_name(name)
+        self.name = module_name(name, MODULE_FIELD)
         self.flags = 0
         """Flags of ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
         self.fault = ""
@@ -91,8 +91,8 @@ class FirmwareModule:
         """The last message received on each topic."""
         self.drops: Counter[str] = Counter()
         """Dropped lines and messages, by reason."""
-        self._publishers = {topic_name(each.topic): _FirmwarePublisher(each) for each in publishers}
-        self._subscribers = {topic_name(each.topic): _FirmwareSubscriber(each) for each in subscribers}
+        self._publishers = {topic_name(each.topic, TOPIC_FIELD): _FirmwarePublisher(each) for each in publishers}
+        self._subscribers = {topic_name(each.topic, TOPIC_FIELD): _FirmwareSubscriber(each) for each in subscribers}
         self._repeats = repeats
         self._heap = heap
         self._responses_needed = 2 if behind_gateway else 1
@@ -365,7 +365,7 @@ class _FirmwarePublisher:
 
     def __init__(self, options: Publishes) -> None:
         self.layout: Layout[Any] = layout(options.type)
-        self.advertisement = management.Advertise(topic_name(options.topic), self.layout.size)
+        self.advertisement = management.Advertise(topic_name(options.topic, TOPIC_FIELD), self.layout.size)
         self.line = debug.encoder(self.advertisement.topic.encode())
         self.joined = False
         self.next_at: int | None = None
@@ -388,7 +388,8 @@ class _FirmwareSubscriber:
 
     def __init__(self, options: Subscribes) -> None:
         self.layout: Layout[Any] = layout(options.type)
-        self.request = management.SubscribeRequest(topic_name(options.topic), self.layout.size, options.queue)
+        topic = topic_name(options.topic, TOPIC_FIELD)
+        self.request = management.SubscribeRequest(topic, self.layout.size, options.queue)
         self.answer = options.answer
         self.opened_at: int | None = None
         self.responses = 0

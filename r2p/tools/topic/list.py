@@ -1,15 +1,16 @@
 """`r2p topic list`, `info` and `find`: what is known about topics."""
 
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
 
 import r2p
-from r2p.names import topic_name
+from r2p.names import chosen_alias, topic_name
 from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output, notify
-from r2p.tools.session import Session
+from r2p.tools.session import Session, alias_or_none
 from r2p.tools.topic.watching import Topic, suggest_topics
 from r2p.tools.types import Types, load_type, of_size
 
@@ -17,13 +18,16 @@ _COLUMNS = ["topic", "type", "size", "publishers", "subscribers"]
 
 
 async def list_(session: Session, *, wait: Wait = None, format: Format = None) -> None:
-    """List topics, types, publishers and subscribers."""
+    """List topics, types, publishers and subscribers.
+
+    With -v also the alias of each long name, which travels on RTCAN and debug lines.
+    """
     output = Output(format)
     await session.settle(wait)
     views, types = session.module.network.topics().values(), Types(session.settings)
     await types.learn_all(session, views)
     rows = [_row(session, view, types) for view in views]
-    await output.table(rows, _COLUMNS)
+    await output.table(rows, session.columns(*_COLUMNS))
     if not rows:
         session.report_none("topics")
 
@@ -32,12 +36,12 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
     """Show everything about a topic.
 
     Its type, its publishers and subscribers by node, and what the links guarantee;
-    with -v also the fields of the type, and the time since it was last announced.
+    with -v also the fields of the type, the alias of a long name, and the time since it was last announced.
     """
     output = Output(format)
     await session.settle(wait)
     views = session.module.network.topics()
-    view = views.get(topic_name(topic))
+    view = views.get(topic_name(topic)) or _with_alias(session, topic_name(topic), views.values())
     if view is None:
         question = suggest_topics(session, topic_name(topic), lambda view: True)
         known = question or f"; known topics: {', '.join(views) or 'none'}"
@@ -48,6 +52,7 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
     if session.verbose:
         age = None if view.age is None else round(view.age, 3)
         details["age"] = f"{age} s" if output.format == "text" else age
+        details |= _alias(session, view)
     await output.put(details)
 
 
@@ -70,9 +75,18 @@ async def find(
     types = Types(session.settings)
     await types.learn_all(session, (view for view, _ in found))
     rows = [_row(session, view, types) | {"match": match} for view, match in found]
-    await output.table(rows, [*_COLUMNS, "match"])
+    await output.table(rows, session.columns(*_COLUMNS, "match"))
     if not rows:
         raise r2p.Error(session.none_yet(f"topics of type {what}"))
+
+
+def _alias(session: Session, view: r2p.TopicView) -> dict[str, Any]:
+    return {"alias": alias_or_none(view.name, lambda name: chosen_alias(name, session.settings.aliases))}
+
+
+def _with_alias(session: Session, alias: str, views: Iterable[r2p.TopicView]) -> r2p.TopicView | None:
+    """Return the topic with this alias, if there is one."""
+    return next((view for view in views if chosen_alias(view.name, session.settings.aliases) == alias), None)
 
 
 def _wanted(what: str) -> tuple[int, bytes | None]:
@@ -92,10 +106,14 @@ def _match(view: r2p.TopicView, size: int, fingerprint: bytes | None) -> str | N
 
 
 def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
-    return types.describe(view) | {
-        "publishers": [each["node"] for each in _endpoints(session, view.publishers, view.published_on)],
-        "subscribers": [each["node"] for each in _endpoints(session, view.subscribers, view.subscribed_on)],
-    }
+    return (
+        types.describe(view)
+        | _alias(session, view)
+        | {
+            "publishers": [each["node"] for each in _endpoints(session, view.publishers, view.published_on)],
+            "subscribers": [each["node"] for each in _endpoints(session, view.subscribers, view.subscribed_on)],
+        }
+    )
 
 
 def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) -> list[dict[str, Any]]:

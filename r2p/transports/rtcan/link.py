@@ -92,7 +92,13 @@ class RtcanLink(BufferedLink):
         name = unique_name(name, hub)  # before all parts, which log and count under it
         counts = LoggedCounter(name, hub.space.clock)
         discovery = Discovery(
-            hub.space.module, hub.instance, rate=_RATE, burst=_BURST, observer=hub.observer, counts=counts
+            hub.space.module,
+            hub.instance,
+            rate=_RATE,
+            burst=_BURST,
+            observer=hub.observer,
+            counts=counts,
+            aliases=hub.space.aliases,
         )
         super().__init__(name, hub, discovery=discovery)
         self._set_pace = discovery.set_pace  # which other kinds of discovery lack
@@ -103,7 +109,7 @@ class RtcanLink(BufferedLink):
         self._utc = UtcEstimator(self.driver)
         self._utc_offset = 0  # of UTC from the monotonic clock (ns)
         self._utc_offset_until = LONG_AGO
-        self._topic_ids = TopicIdAllocator()
+        self._topic_ids = TopicIdAllocator(discovery.alias)
         self._senders = SenderLookup(discovery, name, shared=(FIRMWARE, R2P))
         self._message_ids = MessageIdMap(self, self.engine, self._space)
         self._slotted = SlottedTopics(self, self.driver, self._has_subscribers)
@@ -228,13 +234,14 @@ class RtcanLink(BufferedLink):
         data, message_id = arrival.data, arrival.message_id
         source = rtcan.id8_of(message_id)
         if message_id == rtcan.FIRMWARE_MANAGEMENT:
-            source = address_of(data, self.discovery.modules)
+            source = address_of(data, self.discovery.modules, self.discovery.module_behind)
             data = management.unmark(data)
         publisher = publisher_in(data, source)
         if publisher is not None:
             firmware = source == FIRMWARE and message_id == rtcan.FIRMWARE_MANAGEMENT
             now, id8 = self._clock.monotonic(), self.engine.id8 or 0
-            self._renumber(self._topic_ids.on_announced(now, *publisher, id8, firmware=firmware))
+            topic, offered = self.discovery.topic_behind(publisher[0]), publisher[1]
+            self._renumber(self._topic_ids.on_announced(now, topic, offered, id8, firmware=firmware))
         if self.up:  # before, only the message ids of others matter
             self.manage(data, source)
 

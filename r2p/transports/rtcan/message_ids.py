@@ -5,6 +5,7 @@ knows its module. Modules of 2014 send management with one id for all of them, s
 """
 
 from collections import defaultdict
+from collections.abc import Callable
 
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import Advertise, Alive, ManagementType, SubscribeResponse
@@ -24,13 +25,16 @@ R2P = 256
 _LINGER = SECOND  # ns during which what still comes from a publisher that has left is counted as lost
 
 
-def address_of(data: bytes, modules: dict[str, ModuleInfo]) -> int:
-    """Return the sender of a management message with firmware's id, FIRMWARE or R2P. `modules` are known by name."""
+def address_of(data: bytes, modules: dict[str, ModuleInfo], name_of: Callable[[str], str] = str) -> int:
+    """Return the sender of a management message with firmware's id, FIRMWARE or R2P.
+
+    `modules` are known by name, `name_of` returns the name behind an alias.
+    """
     message_type = management.type_of(data)
     if message_type == ManagementType.ALIVE:
         alive = _decoded(data)
-        info = modules.get(alive.module) if isinstance(alive, Alive) else None
-        is_r2p = info is not None and info.r2p
+        names = {alive.module, name_of(alive.module)} if isinstance(alive, Alive) else set()
+        is_r2p = any(modules[name].r2p for name in names if name in modules)
     else:
         is_r2p = message_type in management.R2P_TYPES or management.is_marked(data)
     return R2P if is_r2p else FIRMWARE

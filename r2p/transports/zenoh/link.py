@@ -19,7 +19,6 @@ from r2p.codecs import UnknownType, liveliness, schemas
 from r2p.codecs.attachment import decode_sender, encode_sender
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
-from r2p.names import NAMESPACED_MAX
 from r2p.protocols.discovery.events import Declare, Event, QueryTokens, SubscriberJoined, SubscriberLeft, Undeclare
 from r2p.protocols.liveliness.session import TOKENS_MAX, LivelinessDiscovery
 from r2p.runtime.sample import PublisherClass
@@ -47,7 +46,6 @@ class ZenohLink(Link):
     """One module on one zenoh network."""
 
     max_payload: ClassVar[int] = SIZE_MAX
-    max_name: ClassVar[int] = NAMESPACED_MAX
     passes_probes: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool) -> None:

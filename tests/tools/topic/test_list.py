@@ -10,6 +10,8 @@ import pytest
 
 import r2p
 from r2p.msg import Led, Velocity3
+from r2p.tools import module as modules
+from r2p.tools import node
 from r2p.tools.session import UsageError
 from r2p.tools.topic.list import find, info, list_
 from tests.tools.rig import VIA, Firmware, printed, robot, tool
@@ -40,6 +42,32 @@ async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         "log": {"type": "r2p.msg:Log", "size": 152, "publishers": ["BOT/log"], "subscribers": []},
         "speed": {"type": "r2p.msg:Velocity3", "size": 12, "publishers": ["BOT/blink"], "subscribers": []},
     }
+
+
+@pytest.mark.virtual_time
+async def test_names_and_with_v_their_aliases(capsys: pytest.CaptureFixture[str]) -> None:
+    topic, module = "front_left/wheel/velocity_estimate", "front_left_wheel_controller"
+
+    async def velocity_estimator(node: r2p.Node) -> None:
+        node.advertise(topic, Led)
+        await asyncio.Event().wait()
+
+    async with robot(velocity_estimator, name=module), tool(verbose=1) as session:
+        await list_(session)
+        rows = by_topic(printed(capsys))
+        assert rows.keys() == {topic, "log"}
+        assert (rows[topic]["alias"], rows["log"]["alias"]) == ("front_left_w446v", None)
+        assert rows[topic]["publishers"] == [f"{module}/velocity_estimator"]
+        for name in (topic, "front_left_w446v"):
+            await info(session, name)
+            (details,) = printed(capsys)
+            assert (details["topic"], details["alias"]) == (topic, "front_left_w446v")
+        await node.list_(session)
+        aliases = {row["node"]: row["alias"] for row in printed(capsys)}
+        assert aliases == {f"{module}/velocity_estimator": "veloa6tr", f"{module}/log": None}
+        await modules.list_(session)
+        (row,) = printed(capsys)
+        assert (row["module"], row["alias"]) == (module, "frowhja")
 
 
 @pytest.mark.virtual_time
