@@ -21,10 +21,30 @@ from r2p.errors import (
     MessageError,
     NameTooLong,
     NodeCrashed,
+    TooLong,
     TransportError,
     TypeMismatch,
 )
-from r2p.messages import Layout, Len, Message, Timestamp, f32, f64, i8, i16, i32, i64, layout, u8, u16, u32, u64
+from r2p.messages import (
+    Array,
+    Duration,
+    Layout,
+    Len,
+    Max,
+    Message,
+    Timestamp,
+    f32,
+    f64,
+    i8,
+    i16,
+    i32,
+    i64,
+    layout,
+    u8,
+    u16,
+    u32,
+    u64,
+)
 from r2p.modules.graph import Endpoint, ModuleView, NetworkView, TopicView
 from r2p.modules.module import Module
 from r2p.modules.runner import run, run_main
@@ -39,6 +59,7 @@ from r2p.runtime.subscriber import Subscriber
 from r2p.version import __version__ as __version__
 
 __all__ = [
+    "Array",
     "BridgeOptions",
     "Broken",
     "ClassOf",
@@ -46,6 +67,7 @@ __all__ = [
     "Command",
     "Deadlock",
     "DecodeError",
+    "Duration",
     "Endpoint",
     "Error",
     "GatewayStatistics",
@@ -57,6 +79,7 @@ __all__ = [
     "LinkUp",
     "LinkWaits",
     "Listening",
+    "Max",
     "Message",
     "MessageError",
     "Mismatched",
@@ -87,6 +110,7 @@ __all__ = [
     "Subscriber",
     "Tick",
     "Timestamp",
+    "TooLong",
     "TopicView",
     "TransportError",
     "TypeMismatch",

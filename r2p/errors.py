@@ -3,8 +3,9 @@
     Error
     ├── InvalidName(ValueError)      a name with a character that the wire does not carry
     │   └── NameTooLong              ... or with more characters than its field has
-    ├── MessageError(ValueError)     a class without a fixed layout, or a value that does not fit
+    ├── MessageError(ValueError)     a class that can't be packed, or a value that does not fit
     ├── DecodeError(ValueError)      bytes that are not a message of this class
+    │   └── TooLong                  ... or that are more than it takes
     ├── TypeMismatch(TypeError)      one topic, two layouts
     ├── TransportError               a transport that can't be made from its URL
     │   ├── Closed                   used after it was closed, or before it was opened
@@ -32,11 +33,15 @@ class NameTooLong(InvalidName):
 
 
 class MessageError(Error, ValueError):
-    """A message class without a fixed layout, a value that does not fit its field, or an invalid option."""
+    """A message class that can't be packed, a value that does not fit its field, or an invalid option."""
 
 
 class DecodeError(Error, ValueError):
     """Bytes that are not a message of this class: of the wrong length, or with a value that a field can't have."""
+
+
+class TooLong(DecodeError):
+    """A message with more elements than its receiver accepts: more than the `r2p.Max` of its class."""
 
 
 class TypeMismatch(Error, TypeError):

@@ -253,6 +253,7 @@ class RoutingTable:
             publishes=own.publishes or publishes,
             subscribes=own.subscribes or subscribes,
             size=published.size,
+            varies=published.varies,
             fingerprint=published.fingerprint,
             asked=asked,
         )

@@ -10,7 +10,8 @@ The first part is the version; tokens of another version are ignored. The last t
 that know the first two only ignore it. `SESSION` is the instance of the r2p module that declares the token, in hex;
 `INSTANCE` is that of the module concerned, another one behind gateways (`HOPS` counts them), and `-` for firmware. `-`
 stands also for a node, a fingerprint or a release that is not known; `%` for each slash of a topic or a module. Names
-are whole. `SIZE` is that of a message, so 1024 at most.
+are whole. `SIZE` is that of a message, up to 64 MiB; `v` and the bound, if the length varies. Modules from before there
+were such messages count a token with a `v` as undecodable.
 
 In front of each token stands `live/*`, behind the name of the network; `live` alone is accepted, too. Every session
 numbers the keys that zenoh passes on to it, up to their first wildcard, and keeps these numbers for as long as it
@@ -42,7 +43,7 @@ _MODULE = re.compile(
 )
 _TOPIC = re.compile(
     rf"({_HEX32})/(pub|sub)/({TOPIC.replace('/', '%')})/({_HEX32}|-)/({NODE}|-)"
-    r"/([0-9]{1,3})/([0-9]{1,6})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
+    r"/([0-9]{1,3})/(v?)([0-9]{1,8})/([0-9a-f]{16}|-)/([0-9]{1,6})/([0-9]{1,2})"
 )
 _SOFTWARE = re.compile(rf"({_HEX32})/version/({_HEX32})/([0-9]{{1,3}})/([A-Za-z0-9.+_-]{{1,{RELEASE_MAX}}})")
 _BYTE_MAX = 0xFF
@@ -82,6 +83,7 @@ class TopicToken(msgspec.Struct, frozen=True):
     fingerprint: bytes = ANY_TYPE
     window: int = 0
     hops: int = 0
+    varies: bool = False
 
 
 class SoftwareToken(msgspec.Struct, frozen=True):
@@ -109,7 +111,7 @@ def encode(token: Token) -> str:
     topic = token.topic.replace("/", "%")
     return (
         f"{VERSION}/{token.session:x}/{_ROLE_NAMES[token.role]}/{topic}/{instance}/{token.node or _NONE}"
-        f"/{token.publisher_class}/{token.size}/{fingerprint}/{token.window}/{token.hops}"
+        f"/{token.publisher_class}/{'v' if token.varies else ''}{token.size}/{fingerprint}/{token.window}/{token.hops}"
     )
 
 
@@ -133,8 +135,8 @@ def decode(key: str) -> Token:
             int(hops),
         )
     found = _TOPIC.fullmatch(rest)
-    if found and len(found[3]) <= TOPIC_MAX and int(found[6]) <= _BYTE_MAX and int(found[7]) <= SIZE_MAX:
-        session, role, topic, instance, node, publisher_class, size, fingerprint, window, hops = found.groups()
+    if found and len(found[3]) <= TOPIC_MAX and int(found[6]) <= _BYTE_MAX and int(found[8]) <= SIZE_MAX:
+        session, role, topic, instance, node, publisher_class, varies, size, fingerprint, window, hops = found.groups()
         return TopicToken(
             int(session, 16),
             _ROLES[role],
@@ -146,6 +148,7 @@ def decode(key: str) -> Token:
             ANY_TYPE if fingerprint == _NONE else bytes.fromhex(fingerprint),
             int(window),
             int(hops),
+            bool(varies),
         )
     raise DecodeError(f"{key[:80]!r} is not a token")
 

@@ -174,6 +174,9 @@ class RefuseReason(enum.IntEnum):
     MANY = 6  # no further reservation can be kept
 
 
+SIZE_VARIES = 0x8000
+"""Bit of a payload's size: the length of the messages varies. The other bits are the most bytes that they have."""
+
 EPOCH_MAX = 0xFFFFFFFF  # Network.epoch
 REQUEST_SERIALS = 256  # values of Reserve.serial and Renew.serial
 NO_PHASE = 0xFFFFFFFF  # Reserve.phase: any will do
@@ -217,7 +220,7 @@ Order = Stop | Reboot | Bootload
 
 
 class Advertise(msgspec.Struct, frozen=True, gc=False):
-    """A topic has a publisher. `size` is the payload's, in bytes; `queue` means nothing here.
+    """A topic has a publisher. `size` is the payload's, in bytes (see `encode_size`); `queue` means nothing here.
 
     `params` belong to the transport of the message: on RTCAN, bytes 0 and 1 are the message id.
     """
@@ -273,7 +276,7 @@ class Hello(msgspec.Struct, frozen=True, gc=False):
 
 
 class TypeInfo(msgspec.Struct, frozen=True, gc=False):
-    """The type of a topic in the role ROLE_...: the fingerprint (8 bytes) of its layout, and its size (bytes)."""
+    """The type of a topic in the role ROLE_...: the fingerprint (8 bytes) of its layout, its size as in Advertise."""
 
     role: int
     topic: str
@@ -519,13 +522,24 @@ def type_of(data: bytes) -> int:
     return data[-1] if len(data) == SIZE else 0
 
 
+def encode_size(size: int, *, varies: bool) -> int:
+    """Return the size field of messages of `size` bytes, or of at most so many. More than it can hold is cut."""
+    return SIZE_VARIES | min(size, SIZE_VARIES - 1) if varies else size
+
+
+def decode_size(field: int) -> tuple[int, bool]:
+    """Return the bytes in a size field, and whether the length varies."""
+    return field & ~SIZE_VARIES, field >= SIZE_VARIES
+
+
 def order_type(order: Order) -> int:
     """Return the type byte of an order, as in a Denied."""
     return _CODEC.code_of(order)
 
 
 def queue_length(size: int, wanted: int = QUEUE) -> int:
-    """Return the queue to request from firmware for messages of `size` bytes: 1 to 16 entries, 1024 bytes at most."""
+    """Return the queue to request from firmware for messages with this size field: 1 to 16, 1024 bytes at most."""
+    size, _ = decode_size(size)
     return max(1, min(wanted, QUEUE_MAX, QUEUE_BYTES_MAX // (size + QUEUE_ENTRY)))
 
 

@@ -11,6 +11,7 @@ import msgspec
 from r2p.errors import MessageError
 from r2p.messages.shapes import show
 
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 _REQUIRED = re.compile(r"Required field '(\w+)' cannot follow optional fields")
 _OPTION = re.compile(r"'(\w+)' is an invalid keyword argument for StructMeta")
 _TWO_BASES = "multiple bases have instance lay-out conflict"
@@ -19,15 +20,22 @@ _TWO_BASES = "multiple bases have instance lay-out conflict"
 class MessageMeta(msgspec.StructMeta):
     """Makes message classes. Raises MessageError for a class that can't be one."""
 
-    def __new__(mcls, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **options: Any) -> "MessageMeta":
-        """Make the class of a `class` statement."""
+    _name: str
+    """The full name that the class statement gives; empty for that of package and class."""
+
+    def __new__(mcls, name: str, bases: tuple[type, ...], members: dict[str, Any], /, **options: Any) -> "MessageMeta":
+        """Make the class of a `class` statement; the option `name` is the full name of the type."""
+        full_name = options.pop("name", "")
+        if full_name and not _TYPE_NAME.fullmatch(str(full_name)):
+            raise MessageError(f"{name}: {full_name!r} is not the full name of a type, such as sensor_msgs/LaserScan")
         try:
-            cls = super().__new__(mcls, name, bases, namespace, **options)
+            cls = super().__new__(mcls, name, bases, members, **options)
         except (TypeError, ValueError) as error:
-            text = _explained(name, bases, namespace, str(error))
+            text = _explained(name, bases, members, str(error))
             if text is None:
                 raise MessageError(f"{name}: {error}") from error
             raise MessageError(text) from None
+        cls._name = full_name
         if cls.__struct_config__.frozen:  # msgspec's own methods, set in each class, do not say what to write
             cls.__setattr__ = cls.__delattr__ = _refuse_assignment  # type: ignore[assignment, method-assign]
         return cls

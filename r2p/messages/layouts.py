@@ -3,8 +3,8 @@
 A layout is kept in its class, not in a table: so a class built from a schema can be garbage-collected, with its layout.
 """
 
-import keyword
 import re
+import sys
 from collections.abc import Iterator
 from enum import Enum
 from hashlib import blake2b
@@ -25,27 +25,50 @@ from typing import (
 import msgspec
 
 from r2p.errors import DecodeError, MessageError
+from r2p.messages.array import Array
 from r2p.messages.definition import MessageMeta
 from r2p.messages.packing import check, functions
-from r2p.messages.shapes import BOOL, Array, Chars, Field, Layout, Len, Nested, Scalar, Shape, show, u32
+from r2p.messages.shapes import (
+    BOOL,
+    SIZE_MAX,
+    Chars,
+    Container,
+    Field,
+    FixedArray,
+    Layout,
+    Len,
+    Max,
+    Nested,
+    Scalar,
+    Shape,
+    VariableArray,
+    VariableText,
+    i32,
+    is_reserved,
+    show,
+    u8,
+    u32,
+)
 from r2p.units import SECOND
 
-SIZE_MAX = 1024
-"""Bytes of the longest message: 128 RTCAN fragments of 8. The debug line carries 255."""
-
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_METHODS = frozenset({"encode", "decode"})  # a field of that name would hide the method
+_PACKAGE = "r2p_msgs"  # the first part of the names of r2p's own types
+_CONTAINERS: tuple[tuple[type, Container], ...] = ((tuple, "tuple"), (Array, "array"), (bytes, "bytes"))
 _KINDS: dict[type, str] = {bool: "bool", int: "r2p.i32", float: "r2p.f32"}  # what to write for a type of Python
 _MUTABLE = (list, dict, set, bytearray)  # an empty one as a default becomes a factory
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
 class Message(msgspec.Struct, metaclass=MessageMeta, frozen=True, gc=False):
-    """The base of all messages: subclass it, and annotate the fields."""
+    """The base of all messages: subclass it, and annotate the fields.
+
+    `class Scan(r2p.Message, name="sensor_msgs/LaserScan")` gives a type another name than that of package and class.
+    """
 
     # gc=False: values of this kind form no cycles, and garbage collection need not look at each message in a queue.
 
     _layout: ClassVar[Any] = None
+    _name: ClassVar[str] = ""
 
     def encode(self) -> bytes:
         """Pack the message; raises MessageError."""
@@ -69,7 +92,7 @@ M = TypeVar("M", bound=Message)
 def layout(cls: type[M]) -> Layout[M]:
     """Return the layout of a message class, compiled at first use.
 
-    Raises MessageError, which says what to write instead, for a class without a fixed layout of 1 to `SIZE_MAX` bytes.
+    Raises MessageError, which says what to write instead, for a class with a field that can't be packed.
     """
     return _find_or_compile(cls, ())
 
@@ -100,6 +123,27 @@ class Timestamp(Message):
         return cls(sec, nsec)
 
 
+class Duration(Message):
+    """A length of time in a message, or a difference of two instants: seconds and nanoseconds, up to 68 years."""
+
+    sec: i32 = 0
+    nsec: i32 = 0
+    """0 to 999 999 999, also where `sec` is negative."""
+
+    @property
+    def ns(self) -> int:
+        """Nanoseconds."""
+        return self.sec * SECOND + self.nsec
+
+    @classmethod
+    def from_ns(cls, ns: int) -> Self:
+        """Return a number of ns as a Duration. Raises MessageError for more than 68 years."""
+        sec, nsec = divmod(ns, SECOND)
+        if not -1 << 31 <= sec < 1 << 31:
+            raise MessageError(f"{show(ns)} ns is longer than 68 years, the longest Duration")
+        return cls(sec, nsec)
+
+
 class ClockOffset(msgspec.Struct, frozen=True, gc=False):
     """The translation of a stamp to UTC from another clock, that of the RTCAN network `epoch`.
 
@@ -117,18 +161,29 @@ class ClockOffset(msgspec.Struct, frozen=True, gc=False):
 
 def check_field_name(path: str, name: str) -> None:
     """Raise MessageError for a name that a field can't have."""
-    if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name) or name in _METHODS:
+    if not _FIELD_NAME.fullmatch(name) or is_reserved(name):
         raise MessageError(
             f"{path}: a field name has letters, digits and _ of ASCII, begins with a letter, and is neither a Python "
-            "keyword nor encode or decode"
+            "keyword nor encode or decode: put a _ behind such a name"
         )
+
+
+def _full_name(cls: type[Message]) -> str:
+    """Return the name that was given, else package and class; of a program that is run as a file, the file's name."""
+    if own := vars(cls).get("_name"):
+        return str(own)
+    package = cls.__module__.partition(".")[0]
+    if package == "__main__":
+        package = str(getattr(sys.modules[package], "__file__", "") or "main").rpartition("/")[2].removesuffix(".py")
+    package = _PACKAGE if package == "r2p" else re.sub(r"\W", "_", package, flags=re.ASCII)
+    return f"{package}/{cls.__name__}"
 
 
 def _find_or_compile(cls: Any, outer: tuple[type, ...]) -> Layout[Any]:
     """Compile the layout of a class; `outer` are the classes that contain it, to find one that contains itself."""
     found: Layout[Any] | None = vars(cls).get("_layout") if isinstance(cls, type) else None  # not a base class's
     if not isinstance(found, Layout):
-        if not (isinstance(cls, type) and issubclass(cls, Message)):
+        if not (isinstance(cls, type) and issubclass(cls, Message)) or cls is Message:
             raise MessageError(_not_a_class(cls))
         cls._layout = found = _compile(cls, outer)
     return found
@@ -136,26 +191,28 @@ def _find_or_compile(cls: Any, outer: tuple[type, ...]) -> Layout[Any]:
 
 def _compile(cls: type[M], outer: tuple[type, ...]) -> Layout[M]:
     if cls in outer:
-        raise MessageError(f"{cls.__name__} contains itself: a message has a fixed size")
+        raise MessageError(f"{cls.__name__} contains itself: a message has a bounded size")
     if not cls.__struct_config__.frozen:
         raise MessageError(f"{cls.__name__} is not frozen, but subscribers share one object: remove frozen=False")
     hints = _hints(cls)
     _check_constants(cls, hints)
     fields = tuple(_field(cls, name, hint, outer) for name, hint in hints.items() if name in cls.__struct_fields__)
-    if not fields:
-        raise MessageError(f"{cls.__name__} has no fields: annotate them, as in `{_example(cls)}`")
-    size = sum(field.shape.size for field in fields)
-    _check_size(cls.__name__, size)
+    if not fields and (example := _example(cls)):
+        raise MessageError(f"{cls.__name__} has no fields: annotate them, as in `{example}`")
+    size_min = sum(field.shape.size_min for field in fields)
+    _check_size(cls.__name__, size_min)
     _check_defaults(cls, {field.name: field.shape for field in fields})
-    encode, decode = functions(cls, fields)
+    size = min(sum(field.shape.size for field in fields), SIZE_MAX)
+    varies = not size or any(field.shape.varies for field in fields)
+    packing = functions(cls, fields)
     try:
-        decode(bytes(size))
+        packing.decode(bytes(size_min))
     except DecodeError as error:
         raise MessageError(
             f"{cls.__name__} can't be all zero, which any module may send: {error}; accept it in __post_init__"
         ) from error
-    schema = " ".join(leaf for field in fields for leaf in _leaves(field.shape, field.name))
-    return Layout(cls, fields, size, schema, fingerprint_of(schema), encode, decode)
+    schema = " ".join(leaf for field in fields for leaf in _leaves(field.shape, field.wire_name))
+    return Layout(cls, _full_name(cls), fields, size, size_min, varies, schema, fingerprint_of(schema), packing)
 
 
 def _hints(cls: type[Message]) -> dict[str, Any]:
@@ -200,41 +257,62 @@ def _check_defaults(cls: type[Message], shapes: dict[str, Shape]) -> None:
 
 def _shape(hint: Any, path: str, outer: tuple[type, ...]) -> Shape:
     base, *marks = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-    length = next((_length(mark.count, path) for mark in marks if isinstance(mark, Len)), None)
-    if get_origin(base) is tuple:
-        return _array(get_args(base), length, path, outer)
-    if base is str and length:
-        return Chars(length)
+    bound = next((mark for mark in marks if isinstance(mark, Len | Max)), None)
+    if bound is not None:
+        _check_count(bound, path)
+    container = next((found for kind, found in _CONTAINERS if kind is (get_origin(base) or base)), None)
+    if container is not None and (bound is not None or container == "tuple"):
+        items = (u8, ...) if container == "bytes" else get_args(base)
+        return _array(items, bound, container, path, outer)
+    if base is str and bound is not None:
+        return Chars(bound.count) if isinstance(bound, Len) else VariableText(bound.count)
     scalar = next((mark for mark in marks if isinstance(mark, Scalar)), BOOL if base is bool else None)
-    if scalar and not length:
+    if scalar and bound is None:
         return scalar
-    if isinstance(base, type) and issubclass(base, Message) and not length:
+    if isinstance(base, type) and issubclass(base, Message) and bound is None:
         return Nested(_find_or_compile(base, outer))
-    raise MessageError(f"{path}: {_spell(hint)} has no fixed size, use {_instead(base)}")
+    raise MessageError(f"{path}: {_spell(hint)} has no bound for its size, use {_instead(base)}")
 
 
-def _length(count: Any, path: str) -> int:
+def _check_count(bound: Len | Max, path: str) -> None:
+    count: object = bound.count
     if not (isinstance(count, int) and 1 <= count <= SIZE_MAX):
-        raise MessageError(f"{path}: Len takes an integer from 1 to {SIZE_MAX}, not {show(count)}")
-    return count
+        raise MessageError(f"{path}: {type(bound).__name__} takes an integer from 1 to {SIZE_MAX}, not {show(count)}")
 
 
-def _array(items: tuple[Any, ...], length: int | None, path: str, outer: tuple[type, ...]) -> Array:
+def _array(
+    items: tuple[Any, ...], bound: Len | Max | None, container: Container, path: str, outer: tuple[type, ...]
+) -> Shape:
+    if container == "array":
+        items = (*items, ...)
     open_ended = items[1:] == (...,)
-    count = length if open_ended else len(items)
-    if not count or (length or count) != count or not (open_ended or all(item == items[0] for item in items)):
+    count = bound.count if open_ended and bound is not None else len(items)
+    if (
+        not items
+        or (open_ended and bound is None)
+        or (bound is not None and bound.count != count)
+        or not (open_ended or (all(item == items[0] for item in items) and not isinstance(bound, Max)))
+    ):
         raise MessageError(
-            f"{path}: an array has one type and a fixed length, tuple[r2p.f32, r2p.f32] or "
-            "Annotated[tuple[r2p.f32, ...], r2p.Len(16)]; for different types nest a Message"
+            f"{path}: an array has one type and a length, as tuple[r2p.f32, r2p.f32] or "
+            "Annotated[tuple[r2p.f32, ...], r2p.Len(16)], or a bound for it: r2p.Max(1000) instead of r2p.Len; for "
+            "different types nest a Message"
         )
-    array = Array(_shape(items[0], f"{path}[]", outer), count)
-    _check_size(path, array.size)
+    item = _shape(items[0], f"{path}[]", outer)
+    if container == "array" and not isinstance(item, Scalar):
+        raise MessageError(f"{path}: the elements of an r2p.Array are numbers; use a tuple of {_spell(items[0])}")
+    if not item.size:
+        raise MessageError(f"{path}: {_spell(items[0])} has no bytes, so an array of it says nothing: send its length")
+    if isinstance(bound, Max):
+        return VariableArray(item, count, container)
+    array = FixedArray(item, count, container)
+    _check_size(path, array.size_min)
     return array
 
 
 def _check_size(path: str, size: int) -> None:
-    if not 1 <= size <= SIZE_MAX:
-        raise MessageError(f"{path} has {size} bytes: a message has 1 to {SIZE_MAX}")
+    if size > SIZE_MAX:
+        raise MessageError(f"{path} has {size} bytes: a message has at most {SIZE_MAX}")
 
 
 def _spell(hint: Any) -> str:
@@ -250,19 +328,20 @@ def _spell(hint: Any) -> str:
     elif origin in (Union, UnionType):
         text = " | ".join(map(_spell, items)).replace("NoneType", "None")
     elif isinstance(origin, type):
-        text = f"{origin.__name__}[{', '.join(map(_spell, items))}]"
+        prefix = "r2p." if origin is Array else ""
+        text = f"{prefix}{origin.__name__}[{', '.join(map(_spell, items))}]"
     else:
         text = base.__name__ if isinstance(base, type) else show(base)
-    length = next((mark for mark in marks if isinstance(mark, Len)), None)
-    return f"Annotated[{text}, r2p.Len({show(length.count)})]" if length else text
+    bound = next((mark for mark in marks if isinstance(mark, Len | Max)), None)
+    return f"Annotated[{text}, r2p.{type(bound).__name__}({show(bound.count)})]" if bound else text
 
 
 def _example(cls: type[Message]) -> str:
-    """A field as it is to be written: the first of the class that lacks only its annotation."""
+    """A field as it is to be written: the first of the class that lacks only its annotation; empty without one."""
     for name, value in vars(cls).items():
         if type(value) in _KINDS and not name.startswith("_"):
             return _annotated(name, value)
-    return "speed: r2p.f32 = 0.0"
+    return ""
 
 
 def _annotated(name: str, value: object) -> str:
@@ -282,13 +361,14 @@ def _not_a_class(value: object) -> str:
 
 def _instead(base: Any) -> str:
     item = _item(base)
-    array = f"tuple[{item}, {item}] or Annotated[tuple[{item}, ...], r2p.Len(16)]"
+    array = f"tuple[{item}, {item}], Annotated[tuple[{item}, ...], r2p.Len(16)], or r2p.Max(1000) for at most so many"
     optional = f"{item}, and a bool beside it that says whether it is set"
     texts = {
         int: "one of r2p.u8 .. r2p.u64, r2p.i8 .. r2p.i64",
         float: "r2p.f32 or r2p.f64",
-        str: "Annotated[str, r2p.Len(16)]",
-        bytes: "Annotated[tuple[r2p.u8, ...], r2p.Len(16)]",
+        str: "Annotated[str, r2p.Max(256)], or r2p.Len(16) for a field of 16 bytes",
+        bytes: "Annotated[bytes, r2p.Max(1000)], or r2p.Len(16) for just 16",
+        Array: f"Annotated[r2p.Array[{item}], r2p.Max(1000)]",
         list: array,
         tuple: array,
         dict: "a Message with a field for each key",
@@ -299,7 +379,7 @@ def _instead(base: Any) -> str:
         return array
     if isinstance(base, type) and issubclass(base, Enum):
         return "r2p.u8, which takes the members of an IntEnum"
-    others = "r2p.u8 .. r2p.f64, bool, a Message, a tuple of one of these, or Annotated[str, r2p.Len(16)]"
+    others = "r2p.u8 .. r2p.f64, bool, a Message, a tuple of one of these, or Annotated[str, r2p.Max(256)]"
     return next((text for kind, text in texts.items() if kind is (get_origin(base) or base)), others)
 
 
@@ -317,9 +397,11 @@ def _leaves(shape: Shape, path: str) -> Iterator[str]:
     match shape:
         case Nested(inner):
             for field in inner.fields:
-                yield from _leaves(field.shape, f"{path}.{field.name}")
-        case Array(Chars() | Array() | Nested() as item, count):
+                yield from _leaves(field.shape, f"{path}.{field.wire_name}")
+        case FixedArray(item, count) if not isinstance(item, Scalar):
             for i in range(count):
                 yield from _leaves(item, f"{path}[{i}]")
+        case VariableArray(item) if not isinstance(item, Scalar):
+            yield from _leaves(item, f"{path}[]")
         case _:
             yield f"{path}:{shape.kind}"

@@ -1,18 +1,34 @@
-"""The two functions that pack and unpack one message class: generated source around one `struct.Struct`.
+"""The functions that pack and unpack one message class: generated source around `struct.Struct`.
 
-The generated `encode` only detects that a value does not fit; a slow walk through the shapes finds the value.
+Fields of fixed size that follow each other are one struct; between them, `parts` packs what varies in length. The
+generated `encode` only detects that a value does not fit; a slow walk through the shapes finds the value.
 """
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator
 from typing import Any
 
-from r2p.errors import DecodeError, MessageError
-from r2p.messages.shapes import Array, Chars, Field, Nested, Scalar, Shape, show
+from r2p.errors import DecodeError, MessageError, TooLong
+from r2p.messages.array import Array
+from r2p.messages.parts import bad_count, bytes_of, pack_chars, part, sharing_of_fields, unpack_chars, view_of
+from r2p.messages.shapes import (
+    Chars,
+    Field,
+    FixedArray,
+    Nested,
+    Packing,
+    Scalar,
+    Shape,
+    VariableArray,
+    VariableText,
+    show,
+)
+
+_INLINE_MAX = 1024  # bytes of an array whose elements are arguments of `pack`, one by one
 
 # `encode` catches everything: users put objects of any kind into messages, and any exception when these are checked or
 # packed (OverflowError, AttributeError, one of their own) means that they do not fit.
-_SOURCE = """
+_FIXED = """
 def encode(message):
     try:
         {check}
@@ -25,77 +41,149 @@ def decode(data):
         {read}
     except (StructError, TypeError, ValueError) as error:
         raise unreadable(data, error) from None
+
+def write(message):
+    return (encode(message),)
+
+def read(data, at):
+    end = at + {size}
+    return decode(data[at:end]), end
+"""
+_VARIABLE = """
+def write(message):
+    {check}
+    return {pieces}
+
+def encode(message):
+    try:
+        {inner_check}
+        return join({pieces})
+    except Exception:
+        raise misfit(message) from None
+
+def read(data, at):
+    size = len(data)
+    {read}
+    return {value}, at
+
+def decode(data):
+    at, size = 0, len(data)
+    try:
+        {inner_read}
+        if at != size:
+            raise ValueError(f"{{size - at}} bytes are left over")
+        return {value}
+    except (StructError, TypeError, ValueError) as error:
+        raise unreadable(data, error) from None
 """
 
 
-def functions(cls: type[Any], fields: tuple[Field, ...]) -> tuple[Callable[[Any], bytes], Callable[[bytes], Any]]:
-    """Generate the `encode` and the `decode` of a message class with these fields."""
-    packed = struct.Struct("<" + "".join(field.shape.format for field in fields))
+def functions(cls: type[Any], fields: tuple[Field, ...]) -> Packing:
+    """Generate the functions of a message class with these fields."""
     source = _SourceCode()
-    value, slots = source.add_message(cls, fields, "message"), ", ".join(source.slots)
-    flat = value == f"T({slots})"  # then the slots need no names, which is faster
-    text = _SOURCE.format(
-        check="\n        ".join(source.checks),
-        values=", ".join(source.values),
-        read="return T(*unpack(data))" if flat else f"{slots}, = unpack(data)\n        return {value}",
-    )
+    value = source.add_message(cls, fields, "message")
+    text = source.finish(value)
 
     def misfit(message: object) -> MessageError:
         return _misfit(cls, fields, message)
 
-    def unreadable(data: bytes, error: Exception) -> DecodeError:
-        reason = f"takes {packed.size} bytes, not {len(data)}" if len(data) != packed.size else str(error)
-        return DecodeError(f"{cls.__name__}: {reason}")
+    def unreadable(data: bytes, reason: object) -> DecodeError:
+        kind = TooLong if isinstance(reason, TooLong) else DecodeError
+        if not source.varies and len(data) != source.size:
+            reason = f"takes {source.size} bytes, not {len(data)}"
+        return kind(f"{cls.__name__}: {reason}")
 
-    names = source.names | {
-        "pack": packed.pack,
-        "unpack": packed.unpack,
-        "misfit": misfit,
-        "unreadable": unreadable,
-        "StructError": struct.error,
-        "__tracebackhide__": True,  # pytest's: a frame without source is of no use
-    }
+    names = source.names | {"misfit": misfit, "unreadable": unreadable}
+    names["__tracebackhide__"] = True  # pytest's: a frame without source is of no use
     file = f"{__file__}, {cls.__name__}"  # in this folder, as for all frames that short tracebacks leave out
     exec(compile(text, file, "exec"), names)  # noqa: S102 - holds nothing but checked names
-    return names["encode"], names["decode"]
+    return Packing(names["encode"], names["decode"], names["write"], names["read"], sharing_of_fields(fields))
 
 
 class _SourceCode:
-    """The parts of the source: checks, then the arguments of `pack`; the slots are the results of `unpack`."""
+    """The parts of the source: checks, then runs of fields of fixed size, and what varies in between.
+
+    `values` are the arguments of the `pack` of the present run; `slots` the results of its `unpack`.
+    """
 
     def __init__(self) -> None:
-        self.names: dict[str, Any] = {"chars": _chars, "text": _text}
+        self.names: dict[str, Any] = {
+            "Array": Array,
+            "StructError": struct.error,
+            "bad_count": bad_count,
+            "bytes_of": bytes_of,
+            "chars": pack_chars,
+            "new": object.__new__,
+            "join": b"".join,
+            "text": unpack_chars,
+            "view_of": view_of,
+        }
         self.checks: list[str] = []
-        self.values: list[str] = []
-        self.slots: list[str] = []
+        self.size = 0
+        self.varies = False
+        self._formats: list[str] = []
+        self._values: list[str] = []
+        self._slots: list[str] = []
+        self._slot_count = 0
+        self._pieces: list[str] = []
+        self._reads: list[str] = []
+
+    def finish(self, value: str) -> str:
+        """Return the source; `value` is the expression that rebuilds the message from the slots."""
+        if not self._pieces:  # one struct for everything, which is faster than an offset that grows
+            packed = struct.Struct("<" + "".join(self._formats))
+            self.size = packed.size
+            self.names |= {"pack": packed.pack, "unpack": packed.unpack}
+            slots = ", ".join(self._slots)
+            flat = value == f"T({slots})"  # then the slots need no names, which is faster
+            unpacked = f"{slots}, = unpack(data)" if slots else "unpack(data)"
+            read = "return T(*unpack(data))" if flat else f"{unpacked}\n        return {value}"
+            return _FIXED.format(
+                check=_lines(self.checks, 8), values=", ".join(self._values), read=read, size=packed.size
+            )
+        self._end_run()
+        return _VARIABLE.format(
+            check=_lines(self.checks, 4),
+            inner_check=_lines(self.checks, 8),
+            pieces=f"({', '.join(self._pieces)},)",
+            read=_lines(self._reads, 4),
+            inner_read=_lines(self._reads, 8),
+            value=value,
+        )
 
     def add(self, shape: Shape, value: str) -> str:
         """Add the packing of the expression `value`; return the expression that rebuilds it from slots."""
         match shape:
-            case Array(item, count):
-                return self.add_array(item, count, value)
             case Nested(inner):
                 return self.add_message(inner.cls, inner.fields, value)
+            case FixedArray(item, count, "tuple") if not item.varies and shape.size <= _INLINE_MAX:
+                return self.add_array(item, count, value)
             case Chars(length):
-                self.values.append(f"chars({value}, {length})")
-                return f"text({self.slot()})"
+                return f"text({self._add_fixed(shape.format, f'chars({value}, {length})')})"
             case Scalar(kind):
                 if kind == "bool":
+                    value = self.local(value)
                     self.refuse(f"{value} is not True and {value} is not False")
-                self.values.append(value)
-                return self.slot()
+                return self._add_fixed(shape.format, value)
+            case VariableText(limit):
+                return self._add_counted(f"{value}.encode()", limit, 1, "data[begin:at].decode()")
+            case VariableArray(Scalar(), limit, "bytes"):
+                return self._add_counted(f"bytes_of({value})", limit, 1, "data[begin:at]")
+            case VariableArray(Scalar() as item, limit, "array"):
+                return self._add_view(item, limit, value)
+            case _:
+                return self._add_part(shape, value)
 
     def add_array(self, item: Shape, count: int, value: str) -> str:
         local = self.local(value)
         self.refuse(f"not isinstance({local}, tuple) or len({local}) != {count}")
-        if isinstance(item, Scalar):
-            if item.kind == "bool":
-                self.refuse(f"{{*map(type, {local})}} != {{bool}}")
-            self.values.append(f"*{local}")
-            parts = [self.slot() for _ in range(count)]
-        else:
-            parts = [self.add(item, f"{local}[{i}]") for i in range(count)]
-        return f"({', '.join(parts)},)"
+        if not isinstance(item, Scalar):
+            return f"({', '.join([self.add(item, f'{local}[{i}]') for i in range(count)])},)"
+        if item.kind == "bool":
+            self.refuse(f"{{*map(type, {local})}} != {{bool}}")
+        self._formats.append(f"{count}{item.format}")
+        self._values.append(f"*{local}")
+        return f"({', '.join([self._slot() for _ in range(count)])},)"
 
     def add_message(self, cls: type[Any], fields: tuple[Field, ...], value: str) -> str:
         local = self.local(value)
@@ -115,20 +203,71 @@ class _SourceCode:
         self.checks.append(f"{name} = {value}")
         return name
 
-    def slot(self) -> str:
-        self.slots.append(f"v{len(self.slots)}")
-        return self.slots[-1]
+    def _add_fixed(self, format: str, value: str) -> str:
+        self._formats.append(format)
+        self._values.append(value)
+        return self._slot()
+
+    def _add_view(self, item: Scalar, limit: int, value: str) -> str:
+        """Add an array field: mostly an Array, which is packed and made without a call of Python."""
+        local, code = self.local(value), repr(item.format)
+        is_array = f"{local}.__class__ is Array and {local}._code == {code}"
+        packed = f"{local}._view if {is_array} else view_of({local}, {code})"
+        slot = self._add_counted(packed, limit, item.size, "new(Array)")
+        if "view = memoryview(data)" not in self._reads:
+            self._reads.insert(0, "view = memoryview(data)")
+        cast = "" if item.format == "B" else f".cast({code})"
+        self._reads += [f"{slot}._code = {code}", f"{slot}._view = view[begin:at]{cast}"]
+        return slot
+
+    def _add_counted(self, packed: str, limit: int, item_size: int, read: str) -> str:
+        """Add elements that are one piece, `packed`: their count is the last number of the run before them."""
+        self.varies = True
+        local = self.local(packed)
+        self.checks.append(f"if len({local}) > {limit}: raise ValueError")
+        count = self._add_fixed("I", f"len({local})")
+        self._end_run()
+        self._pieces.append(local)
+        slot = f"v{self._slot_count}"
+        self._slot_count += 1
+        self._reads += [
+            "begin = at",
+            f"at += {count}" + f" * {item_size}" * (item_size > 1),
+            f"if {count} > {limit} or at > size: raise bad_count({count}, {limit}, size - begin, {item_size})",
+            f"{slot} = {read}",
+        ]
+        return slot
+
+    def _add_part(self, shape: Shape, value: str) -> str:
+        self._end_run()
+        number = len(self.names)
+        self.names[f"write{number}"], self.names[f"read{number}"] = part(shape)
+        self.varies = self.varies or shape.varies
+        self._pieces.append(f"*write{number}({value})")
+        slot = self._slot()
+        self._slots.clear()
+        self._reads.append(f"{slot}, at = read{number}(data, at)")
+        return slot
+
+    def _end_run(self) -> None:
+        """Pack the fields since the last part as one struct."""
+        if not self._formats:
+            return
+        packed, number = struct.Struct("<" + "".join(self._formats)), len(self.names)
+        self.names |= {f"pack{number}": packed.pack, f"unpack{number}": packed.unpack_from}
+        self._pieces.append(f"pack{number}({', '.join(self._values)})")
+        self._reads += [f"{', '.join(self._slots)}, = unpack{number}(data, at)", f"at += {packed.size}"]
+        for run in (self._formats, self._values, self._slots):
+            run.clear()
+
+    def _slot(self) -> str:
+        self._slots.append(f"v{self._slot_count}")
+        self._slot_count += 1
+        return self._slots[-1]
 
 
-def _chars(value: Any, length: int) -> bytes:
-    data: bytes = value.encode("ascii")
-    if len(data) > length or 0 in data:
-        raise ValueError
-    return data
-
-
-def _text(data: bytes) -> str:
-    return data.partition(b"\0")[0].decode("ascii")
+def _lines(lines: list[str], indent: int) -> str:
+    return ("\n" + " " * indent).join(lines)
 
 
 def _misfit(cls: type[Any], fields: tuple[Field, ...], message: object) -> MessageError:
@@ -145,17 +284,41 @@ def _misfit(cls: type[Any], fields: tuple[Field, ...], message: object) -> Messa
 
 def check(shape: Shape, value: Any, path: str) -> None:
     """Raise MessageError for the first part that does not fit."""
-    parts: Iterable[tuple[Shape, Any, str]] = ()
-    match shape:
-        case Array(item, count):
-            fits = isinstance(value, tuple) and len(value) == count
-            parts = ((item, value[i], f"{path}[{i}]") for i in range(count))
-        case Nested(inner):
-            fits = type(value) is inner.cls
-            parts = ((field.shape, getattr(value, field.name), f"{path}.{field.name}") for field in inner.fields)
-        case Scalar() | Chars():
-            fits = shape.holds(value)
-    if not fits:
+    if not _fits(shape, value):
         raise MessageError(f"{path} ({shape.kind}) takes {shape.allowed}, not {show(value)}")
-    for part in parts:
-        check(*part)
+    for inner in _parts(shape, value, path):
+        check(*inner)
+
+
+def _fits(shape: Shape, value: Any) -> bool:
+    """Return whether a value fits, apart from its parts."""
+    match shape:
+        case FixedArray(_, count, "tuple"):
+            return isinstance(value, tuple) and len(value) == count
+        case VariableArray(_, limit, "tuple"):
+            return isinstance(value, tuple) and len(value) <= limit
+        case FixedArray() | VariableArray():
+            return _packs(shape, value)
+        case Nested(inner):
+            return type(value) is inner.cls
+        case Scalar() | Chars() | VariableText():
+            return shape.holds(value)
+
+
+def _parts(shape: Shape, value: Any, path: str) -> Iterator[tuple[Shape, Any, str]]:
+    match shape:
+        case FixedArray(item, _, "tuple") | VariableArray(item, _, "tuple"):
+            for i, each in enumerate(value):
+                yield item, each, f"{path}[{i}]"
+        case Nested(inner):
+            for field in inner.fields:
+                yield field.shape, getattr(value, field.name), f"{path}.{field.name}"
+
+
+def _packs(shape: Shape, value: Any) -> bool:
+    write, _ = part(shape)
+    try:
+        list(write(value))
+    except Exception:  # noqa: BLE001 - as in `encode`: any exception means that the value does not fit
+        return False
+    return True

@@ -2,28 +2,42 @@
 
 Packing is generated from them, and tools use them to turn text into fields.
 
-A field is a number, a text, an array of one shape, or a message. Each shape has its `kind` (as in schemas), the
-`format` and `size` (bytes) that it packs to, and the values that are `allowed`, in words. A tool walks the tree with
+A field is a number, a text, an array of one shape, or a message. Each shape has its `kind` (as in schemas), the `size`
+(bytes) that it packs to, at most, and the values that are `allowed`, in words. The bytes of a shape that `varies`, of
+which there are at least `size_min`, begin with a count; all other shapes have a `format` of the struct module. A tool
+walks the tree with
 
     match field.shape:
         case Scalar(kind): ...
-        case Chars(length): ...
-        case Array(item, count): ...
+        case Chars(length) | VariableText(length): ...
+        case FixedArray(item, count) | VariableArray(item, count): ...
         case Nested(layout): ...
 """
 
+import keyword
 import struct
-from collections.abc import Callable
-from typing import Annotated, Any, Generic, TypeAlias, TypeVar, get_args
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeAlias, TypeVar, get_args
 
 import msgspec
 
 UNFIT = (struct.error, ArithmeticError, AttributeError, TypeError, ValueError)
 """The errors that packing raises for a value that does not fit."""
 
+SIZE_MAX = 64 << 20
+"""Bytes of the longest message. Links have limits of their own: 1024 on RTCAN, 255 on a debug line."""
+
+COUNT_SIZE = 4
+"""Bytes of the count before the elements of an array, or the bytes of a text."""
+
+Container: TypeAlias = Literal["tuple", "array", "bytes"]
+"""What the elements of an array decode to: a tuple, an `r2p.Array`, or bytes."""
+
 
 class Scalar(msgspec.Struct, frozen=True):
     """A number or a bool; `format` is its letter in the struct module."""
+
+    varies: ClassVar[bool] = False
 
     kind: str
     format: str
@@ -31,6 +45,10 @@ class Scalar(msgspec.Struct, frozen=True):
     @property
     def size(self) -> int:
         return struct.calcsize("<" + self.format)
+
+    @property
+    def size_min(self) -> int:
+        return self.size
 
     @property
     def limits(self) -> tuple[int, int]:
@@ -57,6 +75,8 @@ class Scalar(msgspec.Struct, frozen=True):
 class Chars(msgspec.Struct, frozen=True):
     """A text of at most `length` ASCII characters, padded with NUL; without a terminator when it fills the field."""
 
+    varies: ClassVar[bool] = False
+
     length: int
 
     @property
@@ -72,6 +92,10 @@ class Chars(msgspec.Struct, frozen=True):
         return self.length
 
     @property
+    def size_min(self) -> int:
+        return self.length
+
+    @property
     def allowed(self) -> str:
         return f"at most {self.length} ASCII characters without a NUL"
 
@@ -80,11 +104,41 @@ class Chars(msgspec.Struct, frozen=True):
         return isinstance(value, str) and value.isascii() and "\0" not in value and len(value) <= self.length
 
 
-class Array(msgspec.Struct, frozen=True):
-    """A tuple of exactly `count` values of one shape."""
+class VariableText(msgspec.Struct, frozen=True):
+    """A text of at most `limit` bytes of UTF-8."""
+
+    varies: ClassVar[bool] = True
+    kind: ClassVar[str] = "str"
+    size_min: ClassVar[int] = COUNT_SIZE
+
+    limit: int
+
+    @property
+    def size(self) -> int:
+        return COUNT_SIZE + self.limit
+
+    @property
+    def allowed(self) -> str:
+        return f"a text of at most {self.limit} bytes in UTF-8"
+
+    def holds(self, value: object) -> bool:
+        """Return whether the value packs."""
+        try:
+            return isinstance(value, str) and len(value.encode()) <= self.limit
+        except UnicodeEncodeError:
+            return False
+
+
+class FixedArray(msgspec.Struct, frozen=True):
+    """Exactly `count` values of one shape."""
 
     item: "Shape"
     count: int
+    container: Container = "tuple"
+
+    @property
+    def varies(self) -> bool:
+        return self.item.varies
 
     @property
     def kind(self) -> str:
@@ -92,15 +146,54 @@ class Array(msgspec.Struct, frozen=True):
 
     @property
     def format(self) -> str:
-        return f"{self.count}{self.item.format}" if isinstance(self.item, Scalar) else self.item.format * self.count
+        item = format_of(self.item)
+        return f"{self.count}{item}" if isinstance(self.item, Scalar) else item * self.count
 
     @property
     def size(self) -> int:
         return self.count * self.item.size
 
     @property
+    def size_min(self) -> int:
+        return self.count * self.item.size_min
+
+    @property
     def allowed(self) -> str:
-        return f"a tuple of {self.count}"
+        return _array_of(self, f"{self.count}")
+
+
+class VariableArray(msgspec.Struct, frozen=True):
+    """At most `limit` values of one shape."""
+
+    varies: ClassVar[bool] = True
+    size_min: ClassVar[int] = COUNT_SIZE
+
+    item: "Shape"
+    limit: int
+    container: Container = "tuple"
+
+    @property
+    def kind(self) -> str:
+        return f"{self.item.kind}[]"
+
+    @property
+    def size(self) -> int:
+        return min(COUNT_SIZE + self.limit * self.item.size, SIZE_MAX)
+
+    @property
+    def allowed(self) -> str:
+        return _array_of(self, f"at most {self.limit}")
+
+
+def _array_of(array: FixedArray | VariableArray, count: str) -> str:
+    """Say which values an array takes."""
+    match array.container:
+        case "tuple":
+            return f"a tuple of {count}"
+        case "bytes":
+            return f"{count} bytes"
+        case _:
+            return f"{count} values, each {array.item.allowed}, in a buffer of such or a sequence"
 
 
 class Nested(msgspec.Struct, frozen=True):
@@ -109,23 +202,38 @@ class Nested(msgspec.Struct, frozen=True):
     layout: "Layout[Any]"
 
     @property
+    def varies(self) -> bool:
+        return any(field.shape.varies for field in self.layout.fields)
+
+    @property
     def kind(self) -> str:
         return self.layout.cls.__name__
 
     @property
     def format(self) -> str:
-        return "".join(field.shape.format for field in self.layout.fields)
+        return "".join(format_of(field.shape) for field in self.layout.fields)
 
     @property
     def size(self) -> int:
         return self.layout.size
 
     @property
+    def size_min(self) -> int:
+        return self.layout.size_min
+
+    @property
     def allowed(self) -> str:
         return f"a {self.kind}"
 
 
-Shape: TypeAlias = Scalar | Chars | Array | Nested
+Shape: TypeAlias = Scalar | Chars | VariableText | FixedArray | VariableArray | Nested
+
+
+def format_of(shape: Shape) -> str:
+    """Return the format of a shape that does not vary."""
+    if isinstance(shape, VariableText | VariableArray):
+        raise TypeError(f"the size of {shape.kind} varies")
+    return shape.format
 
 
 class Field(msgspec.Struct, frozen=True):
@@ -134,6 +242,16 @@ class Field(msgspec.Struct, frozen=True):
     name: str
     shape: Shape
 
+    @property
+    def wire_name(self) -> str:
+        """The name in schemas and in other languages: without the `_` that a keyword of Python gets in the class."""
+        return self.name[:-1] if self.name.endswith("_") and is_reserved(self.name[:-1]) else self.name
+
+
+def is_reserved(name: str) -> bool:
+    """Return whether a field of a class can't have this name: a keyword, or one that would hide a method."""
+    return keyword.iskeyword(name) or name in {"encode", "decode"}
+
 
 S = TypeVar("S", bound=msgspec.Struct)  # a message class; these are defined on top of this file
 
@@ -141,30 +259,79 @@ S = TypeVar("S", bound=msgspec.Struct)  # a message class; these are defined on 
 class Layout(msgspec.Struct, Generic[S], frozen=True, eq=False):
     """The layout of the messages of one class in bytes.
 
-    `size` is in bytes. `schema` is `name:kind` of all leaves in wire order ("led:u32 value:u8"), with their path where
-    they are nested ("stamp.sec:u32", "wheels[0].speed:f32"), and `fingerprint` is its BLAKE2b-64 (8 bytes). `encode`
-    raises MessageError, which names the field; `decode` raises DecodeError.
+    `name` is the full name of the type, `package/Name`. A message has `size` bytes; at most that, and at least
+    `size_min`, if the length `varies`, which is also said of messages without any bytes. `schema` is `name:kind` of all
+    leaves in wire order ("led:u32 value:u8"), with their path where they are nested ("stamp.sec:u32",
+    "wheels[0].speed:f32", "points[].x:f32"), and `fingerprint` is its BLAKE2b-64 (8 bytes). `encode` raises
+    MessageError, which names the field; `decode` raises DecodeError, or its subclass TooLong.
     """
 
     cls: type[S]
+    name: str
     fields: tuple[Field, ...]
     size: int
+    size_min: int
+    varies: bool
     schema: str
     fingerprint: bytes
-    encode: Callable[[S], bytes]
-    decode: Callable[[bytes], S]
+    packing: "Packing"
+
+    @property
+    def exact_size(self) -> int:
+        """Bytes of each message; 0 if the length varies."""
+        return 0 if self.varies else self.size
+
+    @property
+    def encode(self) -> Callable[[S], bytes]:
+        """Pack a message; raises MessageError."""
+        return self.packing.encode
+
+    @property
+    def decode(self) -> Callable[[bytes], S]:
+        """Unpack a message; raises DecodeError."""
+        return self.packing.decode
 
     @property
     def zero(self) -> S:
         """The message of zero bytes, made anew: a class with an instance of itself would never be garbage-collected."""
-        return self.decode(bytes(self.size))
+        return self.decode(bytes(self.size_min))
 
     def __repr__(self) -> str:
-        return f"<Layout of {self.cls.__name__}, {self.size} bytes: {self.schema}>"
+        size = f"{self.size_min} to {self.size}" if self.varies else f"{self.size}"
+        return f"<Layout of {self.cls.__name__}, {size} bytes: {self.schema}>"
+
+
+class Packing(msgspec.Struct, frozen=True, eq=False):
+    """The functions that pack and unpack the messages of one class."""
+
+    encode: Callable[[Any], bytes]
+    decode: Callable[[bytes], Any]
+    write: "Write"
+    """Pack a message into pieces."""
+    read: "Read"
+    """Unpack the message that begins at an offset; return it and the offset of its end."""
+    shares: Callable[[Any], bool] | None = None
+    """Says whether local subscribers may have this very message: decoding gives one that is equal, in the same types,
+    and nobody can write into it. None: they always may.
+    """
+
+
+Write: TypeAlias = Callable[[Any], Iterable[Any]]
+Read: TypeAlias = Callable[[bytes, int], tuple[Any, int]]
 
 
 class Len(msgspec.Struct, frozen=True):
-    """In `Annotated`: the elements of an array, or the characters (bytes) of a text."""
+    """In `Annotated`: the elements of an array, or the characters (bytes) of a text, always so many."""
+
+    count: int
+
+
+class Max(msgspec.Struct, frozen=True):
+    """In `Annotated`: the elements of an array, or the bytes of a text, of which there are at most so many.
+
+    It bounds what a receiver allocates, and decides which links can carry the message. It is not a part of the type:
+    publisher and subscriber may differ in it.
+    """
 
     count: int
 

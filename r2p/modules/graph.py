@@ -33,8 +33,8 @@ class Endpoint(msgspec.Struct, frozen=True, order=True):
 class TopicView(msgspec.Struct):
     """A topic, as far as this module knows it.
 
-    `size` is in bytes (0: unknown), `fingerprint` that of its layout (None: unknown). `layout` is set only where this
-    module uses the topic.
+    `size` is in bytes (0: unknown); that of the longest message, if their length `varies`. `fingerprint` is that of its
+    layout (None: unknown). `layout` is set only where this module uses the topic.
 
     `publishers` and `subscribers` list endpoints whose node is known; `published_on` and `subscribed_on` name all links
     ("": this module) on which it is published and subscribed. `age` is in seconds since it was last announced.
@@ -50,6 +50,7 @@ class TopicView(msgspec.Struct):
     subscribed_on: list[str] = msgspec.field(default_factory=list)
     age: float | None = None
     mismatch: bool = False
+    varies: bool = False
 
 
 class ModuleView(msgspec.Struct):
@@ -140,6 +141,7 @@ def _add_own(view: TopicView, topic: Topic, module: str) -> None:
     view.layout = topic.layout
     if topic.layout is not None:
         view.size, view.fingerprint = topic.layout.size, topic.layout.fingerprint
+        view.varies = topic.layout.varies
     view.publishers += [Endpoint(module, each.node.name, each.publisher_class) for each in topic.publishers]
     view.subscribers += [Endpoint(module, each.owner) for each in topic.queues]
     if topic.publishers:
@@ -153,6 +155,7 @@ def _add_discovered(views: dict[str, TopicView], link: Link, now: int) -> None:
     for info in link.discovery.topics.values():
         view = views.setdefault(info.name, TopicView(info.name))
         view.size = view.size or info.size
+        view.varies |= info.varies
         view.fingerprint = view.fingerprint or info.fingerprint
         view.mismatch |= info.mismatch
         if info.advertised_at is not None:

@@ -409,8 +409,15 @@ def describe_alias(event: AliasConflict | AliasesDiffer) -> str:
 def describe_mismatch(event: Mismatched) -> str:
     """Describe how the types differ, and what to do about it."""
     role = "publish" if event.role == ROLE_PUBLISHES else "subscribe to"
-    if event.ours.size != event.theirs.size:
-        what = f"messages of {event.theirs.size} bytes, here they have {event.ours.size}"
+    ours, theirs = event.ours, event.theirs
+    if ours.varies and theirs.varies:
+        what = "another layout"
+    elif ours.varies:
+        what = f"messages of {theirs.size} bytes, here their length varies, which firmware can't send or receive"
+    elif theirs.varies:
+        what = f"messages of variable length, here they have {ours.size} bytes"
+    elif ours.size != theirs.size:
+        what = f"messages of {theirs.size} bytes, here they have {ours.size}"
     else:
-        what = f"another layout of the same {event.ours.size} bytes"
+        what = f"another layout of the same {ours.size} bytes"
     return f"others {role} {what}; use one message type on both sides, or another topic"

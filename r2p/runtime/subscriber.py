@@ -13,7 +13,7 @@ from typing import Any, Generic, Literal, Self, TypeVar, overload
 import msgspec
 
 from r2p.clock import LONGEST, SHORTEST, Alarm, check_seconds, check_timeout
-from r2p.errors import Closed, DecodeError, MessageError
+from r2p.errors import Closed, DecodeError, MessageError, TooLong
 from r2p.messages import Layout, Message
 from r2p.runtime.qos import check_count
 from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, SubscriberQueue, checkpoint
@@ -88,6 +88,8 @@ class Subscriber(Generic[T]):
         """The function that `Node.spin` calls with each message; None for iteration or `fetch`."""
         self.undecodable = 0
         """Messages whose bytes don't decode as the type; skipped."""
+        self.too_long = 0
+        """Messages with more elements than the `r2p.Max` of the type here; skipped."""
         self.stale = 0
         """Messages older than `max_age` when their turn came; skipped."""
         self.timeouts = 0
@@ -290,8 +292,11 @@ class Subscriber(Generic[T]):
             return message
         try:
             message = self._layout.decode(sample.data)
-        except DecodeError:
-            self.undecodable += 1
+        except DecodeError as error:
+            if isinstance(error, TooLong):
+                self.too_long += 1
+            else:
+                self.undecodable += 1
             return None
         if sample.message is None:
             sample.message = message  # for the other subscribers

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 from r2p.errors import MessageError
-from r2p.messages import Array, Chars, Layout, Message, Nested, Scalar, Shape, layout, show
+from r2p.messages import Chars, FixedArray, Layout, Message, Nested, Scalar, Shape, layout, show
 
 M = TypeVar("M", bound=Message)
 
@@ -200,7 +200,7 @@ def _value(shape: Shape, plain: Any, path: str) -> Any:
     match shape:
         case Nested(inner) if isinstance(plain, Mapping):
             return _message(inner, plain, path)
-        case Array(item, count) if isinstance(plain, list) and len(plain) == count:
+        case FixedArray(item, count) if isinstance(plain, list) and len(plain) == count:
             return tuple(_value(item, each, f"{path}[{i}]") for i, each in enumerate(plain))
         case Chars():
             value: Any = plain if isinstance(plain, str) else _invalid
@@ -220,7 +220,7 @@ def _wanted(shape: Shape) -> str:
     match shape:
         case Nested(inner):
             return "a mapping of " + ", ".join(field.name for field in inner.fields)
-        case Array(_, count):
+        case FixedArray(_, count):
             return f"a list of {count}"
         case Scalar("bool"):
             return "true or false"
@@ -277,7 +277,7 @@ def _plain(shape: Shape, value: Any) -> Any:
     match shape:
         case Nested(inner):
             return {field.name: _plain(field.shape, getattr(value, field.name)) for field in inner.fields}
-        case Array(item, _):
+        case FixedArray(item, _):
             return [_plain(item, each) for each in value]
         case Scalar("f32" | "f64" as kind):
             if not math.isfinite(value):

@@ -65,6 +65,7 @@ class Announcement(msgspec.Struct, frozen=True):
     subscribes: bool = False
     size: int = 0
     fingerprint: bytes = ANY_TYPE
+    varies: bool = False
     asked: TopicType = TopicType()
     queue: int = QUEUE
     params: bytes = NO_PARAMS
@@ -76,7 +77,8 @@ NOTHING = Announcement()
 
 def type_of(topic: Topic) -> TopicType:
     """The size and fingerprint of a topic's messages, as far as this module knows them."""
-    return TopicType() if topic.layout is None else TopicType(topic.layout.size, topic.layout.fingerprint)
+    layout = topic.layout
+    return TopicType() if layout is None else TopicType(layout.size, layout.fingerprint, layout.varies)
 
 
 def _announcement_of(topic: Topic) -> Announcement:
@@ -93,6 +95,7 @@ def _announcement_of(topic: Topic) -> Announcement:
         subscribes=bool(subscribers),
         size=topic_type.size,
         fingerprint=topic_type.fingerprint,
+        varies=topic_type.varies,
         asked=topic_type,
         endpoints=publishers | subscribers,
     )
@@ -404,7 +407,9 @@ class Link(abc.ABC):
         if not is_used or self.discovery.rival(topic.name):
             desired = NOTHING
         known = self._announced.pop(topic.name, NOTHING)
-        params = self.params(topic.name) if desired.publishes and not self.refusal(desired.size) else None
+        # A gateway passes on those messages of variable length that the link can carry, and counts the others.
+        refused = self.refusal(desired.size) is not None and not (desired.varies and topic.layout is None)
+        params = self.params(topic.name) if desired.publishes and not refused else None
         queue = self.window(topic) if desired.subscribes else QUEUE
         desired = msgspec.structs.replace(
             desired, publishes=params is not None, params=params or NO_PARAMS, queue=queue
@@ -423,14 +428,16 @@ class Link(abc.ABC):
         """Announce the difference between what the other ends know of a topic and should know; return the events."""
         discovery, now = self.discovery, self._clock.monotonic()
         events: list[Event] = []
-        retyped = (desired.size, desired.fingerprint) != (known.size, known.fingerprint)
+        retyped = (desired.size, desired.fingerprint, desired.varies) != (known.size, known.fingerprint, known.varies)
         if desired.publishes and (retyped or not known.publishes or desired.params != known.params):
-            events += discovery.advertise(now, topic, desired.size, desired.fingerprint, desired.params)
+            size, fingerprint, varies = desired.size, desired.fingerprint, desired.varies
+            events += discovery.advertise(now, topic, size, fingerprint, desired.params, varies=varies)
         elif known.publishes and not desired.publishes:
             events += discovery.withdraw(now, topic)
         asks_anew = (desired.asked, desired.queue) != (known.asked, known.queue)
         if desired.subscribes and (asks_anew or not known.subscribes):
-            events += discovery.subscribe(now, topic, desired.asked.size, desired.queue, desired.asked.fingerprint)
+            asked = desired.asked
+            events += discovery.subscribe(now, topic, asked.size, desired.queue, asked.fingerprint, varies=asked.varies)
         elif known.subscribes and not desired.subscribes:
             events += discovery.unsubscribe(now, topic)
         for (node, role), publisher_class in desired.endpoints.items():
@@ -497,7 +504,7 @@ class Link(abc.ABC):
     def _publisher_found(self, name: str, size: int, source: Hashable = None) -> None:
         topic = self._space.topics.get(name)
         if topic is not None and topic.wanted:
-            self.add_publisher(topic, topic.layout.size if topic.layout is not None else size, source)
+            self.add_publisher(topic, size if topic.layout is None else topic.layout.exact_size, source)
 
     def _remove_subscriber(self, name: str) -> None:
         subscriber = self._subscribers.pop(name, None)

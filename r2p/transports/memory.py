@@ -16,7 +16,7 @@ import msgspec
 
 from r2p.clock import check_seconds, in_background, random_of
 from r2p.errors import TransportError
-from r2p.messages import ClockOffset
+from r2p.messages import SIZE_MAX, ClockOffset
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import PublisherClass, Sample, Source
@@ -193,7 +193,7 @@ def network(name: str) -> MemoryNetwork:
 class MemoryLink(BufferedLink):
     """One module's link to a memory network, which can be unplugged and plugged in again."""
 
-    max_payload: ClassVar[int] = 1024
+    max_payload: ClassVar[int] = SIZE_MAX
     in_order: ClassVar[bool] = False
 
     def __init__(self, name: str, hub: Hub, network: MemoryNetwork) -> None:

@@ -75,8 +75,10 @@ def test_keys_as_people_see_them() -> None:
         "1/ab/pub/le ds/ab/blink/1/5/-/0/0",
         "1/ab/both/leds/ab/blink/1/5/-/0/0",
         "1/ab/pub/leds/ab/blink/1/-5/-/0/0",
-        "1/ab/pub/leds/ab/blink/1/1025/-/0/0",
-        "1/ab/sub/leds/ab/blink/1/100000/-/0/0",
+        "1/ab/pub/leds/ab/blink/1/67108865/-/0/0",
+        "1/ab/pub/leds/ab/blink/1/w5/-/0/0",
+        "1/ab/pub/leds/ab/blink/1/v/-/0/0",
+        "1/ab/sub/leds/ab/blink/1/5/-/1000000/0",
         "1/ab/pub/leds/ab/blink/257/5/-/0/0",
         "1/ab/module/PC\n/ab/0/0",
     ],
@@ -116,7 +118,7 @@ def test_topics_that_no_key_carries(topic: str) -> None:
 
 
 def test_sizes_and_hops_that_no_key_carries() -> None:
-    assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, "leds", 7, size=1025))
+    assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, "leds", 7, size=(64 << 20) + 1))
     assert not liveliness.is_representable(TopicToken(7, ROLE_PUBLISHES, "leds", 7, hops=100))
 
 

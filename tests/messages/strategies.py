@@ -4,7 +4,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from r2p.messages import Array, Chars, Layout, Nested, Scalar, Shape
+from r2p.messages import Array, Chars, FixedArray, Layout, Nested, Scalar, Shape, VariableArray, VariableText
 from r2p.messages.layouts import M
 
 FLOATS = {"f32": st.floats(width=32, allow_nan=False), "f64": st.floats(allow_nan=False)}
@@ -16,8 +16,18 @@ def messages(layout: Layout[M]) -> st.SearchStrategy[M]:
 
 def values(shape: Shape) -> st.SearchStrategy[Any]:
     match shape:
-        case Array(item, count):
-            return st.tuples(*[values(item)] * count)
+        case FixedArray(_, count, "bytes"):
+            return st.binary(min_size=count, max_size=count)
+        case VariableArray(_, limit, "bytes"):
+            return st.binary(max_size=limit)
+        case FixedArray(item, count, container):
+            many = st.just((0,) * count) if count > 100 else st.tuples(*[values(item)] * count)
+            return many.map(Array) if container == "array" else many
+        case VariableArray(item, limit, container):
+            some = st.lists(values(item), max_size=min(limit, 5))
+            return some.map(Array) if container == "array" else some.map(tuple)
+        case VariableText(limit):
+            return st.text(max_size=limit // 4)
         case Nested(layout):
             return messages(layout)
         case Chars(length):

@@ -10,14 +10,16 @@ from typing import Annotated, Any, Literal, assert_type
 import msgspec
 import pytest
 
-from r2p.errors import MessageError
+from r2p.errors import DecodeError, MessageError
 from r2p.messages import (
     SIZE_MAX,
     Array,
     Chars,
     Field,
+    FixedArray,
     Layout,
     Len,
+    Max,
     Message,
     Nested,
     Scalar,
@@ -31,6 +33,7 @@ from r2p.messages import (
     u16,
     u32,
 )
+from r2p.messages.shapes import format_of
 from r2p.msg import Led, Velocity3
 from tests.messages import text_annotations
 from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot, Wheel, define
@@ -38,6 +41,10 @@ from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot,
 WHEELS = " ".join(f"wheels[{i}].speed:f32 wheels[{i}].ok:bool wheels[{i}].name:char[4]" for i in range(2))
 NAMES = "names[0]:char[3] names[1]:char[3]"
 REST = "serial:u8[16] best.speed:f32 best.ok:bool best.name:char[4]"
+
+
+class Empty(Message):
+    pass
 
 
 def made(hint: object) -> type[Message]:
@@ -71,12 +78,12 @@ def test_schema_and_size(cls: type[Message], size: int, schema: str) -> None:
 def test_fields_are_a_tree_for_tools() -> None:
     stamp, wheels, grid, names, flags, serial, best = layout(Robot).fields
     assert stamp == Field("stamp", Nested(layout(Timestamp)))
-    assert wheels.shape == Array(Nested(layout(Wheel)), 2)
-    assert grid.shape == Array(Array(Scalar("u8", "B"), 3), 2)
-    assert names.shape == Array(Chars(3), 2)
-    assert flags.shape == Array(Scalar("bool", "?"), 2)
-    assert (serial.shape.kind, serial.shape.size, serial.shape.format) == ("u8[16]", 16, "16B")
-    assert (best.shape.kind, best.shape.size, best.shape.format) == ("Wheel", 9, "f?4s")
+    assert wheels.shape == FixedArray(Nested(layout(Wheel)), 2)
+    assert grid.shape == FixedArray(FixedArray(Scalar("u8", "B"), 3), 2)
+    assert names.shape == FixedArray(Chars(3), 2)
+    assert flags.shape == FixedArray(Scalar("bool", "?"), 2)
+    assert (serial.shape.kind, serial.shape.size, format_of(serial.shape)) == ("u8[16]", 16, "16B")
+    assert (best.shape.kind, best.shape.size, format_of(best.shape)) == ("Wheel", 9, "f?4s")
 
 
 @pytest.mark.parametrize(("hint", "limits"), [(u8, (0, 255)), (i8, (-128, 127)), (u16, (0, 65535))])
@@ -135,39 +142,44 @@ def test_text_that_names_nothing_at_run_time(build: Callable[[], type[Message]])
     [
         (int, "r2p.u8 .. r2p.u64, r2p.i8 .. r2p.i64"),
         (float, "use r2p.f32 or r2p.f64"),
-        (str, r"use Annotated\[str, r2p.Len"),
-        (bytes, r"Annotated\[tuple\[r2p.u8, ...\], r2p.Len"),
+        (str, r"use Annotated\[str, r2p.Max\(256\)\], or r2p.Len"),
+        (bytes, r"Annotated\[bytes, r2p.Max"),
+        (Array[f32], r": r2p.Array\[r2p.f32\] has no bound for its size, use Annotated\[r2p.Array\[r2p.f32\], r2p.Max"),
+        (Annotated[Array[Led], Max(3)], r"the elements of an r2p.Array are numbers; use a tuple of Led"),
+        (Annotated[tuple[Empty, ...], Max(3)], "Empty has no bytes, so an array of it says nothing"),
         (
             list[int],
-            r": list\[int\] has no fixed size, use tuple\[r2p.i32, r2p.i32\] or Annotated\[tuple\[r2p.i32, ...\]",
+            r": list\[int\] has no bound for its size, use tuple\[r2p.i32, r2p.i32\], Annotated\[tuple\[r2p.i32, ...\]",
         ),
-        (list[f32], r": list\[r2p.f32\] has no fixed size, use tuple\[r2p.f32, r2p.f32\]"),
-        (list[Led], r": list\[Led\] has no fixed size, use tuple\[Led, Led\]"),
+        (list[f32], r": list\[r2p.f32\] has no bound for its size, use tuple\[r2p.f32, r2p.f32\]"),
+        (list[Led], r": list\[Led\] has no bound for its size, use tuple\[Led, Led\]"),
         (list, r"use tuple\[r2p.f32"),
-        (tuple, r"use tuple\[r2p.f32"),
+        (tuple, "an array has one type and a length"),
         (dict[str, int], r"use a Message with a field for each key"),
-        (u8 | None, r": r2p.u8 \| None has no fixed size, use r2p.u8, and a bool beside it"),
-        ((u8, u8), r": \(r2p.u8, r2p.u8\) has no fixed size, use tuple\[r2p.u8, r2p.u8\]"),
-        ([f32], r": \[r2p.f32\] has no fixed size, use tuple\[r2p.f32, r2p.f32\]"),
+        (u8 | None, r": r2p.u8 \| None has no bound for its size, use r2p.u8, and a bool beside it"),
+        ((u8, u8), r": \(r2p.u8, r2p.u8\) has no bound for its size, use tuple\[r2p.u8, r2p.u8\]"),
+        ([f32], r": \[r2p.f32\] has no bound for its size, use tuple\[r2p.f32, r2p.f32\]"),
         (IntEnum, "use r2p.u8, which takes the members of an IntEnum"),
-        (set[u8], "has no fixed size, use r2p.u8 .. r2p.f64, bool, a Message, a tuple"),
+        (set[u8], "has no bound for its size, use r2p.u8 .. r2p.f64, bool, a Message, a tuple"),
         (Any, "use r2p.u8 .. r2p.f64, bool"),
         (Literal[1, 2], "use r2p.u8 .. r2p.f64, bool"),
         (msgspec.Struct, "use r2p.u8 .. r2p.f64, bool"),
-        (Annotated[u8, Len(3)], r": Annotated\[r2p.u8, r2p.Len\(3\)\] has no fixed size, use one of r2p.u8"),
-        (Annotated[bool, Len(3)], "has no fixed size"),
-        (Annotated[Led, Len(3)], "has no fixed size"),
-        (tuple[u8, ...], "an array has one type and a fixed length"),
-        (tuple[()], "an array has one type and a fixed length"),
+        (Annotated[u8, Len(3)], r": Annotated\[r2p.u8, r2p.Len\(3\)\] has no bound for its size, use one of r2p.u8"),
+        (Annotated[bool, Len(3)], "has no bound for its size"),
+        (Annotated[Led, Len(3)], "has no bound for its size"),
+        (tuple[u8, ...], "an array has one type and a length"),
+        (tuple[()], "an array has one type and a length"),
         (tuple[u8, f32], "for different types nest a Message"),
         (tuple[u8, u8, u16], "for different types nest a Message"),
-        (Annotated[tuple[u8, u8], Len(3)], "an array has one type and a fixed length"),
+        (Annotated[tuple[u8, u8], Len(3)], "an array has one type and a length"),
         (tuple[int, int], r"\[\]: .* use one of r2p.u8"),
-        (Annotated[str, Len(0)], "Len takes an integer from 1 to 1024, not 0"),
-        (Annotated[str, Len(-1)], "Len takes an integer from 1 to 1024, not -1"),
+        (Annotated[str, Len(0)], "Len takes an integer from 1 to 67108864, not 0"),
+        (Annotated[str, Len(-1)], "Len takes an integer from 1 to 67108864, not -1"),
         (Annotated[tuple[u8, ...], Len(10**9)], "Len takes an integer"),
         (Annotated[str, Len("8")], "Len takes an integer .* not '8'"),  # type: ignore[arg-type]
-        (Annotated[tuple[Annotated[tuple[u8, ...], Len(1000)], ...], Len(1000)], "has 1000000 bytes"),
+        (Annotated[str, Max(0)], "Max takes an integer from 1 to 67108864, not 0"),
+        (Annotated[tuple[u8, u8], Max(2)], "an array has one type and a length"),
+        (Annotated[tuple[Annotated[tuple[u8, ...], Len(10_000)], ...], Len(10_000)], "has 100000000 bytes"),
     ],
 )
 def test_no_fixed_layout(hint: object, instead: str) -> None:
@@ -182,13 +194,19 @@ def test_array_written_out_and_with_its_length() -> None:
 
 
 def test_size_limits() -> None:
-    class Empty(Message):
-        pass
+    assert layout(made(Annotated[str, Len(SIZE_MAX)])).size == 64 << 20
+    with pytest.raises(MessageError, match="Message is not a message class"):
+        layout(Message)
 
-    assert layout(made(Annotated[str, Len(SIZE_MAX)])).size == 1024
-    for cls in (Empty, Message, made(Empty), made(tuple[Empty, Empty])):
-        with pytest.raises(MessageError, match=r"has no fields: annotate them, as in `speed: r2p.f32 = 0.0`"):
-            layout(cls)
+
+def test_empty_messages() -> None:
+    """They have no bytes, and travel as messages of variable length: a link without a length has no sign of them."""
+    assert (layout(Empty).size, layout(Empty).varies, Empty().encode(), Empty.decode(b"")) == (0, True, b"", Empty())
+    holder: Any = define("Holder", [("a", Empty), ("b", u8)])
+    assert (layout(holder).size, layout(holder).varies, layout(holder).schema) == (1, False, "b:u8")
+    assert holder.decode(b"\7") == holder(Empty(), 7)
+    with pytest.raises(DecodeError, match="Empty: takes 0 bytes, not 1"):
+        Empty.decode(b"x")
 
 
 def test_a_value_without_an_annotation_is_no_field() -> None:
@@ -201,10 +219,10 @@ def test_a_value_without_an_annotation_is_no_field() -> None:
 
 def test_too_large_in_all() -> None:
     class Large(Message):
-        a: Annotated[str, Len(1000)]
-        b: Annotated[str, Len(25)]
+        a: Annotated[str, Len(SIZE_MAX)]
+        b: u8
 
-    with pytest.raises(MessageError, match="Large has 1025 bytes: a message has 1 to 1024"):
+    with pytest.raises(MessageError, match="Large has 67108865 bytes: a message has at most 67108864"):
         layout(Large)
 
 

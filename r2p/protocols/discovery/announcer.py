@@ -42,7 +42,7 @@ class LocalTopic(msgspec.Struct, frozen=True):
     queue: int = management.QUEUE
 
     def type_info(self, topic: str, role: int) -> management.TypeInfo:
-        return management.TypeInfo(role, topic, self.type.fingerprint, self.type.size)
+        return management.TypeInfo(role, topic, self.type.fingerprint, self.type.size_field)
 
 
 class Announcer:
@@ -228,11 +228,11 @@ class Announcer:
         return management.Hello(self.module, self.instance, flags, 0, lease, management.WIRE_VERSION, release)
 
     def requests(self, topic: str, own: LocalTopic, size: int = 0) -> list[management.Management]:
-        """Return the request for a topic with this announced `size` (0: unknown), if it may be sent.
+        """Return the request for a topic with this announced size field (0: unknown), if it may be sent.
 
         While the size is unknown, it may not: a request of size 0 makes gateways of firmware overrun their buffers.
         """
-        size = own.type.size or size or self._directory.size_of(topic)
+        size = own.type.size_field or size or self._directory.size_of(topic)
         if not size:
             return []
         params = NO_PARAMS if not self.r2p else ANSWERED if topic in self.publisher_counts else UNANSWERED
@@ -242,7 +242,7 @@ class Announcer:
         """Return the advertisement of a topic, which shows r2p modules whether the topic has a subscriber yet."""
         unanswered = self.r2p and topic not in self.subscriber_counts
         params = management.with_unanswered(own.params) if unanswered else own.params
-        return management.Advertise(topic, own.type.size, 0, params)
+        return management.Advertise(topic, own.type.size_field, 0, params)
 
     def _messages(self, item: Item) -> list[management.Management]:
         match item.kind, item.key:
@@ -271,7 +271,9 @@ class Announcer:
     def _with_type(
         self, own: LocalTopic, topic: str, role: int, messages: list[management.Management]
     ) -> list[management.Management]:
-        return [own.type_info(topic, role), *messages] if self.r2p else messages
+        if self.r2p:
+            return [own.type_info(topic, role), *messages]
+        return [] if own.type.varies else messages  # gateways of firmware would make buffers for messages of one size
 
     def _presence(self, flags: int) -> list[management.Management]:
         hello = self.hello(flags)  # first: after an ALIVE alone the module would be taken for firmware

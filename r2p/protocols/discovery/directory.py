@@ -34,14 +34,16 @@ V = TypeVar("V")
 
 
 class TopicInfo(msgspec.Struct):
-    """A topic on the link. Instants are in monotonic ns, None: never; `size` is in bytes, 0: unknown.
+    """A topic on the link. Instants are in monotonic ns, None: never; `size` is in bytes, 0: unknown, a bound if the
+    length `varies`.
 
     `types` has the type that the peers in each role (ROLE_...) announce, and `typed_at` the time of the last one.
-    `size` and `fingerprint` are those of the publishers, or of the subscribers while publishers have said nothing.
+    These and `fingerprint` are those of the publishers, or of the subscribers while publishers have said nothing.
     """
 
     name: str
     size: int = 0
+    varies: bool = False
     fingerprint: bytes | None = None
     advertised_at: int | None = None
     requested_at: int | None = None
@@ -63,7 +65,7 @@ class TopicInfo(msgspec.Struct):
         else:
             self.types[role] = known
         best = self.types.get(ROLE_PUBLISHES) or self.types.get(ROLE_SUBSCRIBES, TopicType())
-        self.size = best.size
+        self.size, self.varies = best.size, best.varies
         self.fingerprint = None if best.fingerprint == management.ANY_TYPE else best.fingerprint
 
 
@@ -211,9 +213,9 @@ class Directory:
         return known is not None and known.previous == instance
 
     def size_of(self, topic: str) -> int:
-        """Bytes of the topic's messages; 0: unknown."""
+        """The size field of the topic's messages; 0: unknown."""
         info = self.topics.get(topic)
-        return 0 if info is None else info.size
+        return 0 if info is None else management.encode_size(info.size, varies=info.varies)
 
     def touch_topic(self, name: str) -> TopicInfo:
         """Return the entry of a topic that a message has just named."""

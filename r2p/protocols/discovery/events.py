@@ -8,6 +8,7 @@ which has one other end.
 import enum
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
+from typing import Self
 
 import msgspec
 
@@ -34,14 +35,35 @@ COMMAND_OF_TYPE: dict[int, Command] = dict(zip(management.ORDER_TYPES, MESSAGE_O
 
 
 class TopicType(msgspec.Struct, frozen=True):
-    """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (`ANY_TYPE`: unknown)."""
+    """The type of a topic as far as it is known: payload bytes (0: unknown) and fingerprint (`ANY_TYPE`: unknown).
+
+    If the length `varies`, `size` is a bound, which need not be the same in all modules.
+    """
 
     size: int = 0
     fingerprint: bytes = management.ANY_TYPE
+    varies: bool = False
+
+    @classmethod
+    def announced(cls, size: int, fingerprint: bytes = management.ANY_TYPE) -> Self:
+        """Return the type in a management message with this size field."""
+        bound, varies = management.decode_size(size)
+        return cls(bound, fingerprint, varies)
+
+    @property
+    def size_field(self) -> int:
+        """The size as in management messages."""
+        return management.encode_size(self.size, varies=self.varies)
+
+    @property
+    def exact_size(self) -> int:
+        """Bytes of each message; 0: unknown, or the length varies."""
+        return 0 if self.varies else self.size
 
     def fits(self, other: "TopicType") -> bool:
         """Return whether the two agree: what is unknown fits everything."""
-        if self.size != other.size and self.size and other.size:
+        ours, theirs = (self.exact_size or self.varies), (other.exact_size or other.varies)
+        if ours and theirs and (ours, self.varies) != (theirs, other.varies):
             return False
         typed = self.fingerprint != management.ANY_TYPE and other.fingerprint != management.ANY_TYPE
         return not typed or self.fingerprint == other.fingerprint
@@ -49,7 +71,8 @@ class TopicType(msgspec.Struct, frozen=True):
     def merged(self, other: "TopicType") -> "TopicType":
         """Return what is known from either of two types that fit."""
         typed = self.fingerprint != management.ANY_TYPE
-        return TopicType(self.size or other.size, self.fingerprint if typed else other.fingerprint)
+        known = self if self.size or self.varies else other
+        return TopicType(known.size, self.fingerprint if typed else other.fingerprint, known.varies)
 
 
 class ModuleInfo(msgspec.Struct, frozen=True):

@@ -113,7 +113,7 @@ class SubscriptionNegotiation:
     def advertised(self, now: int, message: management.Advertise, source: PeerAddress) -> None:
         """Handle ADVERTISE of a publisher: request its messages if this module subscribes to the topic."""
         topic = message.topic
-        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size)).advertised_at = now
+        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType.announced(message.size)).advertised_at = now
         own = self._own.topics[ROLE_SUBSCRIBES].get(topic)
         peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -126,7 +126,7 @@ class SubscriptionNegotiation:
     def requested(self, now: int, message: management.SubscribeRequest, source: PeerAddress) -> None:
         """Handle SUBSCRIBE_REQUEST of a subscriber: respond, and attach it if it is new. Its size is ignored."""
         topic = message.topic
-        self._directory.add_type(now, topic, ROLE_SUBSCRIBES, TopicType(message.size)).requested_at = now
+        self._directory.add_type(now, topic, ROLE_SUBSCRIBES, TopicType.announced(message.size)).requested_at = now
         own = self._own.topics[ROLE_PUBLISHES].get(topic)
         peer = self._get_or_create(source) if own is not None else None
         if own is None or peer is None:
@@ -141,20 +141,22 @@ class SubscriptionNegotiation:
         peer = self._get_or_create(source) if topic in self._own.topics[ROLE_SUBSCRIBES] else None
         if peer is None or not self._fits(peer, topic, ROLE_PUBLISHES, _implied_type(peer, message)):
             return
-        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType(message.size))
+        self._directory.add_type(now, topic, ROLE_PUBLISHES, TopicType.announced(message.size))
         # Every response to a repeated request arrives here; only new params, as after a restart, are an event.
         if peer.publishers.get(topic) != (message.params, message.size):
             self._own.publisher_counts[topic] += topic not in peer.publishers
             peer.publishers[topic] = (message.params, message.size)
-            self._outbox.emit(PublisherFound(topic, source, message.params, message.size))
+            size = TopicType.announced(message.size).exact_size
+            self._outbox.emit(PublisherFound(topic, source, message.params, size))
 
     def typed(self, now: int, message: management.TypeInfo, source: PeerAddress) -> None:
         """Handle TYPE: compare a peer's type of a topic with this module's, if it has the topic."""
-        self._directory.add_type(now, message.topic, message.role, TopicType(message.size, message.fingerprint))
+        theirs = TopicType.announced(message.size, message.fingerprint)
+        self._directory.add_type(now, message.topic, message.role, theirs)
         own = self._counterpart(message.role).get(message.topic)
         peer = self._get_or_create(source) if own is not None else None
         if peer is not None:
-            theirs = peer.types[message.topic, message.role] = TopicType(message.size, message.fingerprint)
+            peer.types[message.topic, message.role] = theirs
             self._fits(peer, message.topic, message.role, theirs)
 
     def unsubscribed(self, now: int, message: management.Unsubscribe, source: PeerAddress) -> None:
@@ -204,11 +206,11 @@ class SubscriptionNegotiation:
         """Respond to subscribers, and attach those that are new."""
         if any(_needs_type(now, peer, request) for peer, request in requests):
             self._outbox.send(own.type_info(topic, ROLE_PUBLISHES))
-        requests = [each for each in requests if self._may_subscribe(each[0], topic)]
+        requests = [each for each in requests if self._may_subscribe(*each, own.type)]
         if not requests:
             return
         queue = max(requests[-1][1].queue, 1)  # a request with 0, at which firmware halts, is answered with 1
-        self._outbox.send(management.SubscribeResponse(topic, own.type.size, queue, own.params))
+        self._outbox.send(management.SubscribeResponse(topic, own.type.size_field, queue, own.params))
         for peer, request in requests:
             unanswered = peer.is_r2p(now) and request.params == UNANSWERED
             if self._add_subscriber(now, peer, topic, unanswered=unanswered):
@@ -217,8 +219,14 @@ class SubscriptionNegotiation:
                 )
             self._renew(now, peer, topic)
 
-    def _may_subscribe(self, peer: Peer, topic: str) -> bool:
+    def _may_subscribe(self, peer: Peer, request: management.SubscribeRequest, own: TopicType) -> bool:
+        """Compare types where the subscriber has announced its own; a size alone says nothing, except that the length
+        varies or does not: firmware can't receive such messages.
+        """
+        topic = request.topic
         theirs = peer.types.get((topic, ROLE_SUBSCRIBES))
+        if theirs is None and own.varies:
+            theirs = TopicType.announced(request.size)
         return theirs is None or self._fits(peer, topic, ROLE_SUBSCRIBES, theirs)
 
     # Changes of this module
@@ -434,7 +442,7 @@ def _needs_type(now: int, peer: Peer, message: management.SubscribeRequest) -> b
 def _implied_type(peer: Peer, message: management.Advertise | management.SubscribeResponse) -> TopicType:
     """Return the type that a publisher's message implies: that of the TYPE before it, if the sizes agree."""
     typed = peer.types.get((message.topic, ROLE_PUBLISHES))
-    return typed if typed is not None and typed.size == message.size else TopicType(message.size)
+    return typed if typed is not None and typed.size_field == message.size else TopicType.announced(message.size)
 
 
 class SharedAnswers(Generic[M]):

@@ -132,24 +132,42 @@ class DiscoveryProtocol(ABC):
         """Announce a new state of this module at once: FLAG_... of ALIVE."""
 
     def advertise(
-        self, now: int, topic: str, size: int, fingerprint: bytes = ANY_TYPE, params: bytes = NO_PARAMS
+        self,
+        now: int,
+        topic: str,
+        size: int,
+        fingerprint: bytes = ANY_TYPE,
+        params: bytes = NO_PARAMS,
+        *,
+        varies: bool = False,
     ) -> list[Event]:
-        """Publish a topic: messages of `size` bytes (0: not known yet). `params` are the transport's."""
-        return self._set_topic(now, topic, ROLE_PUBLISHES, LocalTopic(TopicType(size, fingerprint), params))
+        """Publish a topic: messages of `size` bytes (0: not known yet); of at most so many, if their length `varies`.
+
+        `params` are the transport's.
+        """
+        return self._set_topic(now, topic, ROLE_PUBLISHES, LocalTopic(TopicType(size, fingerprint, varies), params))
 
     def withdraw(self, now: int, topic: str) -> list[Event]:
         """End the publication of a topic: its remote subscribers are gone."""
         return self._remove_topic(now, topic, ROLE_PUBLISHES)
 
     def subscribe(
-        self, now: int, topic: str, size: int = 0, queue: int = QUEUE, fingerprint: bytes = ANY_TYPE
+        self,
+        now: int,
+        topic: str,
+        size: int = 0,
+        queue: int = QUEUE,
+        fingerprint: bytes = ANY_TYPE,
+        *,
+        varies: bool = False,
     ) -> list[Event]:
         """Subscribe to a topic; size 0 and no fingerprint take every type.
 
         `queue`: how many messages a publisher may have on the way to this module. Management messages bound it by what
         firmware has memory for (`queue_length`); for tokens 0 is any number, as the module would rather lose some.
         """
-        return self._set_topic(now, topic, ROLE_SUBSCRIBES, LocalTopic(TopicType(size, fingerprint), queue=queue))
+        own = LocalTopic(TopicType(size, fingerprint, varies), queue=queue)
+        return self._set_topic(now, topic, ROLE_SUBSCRIBES, own)
 
     def unsubscribe(self, now: int, topic: str) -> list[Event]:
         """End the subscription of a topic: its remote publishers are gone."""
@@ -356,7 +374,7 @@ class Discovery(DiscoveryProtocol):
             if role == ROLE_PUBLISHES and self._demand is not None:
                 # Earlier requests, before there was a publisher, need not be repeated.
                 for source in self._demand.sources_of(topic, ROLE_SUBSCRIBES):
-                    self._negotiation.requested(now, management.SubscribeRequest(topic, own.type.size, 1), source)
+                    self._negotiation.requested(now, management.SubscribeRequest(topic, own.type.size_field, 1), source)
         return self._flush(now)
 
     def _remove_topic(self, now: int, topic: str, role: int) -> list[Event]:

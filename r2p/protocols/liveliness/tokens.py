@@ -139,10 +139,19 @@ class TokenSet:
 
     def _token(self, key: TopicRole, own: LocalTopic, node: str, publisher_class: int) -> str:
         topic, role = key
-        size, fingerprint = own.type.size, own.type.fingerprint
+        known = own.type
         window = own.queue if role == ROLE_SUBSCRIBES else 0
         token = TopicToken(
-            self._instance, role, topic, self._instance, node, publisher_class, size, fingerprint, window
+            self._instance,
+            role,
+            topic,
+            self._instance,
+            node,
+            publisher_class,
+            known.size,
+            known.fingerprint,
+            window,
+            varies=known.varies,
         )
         return liveliness.encode(token)
 
@@ -277,13 +286,13 @@ class Matching:
 
 def _type_of(tokens: dict[str, TopicToken]) -> TopicType:
     """Return the type that a session declares; of several tokens, the first that has one counts."""
-    size = next((each.size for each in tokens.values() if each.size), 0)
+    size, varies = next(((each.size, each.varies) for each in tokens.values() if each.size or each.varies), (0, False))
     fingerprint = next((each.fingerprint for each in tokens.values() if each.fingerprint != ANY_TYPE), ANY_TYPE)
-    return TopicType(size, fingerprint)
+    return TopicType(size, fingerprint, varies)
 
 
 def _detail(tokens: dict[str, TopicToken], role: int) -> int:
     """Return the size of a publisher's messages, or the window of a subscriber."""
     if role == ROLE_PUBLISHES:
-        return _type_of(tokens).size
+        return _type_of(tokens).exact_size
     return max(each.window for each in tokens.values())

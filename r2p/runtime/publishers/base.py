@@ -69,6 +69,7 @@ class BasePublisher(Generic[M, C]):
         self._space = space
         self._topic = topic
         self._encode = layout.encode
+        self._shares = layout.packing.shares
         self._clock = space.clock
         self._now = space.clock.now
         self._source = Source(space.module, node.name)
@@ -83,7 +84,7 @@ class BasePublisher(Generic[M, C]):
 
     @property
     def size(self) -> int:
-        """Bytes of one message."""
+        """Bytes of one message; of the longest, if their length varies."""
         return self._topic.layout.size if self._topic.layout else 0
 
     @property
@@ -174,7 +175,10 @@ class BasePublisher(Generic[M, C]):
         stamp = self._now()
         if deadline:
             deadline += stamp
-        sample = Sample(data, self._source, stamp, deadline, sequence, self.publisher_class, message)
+        if self._shares is not None and not self._shares(message):  # subscribers decode the bytes
+            sample = Sample(data, self._source, stamp, deadline, sequence, self.publisher_class)
+        else:
+            sample = Sample(data, self._source, stamp, deadline, sequence, self.publisher_class, message)
         if self.latch:
             self._last = sample
         return sample

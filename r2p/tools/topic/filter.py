@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from r2p.errors import Error
-from r2p.messages import Array, Layout, Message, Nested, Scalar, Shape, layout
+from r2p.messages import FixedArray, Layout, Message, Nested, Scalar, Shape, layout
 from r2p.tools.values import shortest_f32
 
 LENGTH_MAX = 1000
@@ -218,9 +218,9 @@ class _Compiler:
                 return lambda message: get(message)[at(message)], array.item
         raise FilterError(f"{ast.unparse(node)!r} is not a field")
 
-    def _array(self, node: ast.expr) -> tuple[Evaluate, Array]:
+    def _array(self, node: ast.expr) -> tuple[Evaluate, FixedArray]:
         get, shape = self._path(node)
-        if not isinstance(shape, Array):
+        if not isinstance(shape, FixedArray):
             raise FilterError(f"{ast.unparse(node)} is not an array")
         return get, shape
 
@@ -247,7 +247,7 @@ def _paths(shape: Layout[Any]) -> Iterator[str]:
     """Yield the paths of all fields."""
     for field in shape.fields:
         inner, path = field.shape, field.name
-        while isinstance(inner, Array):
+        while isinstance(inner, FixedArray):
             inner, path = inner.item, f"{path}[0]"
         if isinstance(inner, Nested):
             yield from (f"{path}.{each}" for each in _paths(inner.layout))
@@ -260,7 +260,7 @@ def _converter(shape: Shape) -> Evaluate | None:
     match shape:
         case Scalar("f32"):
             return lambda value: shortest_f32(value) if math.isfinite(value) else value
-        case Array(item, _) if (convert := _converter(item)) is not None:
+        case FixedArray(item, _) if (convert := _converter(item)) is not None:
             return lambda values: tuple(map(convert, values))
     return None
 

@@ -377,7 +377,7 @@ class RxStream:
 
     def _check_type(self, publisher: RemotePublisher) -> None:
         publisher.type_fits = self._type.fits(TopicType(0, publisher.origin.fingerprint))
-        publisher.size = (self._type.size or -1) if publisher.type_fits else -1
+        publisher.size = (self._type.exact_size or -1) if publisher.type_fits else -1
         publisher.last_size = -1
 
 
