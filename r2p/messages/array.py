@@ -5,9 +5,8 @@ asked for one; numpy and `memoryview` use the bytes as they are.
 """
 
 import array
-import ctypes
+import functools
 import operator
-import pickle
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
@@ -40,6 +39,7 @@ class Array(Sequence[T]):
 
         Integers are held as i64 or u64, other numbers as f64. Raises TypeError or OverflowError for anything else.
         """
+        enable_buffers()
         view = buffer_of(values)
         self._view = (_pack(values) if view is None else view).toreadonly()
         self._code = self._view.format
@@ -101,17 +101,21 @@ class Array(Sequence[T]):
             return self._view
 
 
-if sys.version_info < (3, 12):
-    # Only from 3.12 on can a class in Python have a buffer (PEP 688). `pickle.PickleBuffer` hands out the buffer of an
-    # object that it keeps behind its first field, where an Array has `_view`, its second slot: so its functions serve.
-    def _borrow_buffer_functions() -> None:
-        buffer_functions = 20 * ctypes.sizeof(ctypes.c_void_p)  # the offset of `tp_as_buffer` in a type of CPython 3.11
-        ours, theirs = (
-            ctypes.c_void_p.from_address(id(cls) + buffer_functions) for cls in (Array, pickle.PickleBuffer)
-        )
-        ours.value = theirs.value
+@functools.cache
+def enable_buffers() -> None:
+    """Give Arrays their buffer, before the first one is made.
 
-    _borrow_buffer_functions()
+    Only from 3.12 on can a class in Python have one (PEP 688). `pickle.PickleBuffer` hands out the buffer of an object
+    that it keeps behind its first field, where an Array has `_view`, its second slot: so its functions serve.
+    """
+    if sys.version_info >= (3, 12):
+        return
+    import ctypes
+    from pickle import PickleBuffer
+
+    offset = 20 * ctypes.sizeof(ctypes.c_void_p)  # of `tp_as_buffer` in a type of CPython 3.11
+    functions = ctypes.c_void_p.from_address(id(PickleBuffer) + offset)
+    ctypes.c_void_p.from_address(id(Array) + offset).value = functions.value
 
 
 def from_view(view: memoryview, code: str) -> Array[Any]:

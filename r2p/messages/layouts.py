@@ -25,7 +25,7 @@ from typing import (
 import msgspec
 
 from r2p.errors import DecodeError, MessageError
-from r2p.messages.array import Array
+from r2p.messages.array import Array, enable_buffers
 from r2p.messages.definition import MessageMeta
 from r2p.messages.packing import check, functions
 from r2p.messages.shapes import (
@@ -303,6 +303,8 @@ def _array(
         raise MessageError(f"{path}: the elements of an r2p.Array are numbers; use a tuple of {_spell(items[0])}")
     if not item.size:
         raise MessageError(f"{path}: {_spell(items[0])} has no bytes, so an array of it says nothing: send its length")
+    if container == "array":
+        enable_buffers()
     if isinstance(bound, Max):
         return VariableArray(item, count, container)
     array = FixedArray(item, count, container)

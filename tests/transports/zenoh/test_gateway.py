@@ -31,7 +31,7 @@ async def test_values_that_other_links_can_not_carry_stop_nothing() -> None:
 
         with plain_session(net) as session:
             live, topics = session.liveliness(), f"r2p/{net.name}/topic"
-            keys = [f"{STRANGER}/sub/evil{number}/abcd/x/0/100000/-/16/0" for number in range(20)]
+            keys = [f"{STRANGER}/sub/evil{number}/abcd/x/0/99999999/-/16/0" for number in range(20)]
             keys += [f"{STRANGER}/pub/boom/abcd/x/1/0/-/0/0"]
             tokens = [live.declare_token(f"r2p/{net.name}/live/{key}") for key in keys]
             script.hear(b"".join(manage(management.Hello(name, 77)) for name in BAD_NAMES if len(name) < 8))
