@@ -23,10 +23,10 @@ test-lowest: $(LOWEST)/stamp system
 test-pythons:
 	@$(MAKE) --no-print-directory --keep-going $(PYTHONS:%=test-python-%)
 
-# The names of its versions let the shims of pyenv find all of them.
-test-python-%: export PYENV_VERSION = $(shell pyenv versions --bare 2>/dev/null | paste -sd :)
+# The names of its versions let the shims of pyenv find all of them; not for what makes .venv, where the first one counts.
 test-python-%: $(BIN)/uv system
-	@if $(BIN)/uv python find --quiet --no-python-downloads $* >/dev/null 2>&1; then \
+	@export PYENV_VERSION=$$(pyenv versions --bare 2>/dev/null | paste -sd :); \
+	if $(BIN)/uv python find --quiet --no-python-downloads $* >/dev/null 2>&1; then \
 		$(MAKE) --no-print-directory .venv-$*/stamp && \
 		.venv-$*/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadgroup $(TESTS); \
 	else echo "Python $* is not on this machine: skipped"; fi
