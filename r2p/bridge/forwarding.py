@@ -31,7 +31,10 @@ HOPS_MAX = 15
 """Gateways on a message's way, at most: the last defence against loops where messages carry hops."""
 
 HELD_MAX = 4096
-"""Held messages, at most."""
+"""Places for held messages."""
+
+_PLACE = 16 * 1024
+"""Bytes of a message in each place: so held messages have 64 MiB at most, and one message more."""
 
 
 class BridgePort:
@@ -97,6 +100,7 @@ class HeldMessages:
 
     def __init__(self) -> None:
         self._held: deque[tuple[Sample, Callable[[], list[Sink] | None]]] = deque()
+        self._places = 0
 
     def __bool__(self) -> bool:
         return bool(self._held)
@@ -104,14 +108,15 @@ class HeldMessages:
     def hold(self, sample: Sample, go_on: Callable[[], list[Sink] | None]) -> bool:
         """Hold a message; return False if it expires or there are too many. `go_on` returns the sinks without room."""
         # Events and periods are of no use later.
-        if sample.publisher_class != PublisherClass.NON_REAL_TIME or len(self._held) >= HELD_MAX:
+        if sample.publisher_class != PublisherClass.NON_REAL_TIME or self._places >= HELD_MAX:
             return False
+        self._places += 1 + len(sample.data) // _PLACE
         self._held.append((sample, go_on))
         return True
 
     def release(self, failed: Callable[[Exception], object]) -> None:
         """Go on with all messages; `failed` is called with exceptions."""
-        held, self._held = self._held, deque()
+        held, self._held, self._places = self._held, deque(), 0
         for sample, go_on in held:
             try:
                 for sink in go_on() or ():

@@ -39,8 +39,8 @@ class MultihomedModule:
         """The links that are used, by those that can't carry a topic."""
         self._without: dict[str, frozenset[int]] = {}
         """The links that can't carry a topic, by its name, as they were when it was announced last."""
-        self._unable: dict[tuple[int, int], frozenset[int]] = {}
-        """The links that can't carry a topic, by the length of its name and the size of its messages."""
+        self._unable: dict[tuple[int, int, bool], frozenset[int]] = {}
+        """The links that can't carry a topic, by the length of its name, its messages' size, and if that varies."""
         self._filtering = False
         self._alarm = Alarm(space.loop, self._poll, background=True)
 
@@ -51,18 +51,14 @@ class MultihomedModule:
         self._attached += 1
         port = _MultihomedPort(self, link, self._attached)
         self._ports[link.name] = self._by_number[port.number] = port
-        for key, unable in self._unable.items():
-            if _cannot_carry(link, *key):
-                self._unable[key] = unable | {port.number}
+        self._unable.clear()
         link.gateway_hooks = port
 
     def detach(self, link: Link) -> None:
         """Remove a link that the module no longer has."""
         port = self._ports.pop(link.name)
         del self._by_number[port.number]
-        for key, unable in self._unable.items():
-            if port.number in unable:
-                self._unable[key] = unable - {port.number}
+        self._unable.clear()
         self.selection.close(self._now(), port.number)
         self.selection.forget(port.number)
         self._act()
@@ -146,19 +142,32 @@ class MultihomedModule:
         else:
             self._without[topic.name] = without
         topic.drop_filter = self._drop_filter(topic) if self._filtering else None
-        return port.number in without or port.number in self.selection.used(self._now(), without)
+        if port.number in without and not self._size_of(topic)[1]:
+            return True  # the link refuses the topic itself
+        return port.number in self.selection.used(self._now(), without)
 
     def _unable_for(self, topic: Topic) -> frozenset[int]:
-        """Return the links that can't carry the topic."""
-        size = topic.layout.size if topic.layout is not None else 0
-        if not size:
-            infos = (port.link.discovery.topics.get(topic.name) for port in self._by_number.values())
-            size = max((info.size for info in infos if info is not None), default=0)
-        key = len(topic.name), size
+        """Return the links that can't carry the topic.
+
+        If the length of its messages varies, and no link carries the longest ones, those that carry the most are able.
+        """
+        size, varies = self._size_of(topic)
+        key = len(topic.name), size, varies
         if key not in self._unable:
-            ports = self._by_number.items()
-            self._unable[key] = frozenset(number for number, port in ports if _cannot_carry(port.link, *key))
+            links = {number: port.link for number, port in self._by_number.items()}
+            if varies:
+                named = [link for link in links.values() if len(topic.name) <= link.max_name]
+                size = min(size, max((link.longest(varies=True) for link in named), default=size))
+            unable = (number for number, link in links.items() if _cannot_carry(link, len(topic.name), size, varies))
+            self._unable[key] = frozenset(unable)
         return self._unable[key]
+
+    def _size_of(self, topic: Topic) -> tuple[int, bool]:
+        """Return the bytes of a topic's messages (0: not known); at most so many, if the second one is true."""
+        if topic.layout is not None:
+            return topic.layout.size, topic.layout.varies
+        infos = [port.link.discovery.topics.get(topic.name) for port in self._by_number.values()]
+        return max(((info.size, info.varies) for info in infos if info is not None), default=(0, False))
 
     def _drop_filter(self, topic: Topic) -> Callable[[str], bool]:
         """Return a predicate for messages: whether one came from a link that is no longer used.
@@ -278,6 +287,9 @@ class _MultihomedPort(GatewayHooks):
         self._owner.discovery_changed(self)
 
 
-def _cannot_carry(link: Link, name_length: int, size: int) -> bool:
-    """Return whether a topic's name, or its messages of `size` bytes (0: not known), are too long for the link."""
-    return name_length > link.max_name or (size > 0 and link.refusal(size) is not None)
+def _cannot_carry(link: Link, name_length: int, size: int, varies: bool) -> bool:
+    """Return whether a topic's name, or some of its messages of `size` bytes (0: not known), are too long for the link.
+
+    If their length `varies`, they have at most so many.
+    """
+    return name_length > link.max_name or size > link.longest(varies=varies)

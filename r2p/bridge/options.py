@@ -159,11 +159,19 @@ class Policy:
         return any(fnmatchcase(topic, each) for each in self._options.reserve)
 
     def shaper(
-        self, topic: str, source: str, *, soften: bool, reserve: "Callable[[int, float], RelayedPeriodic] | None" = None
+        self,
+        topic: str,
+        source: str,
+        *,
+        soften: bool,
+        reserve: "Callable[[int, float], RelayedPeriodic] | None" = None,
+        varies: Callable[[], bool] = lambda: False,
     ) -> "Shaper | None":
         """Return the shaper of a topic's messages from this link, or None. For the arguments see `Shaper`."""
         rate, klass = _first(self._options.rate_limit, topic), self.class_of(topic, source)
-        return Shaper(rate, klass, soften=soften, reserve=reserve) if rate or klass or soften else None
+        if not (rate or klass or soften):
+            return None
+        return Shaper(rate, klass, soften=soften, reserve=reserve, varies=varies)
 
     def to_link_name(self, topic: str, link: str) -> str:
         """Return the name of a topic on this link."""
@@ -215,15 +223,19 @@ class Policy:
 
 
 class RelayedPeriodic(SlotPublisher):
-    """A publisher in slots of a bus, of `size` bytes each `period` seconds, for messages of another link."""
+    """A publisher in slots of a bus, of `size` bytes each `period` seconds, for messages of another link.
+
+    If the length of the messages `varies`, they have at most so many.
+    """
 
     lead = 0.0005
 
-    def __init__(self, size: int, period: float) -> None:
+    def __init__(self, size: int, period: float, *, varies: bool = False) -> None:
         self.period = period
         self.missed = 0
         """Messages replaced by the next one before their slot, or lost by the bus."""
         self._size = size
+        self._varies = varies
         self._latest: Sample | None = None
         self._slot_link: object = None
 
@@ -231,9 +243,14 @@ class RelayedPeriodic(SlotPublisher):
     def size(self) -> int:
         return self._size
 
+    @property
+    def varies(self) -> bool:
+        return self._varies
+
     def offer(self, sample: Sample) -> bool:
         """Keep a message for the next slot; return False if the bus has no slots for it, or not of this size."""
-        if self._slot_link is None or len(sample.data) != self._size:
+        size = len(sample.data)
+        if self._slot_link is None or size > self._size or (size < self._size and not self._varies):
             return False
         self.missed += self._latest is not None
         self._latest = sample
@@ -267,7 +284,8 @@ class Shaper:
     `rate`: messages a second at most, with room for two at once. `klass`: the class, which a debug line does not carry.
     `soften`: periodic messages become sporadic ones that are due within their period, as the next link has no slots for
     them. `reserve` is called with size (bytes) and period (s) when those of a publisher are known, and again when it
-    comes back with another size; it returns the publisher for the messages from then on.
+    comes back with another size; it returns the publisher for the messages from then on. `varies` returns whether the
+    length of the messages does: then another size says nothing.
     """
 
     def __init__(
@@ -277,9 +295,11 @@ class Shaper:
         *,
         soften: bool,
         reserve: Callable[[int, float], RelayedPeriodic] | None = None,
+        varies: Callable[[], bool] = lambda: False,
     ) -> None:
         self.reserved: RelayedPeriodic | None = None
         self._reserve = reserve
+        self._varies = varies
         self._gap = None if rate is None else round(SECOND / rate)
         self._class = klass
         self._soften = soften
@@ -321,7 +341,7 @@ class Shaper:
             return _UNKNOWN_PERIOD
         since = sample.stamp - known.stamp
         known.stamp = sample.stamp
-        if since >= _PERIOD_MAX or len(sample.data) != known.size:
+        if since >= _PERIOD_MAX or (len(sample.data) != known.size and not self._varies()):
             known.size, known.period, known.count = len(sample.data), 0, 0
         elif since > 0:
             known.count += 1

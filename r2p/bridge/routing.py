@@ -186,13 +186,24 @@ class RoutingTable:
         reserve = (
             functools.partial(self._reserve, topic, target) if has_slots and self._policy.reserves(topic) else None
         )
-        return self._policy.shaper(topic, source.name, soften=has_slots, reserve=reserve)
+        varies = functools.partial(self._varies, topic, target)
+        return self._policy.shaper(topic, source.name, soften=has_slots, reserve=reserve, varies=varies)
+
+    def _varies(self, topic: str, target: BridgePort) -> bool:
+        """Return whether the length of messages to this link varies."""
+        here = self._topic(topic, target)
+        return here.layout.varies if here.layout is not None else self._types(topic, target)[0].varies
 
     def _reserve(self, topic: str, target: BridgePort, size: int, period: float) -> RelayedPeriodic:
-        """Ask a bus for slots for messages of `size` bytes each `period` seconds."""
-        here = self._topic(topic, target)
-        if here.reserved is None or here.reserved.size != size:
-            here.reserved = RelayedPeriodic(size, period)
+        """Ask a bus for slots for messages of `size` bytes each `period` seconds; of the bound, if their length varies.
+
+        Messages with more bytes than any slots could have go as sporadic ones, if the bus carries them at all.
+        """
+        here, varies = self._topic(topic, target), self._varies(topic, target)
+        if varies:
+            size = here.layout.size if here.layout is not None else self._types(topic, target)[0].size
+        if here.reserved is None or (here.reserved.size, here.reserved.varies) != (size, varies):
+            here.reserved = RelayedPeriodic(size, period, varies=varies)
         target.link.topic_changed(here)
         return here.reserved
 

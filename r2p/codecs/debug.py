@@ -30,14 +30,14 @@ _HEX = b"0123456789ABCDEFabcdef"
 _PRINTABLE = bytes(range(0x20, 0x7F))
 _LINE_END = b"\r\n"
 _AT = ord("@")
-_WHOLE = re.compile(rb"@([^:]{8}):([^:]{2})([ -9;-~]{1,16}):([^:]{4,512}):([^:]{2})[\r\n]*")
+_WHOLE = re.compile(rb"@([^:]{8}):([^:]{2})([ -9;-~]{1,16}):([^:]{2,512}):([^:]{2})[\r\n]*")
 _NOISE = re.compile(rb"[^\r\n]+")
 
 
 class Line(msgspec.Struct, frozen=True, gc=False):
     """One message on the line.
 
-    `topic` is 1 to 16 bytes of printable ASCII, `data` is 1 to 255 bytes. `deadline` is an unsigned 32-bit number of
+    `topic` is 1 to 16 bytes of printable ASCII, `data` is at most 255 bytes. `deadline` is an unsigned 32-bit number of
     microseconds, which has a meaning for the sender only.
     """
 
@@ -54,17 +54,21 @@ def encode(topic: bytes, data: bytes, deadline: int) -> bytes:
     return encoder(topic)(data, deadline)
 
 
-def encoder(topic: bytes) -> Callable[[bytes, int], bytes]:
-    """Return a function of payload and deadline that encodes many messages of one topic faster than `encode`."""
+def encoder(topic: bytes, *, empty: bool = False) -> Callable[[bytes, int], bytes]:
+    """Return a function of payload and deadline that encodes many messages of one topic faster than `encode`.
+
+    With `empty`, messages may be empty, as between r2p modules: firmware never gets such a line.
+    """
     if not 1 <= len(topic) <= TOPIC_FIELD or topic.strip(_PRINTABLE):
         raise MessageError(f"topic {topic!r}: a line carries 1 to {TOPIC_FIELD} printable characters")
     name = b":%02X%b:" % (len(topic), topic)  # what all messages of the topic share is worked out once
     name_sum = len(topic) + sum(topic)
+    least = 0 if empty else 1
 
     def encode_message(data: bytes, deadline: int) -> bytes:
         size = len(data)
-        if not 1 <= size <= PAYLOAD_MAX:
-            raise MessageError(f"topic {topic.decode()}: a line carries 1 to {PAYLOAD_MAX} bytes, not {size}")
+        if not least <= size <= PAYLOAD_MAX:
+            raise MessageError(f"topic {topic.decode()}: a line carries {least} to {PAYLOAD_MAX} bytes, not {size}")
         stamp = (deadline & 0xFFFFFFFF).to_bytes(4, "big")
         checksum = -(name_sum + sum(stamp) + size + sum(data)) & 0xFF
         return b"@%b%b%02X%b:%02X\r\n" % (hexlify(stamp).upper(), name, size, hexlify(data).upper(), checksum)
@@ -81,7 +85,7 @@ class Reader:
     | cut short | a line end inside a message |
     | bad hex, bad separator, bad name | another wrong character in that place |
     | topic length | no name, or one of more than 16 bytes |
-    | empty payload | a payload length of 0 |
+    | empty payload | a payload length of 0 and a wrong sum: firmware sends no such line, r2p only a right one |
     | checksum | a wrong sum, which firmware does not check |
 
     Bytes after a dropped message up to the line end belong to it, and are not counted again. The reader holds at most
@@ -178,12 +182,10 @@ class _Fields:
         topic = self._accept(name_size[0], _PRINTABLE, "bad name")
         self._separator()
         size = self._hex(1)
-        if not size[0]:
-            raise _Wrong("empty payload")
         data = self._hex(size[0])
         self._separator()
         if sum(deadline + name_size + topic + size + data + self._hex(1)) & 0xFF:
-            raise _Wrong("checksum")
+            raise _Wrong("checksum" if size[0] else "empty payload")
         return Line(topic, data, int.from_bytes(deadline, "big"))
 
     def _separator(self) -> None:

@@ -4,7 +4,13 @@
                        | 22..7 message id                                    |
 
 This module alone knows the layout of an identifier: hot paths elsewhere shift and mask with the constants below.
+
+The messages of a topic are all of one size, or their length varies: then each begins with its length and a checksum, as
+frames say only how many of them follow.
 """
+
+import struct
+from binascii import crc_hqx
 
 import msgspec
 
@@ -16,6 +22,9 @@ from r2p.errors import DecodeError, MessageError
 from r2p.units import MILLISECOND
 
 PAYLOAD_MAX = 1024  # bytes in a message: 128 fragments
+HEADER_SIZE = 4  # bytes in front of a message whose length varies, within those
+VARIABLE_MAX = PAYLOAD_MAX - HEADER_SIZE  # bytes in such a message
+VARIABLE_MIN = 4  # ... unless all messages of its topic are empty: each has a count
 SLOTS_MAX = 64  # in a cycle: bits in the reservation mask
 
 HRT = 0  # laxity of hard real-time and sync
@@ -41,6 +50,8 @@ NOT_SYNC = ~ID8_MASK  # a sync frame has none of these bits: it has the cycle co
 CYCLE_MASK = 0xFF  # a sync frame carries these bits of the cycle counter
 
 _ALL_SLOTS = (1 << SLOTS_MAX) - 1
+_HEADER = struct.Struct("<HH")  # length and checksum
+_CRC_START = 0xFFFF  # CRC-16/CCITT-FALSE: polynomial 0x1021, not reflected, no final XOR
 
 
 class Identifier(msgspec.Struct, frozen=True, gc=False):
@@ -138,6 +149,40 @@ def fragments(payload: bytes) -> list[tuple[int, bytes]]:
     if count == 1:
         return [(0, payload)]
     return [(count - 1 - i, payload[FRAME_MAX * i : FRAME_MAX * (i + 1)]) for i in range(count)]
+
+
+def size_on_bus(size: int, *, varies: bool = False) -> int:
+    """Return the bytes that a message takes in frames; if its length varies, at most: longer ones are never sent."""
+    return min(size, VARIABLE_MAX) + HEADER_SIZE if varies else size
+
+
+def encode_variable(payload: bytes) -> bytes:
+    """Return a message whose length varies with its header. Raises `MessageError` beyond 1020 bytes."""
+    size = len(payload)
+    if size > VARIABLE_MAX:
+        raise MessageError(f"RTCAN carries up to {VARIABLE_MAX} bytes in a message of variable length, not {size}")
+    return _HEADER.pack(size, crc_hqx(payload, _CRC_START)) + payload
+
+
+def decode_variable(data: bytes) -> bytes:
+    """Return the payload behind a header. Raises `DecodeError` for a wrong length or checksum."""
+    payload = data[HEADER_SIZE:]
+    if len(data) < HEADER_SIZE or _HEADER.unpack_from(data) != (len(payload), crc_hqx(payload, _CRC_START)):
+        raise DecodeError(f"{len(data)} bytes with another length or checksum than their header says")
+    return payload
+
+
+def beginning_of(data: bytes, left: int, *, empty: bool = False) -> int:
+    """Return the bytes, header included, of the message of variable length that a frame begins; 0 if it begins none.
+
+    `left` is its number of fragments left. `empty`: all messages of the topic are; else none is.
+    """
+    if len(data) < HEADER_SIZE:
+        return 0
+    length, _ = _HEADER.unpack_from(data)
+    size: int = length + HEADER_SIZE
+    whole = size <= PAYLOAD_MAX and left + 1 == fragment_count(size) and len(data) == min(size, FRAME_MAX)
+    return size if whole and (not length if empty else length >= VARIABLE_MIN) else 0
 
 
 def encode_sync(cycle: int, mask: int) -> Frame:

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar, overload
 from r2p.clock import SHORTEST, Alarm, Ticker, check_seconds, check_timeout
 from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.log_lines import node_logger, short_traceback
-from r2p.messages import Message, layout
+from r2p.messages import Layout, Message, layout
 from r2p.names import MANAGEMENT, topic_name
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
-from r2p.runtime.queues import checkpoint
+from r2p.runtime.queues import QUEUE_BYTES, checkpoint
 from r2p.runtime.subscriber import Callback, Keep, Subscriber, SubscriberOptions
 from r2p.runtime.topic import TopicSpace
 from r2p.units import SECOND
@@ -148,13 +148,15 @@ class Node:
         With `latch` the last message is sent to every subscriber that joins later, and again when its module reboots.
         With `strict`, raise TransportError if a link is known to give less than the class asks for.
 
-        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or an invalid
+        A link that can't carry all messages of the type is named in a warning.
+
+        Raises InvalidName or NameTooLong for the topic, MessageError for a type that can't be packed or an invalid
         class value, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
         shape = layout(type)
         name = self._resolve(topic)
         check_class(name, klass)
-        self._check_links(name, shape.size, klass, strict=strict)
+        self._check_links(name, shape, klass, strict=strict)
         where = self._space.open(name, shape)
         publisher: Publisher[M] | SporadicPublisher[M] | PeriodicPublisher[M]
         try:
@@ -189,6 +191,7 @@ class Node:
         max_age: float | None = ...,
         timeout: float | None = ...,
         on_timeout: Callable[[], object] | None = ...,
+        queue_bytes: int = ...,
     ) -> Subscriber[M]: ...
 
     @overload
@@ -204,6 +207,7 @@ class Node:
         max_age: float | None = ...,
         timeout: float | None = ...,
         on_timeout: Callable[[], object] | None = ...,
+        queue_bytes: int = ...,
     ) -> Subscriber[bytes]: ...
 
     def subscribe(
@@ -218,12 +222,13 @@ class Node:
         max_age: float | None = None,
         timeout: float | None = None,
         on_timeout: Callable[[], object] | None = None,
+        queue_bytes: int = QUEUE_BYTES,
     ) -> Subscriber[Any]:
         """Subscribe to a topic. With the type None, messages are packed bytes.
 
-        The subscription holds `queue` messages. When it is full, non real-time publishers wait for it, up to their
-        stall time, unless it is `lossy`. A publisher that does not wait makes the queue drop its oldest message, or
-        with `keep="oldest"` the new one; both are counted in `lost`.
+        The subscription holds `queue` messages, and is full with fewer that have `queue_bytes` bytes. When it is full,
+        non real-time publishers wait for it, up to their stall time, unless it is `lossy`. A publisher that does not
+        wait makes the queue drop its oldest messages, or with `keep="oldest"` the new one; both are counted in `lost`.
 
         Messages older than `max_age` seconds are skipped, and counted in `stale`. The age is measured from the
         publisher's stamp to this computer's clock, so the two clocks have to agree.
@@ -231,13 +236,15 @@ class Node:
         When no message arrives for `timeout` seconds, `on_timeout` is called once; without it, reading raises
         TimeoutError. A `callback` is called from `spin()`, in this node's task.
 
-        Raises InvalidName or NameTooLong for the topic, MessageError for a type without a fixed layout or an invalid
+        Raises InvalidName or NameTooLong for the topic, MessageError for a type that can't be packed or an invalid
         option, TypeMismatch if the topic has another layout, and Closed once the node has ended.
         """
-        options = SubscriberOptions(callback, queue, lossy, keep, max_age, timeout, on_timeout)
+        options = SubscriberOptions(callback, queue, lossy, keep, max_age, timeout, on_timeout, queue_bytes)
         options.check(topic)
         shape = None if type is None else layout(type)
         where = self._space.open(self._resolve(topic), shape)
+        if shape is not None:
+            self._warn_of_links(where.name, shape, "can't be received on")
         subscriber: Subscriber[Any] = Subscriber(self._space, self, where, shape, options)
         self.subscribers[subscriber] = None
         subscriber.open()
@@ -391,19 +398,32 @@ class Node:
         return name
 
     def _check_links(
-        self, topic: str, size: int, klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool
+        self, topic: str, shape: Layout[Any], klass: NonRealTime | Sporadic | Periodic[Any], *, strict: bool
     ) -> None:
         """Warn of links that can't send the topic; `strict`: raise TransportError for links that give less."""
+        if not strict:
+            self._warn_of_links(topic, shape, "is not sent on")
+            return
+        size, varies = shape.size, shape.varies
         for link in self._space.links:
-            reason = link.refusal(size)
-            if reason and not strict:
-                self.log.warning("topic %s is not sent on link %s: %s", topic, link.name, reason)
-            elif strict and link.best_effort(klass.publisher_class):
+            reason = link.refusal(size, varies=varies)
+            if not reason and link.best_effort(klass.publisher_class):
                 reason = link.guarantee(topic, klass.publisher_class)
-            elif strict and isinstance(klass, Periodic):
-                reason = link.inadmissible(size, klass.period)
-            if reason and strict:
+            elif not reason and isinstance(klass, Periodic):
+                reason = link.inadmissible(size, klass.period, varies=varies)
+            if reason:
                 raise TransportError(f"topic {topic} on link {link.name}: {reason} (advertised with strict=True)")
+
+    def _warn_of_links(self, topic: str, shape: Layout[Any], what: str) -> None:
+        """Warn of links that can't carry the topic, or not all of its messages. `what` is the predicate."""
+        for link in self._space.links:
+            if (reason := link.refusal(shape.size, varies=shape.varies)) is None:
+                continue
+            if shape.varies:
+                text = "topic %s: link %s can't carry its longest messages (%s); they are counted as too long"
+                self.log.warning(text, topic, link.name, reason)
+            else:
+                self.log.warning("topic %s %s link %s: %s", topic, what, link.name, reason)
 
     async def _serve(self) -> bool:
         served = False

@@ -26,6 +26,9 @@ YIELD_EVERY = 16
 A turn of the loop takes as long as a few messages, so not after each one; other tasks wait for so many at most.
 """
 
+QUEUE_BYTES = 64 << 20
+"""Bytes of the messages in a subscriber's queue, by default: it is full from there on."""
+
 _NRT = PublisherClass.NON_REAL_TIME
 
 
@@ -128,8 +131,43 @@ class WakeScheduler:
         self._running = False
 
 
+class SampleQueue(deque[Sample]):
+    """Unread messages whose bytes are counted: with `most` of them the queue is full, however few messages they are.
+
+    It has room for one message at least, so its bytes exceed `most` by less than one message. Small messages of fixed
+    length can't be so many, and have a `deque` instead: counting takes time.
+    """
+
+    def __init__(self, sink: "SubscriberQueue", most: int) -> None:
+        super().__init__()
+        self._sink = sink
+        self._most = most
+        self._bytes = 0
+
+    def append(self, sample: Sample) -> None:
+        super().append(sample)
+        self._count(len(sample.data))
+
+    def popleft(self) -> Sample:
+        sample = super().popleft()
+        self._count(-len(sample.data))
+        return sample
+
+    def clear(self) -> None:
+        super().clear()
+        self._count(-self._bytes)
+
+    def _count(self, change: int) -> None:
+        self._bytes += change
+        sink = self._sink
+        sink.limit = sink.places if self._bytes < self._most else min(len(self), sink.places)
+
+
 class SubscriberQueue(Sink):
-    """The bounded queue of one subscriber: its topic fills it, the subscriber empties it."""
+    """The bounded queue of one subscriber: its topic fills it, the subscriber empties it.
+
+    `limit` is the number of messages at which it is full now: fewer than `places`, while they have too many bytes.
+    """
 
     __slots__ = (
         "_wake_scheduler",
@@ -137,6 +175,7 @@ class SubscriberQueue(Sink):
         "limit",
         "lossy",
         "node",
+        "places",
         "priority",
         "publisher_came",
         "queue",
@@ -150,12 +189,13 @@ class SubscriberQueue(Sink):
         super().__init__()
         self._wake_scheduler = wake_scheduler
         self.node = node
-        self.limit = limit
+        self.limit = self.places = limit
         self.priority = node.priority
         self.keep_oldest = keep_oldest
         self.lossy = lossy
         self.blocks_publishers = not lossy
         self.queue: deque[Sample] = deque()
+        """Unread messages. A link or a publisher appends to it itself, after a look at `limit`."""
         self.waiter: asyncio.Future[None] | None = None
         """The reader's future, while it waits for a message."""
         self.publisher_came = Pulse()
@@ -179,6 +219,9 @@ class SubscriberQueue(Sink):
         if self.keep_oldest:
             return False
         self.queue.popleft()
+        while len(self.queue) >= self.limit:  # by its bytes: a long message takes the place of many
+            self.queue.popleft()
+            self.lost += 1
         return True
 
     def force(self, sample: Sample) -> None:

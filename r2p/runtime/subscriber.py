@@ -5,7 +5,6 @@ Nothing is awaited between popping a message and handing it out, so a cancelled 
 
 import asyncio
 import inspect
-from collections import deque
 from collections.abc import AsyncIterator, Callable
 from types import TracebackType
 from typing import Any, Generic, Literal, Self, TypeVar, overload
@@ -14,9 +13,9 @@ import msgspec
 
 from r2p.clock import LONGEST, SHORTEST, Alarm, check_seconds, check_timeout
 from r2p.errors import Closed, DecodeError, MessageError, TooLong
-from r2p.messages import Layout, Message
+from r2p.messages import SIZE_MAX, Layout, Message
 from r2p.runtime.qos import check_count
-from r2p.runtime.queues import YIELD_EVERY, EndpointOwner, SubscriberQueue, checkpoint
+from r2p.runtime.queues import QUEUE_BYTES, YIELD_EVERY, EndpointOwner, SampleQueue, SubscriberQueue, checkpoint
 from r2p.runtime.sample import Sample
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.units import SECOND
@@ -38,10 +37,12 @@ class SubscriberOptions(msgspec.Struct, frozen=True):
     max_age: float | None
     timeout: float | None
     on_timeout: Callable[[], object] | None
+    queue_bytes: int = QUEUE_BYTES
 
     def check(self, topic: str) -> None:
         """Raise MessageError for invalid options."""
         check_count(topic, "queue", self.queue)
+        check_count(topic, "queue_bytes", self.queue_bytes)
         if self.keep not in ("newest", "oldest"):
             raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {self.keep!r}")
         if self.callback is not None and not callable(self.callback):
@@ -55,11 +56,11 @@ class SubscriberOptions(msgspec.Struct, frozen=True):
                 check_seconds(f"topic {topic}: {option}", value, least=SHORTEST)
 
 
-class _MonitoredQueue(deque[Sample]):
+class _MonitoredQueue(SampleQueue):
     """A queue that notes the arrival of messages; only for subscribers with a time-out, as it costs time."""
 
-    def __init__(self, note: Callable[[Sample], None]) -> None:
-        super().__init__()
+    def __init__(self, sink: SubscriberQueue, most: int, note: Callable[[Sample], None]) -> None:
+        super().__init__(sink, most)
         self._note = note
 
     def append(self, sample: Sample) -> None:
@@ -111,8 +112,10 @@ class Subscriber(Generic[T]):
         self._last_message = space.clock.monotonic()
         self._alarm = Alarm(space.loop, self._check_silence, background=self._is_idle)
         if options.timeout is not None:
-            self._sink.queue = _MonitoredQueue(self._note)
+            self._sink.queue = _MonitoredQueue(self._sink, options.queue_bytes, self._note)
             self._alarm.set(self._last_message + self._timeout)
+        elif (SIZE_MAX if layout is None else layout.size) * options.queue >= options.queue_bytes:
+            self._sink.queue = SampleQueue(self._sink, options.queue_bytes)
         self.queue = self._sink.queue
         """Unread messages, oldest first."""
 

@@ -69,7 +69,12 @@ class SlotPublisher(abc.ABC):
     @property
     @abc.abstractmethod
     def size(self) -> int:
-        """Bytes of one message."""
+        """Bytes of one message; of the longest, if their length varies."""
+
+    @property
+    @abc.abstractmethod
+    def varies(self) -> bool:
+        """Return whether the length of the messages varies."""
 
     @abc.abstractmethod
     def use_slot_clock(self, slot_link: object, period: float) -> bool:
@@ -257,10 +262,10 @@ class LinkView(Protocol):
     def best_effort(self, publisher_class: PublisherClass) -> bool:
         """Return whether the link gives less than the class asks for."""
 
-    def refusal(self, size: int) -> str | None:
-        """Return the reason why messages of `size` bytes can't be sent on this link, if there is one."""
+    def refusal(self, size: int, *, varies: bool = False) -> str | None:
+        """Return the reason why messages of `size` bytes, or of up to so many, don't all pass, if there is one."""
 
-    def inadmissible(self, size: int, period: float) -> str | None:
+    def inadmissible(self, size: int, period: float, *, varies: bool = False) -> str | None:
         """Return the reason why slots for `size` bytes each `period` seconds are impossible, if there is one."""
 
     def network_time(self) -> int | None:

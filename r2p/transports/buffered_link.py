@@ -20,7 +20,7 @@ from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJo
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import Sample, Source
-from r2p.runtime.topic import Topic
+from r2p.runtime.topic import PublisherHandle, Topic
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, LinkSubscriber
 from r2p.transports.receive_backpressure import LinkBackpressure
 from r2p.units import SECOND
@@ -28,7 +28,11 @@ from r2p.units import SECOND
 _MANAGEMENT = MANAGEMENT.encode()
 _EARLY = SECOND  # ns by which a message may come before the answer to its subscription
 _EARLY_MAX = 256  # messages that come early and are kept: any sender can send them, so there is a limit
+_EARLY_LONG = 64 * 1024  # bytes
 _NOT_SUBSCRIBED = "not subscribed"
+
+TOO_LONG = "too long"
+"""The reason of a message that has more bytes than the link carries: it is counted, and never sent."""
 
 
 class Arrival(Protocol):
@@ -123,6 +127,17 @@ class BufferedLink(Link):
             pass  # the sample that raised is out of the queue: go on with the others
         if not self.full:
             self.wait_queue.recover()
+
+    def count_unsendable(self, topic: str, sample: Sample, reason: str) -> None:
+        """Count a message that the link can't carry, and report it to its publisher, if that is of this module."""
+        self.stats.lost[reason] += 1
+        if (publisher := self.publisher_of(topic, sample)) is not None:
+            publisher.link_missed(self.name, reason, sequence=sample.sequence)
+
+    def publisher_of(self, topic: str, sample: Sample) -> PublisherHandle | None:
+        """Return this module's publisher of a sample, to which its fate is reported; None if another module's."""
+        known = self._space.topics.get(topic)
+        return None if known is None else known.publisher_of(sample)
 
     def on_down(self, reason: str) -> None:
         if self.up:
@@ -268,6 +283,8 @@ class BufferedLink(Link):
         self._early.pop(key, None)
         if len(self._early) >= _EARLY_MAX:
             del self._early[next(iter(self._early))]
+        if len(arrival.data) > _EARLY_LONG:  # one of these at most: with many of them memory would be large
+            self._early = {key: each for key, each in self._early.items() if len(each[0].data) <= _EARLY_LONG}
         self._early[key] = arrival, self._clock.monotonic()
 
     def _publisher_found(self, name: str, size: int, source: Hashable = None) -> None:

@@ -25,8 +25,8 @@ from r2p.names import LOADER_PREFIX, MANAGEMENT
 from r2p.protocols.discovery.negotiation import GRACE
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
-from r2p.runtime.topic import PublisherHandle, Topic
-from r2p.transports.buffered_link import BufferedLink, SenderLookup
+from r2p.runtime.topic import Topic
+from r2p.transports.buffered_link import TOO_LONG, BufferedLink, SenderLookup
 from r2p.transports.link import NOTHING, Hub, is_booting
 from r2p.units import SECOND
 
@@ -225,11 +225,11 @@ class LineLink(BufferedLink):
         try:
             encode = self._encoders[topic]
         except KeyError:
-            encode = self._encoders[topic] = debug.encoder(self.key(topic))
+            encode = self._encoders[topic] = debug.encoder(self.key(topic), empty=topic in self.varying)
         try:
             line = encode(sample.data, deadline)
-        except MessageError:  # only from another link, with a topic of any size
-            self.stats.lost["impossible message"] += 1
+        except MessageError:  # a topic of another link, with messages of any size, or one whose length varies
+            self.count_unsendable(topic, sample, TOO_LONG if sample.data else "impossible message")
             return
         self.stats.sent += 1
         real_time = sample.publisher_class != _NRT
@@ -383,7 +383,7 @@ class LineLink(BufferedLink):
         if unsent is not None:
             topic, sample = unsent
             late = self._clock.now() - sample.deadline
-            if sample.deadline and late > 0 and (publisher := self._publisher(topic, sample)) is not None:
+            if sample.deadline and late > 0 and (publisher := self.publisher_of(topic, sample)) is not None:
                 publisher.link_late(self.name, "sent late", late / SECOND)
 
     def _lose_unsent(self) -> None:
@@ -391,13 +391,9 @@ class LineLink(BufferedLink):
         if unsent is not None:
             self.stats.sent -= 1
             self.stats.lost[LINK_DOWN] += 1
-            publisher = self._publisher(*unsent)
+            publisher = self.publisher_of(*unsent)
             if publisher is not None:
                 publisher.link_missed(self.name, LINK_DOWN, sequence=unsent[1].sequence)
-
-    def _publisher(self, name: str, sample: Sample) -> PublisherHandle | None:
-        topic = self._space.topics.get(name)
-        return None if topic is None else topic.publisher_of(sample)
 
     # The loader's topic flows without a handshake while its module is in boot mode (PROTOCOL.md 5): that of a module at
     # the other end, or this module itself.
@@ -412,6 +408,7 @@ class LineLink(BufferedLink):
         self.module_changed(self._space.module)
 
     def topic_changed(self, topic: Topic) -> None:
+        self._encoders.pop(topic.name, None)  # it may take empty messages from now on, or no longer
         super().topic_changed(topic)
         if topic.name.startswith(LOADER_PREFIX):
             self._match_loader(topic)

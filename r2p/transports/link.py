@@ -185,6 +185,8 @@ class Link(abc.ABC):
 
     max_payload: ClassVar[int] = 255
     """Bytes of the longest message."""
+    max_variable: ClassVar[int | None] = None
+    """Bytes of the longest message of those whose length varies; None: the same."""
     max_name: ClassVar[int] = TOPIC_MAX
     """Characters of the longest topic's name."""
     passes_probes: ClassVar[bool] = True
@@ -222,6 +224,8 @@ class Link(abc.ABC):
         self._alarm = Alarm(hub.space.loop, self._poll, background=True)  # announcements keep no program going
         self._subscribers: dict[str, LinkSubscriber] = {}
         """Subscribers at the other end as publishers here see them, by topic."""
+        self.varying: set[str] = set()
+        """Topics that are published on the link, by this module or a gateway, and whose messages vary in length."""
         self._announced: dict[str, Announcement] = {}
         self._lapsed: set[str] = set()  # topics that lost their subscribers while the link was down
         self._events: deque[Event] = deque()
@@ -343,12 +347,21 @@ class Link(abc.ABC):
         """Return whether the link gives less than the class asks for."""
         return publisher_class != PublisherClass.NON_REAL_TIME
 
-    def refusal(self, size: int) -> str | None:
-        """Return why messages of `size` bytes can't be sent on this link; None if they can."""
-        too_long = size > self.max_payload
-        return f"{size} bytes, and it carries at most {self.max_payload} in a message" if too_long else None
+    def longest(self, *, varies: bool) -> int:
+        """Return the bytes of the longest message that the link carries, of those whose length `varies` or is fixed."""
+        return self.max_variable if varies and self.max_variable is not None else self.max_payload
 
-    def inadmissible(self, size: int, period: float) -> str | None:
+    def refusal(self, size: int, *, varies: bool = False) -> str | None:
+        """Return why messages of `size` bytes can't be sent on this link; None if they can.
+
+        Of messages whose length `varies`, up to `size` bytes, those pass that fit; the others are counted.
+        """
+        most = self.longest(varies=varies)
+        if size <= most:
+            return None
+        return f"{'up to ' if varies else ''}{size} bytes, and it carries at most {most} in a message"
+
+    def inadmissible(self, size: int, period: float, *, varies: bool = False) -> str | None:
         """Return why there can never be slots for messages of `size` bytes each `period` seconds; None if there can."""
         return None
 
@@ -407,8 +420,12 @@ class Link(abc.ABC):
         if not is_used or self.discovery.rival(topic.name):
             desired = NOTHING
         known = self._announced.pop(topic.name, NOTHING)
-        # A gateway passes on those messages of variable length that the link can carry, and counts the others.
-        refused = self.refusal(desired.size) is not None and not (desired.varies and topic.layout is None)
+        # Of messages of variable length those pass that the link can carry, and the others are counted.
+        refused = not desired.varies and self.refusal(desired.size) is not None
+        if desired.varies and desired.publishes:  # before subscribers are found, who may get a latched value at once
+            self.varying.add(topic.name)
+        else:
+            self.varying.discard(topic.name)
         params = self.params(topic.name) if desired.publishes and not refused else None
         queue = self.window(topic) if desired.subscribes else QUEUE
         desired = msgspec.structs.replace(

@@ -25,7 +25,10 @@ from r2p.transports.link import Hub, Transport
 from r2p.transports.url import Url, duration
 
 IN_FLIGHT = 1024
-"""Messages on their way at which the network is full for senders."""
+"""Places for messages on their way, without which the network is full for senders."""
+
+_PLACE = 64 * 1024
+"""Bytes of a message in each place: so what is on its way has 64 MiB at most, and one message more."""
 
 
 class Datagram(msgspec.Struct, frozen=True, gc=False):
@@ -64,8 +67,9 @@ class MemoryPort:
         """Hand on held messages."""
         self.paused = False
         while self.held and not self.paused:
-            self.network.release()
-            self.receive(self.held.popleft())
+            datagram = self.held.popleft()
+            self.network.release(_places(datagram))
+            self.receive(datagram)
 
 
 class MemoryNetwork:
@@ -118,7 +122,7 @@ class MemoryNetwork:
     def unplug(self, address: int) -> None:
         port = self._ports.pop(address, None)
         if port is not None:
-            self.release(len(port.held))
+            self.release(sum(map(_places, port.held)))
             port.held.clear()
 
     def send(self, datagram: Datagram) -> None:
@@ -127,10 +131,10 @@ class MemoryNetwork:
             if address != datagram.port:
                 self._send_to(address, datagram)
 
-    def release(self, count: int = 1) -> None:
+    def release(self, places: int) -> None:
         """Note that messages are no longer on their way."""
         was_full = self.full
-        self._in_flight -= count
+        self._in_flight -= places
         if was_full and not self.full:
             for port in list(self._ports.values()):
                 port.made_room()
@@ -160,7 +164,7 @@ class MemoryNetwork:
 
     def _schedule(self, delay: float, address: int, datagram: Datagram) -> None:
         loop = asyncio.get_running_loop()
-        self._in_flight += 1
+        self._in_flight += _places(datagram)
         if delay:
             in_background(loop.call_later(delay, self._arrive, address, datagram))
         else:
@@ -169,14 +173,18 @@ class MemoryNetwork:
     def _arrive(self, address: int, datagram: Datagram) -> None:
         port = self._ports.get(address)
         if port is None:
-            self.release()
+            self.release(_places(datagram))
             return
         self.counts["delivered"] += 1
         if port.paused:
             port.held.append(datagram)
             return
-        self.release()
+        self.release(_places(datagram))
         port.receive(datagram)
+
+
+def _places(datagram: Datagram) -> int:
+    return 1 + len(datagram.data) // _PLACE
 
 
 _networks: "weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, dict[str, MemoryNetwork]]" = (

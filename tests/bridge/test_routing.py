@@ -41,7 +41,7 @@ async def test_a_message_too_long_for_the_next_link_is_counted_and_the_others_pa
             tap._network.send(Datagram(tap._address, b"boom", bytes(size)))
         await asyncio.sleep(0.1)
         assert [len(each) for each in script.topics("boom")] == [1, 255, 2]
-        assert script.link.losses == {"impossible message": 3}
+        assert script.link.losses == {"too long": 2, "impossible message": 1}
         assert script.link.stats.sent == 3
 
 

@@ -152,12 +152,16 @@ class SubscriberLeft(msgspec.Struct, frozen=True):
 
 
 class PublisherFound(msgspec.Struct, frozen=True):
-    """A remote publisher is new, or has new parameters: accept its messages. `size` is in bytes, 0: unknown."""
+    """A remote publisher is new, or has new parameters: accept its messages. `size` is in bytes, 0: unknown, or their
+    length `varies`: then they have at most `bound` bytes.
+    """
 
     topic: str
     source: PeerAddress
     params: bytes
     size: int
+    varies: bool = False
+    bound: int = 0
 
 
 class PublisherGone(msgspec.Struct, frozen=True):

@@ -146,8 +146,9 @@ class SubscriptionNegotiation:
         if peer.publishers.get(topic) != (message.params, message.size):
             self._own.publisher_counts[topic] += topic not in peer.publishers
             peer.publishers[topic] = (message.params, message.size)
-            size = TopicType.announced(message.size).exact_size
-            self._outbox.emit(PublisherFound(topic, source, message.params, size))
+            theirs = TopicType.announced(message.size)
+            bound = theirs.size if theirs.varies else 0
+            self._outbox.emit(PublisherFound(topic, source, message.params, theirs.exact_size, theirs.varies, bound))
 
     def typed(self, now: int, message: management.TypeInfo, source: PeerAddress) -> None:
         """Handle TYPE: compare a peer's type of a topic with this module's, if it has the topic."""

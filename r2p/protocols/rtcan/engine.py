@@ -238,9 +238,13 @@ class Engine:
             self.management.send_bytes(now, data, urgent=urgent, handle=handle)
         return self._drain()
 
-    def subscribe(self, message: int, size: int) -> None:
-        """Receive the messages with this id, of `size` bytes each. Raises `MessageError` beyond 1..1024."""
-        self.reassembly.subscribe(message, size)
+    def subscribe(self, message: int, size: int, *, varies: bool = False) -> None:
+        """Receive the messages with this id, of `size` bytes each. Raises `MessageError` beyond 1..1024.
+
+        If their length `varies`, they have a header (`rtcan.encode_variable`), and `size` is a bound without it: 0 says
+        that all are empty.
+        """
+        self.reassembly.subscribe(message, size, varies=varies)
 
     def unsubscribe(self, message: int) -> None:
         """Stop receiving messages with this id."""
@@ -249,17 +253,28 @@ class Engine:
     # Periodic messages
 
     def reserve(
-        self, now: int, high: int, size: int, interval: int, *, lead: int = 0, handle: Hashable = None
+        self,
+        now: int,
+        high: int,
+        size: int,
+        interval: int,
+        *,
+        lead: int = 0,
+        varies: bool = False,
+        handle: Hashable = None,
     ) -> Sequence[Action]:
         """Send a message of `size` bytes every `interval` ns, in slots of its own if the master grants them.
 
-        `Due` asks for the data, `lead` ns before the slot. Raises `MessageError` for a size that RTCAN can't carry.
+        If its length `varies`, it has at most so many, header included, and slots for all of them. `Due` asks for the
+        data, `lead` ns before the slot. Raises `MessageError` for a size that RTCAN can't carry.
         """
         _check_topic(high)
         fragments = rtcan.fragment_count(size)
         self._end_periodic(now, high)
         message = self._message_id(high) if self.ready else 0
-        periodic = self.periodics[high] = PeriodicMessage(high, message, size, fragments, interval, lead, handle)
+        periodic = self.periodics[high] = PeriodicMessage(
+            high, message, size, fragments, interval, lead, handle, varies
+        )
         if self.ready:
             self.requests.start(now, periodic)
         return self._drain()
@@ -269,7 +284,7 @@ class Engine:
         periodic = self.periodics.get(high)
         if periodic is None or not self.ready:
             return self._drain()
-        if payload is not None and len(payload) != periodic.size:
+        if payload is not None and not periodic.takes(len(payload)):
             raise ValueError(f"{len(payload)} bytes for a periodic message of {periodic.size}")
         if not periodic.ticked:
             self.transmitter.fill(now, periodic, payload)

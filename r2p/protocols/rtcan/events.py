@@ -70,11 +70,15 @@ class Fate(enum.Enum):
 
 
 class Received(msgspec.Struct, frozen=True, gc=False):
-    """A complete message. `identifier` is its first frame's, `stamp` the end of that frame."""
+    """A complete message. `identifier` is its first frame's, `stamp` the end of that frame.
+
+    `header` was in front of the payload, if the length of the topic's messages varies.
+    """
 
     identifier: int
     payload: bytes
     stamp: int
+    header: bytes = b""
 
     @property
     def message(self) -> int:
@@ -102,7 +106,8 @@ class Received(msgspec.Struct, frozen=True, gc=False):
 
     def started(self, bit: int) -> int:
         """Return the start of the first frame, exact to the stuff bits; `bit` is the bit time (ns). Takes 5 us."""
-        return start_of_frame(Frame(self.identifier, self.payload[: rtcan.FRAME_MAX]), self.stamp, bit)
+        first = (self.header + self.payload)[: rtcan.FRAME_MAX]
+        return start_of_frame(Frame(self.identifier, first), self.stamp, bit)
 
 
 class Done(msgspec.Struct, frozen=True, gc=False):

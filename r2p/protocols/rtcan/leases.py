@@ -28,12 +28,13 @@ _AHEAD = 1  # cycles from a grant to its first slot: by then all nodes have the 
 
 
 class PeriodicMessage(msgspec.Struct, eq=False):
-    """A message that goes every `interval` ns. `lead`: how long before its slot its data are needed (ns).
+    """A message that goes every `interval` ns. `lead`: how long before its slot its data are needed (ns). It has `size`
+    bytes; at most so many if its length `varies`: then it leaves some of its slots empty.
 
-    `active`: its slots may be used, from `from_cycle` on. Of an occurrence: `payload` to send, frames `sent`, and
-    `waiting`, the number of the slot for which data were asked but not given yet. Without slots: `tick`, when it is due
-    next, and `ticked`, whether data were asked. Of its requests: `asked`, when each was sent, by serial; `confirmed`,
-    when the one was sent that was granted last; `refused`, the reason of the last `SlotsRefused`.
+    `active`: its slots may be used, from `from_cycle` on. Of an occurrence: `payload` to send in so many `frames`,
+    those `sent`, and `waiting`, the number of the slot for which data were asked but not given yet. Without slots:
+    `tick`, when it is due next, and `ticked`, whether data were asked. Of its requests: `asked`, when each was sent, by
+    serial; `confirmed`, when the one was sent that was granted last; `refused`, the reason of the last `SlotsRefused`.
     """
 
     high: int
@@ -43,10 +44,12 @@ class PeriodicMessage(msgspec.Struct, eq=False):
     interval: int
     lead: int
     handle: Hashable
+    varies: bool = False
     reservation: Reservation | None = None
     active: bool = False
     from_cycle: int = 0
     payload: bytes | None = None
+    frames: int = 0
     sent: int = 0
     waiting: int | None = None
     unknown: bool = False
@@ -56,10 +59,15 @@ class PeriodicMessage(msgspec.Struct, eq=False):
     confirmed: int = LONG_AGO
     refused: str = ""
 
+    def takes(self, size: int) -> bool:
+        """Return whether the message may have so many bytes."""
+        return size == self.size or (self.varies and size < self.size)
+
     def restart(self, payload: bytes | None = None) -> bool:
         """Begin the next occurrence, with fresh data; return whether data of the previous one were left."""
         unfinished = self.payload is not None
         self.payload = payload
+        self.frames = 0 if payload is None else rtcan.fragment_count(len(payload))
         self.sent = 0
         self.waiting = None
         self.unknown = False

@@ -1,8 +1,11 @@
 """Frames to messages, with losses by source (PROTOCOL.md 6).
 
-A frame says only how many follow it, so a beginning is known by the size that its topic must have. A frame that
-does not continue a message in the right way ends it; the rest is skipped up to the next beginning. A repeat of the last
-frame, which CAN can make, is not a gap.
+A frame says only how many follow it, so a beginning is known by the size that its topic must have, or, where the length
+varies, by a header whose length fits that number. A frame that does not continue a message in the right way ends it;
+the rest is skipped up to the next beginning. A repeat of the last frame, which CAN can make, is not a gap.
+
+Where the length varies, frames of two messages can look like one: then the checksum is wrong, and the message counts as
+"damaged".
 """
 
 from collections import Counter, defaultdict
@@ -10,7 +13,8 @@ from collections import Counter, defaultdict
 import msgspec
 
 from r2p.codecs import rtcan
-from r2p.codecs.rtcan import FRAME_MAX, LEFT_MASK, MESSAGE_MAX, MESSAGE_SHIFT, Frame
+from r2p.codecs.rtcan import FRAME_MAX, HEADER_SIZE, LEFT_MASK, MESSAGE_MAX, MESSAGE_SHIFT, Frame
+from r2p.errors import DecodeError
 from r2p.protocols.rtcan.events import Received
 from r2p.units import NEVER
 
@@ -20,7 +24,8 @@ _IDLE = -1  # `SourceBuffer.expected` between two messages
 
 
 class SourceBuffer(msgspec.Struct, eq=False):
-    """The unfinished message of one publisher. All of them have `size` bytes, and begin with `first` fragments left.
+    """The unfinished message of one publisher. All of them have `size` bytes, and begin with `first` fragments left; if
+    their length `varies`, each has its own, and `empty` says that all are.
 
     With `parts`, a message is being received and `expected` is the number of its next frame; without, frames from
     `expected` down are the rest of a lost one. `tail` is the last frame of the previous message.
@@ -29,6 +34,8 @@ class SourceBuffer(msgspec.Struct, eq=False):
     message: int
     first: int
     size: int
+    varies: bool = False
+    empty: bool = False
     expected: int = _IDLE
     parts: list[bytes] = msgspec.field(default_factory=list)
     identifier: int = 0
@@ -47,13 +54,14 @@ class Reassembly:
         self.open: dict[int, SourceBuffer] = {}
         """Unfinished messages by id, the oldest first."""
 
-    def subscribe(self, message: int, size: int) -> None:
-        """Receive messages with this id, of `size` bytes. Raises `MessageError` beyond 1..1024."""
+    def subscribe(self, message: int, size: int, *, varies: bool = False) -> None:
+        """Receive messages with this id, of `size` bytes, or at most so many. Raises `MessageError` beyond 1..1024."""
         before = self._buffers.get(message)
-        if before is None or before.size != size:
-            buffer = SourceBuffer(message, rtcan.fragment_count(size) - 1, size)
-            self.unsubscribe(message)
-            self._buffers[message] = buffer
+        if varies:
+            if before is None or (before.varies, before.empty) != (True, not size):
+                self._enter(SourceBuffer(message, 0, 0, varies=True, empty=not size))
+        elif before is None or before.varies or before.size != size:
+            self._enter(SourceBuffer(message, rtcan.fragment_count(size) - 1, size))
 
     def unsubscribe(self, message: int) -> None:
         """Stop receiving messages with this id; an unfinished one is lost."""
@@ -83,7 +91,7 @@ class Reassembly:
         if buffer is None:
             return None
         left = identifier & LEFT_MASK
-        if buffer.first or left or buffer.expected != _IDLE:
+        if buffer.first or left or buffer.expected != _IDLE or buffer.varies:
             return self._fragment(buffer, frame, left, stamp)
         if len(data) == buffer.size:
             return Received(identifier, data, stamp)
@@ -110,6 +118,10 @@ class Reassembly:
             self._reset(buffer, "interrupted")
             buffer.expected = _IDLE
 
+    def _enter(self, buffer: SourceBuffer) -> None:
+        self.unsubscribe(buffer.message)
+        self._buffers[buffer.message] = buffer
+
     def _fragment(self, buffer: SourceBuffer, frame: Frame, left: int, stamp: int) -> Received | None:
         if stamp - buffer.last > TIMEOUT:
             if buffer.parts:
@@ -118,7 +130,7 @@ class Reassembly:
         if not buffer.parts:
             return self._begin(buffer, frame, left, stamp)
         if left == buffer.expected:
-            return self._continue(buffer, frame.data, stamp)
+            return self._continue(buffer, frame, stamp)
         if left == buffer.expected + 1 and frame.data == buffer.parts[-1]:
             self._lose(buffer.message, "repeat")
             return None
@@ -130,25 +142,27 @@ class Reassembly:
     def _begin(self, buffer: SourceBuffer, frame: Frame, left: int, stamp: int) -> Received | None:
         """Handle a frame without an open message: a beginning, or part of a message without its beginning."""
         rest = left == buffer.expected  # of something that has been counted as lost
-        if left == buffer.first and not rest:
+        if _begins_variable(buffer, frame, left, rest=rest) if buffer.varies else left == buffer.first and not rest:
             buffer.identifier, buffer.started = frame.id, stamp
-            return self._continue(buffer, frame.data, stamp)
+            return self._continue(buffer, frame, stamp)
         if left == 0 and not rest and frame.data == buffer.tail:
             self._lose(buffer.message, "repeat")
         elif not rest:
-            self._lose(buffer.message, "too long" if left > buffer.first else "no beginning")
+            too_long = left > buffer.first and not buffer.varies
+            self._lose(buffer.message, "too long" if too_long else "no beginning")
         buffer.expected = left - 1
         buffer.last = stamp
         return None
 
-    def _continue(self, buffer: SourceBuffer, data: bytes, stamp: int) -> Received | None:
-        left = buffer.first - len(buffer.parts)
-        buffer.expected = left - 1
+    def _continue(self, buffer: SourceBuffer, frame: Frame, stamp: int) -> Received | None:
+        data, left = frame.data, buffer.first - len(buffer.parts)
         buffer.last = stamp
         # Only the last frame may be shorter.
         if len(data) != (FRAME_MAX if left else buffer.size - buffer.first * FRAME_MAX):
-            self._reset(buffer, "wrong length")
-            return None
+            self._reset(buffer, "damaged" if buffer.varies else "wrong length")
+            buffer.expected = left  # the rest of it, unless it begins another message
+            return self._begin(buffer, frame, left, stamp)
+        buffer.expected = left - 1
         buffer.parts.append(data)
         self.open.pop(buffer.message, None)
         if left:
@@ -157,7 +171,26 @@ class Reassembly:
         payload = b"".join(buffer.parts)
         buffer.parts.clear()
         buffer.tail = data
+        if buffer.varies:
+            return self._check_variable(buffer, payload, frame, stamp)
         return Received(buffer.identifier, payload, buffer.started)
+
+    def _check_variable(self, buffer: SourceBuffer, data: bytes, frame: Frame, stamp: int) -> Received | None:
+        """Return the message, if its checksum is right; else the one that is in its last frame alone, if there is one.
+
+        That one would else be lost along with the message before it, whose last frame is missing.
+        """
+        if buffer.first == 0:
+            buffer.tail = b""  # equal messages of one frame are no repeats
+        try:
+            return Received(buffer.identifier, rtcan.decode_variable(data), buffer.started, data[:HEADER_SIZE])
+        except DecodeError:
+            self._lose(buffer.message, "damaged")
+        alone, buffer.tail = buffer.first > 0, b""
+        if alone and _begins_variable(buffer, frame, 0, rest=True):
+            header, payload = frame.data[:HEADER_SIZE], frame.data[HEADER_SIZE:]
+            return Received(frame.id, payload, stamp, header)
+        return None
 
     def _reset(self, buffer: SourceBuffer, reason: str) -> None:
         self._lose(buffer.message, reason)
@@ -167,3 +200,24 @@ class Reassembly:
     def _lose(self, message: int, reason: str) -> None:
         counts = self.losses[rtcan.id8_of(message)]
         counts[reason] += 1
+
+
+def _begins_variable(buffer: SourceBuffer, frame: Frame, left: int, *, rest: bool) -> bool:
+    """Return whether a frame begins a message whose length varies, and note its size. `rest`: it may be left over from
+    a message that is lost, so one frame alone must be right as a whole.
+    """
+    if left == 0 and frame.data == buffer.tail:
+        return False  # a repeat, whatever it looks like
+    size = rtcan.beginning_of(frame.data, left, empty=buffer.empty)
+    if not size or (rest and not left and not _is_whole(frame.data)):
+        return False
+    buffer.first, buffer.size = left, size
+    return True
+
+
+def _is_whole(data: bytes) -> bool:
+    try:
+        rtcan.decode_variable(data)
+    except DecodeError:
+        return False
+    return True

@@ -452,7 +452,7 @@ class SlotTransmitter:
         payload, mask = periodic.payload, self._cycle.mask
         assert payload is not None
         at = fragment * FRAME_MAX
-        identifier = rtcan.encode_identifier(rtcan.HRT, periodic.message, periodic.fragments - 1 - fragment)
+        identifier = rtcan.encode_identifier(rtcan.HRT, periodic.message, periodic.frames - 1 - fragment)
         frame = Frame(identifier, payload[at : at + FRAME_MAX])
         start = self._cycle.reference + slot * self._slot
         # To the stuff bit, as there is no other slot for it; a passed slot is missed.
@@ -475,7 +475,7 @@ class SlotTransmitter:
             return
         periodic.unknown = periodic.unknown or outcome is _UNKNOWN
         periodic.sent += 1
-        if periodic.sent == periodic.fragments:
+        if periodic.sent == periodic.frames:
             fate = Fate.UNKNOWN if periodic.unknown else _ALL_SENT
             periodic.restart()
             self._report(periodic.handle, fate, missed=False, at=at)

@@ -88,6 +88,11 @@ class BasePublisher(Generic[M, C]):
         return self._topic.layout.size if self._topic.layout else 0
 
     @property
+    def varies(self) -> bool:
+        """True if the length of the messages varies."""
+        return self._topic.layout is not None and self._topic.layout.varies
+
+    @property
     def subscribers(self) -> int:
         """The number of subscribers now: queues of this module, and links with subscribers behind them."""
         return len(self._topic.queues) + sum(remote.reachable for remote in self._topic.remote_subscribers)

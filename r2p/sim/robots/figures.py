@@ -243,7 +243,7 @@ class FiguresReader:
             of = link.engine.timing.slots
             for each in link.slots.values():
                 if each.period:
-                    used += of / each.period * rtcan.fragment_count(each.publisher.size)
+                    used += of / each.period * rtcan.fragment_count(each.size)
         return used, of
 
 

@@ -160,7 +160,14 @@ def _guarantees(session: Session, view: r2p.TopicView) -> dict[str, str]:
     guarantees = {}
     for link in session.module.links:
         for publisher_class in sorted(classes or {r2p.PublisherClass.NON_REAL_TIME}):
-            refusal = link.refusal(view.size)
-            text = f"not carried: {refusal}" if refusal else link.guarantee(view.name, publisher_class)
-            guarantees[f"{link.name} {CLASS_NAMES[publisher_class]}"] = text
+            guarantees[f"{link.name} {CLASS_NAMES[publisher_class]}"] = _carried(
+                link.refusal(view.size, varies=view.varies), link.guarantee(view.name, publisher_class), view
+            )
     return guarantees
+
+
+def _carried(refusal: str | None, guarantee: str, view: r2p.TopicView) -> str:
+    """Return a link's guarantee, and why it does not carry the topic, or not all of its messages."""
+    if refusal is None:
+        return guarantee
+    return f"{guarantee}; its longest messages are not carried: {refusal}" if view.varies else f"not carried: {refusal}"

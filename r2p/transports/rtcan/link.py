@@ -38,7 +38,7 @@ from r2p.protocols.rtcan.master import Role
 from r2p.protocols.rtcan.topic_ids import TopicIdAllocator
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
-from r2p.transports.buffered_link import BufferedLink, SenderLookup
+from r2p.transports.buffered_link import TOO_LONG, BufferedLink, SenderLookup
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, unique_name
 from r2p.transports.rtcan.driver import EngineDriver, UtcEstimator
@@ -84,6 +84,7 @@ class RtcanLink(BufferedLink):
     """A module's link to an RTCAN bus. `utc_error` (ns): the accuracy of the module's UTC, None if unknown."""
 
     max_payload: ClassVar[int] = rtcan.PAYLOAD_MAX
+    max_variable: ClassVar[int] = rtcan.VARIABLE_MAX
     has_slots: ClassVar[bool] = True
 
     def __init__(
@@ -223,7 +224,8 @@ class RtcanLink(BufferedLink):
         """Return the start of the first frame; roughly on a coarse port, whose stamps do not justify counting bits."""
         bit = self.engine.timing.bit
         if self.driver.port.coarse:
-            return received.stamp - can_bits.frame_bits_max(min(len(received.payload), rtcan.FRAME_MAX)) * bit
+            first = min(len(received.header) + len(received.payload), rtcan.FRAME_MAX)
+            return received.stamp - can_bits.frame_bits_max(first) * bit
         return received.started(bit)
 
     def sender(self, arrival: ReceivedMessage) -> Hashable:
@@ -254,8 +256,8 @@ class RtcanLink(BufferedLink):
 
     def _act(self, event: Event) -> None:
         match event:
-            case PublisherFound(topic, source, params, size):
-                self._message_ids.add(self._clock.monotonic(), topic, source, params, size)
+            case PublisherFound():
+                self._message_ids.add(self._clock.monotonic(), event)
                 self.driver.update_filters()
             case PublisherGone(topic, source):
                 self._message_ids.remove(self._clock.monotonic(), topic, source)
@@ -275,12 +277,17 @@ class RtcanLink(BufferedLink):
         return self._transmitter.has_room_for(sample)
 
     def write(self, topic: str, sample: Sample) -> None:
-        high = self._topic_ids.pick(topic)
+        high, data = self._topic_ids.pick(topic), sample.data
+        if topic in self.varying:
+            if len(data) > self.max_variable:
+                self.count_unsendable(topic, sample, TOO_LONG)
+                return
+            data = rtcan.encode_variable(data)
         # Only topics of other links, which a gateway forwards, may have no message id or messages of any size.
-        if high is None or not 1 <= len(sample.data) <= self.max_payload:
-            self.stats.lost["impossible message"] += 1
+        if high is None or not 1 <= len(data) <= self.max_payload:
+            self.count_unsendable(topic, sample, "impossible message" if high is None or not data else TOO_LONG)
             return
-        self.driver.carry_out(self._transmitter.send(self._subscribers.get(topic), topic, high, sample))
+        self.driver.carry_out(self._transmitter.send(self._subscribers.get(topic), topic, high, sample, data))
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         self.driver.carry_out(self._transmitter.send_management(data, urgent=urgent))
@@ -352,8 +359,8 @@ class RtcanLink(BufferedLink):
     def best_effort(self, publisher_class: PublisherClass) -> bool:
         return publisher_class == PublisherClass.PERIODIC and bool(no_slots(self.engine))
 
-    def inadmissible(self, size: int, period: float) -> str | None:
-        return inadmissible(self.engine.timing, size, period)
+    def inadmissible(self, size: int, period: float, *, varies: bool = False) -> str | None:
+        return inadmissible(self.engine.timing, rtcan.size_on_bus(size, varies=varies), period)
 
     async def admission(self, topic: str) -> None:
         """Wait until a periodic topic sends in slots of its own, if it ever can."""

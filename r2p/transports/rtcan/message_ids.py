@@ -10,7 +10,7 @@ from collections.abc import Callable
 from r2p.codecs import management, rtcan
 from r2p.codecs.management import Advertise, Alive, ManagementType, SubscribeResponse
 from r2p.errors import DecodeError
-from r2p.protocols.discovery.events import ModuleInfo, PeerAddress
+from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, PublisherFound
 from r2p.protocols.rtcan.engine import Engine
 from r2p.protocols.rtcan.events import Profile
 from r2p.runtime.topic import TopicSpace
@@ -76,20 +76,23 @@ class MessageIdMap:
         self._space = space
         self._ids: defaultdict[tuple[str, PeerAddress], set[int]] = defaultdict(set)
 
-    def add(self, now: int, name: str, source: PeerAddress, params: bytes, size: int) -> None:
-        """Receive the messages of a publisher, of `size` bytes unless the topic has a type here."""
-        topic = self._space.topics.get(name)
+    def add(self, now: int, found: PublisherFound) -> None:
+        """Receive the messages of a publisher: of the announced size, unless the topic has a type here."""
+        topic = self._space.topics.get(found.topic)
         if topic is None or not topic.wanted:
             return
-        size = topic.layout.size if topic.layout is not None else size
-        message_id = management.rtcan_message_id(params)
-        if not self._plausible(message_id, source) or not 1 <= size <= rtcan.PAYLOAD_MAX:
+        size, varies = found.bound if found.varies else found.size, found.varies
+        if topic.layout is not None:
+            size, varies = topic.layout.size, topic.layout.varies
+        message_id = management.rtcan_message_id(found.params)
+        possible = varies or 1 <= size <= rtcan.PAYLOAD_MAX
+        if not (possible and self._plausible(message_id, found.source)):
             self._link.stats.lost["impossible publisher"] += 1
             return
-        self._assign(now, message_id, name, source)
+        self._assign(now, message_id, found.topic, found.source)
         self.lingering.pop(message_id, None)
-        self._engine.subscribe(message_id, size)
-        self._link.add_publisher(topic, size, message_id)
+        self._engine.subscribe(message_id, size, varies=varies)
+        self._link.add_publisher(topic, 0 if varies else size, message_id)
 
     def remove(self, now: int, name: str, source: PeerAddress) -> None:
         """Stop receiving from this publisher, or from all firmware."""

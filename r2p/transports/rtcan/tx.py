@@ -19,7 +19,8 @@ from r2p.protocols.rtcan.events import Action, Done, Due, Fate, Profile, SlotEve
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import PublisherHandle, SlotPublisher, Topic
-from r2p.transports.link import Link, LinkSubscriber
+from r2p.transports.buffered_link import TOO_LONG, BufferedLink
+from r2p.transports.link import LinkSubscriber
 from r2p.transports.rtcan.driver import EngineDriver
 from r2p.units import NEVER, SECOND
 
@@ -40,7 +41,8 @@ _SENT = (Fate.SENT, Fate.UNKNOWN)
 
 
 class SlottedTopic(msgspec.Struct, eq=False):
-    """A periodic topic and its slots. `period` and `phase` are in slots (0: none granted), `interval` in ns.
+    """A periodic topic and its slots. `period` and `phase` are in slots (0: none granted), `interval` in ns. `size`:
+    bytes of its messages on the bus, at most.
 
     `is_clock`: these slots are the publisher's clock; `clock_elsewhere`: those of another link are. `sent` and `missed`
     count messages since the grant; `earliest` and `latest` are when they ended, in ns from the start of their first
@@ -50,6 +52,7 @@ class SlottedTopic(msgspec.Struct, eq=False):
     topic: Topic
     publisher: SlotPublisher
     high: int
+    size: int
     period: int = 0
     phase: int = 0
     interval: int = 0
@@ -74,8 +77,8 @@ class SlottedTopic(msgspec.Struct, eq=False):
         if not self.period:
             return f"refused: {self.refusal}" if self.refusal else "waiting for admission"
         text = f"a slot every {self.period} slots ({self.interval / 1e6:g} ms), phase {self.phase}"
-        if self.publisher.size > rtcan.FRAME_MAX:
-            text = text.replace("a slot", f"{rtcan.fragment_count(self.publisher.size)} slots", 1)
+        if self.size > rtcan.FRAME_MAX:
+            text = text.replace("a slot", f"{rtcan.fragment_count(self.size)} slots", 1)
         jitter = (self.latest - self.earliest) // 1000
         if jitter or self.missed:
             text += f"; jitter {jitter} us, {self.missed} of {self.sent + self.missed} missed their slot"
@@ -83,7 +86,7 @@ class SlottedTopic(msgspec.Struct, eq=False):
 
 
 def inadmissible(timing: Timing, size: int, period: float) -> str | None:
-    """The reason why messages of `size` bytes each `period` seconds can never have slots; None if they may."""
+    """The reason why messages of `size` bytes on the bus never get slots each `period` seconds; None if they may."""
     wanted = round(period * SECOND) // timing.slot
     fragments = rtcan.fragment_count(size)
     any_message = rtcan.message_id(rtcan.FIRST_TOPIC, 0)
@@ -99,7 +102,7 @@ class SlottedTopics:
     sends, as for every other link, and the link sends soft real-time messages.
     """
 
-    def __init__(self, link: Link, driver: EngineDriver, has_subscribers: Callable[[str], bool]) -> None:
+    def __init__(self, link: BufferedLink, driver: EngineDriver, has_subscribers: Callable[[str], bool]) -> None:
         """`has_subscribers` returns whether a topic has reachable subscribers on the bus."""
         self.by_topic: dict[str, SlottedTopic] = {}
         self._link = link
@@ -119,7 +122,8 @@ class SlottedTopics:
             self._release(known)  # slots belong to a message id, and are as long as the publisher's messages
             known = None
         if known is None and publisher is not None and high is not None:
-            self._reserve(SlottedTopic(topic, publisher, high))
+            size = rtcan.size_on_bus(publisher.size, varies=publisher.varies)
+            self._reserve(SlottedTopic(topic, publisher, high, size))
 
     async def wait_for_change(self) -> None:
         self._changed.clear()  # tasks that wait already were woken by `set`
@@ -188,15 +192,24 @@ class SlottedTopics:
         sample = each.publisher.tick(scheduled, late, max(0, since - 1))
         if sample is None or not self._has_subscribers(each.topic.name):
             return None
+        data = sample.data
+        if each.publisher.varies:
+            if len(data) + rtcan.HEADER_SIZE > each.size:
+                self._link.count_unsendable(each.topic.name, sample, TOO_LONG)
+                return None
+            data = rtcan.encode_variable(data)
         self._link.stats.sent += 1
         self._link.stats.bytes_sent += len(sample.data)
-        return sample.data
+        return data
 
     def _reserve(self, each: SlottedTopic) -> None:
         self.by_topic[each.topic.name] = self._by_high[each.high] = each
-        interval, lead = round(each.publisher.period * SECOND), round(each.publisher.lead * SECOND)
-        engine, now = self._driver.engine, self._driver.now()
-        self._driver.carry_out(engine.reserve(now, each.high, each.publisher.size, interval, lead=lead, handle=each))
+        publisher, engine, now = each.publisher, self._driver.engine, self._driver.now()
+        interval, lead = round(publisher.period * SECOND), round(publisher.lead * SECOND)
+        varies = publisher.varies
+        self._driver.carry_out(
+            engine.reserve(now, each.high, each.size, interval, lead=lead, varies=varies, handle=each)
+        )
 
     def _release(self, each: SlottedTopic) -> None:
         self._lose_slots(each)
@@ -229,7 +242,7 @@ class ResponseHandle(msgspec.Struct, eq=False):
 class Transmitter:
     """Passes a link's messages to the engine, counts them there, and reports late and lost ones."""
 
-    def __init__(self, link: Link, driver: EngineDriver, slotted: SlottedTopics) -> None:
+    def __init__(self, link: BufferedLink, driver: EngineDriver, slotted: SlottedTopics) -> None:
         self._name = link.name
         self._stats = link.stats
         self._driver = driver
@@ -254,9 +267,14 @@ class Transmitter:
         """Return whether there is room for this sample."""
         return self._frames < NRT_FRAMES_MAX if sample.publisher_class == _NRT else self._messages < SRT_MESSAGES_MAX
 
-    def send(self, subscriber: LinkSubscriber | None, topic: str, high: int, sample: Sample) -> Sequence[Action]:
-        """Send a sample of a topic with this high byte, and a `subscriber` if this module has the topic."""
-        now, data = self._driver.now(), sample.data
+    def send(
+        self, subscriber: LinkSubscriber | None, topic: str, high: int, sample: Sample, data: bytes
+    ) -> Sequence[Action]:
+        """Send a sample of a topic with this high byte, and a `subscriber` if this module has the topic.
+
+        `data` are its bytes on the bus.
+        """
+        now = self._driver.now()
         publisher = subscriber.topic.publisher_of(sample) if subscriber is not None else None
         frames = rtcan.fragment_count(len(data))
         if sample.publisher_class == _NRT:
@@ -266,7 +284,7 @@ class Transmitter:
             deadline = now + self._time_left(topic, sample, publisher)
             self._messages += 1
         self._stats.sent += 1
-        self._stats.bytes_sent += len(data)
+        self._stats.bytes_sent += len(sample.data)
         handle = SampleHandle(publisher, frames, deadline)
         return self._engine.publish(now, high, data, deadline=deadline, drop=sample.drop_late, handle=handle)
 
