@@ -1,4 +1,4 @@
-"""The standard messages: those of the firmware, those of the modules of thesis 7, texts, and the state of gateways.
+"""The standard messages: the firmware's, those of the modules of thesis 7, texts, gateways' states, and some of ROS's.
 
 All fields default to zero. For other data define your own `r2p.Message`. A changed layout needs a new topic.
 
@@ -6,9 +6,10 @@ In `Stamped...` messages `timestamp` is the network time (RTCAN) of the measurem
 classes that are not the firmware's say how many their message takes.
 """
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
-from r2p.messages import Len, Message, f32, f64, i16, i32, u8, u16, u32, u64
+from r2p.messages import Array, Len, Max, Message, f32, f64, i16, i32, u8, u16, u32, u64
+from r2p.messages import Duration as Duration  # as Timestamp
 from r2p.messages import Timestamp as Timestamp  # a part of the standard messages: imported from here
 
 # The firmware's, byte for byte (PROTOCOL.md 2). The names are the firmware's, without `Msg`, and with `Stamped` for its
@@ -366,3 +367,134 @@ class GatewayStatus(Message):
     dropped: u64 = 0
     rate: f32 = 0.0
     """Messages in the last second."""
+
+
+# ROS's, with its names, fields and bytes (those of ROS 1), for data whose length varies. Their bounds, `r2p.Max`, are
+# generous: they decide which links carry a topic. For smaller ones define the message with the same fields and name.
+
+
+class Empty(Message, name="std_msgs/Empty"):
+    """Nothing but the fact that it was sent."""
+
+
+class String(Message, name="std_msgs/String"):
+    """A text of any length. `Text`, of fixed length, is for links that firmware shares."""
+
+    data: Annotated[str, Max(65_536)] = ""
+
+
+class Header(Message, name="std_msgs/Header"):
+    """The beginning of ROS's messages: when and in which frame of coordinates they were measured."""
+
+    seq: u32 = 0
+    """Counts the messages of a publisher; ROS 2 has it no more."""
+    stamp: Timestamp = Timestamp()
+    frame_id: Annotated[str, Max(256)] = ""
+
+
+class Image(Message, name="sensor_msgs/Image"):
+    """A picture, not compressed. `numpy.asarray(image.data).reshape(image.height, image.step)` copies nothing."""
+
+    header: Header = Header()
+    height: u32 = 0
+    """Rows."""
+    width: u32 = 0
+    """Columns."""
+    encoding: Annotated[str, Max(64)] = ""
+    """What the bytes of a pixel are: rgb8, bgr8, mono8, 16UC1, 32FC1, ..."""
+    is_bigendian: u8 = 0
+    """1: numbers of several bytes begin with the highest."""
+    step: u32 = 0
+    """Bytes of a row."""
+    data: Annotated[Array[u8], Max(32 << 20)] = Array()
+    """`step * height` bytes; enough for 3840 x 2160 pixels of 4 bytes."""
+
+
+class CompressedImage(Message, name="sensor_msgs/CompressedImage"):
+    """A compressed picture."""
+
+    header: Header = Header()
+    format: Annotated[str, Max(64)] = ""
+    """How it is compressed: jpeg, png, ..."""
+    data: Annotated[Array[u8], Max(16 << 20)] = Array()
+    """The contents of such a file."""
+
+
+class LaserScan(Message, name="sensor_msgs/LaserScan"):
+    """One scan of a planar laser range finder. Angles are counter-clockwise from the x axis (forward)."""
+
+    header: Header = Header()
+    """Its stamp is the time of the first ray."""
+    angle_min: f32 = 0.0
+    """Of the first ray, rad."""
+    angle_max: f32 = 0.0
+    """Of the last ray, rad."""
+    angle_increment: f32 = 0.0
+    """Between two rays, rad."""
+    time_increment: f32 = 0.0
+    """Between two rays, s."""
+    scan_time: f32 = 0.0
+    """Between two scans, s."""
+    range_min: f32 = 0.0
+    """m; a shorter range is no measurement."""
+    range_max: f32 = 0.0
+    """m; a longer range is no measurement."""
+    ranges: Annotated[Array[f32], Max(16_384)] = Array()
+    """m."""
+    intensities: Annotated[Array[f32], Max(16_384)] = Array()
+    """In units of the device; empty, if it measures none."""
+
+
+class JointState(Message, name="sensor_msgs/JointState"):
+    """State of joints. Each array has an element for each joint, or is empty."""
+
+    header: Header = Header()
+    name: Annotated[tuple[Annotated[str, Max(128)], ...], Max(256)] = ()
+    position: Annotated[Array[f64], Max(256)] = Array()
+    """rad or m."""
+    velocity: Annotated[Array[f64], Max(256)] = Array()
+    """rad/s or m/s."""
+    effort: Annotated[Array[f64], Max(256)] = Array()
+    """Nm or N."""
+
+
+class PointField(Message, name="sensor_msgs/PointField"):
+    """One number of each point of a PointCloud2."""
+
+    INT8: ClassVar = 1
+    UINT8: ClassVar = 2
+    INT16: ClassVar = 3
+    UINT16: ClassVar = 4
+    INT32: ClassVar = 5
+    UINT32: ClassVar = 6
+    FLOAT32: ClassVar = 7
+    FLOAT64: ClassVar = 8
+
+    name: Annotated[str, Max(64)] = ""
+    """x, y, z, intensity, rgb, ..."""
+    offset: u32 = 0
+    """Of its first byte in a point."""
+    datatype: u8 = 0
+    """INT8 to FLOAT64."""
+    count: u32 = 0
+    """Numbers of this kind in a row."""
+
+
+class PointCloud2(Message, name="sensor_msgs/PointCloud2"):
+    """Points, each of `point_step` bytes that `fields` describe."""
+
+    header: Header = Header()
+    height: u32 = 0
+    """Rows; 1, if the points have no order."""
+    width: u32 = 0
+    """Points of a row."""
+    fields: Annotated[tuple[PointField, ...], Max(64)] = ()
+    is_bigendian: bool = False
+    point_step: u32 = 0
+    """Bytes of a point."""
+    row_step: u32 = 0
+    """Bytes of a row."""
+    data: Annotated[Array[u8], Max(32 << 20)] = Array()
+    """`row_step * height` bytes; enough for a million points of 32 bytes."""
+    is_dense: bool = False
+    """No point is invalid (NaN)."""

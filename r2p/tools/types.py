@@ -2,6 +2,8 @@
 
 A peer announces the fingerprint of a layout. It is looked up in `r2p.msg` and in the classes that r2p.toml names; then,
 on zenoh, modules that have such a type are queried for its fields.
+
+Types are shown by their full names, `package/Name`, which `--type` takes wherever the class is known.
 """
 
 import asyncio
@@ -11,20 +13,33 @@ from collections.abc import Iterable
 from typing import Any
 
 import r2p
+from r2p.codecs.management import decode_size, encode_size
+from r2p.messages import SIZE_MAX
+from r2p.protocols.discovery.events import TopicType
 from r2p.tools.run import load_module
 from r2p.tools.session import Session, Settings, UsageError, wait_until
+from r2p.tools.session import settings as read_settings
 
 STANDARD = "r2p.msg"
 LEARNT = "r2p.messages.schemas"
 """The `__module__` of classes that were made from the fields of another module's type."""
+
+SIZE_CUT, _ = decode_size(encode_size(SIZE_MAX, varies=True))
+"""The size that management messages give for all messages of variable length that may have more bytes."""
 
 _ANSWERS = 1.0  # seconds to wait for the types of a list
 _ANNOUNCED = 2.0  # seconds to wait for a topic that others have not announced with the rest
 _AT_ONCE = 16  # queries
 
 
-def load_type(text: str) -> type[r2p.Message]:
-    """Return the message class of `package.module:Class`, `FILE.py:Class`, or a name in r2p.msg. Raises UsageError."""
+def load_type(text: str, others: Iterable[type[r2p.Message]] = ()) -> type[r2p.Message]:
+    """Return the message class of `package.module:Class`, `FILE.py:Class`, or a name of a type. Raises UsageError.
+
+    A name is one in r2p.msg (`LaserScan`), or the full one (`sensor_msgs/LaserScan`, also as ROS 2 writes it, with
+    `/msg/`) of a class there or of `others`.
+    """
+    if "/" in text and ":" not in text:
+        return _by_full_name(text, [*standard_types(), *others])
     where, _, name = (text if ":" in text else f"{STANDARD}:{text}").rpartition(":")
     cls = getattr(load_module(where), name, None)
     if not (isinstance(cls, type) and issubclass(cls, r2p.Message)):
@@ -34,6 +49,16 @@ def load_type(text: str) -> type[r2p.Message]:
     except r2p.MessageError as error:
         raise UsageError(f"{text}: {error}") from error
     return cls
+
+
+def _by_full_name(text: str, known: list[type[r2p.Message]]) -> type[r2p.Message]:
+    by_name = {r2p.layout(cls).name: cls for cls in reversed(known)}
+    found = by_name.get(text.replace("/msg/", "/"))
+    if found is None:
+        close = difflib.get_close_matches(text, by_name, n=1)
+        advice = f"did you mean {close[0]}?" if close else "write package.module:Class or FILE.py:Class"
+        raise UsageError(f"neither r2p.msg nor [types] of r2p.toml has a type {text}; {advice}")
+    return found
 
 
 def _similar(where: str, name: str) -> str:
@@ -49,12 +74,26 @@ def standard_types() -> list[type[r2p.Message]]:
 
 
 def type_name(cls: type[r2p.Message]) -> str:
-    """Return the name of a class for `--type`; only its bare name if it was learnt from another module."""
+    """Return the full name of a class; the bare one of a class that was learnt without."""
+    name = r2p.layout(cls).name
+    return cls.__name__ if cls.__module__ == LEARNT and name.startswith("r2p_msgs/") else name
+
+
+def class_path(cls: type[r2p.Message]) -> str:
+    """Return where the class of a type is, `package.module:Class`; empty for one that was learnt."""
     if cls.__module__ == LEARNT:
-        return cls.__name__
+        return ""
     if vars(load_module(STANDARD)).get(cls.__name__) is cls:  # its own module may be a private one
         return f"{STANDARD}:{cls.__name__}"
     return f"{cls.__module__}:{cls.__name__}"
+
+
+def size_text(size: int, *, varies: bool) -> str:
+    """Return the size of the messages of a type, in words: "8 bytes", "up to 131 380 bytes"."""
+    text = f"{size:,}".replace(",", " ") + f" byte{'' if size == 1 else 's'}"
+    if varies and size == SIZE_CUT:
+        return f"{text} or more"
+    return f"up to {text}" if varies else text
 
 
 class Types:
@@ -65,14 +104,26 @@ class Types:
         self._by_fingerprint: dict[bytes, type[r2p.Message]] | None = None
         self._learnt: dict[bytes, type[r2p.Message]] = {}
 
+    @property
+    def named(self) -> list[type[r2p.Message]]:
+        """The classes that r2p.toml names. Raises UsageError."""
+        return [self._load_named(topic) for topic in self._by_topic]
+
+    def load(self, text: str) -> type[r2p.Message]:
+        """Return the class that the user names. Raises UsageError."""
+        return load_type(text, self.named if "/" in text and ":" not in text else ())
+
+    def _load_named(self, topic: str) -> type[r2p.Message]:
+        try:
+            return load_type(self._by_topic[topic])
+        except UsageError as error:
+            raise UsageError(f"[types] {topic}: {error}") from error
+
     def stated(self, topic: str, given: str | None) -> type[r2p.Message] | None:
         """Return the type that the user states: `given` by --type, or in r2p.toml. Raises UsageError."""
         if given:
-            return load_type(given)
-        try:
-            return load_type(self._by_topic[topic]) if topic in self._by_topic else None
-        except UsageError as error:
-            raise UsageError(f"[types] {topic}: {error}") from error
+            return self.load(given)
+        return self._load_named(topic) if topic in self._by_topic else None
 
     def of(self, view: r2p.TopicView) -> type[r2p.Message] | None:
         """Return the type of a topic if it is stated or known. Raises UsageError for an invalid name in r2p.toml."""
@@ -82,9 +133,16 @@ class Types:
         return self.by_fingerprint(view.fingerprint) or self._learnt.get(view.fingerprint)
 
     def describe(self, view: r2p.TopicView) -> dict[str, Any]:
-        """Return name, type and size of a topic as a record; None is what is unknown."""
+        """Return name, type and size of a topic as a record; None is what is unknown.
+
+        Where the length of its messages `varies`, the size is that of the longest one.
+        """
         cls = self.of(view)
-        return {"topic": view.name, "type": None if cls is None else type_name(cls), "size": view.size or None}
+        size = view.size or (0 if view.varies else None)
+        if view.varies and view.size == SIZE_CUT and cls is not None:
+            size = max(SIZE_CUT, r2p.layout(cls).size)
+        name = None if cls is None else type_name(cls)
+        return {"topic": view.name, "type": name, "size": size, "varies": view.varies}
 
     async def learn(self, session: Session, view: r2p.TopicView) -> type[r2p.Message] | None:
         """Return the type of a topic, and query the network for an unknown one, if the transport carries types."""
@@ -113,14 +171,14 @@ class Types:
     def by_fingerprint(self, fingerprint: bytes) -> type[r2p.Message] | None:
         """Return the known class of a layout."""
         if self._by_fingerprint is None:
-            known = [*standard_types(), *map(load_type, self._by_topic.values())]
+            known = [*standard_types(), *self.named]
             self._by_fingerprint = {r2p.layout(cls).fingerprint: cls for cls in reversed(known)}
         return self._by_fingerprint.get(fingerprint)
 
 
 def of_size(size: int) -> list[str]:
-    """Return the names of the standard types of this size in bytes."""
-    return [type_name(cls) for cls in standard_types() if r2p.layout(cls).size == size]
+    """Return the names of the standard types whose messages all have this size in bytes."""
+    return [type_name(cls) for cls in standard_types() if size and r2p.layout(cls).exact_size == size]
 
 
 def suggestion(size: int) -> str:
@@ -129,22 +187,36 @@ def suggestion(size: int) -> str:
     return f"; types of {size} bytes: {', '.join(names)}" if names else ""
 
 
-def describe_other(settings: Settings, what: str, cls: type[r2p.Message], size: int, fingerprint: bytes) -> str:
+def describe_other(settings: Settings, what: str, cls: type[r2p.Message], theirs: TopicType) -> str:
     """Say that a topic (`what`: with a verb) has another type than `cls`, and which to give."""
-    known, own, name = Types(settings).by_fingerprint(fingerprint), r2p.layout(cls).size, type_name(cls)
+    known, own, name = Types(settings).by_fingerprint(theirs.fingerprint), r2p.layout(cls), type_name(cls)
+    size = size_text(theirs.size, varies=theirs.varies)
     if known is not None:
-        return f"{what} {type_name(known)} ({size} bytes), not {name} ({own} bytes): give --type {type_name(known)}"
-    if size == own:
-        return f"{what} another type of {size} bytes than {name}: give the right --type, or none"
-    return f"{what} messages of {size} bytes, but {name} has {own}: give the right --type{suggestion(size)}"
+        own_size = size_text(own.size, varies=own.varies)
+        return f"{what} {type_name(known)} ({size}), not {name} ({own_size}): give --type {type_name(known)}"
+    if theirs.varies and own.varies:
+        return f"{what} another type of variable length than {name}: give the right --type, or none"
+    if theirs.exact_size == own.exact_size:
+        return f"{what} another type of {size} than {name}: give the right --type, or none"
+    has = "messages of variable length" if own.varies else f"{own.size}"
+    return f"{what} messages of {size}, but {name} has {has}: give the right --type{suggestion(theirs.exact_size)}"
 
 
 def complete_type(incomplete: str) -> list[str]:
-    """Completions for --type: bare names, because a colon begins a new word in bash."""
-    names = [cls.__name__ for cls in standard_types()]
+    """Completions for --type: bare and full names; no `r2p.msg:` before its colon, which begins a new word in bash."""
+    classes = standard_types()
     if ":" in incomplete:
-        names = [f"{STANDARD}:{name}" for name in names]
+        names = [f"{STANDARD}:{cls.__name__}" for cls in classes]
+    else:
+        names = [cls.__name__ for cls in classes] + [type_name(cls) for cls in [*classes, *_named_by_settings()]]
     return [name for name in names if name.startswith(incomplete)]
+
+
+def _named_by_settings() -> list[type[r2p.Message]]:
+    try:
+        return Types(read_settings()).named
+    except UsageError:  # what is wrong with the file is said when the command runs
+        return []
 
 
 async def _announced(session: Session, topic: str) -> r2p.TopicView:
@@ -155,7 +227,7 @@ async def _announced(session: Session, topic: str) -> r2p.TopicView:
 
     if session.settings.via:
         with session.waiting(f"the type of {topic}"):
-            await wait_until(lambda: view().size > 0, _ANNOUNCED)
+            await wait_until(lambda: view().size > 0 or view().varies, _ANNOUNCED)
     return view()
 
 
@@ -169,7 +241,8 @@ async def find(session: Session, topic: str, given: str | None) -> type[r2p.Mess
     view = await _announced(session, topic)
     found = await types.learn(session, view)
     if found is None:
-        names = ", ".join(of_size(view.size)) or "none in r2p.msg"
-        size = f" ({view.size} bytes; types of this size: {names})" if view.size else ""
+        exact = 0 if view.varies else view.size
+        names = ", ".join(of_size(exact)) or "none in r2p.msg"
+        size = f" ({exact} bytes; types of this size: {names})" if exact else ""
         raise UsageError(f"the type of {topic} is unknown{size}: give --type package.module:Class")
     return found

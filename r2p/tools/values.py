@@ -1,20 +1,42 @@
 """Messages as text, in both directions: `pub` accepts what `echo` prints.
 
 A value gets its type from the field of the message, never from how it is written: all YAML scalars are read as texts.
-So `1e-3` is a number, the key `on` is a text, and "nan" in quotes, as JSON needs it, is still not-a-number.
+So `1e-3` is a number, the key `on` is a text, and "nan" in quotes, as JSON needs it, is still not-a-number. Bytes whose
+number varies, such as those of an image, are a text in base64; a list of numbers is accepted, too.
 """
 
+import base64
+import binascii
 import json
 import math
 import re
 import struct
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, TypeAlias, TypeVar
 
 from r2p.errors import MessageError
-from r2p.messages import Chars, FixedArray, Layout, Message, Nested, Scalar, Shape, layout, show
+from r2p.messages import (
+    Array,
+    Chars,
+    Field,
+    FixedArray,
+    Layout,
+    Message,
+    Nested,
+    Scalar,
+    Shape,
+    VariableArray,
+    VariableText,
+    layout,
+    show,
+)
+from r2p.messages.parts import view_of
 
 M = TypeVar("M", bound=Message)
+
+Form: TypeAlias = Literal["whole", "short", "cells"]
+"""How much of a message is converted, for whom: all of it for programs; for people only the first elements of long
+arrays; and for the cells of a table, in which an array of variable length is one text, as JSON has it."""
 
 META = "_"
 """The key of a message's context: its topic, stamp, source."""
@@ -23,6 +45,11 @@ DEPTH = 32
 """Levels of mappings and lists that are accepted; no message has as many."""
 
 _EXCERPT = 80  # characters of a text in an error
+_LONG = 16  # elements of an array that are all shown; of a longer one:
+_FIRST = 8
+_LONG_TEXT = 1000  # characters of a text that are all shown; of a longer one:
+_FIRST_TEXT = 200
+_INDEX_DIGITS = 9
 _PAIR = re.compile(r"([A-Za-z_][\w.]*)=(.*)", re.DOTALL)
 _STEP = re.compile(r"[^.\[\]]+")
 _TRUE = {"true", "yes", "on", "1"}
@@ -67,31 +94,49 @@ def from_plain(cls: type[M], plain: Mapping[str, Any]) -> M:
     return message
 
 
-def to_plain(message: Message) -> dict[str, Any]:
+def to_plain(message: Message, form: Form = "whole") -> dict[str, Any]:
     """Return a message as values for JSON: NaN and infinities as texts, an f32 as its shortest decimal."""
-    shape = layout(type(message))
-    return {field.name: _plain(field.shape, getattr(message, field.name)) for field in shape.fields}
+    plain: dict[str, Any] = _plain(Nested(layout(type(message))), message, form)
+    return plain
 
 
-def pick(plain: Mapping[str, Any], path: str) -> Any:
-    """Return the value at a path: `stamp.sec`, `value[0]`. Raises KeyError with the existing paths."""
-    value: Any = plain
-    for step in _STEP.findall(path):
-        if isinstance(value, Mapping) and step in value:
-            value = value[step]
-        elif isinstance(value, list) and step.isdecimal() and int(step) < len(value):
-            value = value[int(step)]
-        else:
-            raise KeyError(f"there is no field {path[:_EXCERPT]}; the fields are {', '.join(_names(plain))}")
-    return value
+def pick(message: Message, path: str, form: Form = "whole") -> Any:
+    """Return the value at a path: `stamp.sec`, `value[0]`. None for an element that an array of this length lacks.
+
+    Raises KeyError with the existing paths.
+    """
+    shape, value = _at(Nested(layout(type(message))), message, _STEP.findall(path))
+    if shape is None:
+        names = ", ".join(_names(layout(type(message))))
+        raise KeyError(f"there is no field {path[:_EXCERPT]}; the fields are {names}")
+    return None if value is None else _plain(shape, value, form)
 
 
-def _names(plain: Mapping[str, Any]) -> list[str]:
+def _at(shape: Shape, value: Any, steps: list[str]) -> tuple[Shape | None, Any]:
+    """Return the shape and the value that are that many steps inside of others; no shape if there is no such place."""
+    for step in steps:
+        index = int(step) if step.isdecimal() and len(step) <= _INDEX_DIGITS else -1
+        match shape:
+            case Nested(inner) if (field := find_field(inner, step)) is not None:
+                shape, value = field.shape, None if value is None else getattr(value, field.name)
+            case FixedArray(item, count) | VariableArray(item, count) if 0 <= index < count:
+                shape, value = item, None if value is None or index >= len(value) else value[index]
+            case _:
+                return None, None
+    return shape, value
+
+
+def find_field(shape: Layout[Any], name: str) -> Field | None:
+    """Return the field of this name: that of the class, or the one on the wire."""
+    return next((field for field in shape.fields if name in (field.wire_name, field.name)), None)
+
+
+def _names(shape: Layout[Any]) -> list[str]:
     """Return the paths of all fields, for an error."""
     names: list[str] = []
-    for name, value in plain.items():
-        inner = _names(value) if isinstance(value, Mapping) else []
-        names += [f"{name}.{each}" for each in inner] or [name]
+    for field in shape.fields:
+        inner = _names(field.shape.layout) if isinstance(field.shape, Nested) else []
+        names += [f"{field.wire_name}.{each}" for each in inner] or [field.wire_name]
     return names
 
 
@@ -113,7 +158,17 @@ def _yaml(text: str) -> Any:
                 raise _too_deep(text)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, UnicodeError) as error:
+        if (plain := _json(text)) is not None:
+            return plain
         raise MessageError(f"{_excerpt(text)} is not valid {_problem(text, error)}") from error
+
+
+def _json(text: str) -> Any:
+    """Return a mapping in JSON; None if it is none. JSON that YAML does not read has a pair of surrogates."""
+    try:
+        return json.loads(text) if text.lstrip().startswith("{") else None
+    except (ValueError, RecursionError):
+        return None
 
 
 def _problem(text: str, error: Exception) -> str:
@@ -157,13 +212,8 @@ def _mapping(text: str) -> dict[str, Any]:
 
 def _is_text(shape: Layout[Any], path: str) -> bool:
     """Return whether the path is that of a text field, whose value is used as it is."""
-    kind: Shape = Nested(shape)
-    for name in path.split("."):
-        fields = {field.name: field.shape for field in kind.layout.fields} if isinstance(kind, Nested) else {}
-        if name not in fields:
-            return False
-        kind = fields[name]
-    return isinstance(kind, Chars)
+    found, _ = _at(Nested(shape), None, path.split("."))
+    return isinstance(found, Chars | VariableText)
 
 
 def _merge(into: dict[str, Any], plain: Mapping[str, Any], depth: int = 0) -> None:
@@ -186,13 +236,18 @@ def _merge(into: dict[str, Any], plain: Mapping[str, Any], depth: int = 0) -> No
 
 
 def _message(shape: Layout[Any], plain: Mapping[str, Any], path: str) -> Any:
-    fields = {field.name: field.shape for field in shape.fields}
-    unknown = [name for name in plain if name not in fields]
+    fields = {name: find_field(shape, name) for name in plain}
+    unknown = [name for name, field in fields.items() if field is None]
     if unknown:
-        raise MessageError(f"{path} has no field {', '.join(unknown)}: it has {', '.join(fields)}")
-    given = {name: _value(fields[name], value, f"{path}.{name}") for name, value in plain.items()}
+        names = ", ".join(field.wire_name for field in shape.fields) or "none at all"
+        raise MessageError(f"{path} has no field {', '.join(unknown)}: it has {names}")
+    given = {
+        field.name: _value(field.shape, plain[name], f"{path}.{name}")
+        for name, field in fields.items()
+        if field is not None
+    }
     zero = shape.zero
-    rest = {name: getattr(zero, name) for name in fields if name not in given}
+    rest = {field.name: getattr(zero, field.name) for field in shape.fields if field.name not in given}
     return shape.cls(**given, **rest)
 
 
@@ -200,28 +255,60 @@ def _value(shape: Shape, plain: Any, path: str) -> Any:
     match shape:
         case Nested(inner) if isinstance(plain, Mapping):
             return _message(inner, plain, path)
-        case FixedArray(item, count) if isinstance(plain, list) and len(plain) == count:
-            return tuple(_value(item, each, f"{path}[{i}]") for i, each in enumerate(plain))
-        case Chars():
-            value: Any = plain if isinstance(plain, str) else _invalid
+        case FixedArray() | VariableArray():
+            value = _elements(shape, _bytes(plain) if _is_bytes(shape) and isinstance(plain, str) else plain, path)
+        case Chars() | VariableText():
+            value = plain if isinstance(plain, str) else _invalid
         case Scalar():
             value = _number(shape, plain)
         case _:
             value = _invalid
-    if value is _invalid or (isinstance(shape, Scalar | Chars) and not shape.holds(value)):
+    if value is _invalid or (isinstance(shape, Scalar | Chars | VariableText) and not shape.holds(value)):
         raise MessageError(f"{path} takes {_wanted(shape)}, not {_shown(plain)}")
     return value
 
 
+def _elements(shape: FixedArray | VariableArray, plain: Any, path: str) -> Any:
+    """Return the value of an array; `_invalid` for what is neither a list nor bytes, or has another length."""
+    least, most = (shape.count, shape.count) if isinstance(shape, FixedArray) else (0, shape.limit)
+    if not isinstance(plain, list | bytes) or not least <= len(plain) <= most:
+        return _invalid
+    values: Sequence[Any] = plain
+    if isinstance(plain, list):
+        values = tuple(_value(shape.item, each, f"{path}[{i}]") for i, each in enumerate(plain))
+    match shape.container, shape.item:
+        case "bytes", _:
+            return bytes(values)
+        case "array", Scalar(_, code):
+            return Array(view_of(values, code))
+        case _:
+            return tuple(values)
+
+
+def _is_bytes(shape: Shape) -> bool:
+    return isinstance(shape, FixedArray | VariableArray) and shape.item == _BYTE
+
+
+def _bytes(text: str) -> Any:
+    """Return the bytes of a text in base64; `_invalid` if it is none."""
+    try:
+        return base64.b64decode("".join(text.split()), validate=True)
+    except (binascii.Error, ValueError):
+        return _invalid
+
+
+_BYTE = Scalar("u8", "B")
 _invalid = object()
 
 
 def _wanted(shape: Shape) -> str:
     match shape:
         case Nested(inner):
-            return "a mapping of " + ", ".join(field.name for field in inner.fields)
+            return "a mapping of " + ", ".join(field.wire_name for field in inner.fields)
         case FixedArray(_, count):
             return f"a list of {count}"
+        case VariableArray(_, limit):
+            return f"a list of at most {limit}{', or their base64' if _is_bytes(shape) else ''}"
         case Scalar("bool"):
             return "true or false"
         case _:
@@ -273,12 +360,20 @@ def _integer(plain: float | str) -> int:
 # Values to text
 
 
-def _plain(shape: Shape, value: Any) -> Any:
+def _plain(shape: Shape, value: Any, form: Form) -> Any:
     match shape:
         case Nested(inner):
-            return {field.name: _plain(field.shape, getattr(value, field.name)) for field in inner.fields}
-        case FixedArray(item, _):
-            return [_plain(item, each) for each in value]
+            return {field.wire_name: _plain(field.shape, getattr(value, field.name), form) for field in inner.fields}
+        case VariableArray() if _is_bytes(shape) and (form != "short" or len(value) > _LONG):
+            return f"<bytes {len(value)}>" if form == "short" else base64.b64encode(bytes(value)).decode()
+        case VariableArray(item) if form == "cells":
+            return json.dumps([_plain(item, each, "whole") for each in value])
+        case FixedArray(item) | VariableArray(item):
+            shown = _FIRST if form == "short" and len(value) > _LONG else len(value)
+            more = [f"and {len(value) - shown} more"] if shown < len(value) else []
+            return [_plain(item, each, form) for each in value[:shown]] + more
+        case VariableText() if form == "short" and len(value) > _LONG_TEXT:
+            return f"{value[:_FIRST_TEXT]}... ({len(value)} characters)"
         case Scalar("f32" | "f64" as kind):
             if not math.isfinite(value):
                 return str(float(value))

@@ -67,10 +67,10 @@ async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
         "module": "running",
         "link": "memory:lab",
         "publishes": [
-            {"topic": "encoder", "type": "r2p.msg:Encoder", "size": 4, "class": "periodic"},
-            {"topic": "leds", "type": "r2p.msg:Led", "size": 5, "class": "nrt"},
+            {"topic": "encoder", "type": "r2p_msgs/Encoder", "size": 4, "varies": False, "class": "periodic"},
+            {"topic": "leds", "type": "r2p_msgs/Led", "size": 5, "varies": False, "class": "nrt"},
         ],
-        "subscribes": [{"topic": "cmd", "type": "r2p.msg:Velocity3", "size": 12}],
+        "subscribes": [{"topic": "cmd", "type": "r2p_msgs/Velocity3", "size": 12, "varies": False}],
     }
 
 

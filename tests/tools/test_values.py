@@ -14,9 +14,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import r2p
-from r2p.msg import IMU, Led, Proximity, Speed2, StampedPose3, Text, Velocity3
+from r2p import Array
+from r2p.msg import (
+    IMU,
+    Header,
+    Image,
+    JointState,
+    LaserScan,
+    Led,
+    PointCloud2,
+    PointField,
+    Proximity,
+    Speed2,
+    StampedPose3,
+    String,
+    Text,
+    Velocity3,
+)
 from r2p.tools.output import to_yaml
-from r2p.tools.types import load_type, of_size, standard_types, type_name
+from r2p.tools.session import UsageError
+from r2p.tools.types import class_path, load_type, of_size, standard_types, type_name
 from r2p.tools.values import from_plain, parse, parse_line, pick, shortest_f32, to_plain
 from tests.messages.strategies import messages
 
@@ -38,7 +55,16 @@ class Grid(r2p.Message):
     far: r2p.f64 = 0.0
 
 
-TYPES: list[type[r2p.Message]] = [*standard_types(), Switch, Grid]
+class Bytes(r2p.Message):
+    """Bytes, with a bound and of fixed length, and a name that Python forbids."""
+
+    raw: Annotated[bytes, r2p.Max(4)] = b""
+    serial: Annotated[bytes, r2p.Len(3)] = bytes(3)
+    class_: r2p.u8 = 0
+
+
+TYPES: list[type[r2p.Message]] = [*standard_types(), Switch, Grid, Bytes]
+SCANNED = Header(frame_id="5")
 
 
 @pytest.mark.parametrize("cls", TYPES, ids=lambda cls: cls.__name__)
@@ -54,8 +80,17 @@ def test_what_echo_prints_pub_takes(cls: type[r2p.Message], data: st.DataObject)
 
 def test_types_are_offered_by_names_that_type_takes() -> None:
     assert [load_type(type_name(cls)) for cls in standard_types()] == standard_types()
-    assert all(type_name(cls).startswith("r2p.msg:") for cls in standard_types())
-    assert "r2p.msg:Timestamp" in of_size(8)
+    assert [load_type(class_path(cls)) for cls in standard_types()] == standard_types()
+    assert {type_name(cls).partition("/")[0] for cls in standard_types()} == {"r2p_msgs", "sensor_msgs", "std_msgs"}
+    assert "r2p_msgs/Timestamp" in of_size(8)
+    assert load_type("sensor_msgs/msg/LaserScan") is LaserScan  # as in ROS 2
+
+
+def test_a_full_name_that_is_unknown() -> None:
+    with pytest.raises(UsageError, match=r"has a type sensor_msgs/Laserscan; did you mean sensor_msgs/LaserScan\?$"):
+        load_type("sensor_msgs/Laserscan")
+    with pytest.raises(UsageError, match=r"write package\.module:Class or FILE\.py:Class"):
+        load_type("nowhere/Zzz")
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -102,6 +137,13 @@ def test_an_f32_prints_the_shortest_text_that_packs_to_the_same_bytes(bits: int)
         (["ranges=[1,2,3,0xffff]"], Proximity(ranges=(1, 2, 3, 65535))),
         (["{on: yes, y: 1, no: off}"], Switch(on=True, y=1.0, no="off")),
         (["on=0"], Switch()),
+        (["ranges=[1, -.5, inf]", "header.frame_id=5"], LaserScan(SCANNED, ranges=Array([1.0, -0.5, math.inf]))),
+        (["data=[1, 0xff]"], Image(data=Array(b"\1\xff"))),
+        (["data=Af8=", "encoding=on"], Image(data=Array(b"\1\xff"), encoding="on")),
+        (['{"raw": "Af8=", "class": 7}'], Bytes(raw=b"\1\xff", class_=7)),
+        (["raw=[1, 255]", "class_=7"], Bytes(raw=b"\1\xff", class_=7)),
+        (["{name: [a, on], position: [1]}"], JointState(name=("a", "on"), position=Array([1.0]))),
+        (["fields=[{name: x, datatype: 7}, {}]"], PointCloud2(fields=(PointField("x", datatype=7), PointField()))),
         (["poses=[{x: 1}, {}]", "names=[a, b]"], Grid(poses=(Velocity3(x=1.0), Velocity3()), names=("a", "b"))),
     ],
 )
@@ -112,6 +154,10 @@ def test_people_write(texts: list[str], message: r2p.Message) -> None:
 @pytest.mark.parametrize(
     ("cls", "texts", "complaint"),
     [
+        (Image, ["data=Af8"], "Image.data takes a list of at most 33554432, or their base64, not 'Af8'"),
+        (Bytes, ["raw=[1,2,3,4,5]"], "Bytes.raw takes a list of at most 4, or their base64, not a list of 5"),
+        (Bytes, ["raw=[1,256]"], "Bytes.raw[1] takes an integer from 0 to 255, not '256'"),
+        (String, ["{data: [1]}"], "String.data takes a text of at most 65536 bytes in UTF-8, not a list of 1"),
         (Led, ["valu=1"], "Led has no field valu: it has led, value"),
         (Led, ["led=-1"], "Led.led takes an integer from 0 to 4294967295, not '-1'"),
         (Led, ["value=1.5"], "Led.value takes an integer from 0 to 255, not '1.5'"),
@@ -200,6 +246,29 @@ def test_not_a_number_goes_through_as_a_text() -> None:
     assert math.isnan(from_plain(IMU, plain).roll)
 
 
+def test_bytes_are_base64_and_names_those_of_the_wire() -> None:
+    assert to_plain(Bytes(b"\1\xff", b"abc", 7)) == {"raw": "Af8=", "serial": [97, 98, 99], "class": 7}
+    assert to_plain(Image(data=Array(b"\1\xff")))["data"] == "Af8="
+
+
+def test_long_arrays_are_shortened_for_people() -> None:
+    scan = to_plain(LaserScan(ranges=Array([0.5] * 720), intensities=Array([1.0] * 16)), "short")
+    assert scan["ranges"] == [0.5] * 8 + ["and 712 more"]
+    assert scan["intensities"] == [1.0] * 16
+    assert "ranges: [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, and 712 more]\n" in to_yaml(scan)
+    assert to_plain(Image(data=Array(bytes(921_600))), "short")["data"] == "<bytes 921600>"
+    assert to_plain(Image(data=Array(bytes(3))), "short")["data"] == [0, 0, 0]
+    assert to_plain(String("ä" * 2000), "short")["data"] == "ä" * 200 + "... (2000 characters)"
+
+
+def test_what_varies_is_one_cell_of_a_table() -> None:
+    joints = to_plain(JointState(name=("a", "b"), position=Array([0.1])), "cells")
+    assert [joints[name] for name in ("name", "position", "effort")] == ['["a", "b"]', "[0.1]", "[]"]
+    assert to_plain(PointCloud2(fields=(PointField("x"),)), "cells")["fields"] == (
+        '[{"name": "x", "offset": 0, "datatype": 0, "count": 0}]'
+    )
+
+
 def test_what_meta_adds_is_no_field() -> None:
     assert parse_line(Led, '{"led": 3, "_": {"topic": "leds"}}') == Led(led=3)
 
@@ -209,13 +278,25 @@ def test_what_meta_adds_is_no_field() -> None:
     [("far", 2.5), ("poses[1].x", 0.5), ("poses[1]", {"x": 0.5, "y": 0.0, "w": 0.0}), ("cells[0][1]", 7)],
 )
 def test_pick(path: str, value: Any) -> None:
-    grid = to_plain(Grid(cells=((0, 7), (0, 0)), poses=(Velocity3(), Velocity3(x=0.5)), far=2.5))
+    grid = Grid(cells=((0, 7), (0, 0)), poses=(Velocity3(), Velocity3(x=0.5)), far=2.5)
     assert pick(grid, path) == value
+
+
+def test_pick_from_arrays_of_variable_length() -> None:
+    scan = LaserScan(ranges=Array([0.1, 0.2]))  # as published: not rounded
+    assert [pick(scan, path) for path in ("ranges[1]", "ranges[2]", "header.stamp.sec")] == [0.2, None, 0]
+    assert pick(Bytes(class_=3), "class") == pick(Bytes(class_=3), "class_") == 3
+    cloud = PointCloud2(fields=(PointField("x"),))
+    assert [pick(cloud, path) for path in ("fields[0].name", "fields[1].name", "data[0]")] == ["x", None, None]
+    with pytest.raises(KeyError, match="no field ranges"):
+        pick(scan, "ranges[16384]")
+    with pytest.raises(KeyError, match="no field ranges"):
+        pick(scan, f"ranges[{'9' * 5000}]")
 
 
 @pytest.mark.parametrize("path", ["fat", "poses.x", "cells[2]", "far.x", "poses[0].z"])
 def test_pick_tells_what_there_is(path: str) -> None:
     with pytest.raises(KeyError, match="the fields are cells, poses, names, far"):
-        pick(to_plain(Grid()), path)
+        pick(Grid(), path)
     with pytest.raises(KeyError, match=r"the fields are timestamp\.sec, timestamp\.nsec, x, y, w"):
-        pick(to_plain(StampedPose3()), "z")
+        pick(StampedPose3(), "z")

@@ -4,7 +4,7 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import msgspec
 import typer
@@ -17,13 +17,15 @@ from r2p.tools.session import REPORT_WAITING_AFTER, Session, UsageError, patienc
 from r2p.tools.topic.filter import Filter, FilterError
 from r2p.tools.topic.watching import Topics, TypeName, received_samples, while_publishers_fit
 from r2p.tools.types import Types, suggestion
-from r2p.tools.values import META, pick, to_plain
+from r2p.tools.values import META, Form, pick, to_plain
 from r2p.units import SECOND
 
 QUEUE = 1024
 """Messages that wait for a slow terminal or pipe; beyond that the oldest are lost, and counted."""
 
 _HEX = "data"  # the field of a message of unknown type
+
+_Content: TypeAlias = r2p.Message | dict[str, Any]
 
 logger = logging.getLogger("r2p.echo")
 
@@ -41,6 +43,7 @@ async def echo(
         str | None,
         typer.Option("--filter", metavar="EXPR", help="Only messages for which it is true: 'x > 3 and abs(w) < 0.1'."),
     ] = None,
+    full: Annotated[bool, typer.Option("--full", help="Print long arrays and texts whole at a terminal, too.")] = False,
     meta: Annotated[bool, typer.Option("--meta", help="Add topic, stamp, source and sequence, under `_`.")] = False,
     count: Count = None,
     once: Once = False,
@@ -49,26 +52,28 @@ async def echo(
 ) -> None:
     """Print the messages of topics.
 
-    Messages of unknown type are printed as bytes in hex. With --filter, messages that do not pass count neither for -n
-    nor for --timeout. Ctrl-C ends it.
+    Messages of unknown type are printed as bytes in hex. At a terminal and as YAML, long arrays are shortened, and
+    bytes are counted; JSON and CSV have all of them. With --filter, messages that do not pass count neither for -n nor
+    for --timeout. Ctrl-C ends it.
     """
     output = Output(format)
     names = list(dict.fromkeys(map(topic_name, topics)))
     types = Types(session.settings)
     readers = [_TopicReader(session, name, types, type, filter) for name in names]
-    selection = _Selection(names, field or [], meta=meta, csv=output.format == "csv")
+    form: Form = "cells" if output.format == "csv" else "whole" if full or output.format == "json" else "short"
+    selection = _Selection(names, field or [], meta=meta, form=form)
     left = 1 if once else count
 
     async def print_all(reader: _TopicReader) -> None:
         nonlocal left
         async with reader.while_type_fits():
-            async for record, sample in reader.records():
+            async for content, sample in reader.messages():
                 received()
                 if left == 0:
                     return
                 if left is not None:
                     left -= 1
-                await output.put(selection.of(reader.topic, record, sample))
+                await output.put(selection.of(reader.topic, content, sample))
                 if left == 0:
                     for task in tasks:
                         task.cancel()
@@ -96,44 +101,56 @@ async def _print_header(
 
 
 class _Selection(msgspec.Struct):
-    """The printed part of a message: the `fields` that the user chose, and where it comes from.
+    """The printed part of a message: the `fields` that the user chose, in a `form`, and where it comes from.
 
-    Of several `topics` only one needs to have a field: `lacking` are the topics without it, by field.
+    A content of unknown type is a record with its bytes in hex. Of several `topics` only one needs to have a field:
+    `lacking` are the topics without it, by field.
     """
 
     topics: list[str]
     fields: list[str]
     meta: bool
-    csv: bool
+    form: Form
     lacking: dict[str, set[str]] = {}
 
     @property
     def labelled(self) -> bool:
         """True if a column names the topic of each row: CSV has one header for all topics."""
-        return self.csv and len(self.topics) > 1
+        return self.form == "cells" and len(self.topics) > 1
 
-    def of(self, topic: str, record: dict[str, Any], sample: r2p.Sample | None) -> dict[str, Any]:
+    def of(self, topic: str, content: _Content, sample: r2p.Sample | None) -> dict[str, Any]:
         """Return the record to print. Raises UsageError for a field that no topic has."""
-        return self.label(topic, self._chosen(topic, record) if self.fields else record, sample)
+        if self.fields:
+            record = self._chosen(topic, content)
+        else:
+            record = to_plain(content, self.form) if isinstance(content, r2p.Message) else content
+        return self.label(topic, record, sample)
 
     def label(self, topic: str, row: dict[str, Any], sample: r2p.Sample | None) -> dict[str, Any]:
         """Return a row with the topic, and with what else --meta adds."""
         if self.labelled:
             row = {"topic": topic} | {"topic_" if name == "topic" else name: value for name, value in row.items()}
-        if self.meta or (len(self.topics) > 1 and not self.csv):
+        if self.meta or (len(self.topics) > 1 and self.form != "cells"):
             row[META] = _meta(topic, sample)
         return row
 
-    def _chosen(self, topic: str, record: dict[str, Any]) -> dict[str, Any]:
+    def _chosen(self, topic: str, content: _Content) -> dict[str, Any]:
         row = {}
         for path in self.fields:
             lacking = self.lacking.setdefault(path, set())
             try:
-                row[path] = pick(record, path)
+                row[path] = self._pick(content, path)
                 lacking.discard(topic)  # its type was not known before
             except KeyError as error:
                 self._note_lacking(topic, path, lacking, error.args[0])
         return row
+
+    def _pick(self, content: _Content, path: str) -> Any:
+        if isinstance(content, r2p.Message):
+            return pick(content, path, self.form)
+        if path not in content:
+            raise KeyError(f"there is no field {path}; the fields are {', '.join(content)}")
+        return content[path]
 
     def _note_lacking(self, topic: str, path: str, lacking: set[str], problem: str) -> None:
         """Report once that a topic lacks a field. Raises UsageError if none of them has it."""
@@ -163,15 +180,15 @@ class _TopicReader:
     def typed(self) -> bool:
         return self._cls is not None
 
-    async def records(self) -> AsyncIterator[tuple[dict[str, Any], r2p.Sample]]:
-        """Yield each message that passes the filter as a record, with its sample. Raises UsageError."""
+    async def messages(self) -> AsyncIterator[tuple[_Content, r2p.Sample]]:
+        """Yield each message that passes the filter, with its sample. Raises UsageError."""
         async for sample in received_samples(self._session, self._subscriber, typed=self.typed):
             message = self._decoded(sample)
             if message is None:
                 await self._look_up_type(sample)
                 message = self._decoded(sample)
             if self._passes(message):
-                yield {_HEX: sample.data.hex()} if message is None else to_plain(message), sample
+                yield {_HEX: sample.data.hex()} if message is None else message, sample
 
     def while_type_fits(self) -> AbstractAsyncContextManager[None]:
         """Raise r2p.Error in the block when all publishers have another type than the one stated."""
@@ -183,12 +200,12 @@ class _TopicReader:
             await self._learn()
         if self._cls is None:  # its messages are in hex, or have these fields once their type is known
             return list(flatten(selection.label(self.topic, dict.fromkeys(selection.fields or [_HEX], ""), None)))
-        return list(flatten(selection.of(self.topic, to_plain(r2p.layout(self._cls).zero), None)))
+        return list(flatten(selection.of(self.topic, r2p.layout(self._cls).zero, None)))
 
     def check_fields(self, selection: _Selection) -> None:
         """Raise UsageError for a field that no topic has, as far as their types are known by now."""
         if self._cls is not None:
-            selection.of(self.topic, to_plain(r2p.layout(self._cls).zero), None)
+            selection.of(self.topic, r2p.layout(self._cls).zero, None)
 
     def report(self) -> None:
         """Report what is missing in the output."""
@@ -196,6 +213,8 @@ class _TopicReader:
             notify(f"{self._subscriber.lost} messages of {self.topic} lost: the output was too slow")
         if self._subscriber.undecodable:
             notify(f"{self._subscriber.undecodable} messages of {self.topic} were of another type")
+        if self._subscriber.too_long:
+            notify(f"{self._subscriber.too_long} messages of {self.topic} were longer than the type here allows")
         if self._filter is not None and self._filter.seen:
             logger.info("%s", f"{self.topic}: {self._filter.summary}")
 

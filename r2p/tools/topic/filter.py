@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from r2p.errors import Error
-from r2p.messages import FixedArray, Layout, Message, Nested, Scalar, Shape, layout
+from r2p.messages import Array, FixedArray, Layout, Message, Nested, Scalar, Shape, VariableArray, layout
 from r2p.tools.values import shortest_f32
 
 LENGTH_MAX = 1000
@@ -143,6 +143,9 @@ class _Compiler:
                 return self._joined(all if isinstance(op, ast.And) else any, values)
             case ast.Compare(left=left, ops=ops, comparators=others) if all(type(op) in _COMPARISONS for op in ops):
                 return self._comparison([left, *others], [_COMPARISONS[type(op)] for op in ops])
+            case ast.Call(func=ast.Name(id="len"), args=[ast.Name() | ast.Attribute() | ast.Subscript() as field]):
+                get, _ = self._value_path(field)  # not converted: it may have a million elements
+                return lambda message: len(get(message))
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
                 return self._apply(FUNCTIONS[name], arguments)
             case ast.Call(func=function):
@@ -191,12 +194,17 @@ class _Compiler:
 
     def _leaf(self, node: ast.expr) -> Evaluate:
         """Return the function for the value of a field, as `echo` prints it; only what is not finite stays a float."""
+        get, shape = self._value_path(node)
+        convert = _converter(shape)
+        return get if convert is None else lambda message: convert(get(message))
+
+    def _value_path(self, node: ast.expr) -> tuple[Evaluate, Shape]:
+        """Return the function for what is at a path that ends at a value, unconverted, and its shape."""
         get, shape = self._path(node)
         if isinstance(shape, Nested):
             names = (f"{ast.unparse(node)}.{field.name}" for field in shape.layout.fields)
             raise FilterError(f"{ast.unparse(node)} has fields: write {' or '.join(names)}")
-        convert = _converter(shape)
-        return get if convert is None else lambda message: convert(get(message))
+        return get, shape
 
     def _path(self, node: ast.expr) -> tuple[Evaluate, Shape]:
         """Return the function for what is at a path, unconverted, and its shape."""
@@ -212,15 +220,17 @@ class _Compiler:
                 return lambda message: get(message)[slice(*[end(message) for end in ends])], array
             case ast.Subscript(value=inner, slice=index):
                 get, array = self._array(inner)
-                if isinstance(index, ast.Constant) and isinstance(index.value, int) and index.value >= array.count:
-                    raise FilterError(f"{ast.unparse(node)}: {ast.unparse(inner)} has {array.count} values, from 0 on")
+                count = array.count if isinstance(array, FixedArray) else array.limit
+                if isinstance(index, ast.Constant) and isinstance(index.value, int) and index.value >= count:
+                    most = "" if isinstance(array, FixedArray) else "at most "
+                    raise FilterError(f"{ast.unparse(node)}: {ast.unparse(inner)} has {most}{count} values, from 0 on")
                 at = self.value(index)
                 return lambda message: get(message)[at(message)], array.item
         raise FilterError(f"{ast.unparse(node)!r} is not a field")
 
-    def _array(self, node: ast.expr) -> tuple[Evaluate, FixedArray]:
+    def _array(self, node: ast.expr) -> tuple[Evaluate, FixedArray | VariableArray]:
         get, shape = self._path(node)
-        if not isinstance(shape, FixedArray):
+        if not isinstance(shape, FixedArray | VariableArray):
             raise FilterError(f"{ast.unparse(node)} is not an array")
         return get, shape
 
@@ -247,7 +257,7 @@ def _paths(shape: Layout[Any]) -> Iterator[str]:
     """Yield the paths of all fields."""
     for field in shape.fields:
         inner, path = field.shape, field.name
-        while isinstance(inner, FixedArray):
+        while isinstance(inner, FixedArray | VariableArray):
             inner, path = inner.item, f"{path}[0]"
         if isinstance(inner, Nested):
             yield from (f"{path}.{each}" for each in _paths(inner.layout))
@@ -260,7 +270,7 @@ def _converter(shape: Shape) -> Evaluate | None:
     match shape:
         case Scalar("f32"):
             return lambda value: shortest_f32(value) if math.isfinite(value) else value
-        case FixedArray(item, _) if (convert := _converter(item)) is not None:
+        case FixedArray(item) | VariableArray(item) if (convert := _converter(item)) is not None:
             return lambda values: tuple(map(convert, values))
     return None
 
@@ -326,7 +336,7 @@ def _round(value: float, digits: int = 0) -> Any:
 def _kind(value: Any) -> str:
     if isinstance(value, int | float):
         return "a number"
-    return "a text" if isinstance(value, str) else "a list" if isinstance(value, tuple) else "a message"
+    return "a text" if isinstance(value, str) else "a list" if isinstance(value, tuple | Array | bytes) else "a message"
 
 
 def _alike(function: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:

@@ -12,9 +12,9 @@ from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, alias_or_none
 from r2p.tools.topic.watching import Topic, suggest_topics
-from r2p.tools.types import Types, load_type, of_size
+from r2p.tools.types import Types, of_size, size_text
 
-_COLUMNS = ["topic", "type", "size", "publishers", "subscribers"]
+_COLUMNS = ["topic", "type", "size", "varies", "publishers", "subscribers"]
 
 
 async def list_(session: Session, *, wait: Wait = None, format: Format = None) -> None:
@@ -27,7 +27,7 @@ async def list_(session: Session, *, wait: Wait = None, format: Format = None) -
     views, types = session.module.network.topics().values(), Types(session.settings)
     await types.learn_all(session, views)
     rows = [_row(session, view, types) for view in views]
-    await output.table(rows, session.columns(*_COLUMNS))
+    await _print(output, rows, session.columns(*_COLUMNS))
     if not rows:
         session.report_none("topics")
 
@@ -53,29 +53,34 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
         age = None if view.age is None else round(view.age, 3)
         details["age"] = f"{age} s" if output.format == "text" else age
         details |= _alias(session, view)
+    if output.format == "text" and details["size"] is not None:
+        details |= {"size": size_text(details["size"], varies=details["varies"])}
     await output.put(details)
 
 
 async def find(
     session: Session,
-    what: Annotated[str, typer.Argument(metavar="TYPE|FINGERPRINT|SIZE", help="r2p.msg:Led, 16 hex digits, or bytes.")],
+    what: Annotated[
+        str, typer.Argument(metavar="TYPE|FINGERPRINT|SIZE", help="sensor_msgs/LaserScan, 16 hex digits, or bytes.")
+    ],
     *,
     wait: Wait = None,
     format: Format = None,
 ) -> None:
     """Find the topics of a type.
 
-    Firmware does not announce the fingerprint of a type: then only the size is compared, and the match is "size".
+    Firmware does not announce the fingerprint of a type: then only the size is compared, and the match is "size". The
+    size of a topic whose messages vary in length is that of the longest one, and matches nothing.
     """
     output = Output(format)
-    size, fingerprint = _wanted(what)
+    types = Types(session.settings)
+    size, fingerprint = _wanted(what, types)
     await session.settle(wait)
     views = session.module.network.topics().values()
     found = [(view, match) for view in views if (match := _match(view, size, fingerprint)) is not None]
-    types = Types(session.settings)
     await types.learn_all(session, (view for view, _ in found))
     rows = [_row(session, view, types) | {"match": match} for view, match in found]
-    await output.table(rows, session.columns(*_COLUMNS, "match"))
+    await _print(output, rows, session.columns(*_COLUMNS, "match"))
     if not rows:
         raise r2p.Error(session.none_yet(f"topics of type {what}"))
 
@@ -89,20 +94,28 @@ def _with_alias(session: Session, alias: str, views: Iterable[r2p.TopicView]) ->
     return next((view for view in views if chosen_alias(view.name, session.settings.aliases) == alias), None)
 
 
-def _wanted(what: str) -> tuple[int, bytes | None]:
+async def _print(output: Output, rows: list[dict[str, Any]], columns: list[str]) -> None:
+    """Print the table of topics; a terminal gets `varies` as a word before the size."""
+    if output.format == "text":
+        columns = [name for name in columns if name != "varies"]
+        rows = [row | {"size": f"up to {row['size']}"} if row["varies"] else row for row in rows]
+    await output.table(rows, columns)
+
+
+def _wanted(what: str, types: Types) -> tuple[int, bytes | None]:
     """Return the size (0: any) and the fingerprint (None: any) to find."""
     if re.fullmatch(r"[0-9a-fA-F]{16}", what):
         return 0, bytes.fromhex(what)
     if what.isdecimal():
         return int(what), None
-    layout = r2p.layout(load_type(what))
-    return layout.size, layout.fingerprint
+    layout = r2p.layout(types.load(what))
+    return layout.exact_size, layout.fingerprint
 
 
 def _match(view: r2p.TopicView, size: int, fingerprint: bytes | None) -> str | None:
     if fingerprint is not None and view.fingerprint is not None:
         return "type" if view.fingerprint == fingerprint else None
-    return "size" if size and view.size == size else None
+    return "size" if size and view.size == size and not view.varies else None
 
 
 def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
@@ -151,7 +164,7 @@ def _fields(cls: type[r2p.Message] | None, view: r2p.TopicView) -> dict[str, Any
     if cls is not None:
         pairs = (field.rpartition(":") for field in r2p.layout(cls).schema.split())
         return {"fields": {path: kind for path, _, kind in pairs}}
-    return {"fields": None, "maybe": of_size(view.size)}
+    return {"fields": None, "maybe": [] if view.varies else of_size(view.size)}
 
 
 def _guarantees(session: Session, view: r2p.TopicView) -> dict[str, str]:

@@ -14,6 +14,7 @@ import typer
 
 import r2p
 from r2p.bridge import ClassOf
+from r2p.messages import SIZE_MAX
 from r2p.names import topic_name
 from r2p.tools.options import Count, Once, Rate, class_choice, time_option
 from r2p.tools.output import notify, wait_ready, waitable
@@ -36,7 +37,7 @@ STDIN = "-"
 DEFAULT_RATE = 1.0
 
 _CHUNK = 65536  # bytes
-_LINE_MAX = 1 << 20  # bytes
+_LINE_MAX = 2 * SIZE_MAX  # bytes: the longest message in base64, with room for its other fields
 
 _EXCERPT = 120  # characters of a message that are shown
 _NAMED = 0.5  # seconds in which subscribers announce the names of their nodes
@@ -226,29 +227,34 @@ class _Publication(msgspec.Struct):
 
 
 def _excerpt(message: r2p.Message) -> str:
-    text = json.dumps(to_plain(message))
+    text = json.dumps(to_plain(message, "short"))
     return text if len(text) <= _EXCERPT else f"{text[:_EXCERPT]}..."
 
 
 async def read_lines(stream: TextIO | None = None) -> AsyncIterator[str]:
     """Yield the lines of stdin (or of `stream`), without their ends, and without blocking the event loop.
 
-    Bytes that are not UTF-8 become U+FFFD. Raises MessageError for a line longer than 1 MB.
+    Bytes that are not UTF-8 become U+FFFD. Raises MessageError for a line longer than 128 MiB.
     """
-    rest = b""
+    rest: list[bytes] = []
+    size = 0
     async for data in _chunks(stream or sys.stdin):
-        *complete, rest = (rest + data).split(b"\n")
+        *complete, last = data.split(b"\n")
         for line in complete:
-            yield _decode(line)
-        if len(rest) > _LINE_MAX:
+            yield _decode(b"".join([*rest, line]))
+            rest.clear()
+            size = 0
+        rest.append(last)
+        size += len(last)
+        if size > _LINE_MAX:
             break
-    if rest:
-        yield _decode(rest)
+    if size:
+        yield _decode(b"".join(rest))
 
 
 def _decode(line: bytes) -> str:
     if len(line) > _LINE_MAX:
-        raise r2p.MessageError("a line on stdin is longer than 1 MB")
+        raise r2p.MessageError("a line on stdin is longer than 128 MiB")
     return line.removesuffix(b"\r").decode(errors="replace")
 
 

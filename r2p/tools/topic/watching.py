@@ -41,7 +41,8 @@ TypeName = Annotated[
         "--type",
         metavar="TYPE",
         autocompletion=complete_type,
-        help="package.module:Class, FILE.py:Class, or a name in r2p.msg; default: from r2p.toml or the peer.",
+        help="sensor_msgs/LaserScan, a name in r2p.msg, package.module:Class or FILE.py:Class; "
+        "default: from r2p.toml or the peer.",
     ),
 ]
 
@@ -132,7 +133,7 @@ def _other_type(session: Session, topic: str, cls: type[r2p.Message], role: int)
         theirs = info.types.get(role) if info is not None and info.mismatch and link.up else None
         if theirs is not None:
             verb = "carries" if role == ROLE_PUBLISHES else "is subscribed as"
-            return describe_other(session.settings, f"{topic} {verb}", cls, theirs.size, theirs.fingerprint)
+            return describe_other(session.settings, f"{topic} {verb}", cls, theirs)
     return None
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from typing import Annotated
 
 import pytest
 
 import r2p
-from r2p.msg import GatewayStatus, Led, StampedPose3, Velocity3
+from r2p.msg import GatewayStatus, Header, LaserScan, Led, StampedPose3, Velocity3
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.echo import QUEUE, echo
 from tests.tools.rig import Firmware, printed, robot, tool
@@ -38,6 +39,12 @@ async def poses(node: r2p.Node) -> None:
         await publisher.publish(StampedPose3(r2p.Timestamp(5, 6), x=0.1))
 
 
+async def scans(node: r2p.Node) -> None:
+    publisher = node.advertise("scan", LaserScan)
+    async for _ in node.every(0.25):
+        await publisher.publish(LaserScan(Header(7), ranges=r2p.Array([0.5] * 20)))
+
+
 async def secrets(node: r2p.Node) -> None:
     publisher = node.advertise("secrets", Private)
     async for _ in node.every(0.1):
@@ -57,6 +64,24 @@ async def test_yaml(capsys: pytest.CaptureFixture[str]) -> None:
     async with robot(poses), tool() as session:
         await echo(session, ["poses"], once=True, format="yaml")
     assert capsys.readouterr().out == "timestamp:\n  sec: 5\n  nsec: 6\nx: 0.1\ny: 0.0\nw: 0.0\n---\n"
+
+
+@pytest.mark.virtual_time
+async def test_long_arrays(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whole for programs, shortened for people, one cell of a table; a field is found in each message anew."""
+    shown = [[0.5] * 8 + ["and 12 more"], [0.5] * 20]
+    async with robot(scans), tool() as session:
+        await echo(session, ["scan"], once=True)
+        await echo(session, ["scan"], once=True, format="yaml", field=["ranges"])
+        await echo(session, ["scan"], once=True, format="yaml", field=["ranges"], full=True)
+        await echo(session, ["scan"], once=True, format="csv", field=["ranges", "header.seq"])
+        await echo(session, ["scan"], once=True, field=["ranges[19]", "ranges[20]", "header"], filter="len(ranges) > 2")
+    first, *yaml, head, row, last = capsys.readouterr().out.splitlines()
+    assert json.loads(first)["ranges"] == [0.5] * 20
+    assert yaml == [line for each in shown for line in (f"ranges: {each}".replace("'", ""), "---")]
+    assert (head, row) == ("ranges,header.seq", f'"{[0.5] * 20}",7')
+    header = {"seq": 7, "stamp": {"sec": 0, "nsec": 0}, "frame_id": ""}
+    assert json.loads(last) == {"ranges[19]": 0.5, "ranges[20]": None, "header": header}
 
 
 @pytest.mark.virtual_time
@@ -152,7 +177,7 @@ async def test_an_unknown_type_is_printed_in_hex_and_told_once(capsys: pytest.Ca
     captured = capsys.readouterr()
     assert captured.out == '{"data": "3412"}\n' * 2
     assert captured.err.count("the type of secrets is unknown") == 1
-    assert "r2p.msg:PWM" in captured.err  # has two bytes, too
+    assert "r2p_msgs/PWM" in captured.err  # has two bytes, too
 
 
 @pytest.mark.virtual_time
@@ -171,12 +196,13 @@ async def test_a_stated_type_that_is_not_the_publishers_is_an_error(capsys: pyte
         with pytest.raises(ExceptionGroup) as caught:
             await echo(session, ["leds"], type="r2p.msg:Velocity3", timeout=2)
         assert caught.group_contains(
-            r2p.Error, match=r"leds carries r2p.msg:Led \(5 bytes\), not r2p.msg:Velocity3 .*: give --type r2p.msg:Led$"
+            r2p.Error,
+            match=r"leds carries r2p_msgs/Led \(5 bytes\), not r2p_msgs/Velocity3 .* --type r2p_msgs/Led$",
         )
     async with robot(leds), tool() as session:
         with pytest.raises(ExceptionGroup) as caught:
             await echo(session, ["leds"], type=f"{__name__}:Five")
-        assert caught.group_contains(r2p.Error, match=r"leds carries r2p.msg:Led \(5 bytes\), not .*:Five")
+        assert caught.group_contains(r2p.Error, match=r"leds carries r2p_msgs/Led \(5 bytes\), not tests/Five")
     assert capsys.readouterr() == ("", "")
 
 
@@ -187,7 +213,7 @@ async def test_a_stated_type_that_does_not_fit_firmware_is_an_error() -> None:
         with pytest.raises(ExceptionGroup) as caught:
             await echo(session, ["leds"], type="Velocity3")
     assert caught.group_contains(
-        r2p.Error, match="messages of 5 bytes, but r2p.msg:Velocity3 has 12: .*; types of 5 bytes: r2p.msg:Led$"
+        r2p.Error, match="messages of 5 bytes, but r2p_msgs/Velocity3 has 12: .*; types of 5 bytes: r2p_msgs/Led$"
     )
 
 

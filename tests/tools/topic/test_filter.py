@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import r2p
-from r2p.msg import StampedPose3, Text, Velocity3
+from r2p.msg import Header, Image, JointState, LaserScan, StampedPose3, Text, Velocity3
 from r2p.tools.topic.filter import BITS_MAX, LENGTH_MAX, Filter, FilterError
 
 
@@ -203,6 +203,36 @@ def test_what_errors_say(text: str, error: str) -> None:
     with pytest.raises(FilterError) as caught:
         Filter(text).bind(Mixed)
     assert error in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "min(ranges) < 0.1 <= ranges[1]",
+        "len(ranges) == 3 and 0.3 in ranges and 0.4 not in ranges",
+        "ranges[-1] == 0.3 and ranges[1:] == (0.1, 0.3) and sum(ranges[:1]) == 0.05",
+        "len(intensities) == 0 and intensities == () and ranges != ()",
+        "header.frame_id == 'laser' and len(header.frame_id) == 5",
+    ],
+)
+def test_arrays_of_variable_length(text: str) -> None:
+    scan = LaserScan(Header(frame_id="laser"), ranges=r2p.Array([0.05, 0.1, 0.3]))
+    made = Filter(text)
+    assert made.passes(LaserScan.decode(scan.encode()))
+    assert not made.passes(LaserScan())
+
+
+def test_bytes_and_names_in_arrays() -> None:
+    assert Filter("data[0] == 7 and 8 in data and len(data) == 2").passes(Image(data=r2p.Array(b"\7\10")))
+    assert Filter("'left' in name and name[0] == 'left'").passes(JointState(name=("left", "right")))
+
+
+def test_an_element_that_is_not_there() -> None:
+    made = Filter("ranges[5] > 1")
+    assert not made.passes(LaserScan(ranges=r2p.Array([1.0])))
+    assert made.undefined == 1
+    with pytest.raises(FilterError, match="ranges has at most 16384 values, from 0 on"):
+        Filter("ranges[16384] > 1").bind(LaserScan)
 
 
 def test_it_follows_the_type_of_the_messages_and_counts_them() -> None:

@@ -9,18 +9,26 @@ from typing import Any
 import pytest
 
 import r2p
-from r2p.msg import Led, Velocity3
+from r2p.msg import LaserScan, Led, Velocity3
 from r2p.tools import module as modules
 from r2p.tools import node
 from r2p.tools.session import UsageError
 from r2p.tools.topic.list import find, info, list_
 from tests.tools.rig import VIA, Firmware, printed, robot, tool
 
+FIXED = {"varies": False}
+
 
 async def blink(node: r2p.Node) -> None:
     node.advertise("leds", Led)
     node.advertise("speed", Velocity3, r2p.Periodic(0.1, Velocity3))
     await asyncio.Event().wait()
+
+
+async def scan(node: r2p.Node) -> None:
+    publisher = node.advertise("scan", LaserScan)
+    async for _ in node.every(0.1):
+        await publisher.publish(LaserScan())
 
 
 async def watch(node: r2p.Node) -> None:
@@ -38,9 +46,9 @@ async def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         await list_(session)
     captured = printed(capsys)
     assert by_topic(captured) == {
-        "leds": {"type": "r2p.msg:Led", "size": 5, "publishers": ["BOT/blink"], "subscribers": ["BOT/watch"]},
-        "log": {"type": "r2p.msg:Log", "size": 152, "publishers": ["BOT/log"], "subscribers": []},
-        "speed": {"type": "r2p.msg:Velocity3", "size": 12, "publishers": ["BOT/blink"], "subscribers": []},
+        "leds": {"type": "r2p_msgs/Led", "size": 5, **FIXED, "publishers": ["BOT/blink"], "subscribers": ["BOT/watch"]},
+        "log": {"type": "r2p_msgs/Log", "size": 152, **FIXED, "publishers": ["BOT/log"], "subscribers": []},
+        "speed": {"type": "r2p_msgs/Velocity3", "size": 12, **FIXED, "publishers": ["BOT/blink"], "subscribers": []},
     }
 
 
@@ -78,7 +86,7 @@ async def test_list_of_firmware(capsys: pytest.CaptureFixture[str]) -> None:
         asyncio.get_running_loop().call_later(0.6, imu.advertise, "imu", 26)
         await list_(session)
         rows = printed(capsys)
-    assert rows == [{"topic": "imu", "type": None, "size": 26, "publishers": ["IMU/?"], "subscribers": []}]
+    assert rows == [{"topic": "imu", "type": None, "size": 26, **FIXED, "publishers": ["IMU/?"], "subscribers": []}]
 
 
 @pytest.mark.virtual_time
@@ -109,8 +117,9 @@ async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
     speed, leds = printed(capsys)
     assert speed == {
         "topic": "speed",
-        "type": "r2p.msg:Velocity3",
+        "type": "r2p_msgs/Velocity3",
         "size": 12,
+        "varies": False,
         "fingerprint": r2p.layout(Velocity3).fingerprint.hex(),
         "publishers": [{"node": "BOT/blink", "class": "periodic", "link": VIA}],
         "subscribers": [],
@@ -118,6 +127,25 @@ async def test_info(capsys: pytest.CaptureFixture[str]) -> None:
     }
     assert leds["subscribers"] == [{"node": "BOT/watch", "link": VIA}]
     assert list(leds["guarantees"]) == [f"{VIA} nrt"]
+
+
+@pytest.mark.virtual_time
+async def test_what_varies_in_length(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    size = r2p.layout(LaserScan).size
+    async with robot(scan), tool(verbose=1) as session:
+        await info(session, "scan")
+        await find(session, "sensor_msgs/LaserScan")
+        with pytest.raises(r2p.Error, match="no topics of type"):
+            await find(session, str(size))
+        monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+        lines = len(capsys.readouterr().out.splitlines())
+        await info(session, "scan")
+        await list_(session)
+    assert lines == 2
+    out = capsys.readouterr().out
+    assert "type: sensor_msgs/LaserScan\nsize: up to 131 380 bytes\nvaries: true\n" in out
+    assert "\n  ranges: f32[]\n" in out
+    assert re.search(rf"\nscan +sensor_msgs/LaserScan +up to {size} ", out)
 
 
 @pytest.mark.virtual_time
@@ -130,7 +158,7 @@ async def test_info_with_more(capsys: pytest.CaptureFixture[str]) -> None:
     assert leds["fields"] == {"led": "u32", "value": "u8"}
     assert 0 <= leds["age"] < 5
     assert raw["type"] is None
-    assert (raw["fields"], raw["maybe"]) == (None, ["r2p.msg:Led"])
+    assert (raw["fields"], raw["maybe"]) == (None, ["r2p_msgs/Led"])
 
 
 @pytest.mark.virtual_time
@@ -168,7 +196,7 @@ async def test_info_tells_of_different_types(capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("what", "found"),
     [
-        ("r2p.msg:Led", {"leds": "type", "raw": "size"}),
+        ("r2p_msgs/Led", {"leds": "type", "raw": "size"}),
         ("Led", {"leds": "type", "raw": "size"}),
         (r2p.layout(Led).fingerprint.hex(), {"leds": "type"}),
         ("5", {"leds": "size", "raw": "size"}),

@@ -178,7 +178,7 @@ async def test_subscribers_of_another_type_are_not_waited_for() -> None:
         with pytest.raises(ExceptionGroup) as caught:
             await pub(session, "cmd", [], type="Led", once=True)
     assert caught.group_contains(
-        r2p.Error, match=r"cmd is subscribed as r2p.msg:Velocity3 \(12 bytes\), not r2p.msg:Led"
+        r2p.Error, match=r"cmd is subscribed as r2p_msgs/Velocity3 \(12 bytes\), not r2p_msgs/Led"
     )
 
 
@@ -255,7 +255,11 @@ async def test_bad_json_on_stdin_is_told_by_its_line_and_place(monkeypatch: pyte
 
 
 @pytest.mark.parametrize("regular", [True, False], ids=["file", "pipe"])
-def test_lines_are_read_alike_from_files_and_pipes(regular: bool, tmp_path: Path) -> None:
+def test_lines_are_read_alike_from_files_and_pipes(
+    regular: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("r2p.tools.topic.pub._LINE_MAX", 1 << 20)
+
     async def lines(data: bytes) -> list[str]:
         path = tmp_path / "lines"
         if regular:
@@ -275,5 +279,5 @@ def test_lines_are_read_alike_from_files_and_pipes(regular: bool, tmp_path: Path
     assert asyncio.run(lines(b"one\r\n\n\xff two\nthree")) == ["one", "", "\ufffd two", "three"]
     assert asyncio.run(lines(b"x" * (1 << 20) + b"\ny")) == ["x" * (1 << 20), "y"]
     for too_long in b"x" * (1 << 20) + b"xx\n", b"x" * (1 << 20) + b"x":
-        with pytest.raises(r2p.MessageError, match="longer than 1 MB"):
+        with pytest.raises(r2p.MessageError, match="longer than 128 MiB"):
             asyncio.run(lines(too_long))
