@@ -15,7 +15,6 @@ from typing import Any
 import r2p
 from r2p.codecs.management import decode_size, encode_size
 from r2p.messages import SIZE_MAX
-from r2p.protocols.discovery.events import TopicType
 from r2p.tools.run import load_module
 from r2p.tools.session import Session, Settings, UsageError, wait_until
 from r2p.tools.session import settings as read_settings
@@ -187,19 +186,21 @@ def suggestion(size: int) -> str:
     return f"; types of {size} bytes: {', '.join(names)}" if names else ""
 
 
-def describe_other(settings: Settings, what: str, cls: type[r2p.Message], theirs: TopicType) -> str:
+def describe_other(
+    settings: Settings, what: str, cls: type[r2p.Message], size: int, fingerprint: bytes, *, varies: bool
+) -> str:
     """Say that a topic (`what`: with a verb) has another type than `cls`, and which to give."""
-    known, own, name = Types(settings).by_fingerprint(theirs.fingerprint), r2p.layout(cls), type_name(cls)
-    size = size_text(theirs.size, varies=theirs.varies)
+    known, own, name = Types(settings).by_fingerprint(fingerprint), r2p.layout(cls), type_name(cls)
+    exact, shown = 0 if varies else size, size_text(size, varies=varies)
     if known is not None:
         own_size = size_text(own.size, varies=own.varies)
-        return f"{what} {type_name(known)} ({size}), not {name} ({own_size}): give --type {type_name(known)}"
-    if theirs.varies and own.varies:
+        return f"{what} {type_name(known)} ({shown}), not {name} ({own_size}): give --type {type_name(known)}"
+    if varies and own.varies:
         return f"{what} another type of variable length than {name}: give the right --type, or none"
-    if theirs.exact_size == own.exact_size:
-        return f"{what} another type of {size} than {name}: give the right --type, or none"
+    if exact == own.exact_size:
+        return f"{what} another type of {shown} than {name}: give the right --type, or none"
     has = "messages of variable length" if own.varies else f"{own.size}"
-    return f"{what} messages of {size}, but {name} has {has}: give the right --type{suggestion(theirs.exact_size)}"
+    return f"{what} messages of {shown}, but {name} has {has}: give the right --type{suggestion(exact)}"
 
 
 def complete_type(incomplete: str) -> list[str]:

@@ -133,7 +133,8 @@ def _other_type(session: Session, topic: str, cls: type[r2p.Message], role: int)
         theirs = info.types.get(role) if info is not None and info.mismatch and link.up else None
         if theirs is not None:
             verb = "carries" if role == ROLE_PUBLISHES else "is subscribed as"
-            return describe_other(session.settings, f"{topic} {verb}", cls, theirs)
+            what = f"{topic} {verb}"
+            return describe_other(session.settings, what, cls, theirs.size, theirs.fingerprint, varies=theirs.varies)
     return None
 
 
