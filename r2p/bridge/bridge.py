@@ -34,7 +34,8 @@ from r2p.protocols.bridge.tree import FIRST_CLIENT, SpanningTree
 from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.link import Announcement, GatewayHooks, Link
+from r2p.transports.announcement import Announcement
+from r2p.transports.link import GatewayHooks, Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _FORWARDS = (PortState.ALONE, PortState.FORWARDING)
@@ -199,6 +200,10 @@ class Bridge:
             return False
         return self._is_own(port, message) or self._receive_presence(port, message, data)
 
+    def order_refused(self, link: Link, order: management.Order, reason: int) -> None:
+        """Refuse an order that came without the link's key (DENIED_...)."""
+        self._orders.refuse(self.ports[link.name], order, reason)
+
     def _receive_presence(self, port: BridgePort, message: management.Management, data: bytes) -> bool:
         """Handle an ALIVE, which may be a probe, or a HELLO; return True if discovery need not see it."""
         if isinstance(message, management.Hello):
@@ -296,14 +301,14 @@ class Bridge:
 
     def _send(self, port: BridgePort, action: SendToPort | SendProbe) -> None:
         if isinstance(action, SendToPort):
-            port.link.write_management(management.encode(action.message), urgent=True)
+            port.link.send_management(management.encode(action.message), urgent=True)
         elif port.link.passes_probes:
             port.link.write_management(probes.encode(self.tree.gateway, port.number))
 
     def _send_to_clients(self, data: bytes) -> None:
         for port in self.ports.values():
             if port.is_client and port.link.up:
-                port.link.stats.lost.guard(port.link.write_management, data, urgent=True)
+                port.link.stats.lost.guard(port.link.send_management, data, urgent=True)
 
     def _report_state(self, port: BridgePort) -> None:
         state = port.tree_port.state

@@ -14,7 +14,8 @@ from r2p.errors import DecodeError
 from r2p.protocols.bridge.link_selection import LinkSelection
 from r2p.runtime.sample import Source
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.link import NOTHING, Announcement, GatewayHooks, Link
+from r2p.transports.announcement import NOTHING, Announcement
+from r2p.transports.link import GatewayHooks, Link
 from r2p.transports.stats import RETRY_AFTER_ERROR, count_internal_error
 
 _TYPES = {ManagementType.ALIVE, ManagementType.HELLO, *management.GATEWAY_TYPES}
@@ -201,7 +202,7 @@ class MultihomedModule:
         for number, message in self.selection.pop_messages():
             link = self._by_number[number].link
             if link.up and message is not None:
-                link.write_management(management.encode(message), urgent=True)
+                link.send_management(management.encode(message), urgent=True)
             elif link.up and link.passes_probes:
                 link.write_management(probes.encode(self._instance, number))
         filtering = self.selection.needs_consent

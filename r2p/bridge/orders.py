@@ -26,6 +26,9 @@ _REASONS = {
     management.DENIED_CONTROL: "see --allow-control",
     management.DENIED_READ_ONLY: "see --read-only",
     management.DENIED_BOOT: "the module is in boot mode, where a STOP hangs it",
+    management.DENIED_NO_KEY: "its sender lacks this link's key",
+    management.DENIED_OTHER_KEY: "its sender has another key than this link",
+    management.DENIED_OPEN_LINK: "its link has no key, and the module's has one",
 }
 
 
@@ -112,12 +115,21 @@ class OrderRelay:
             if not reason:
                 passed = True
                 named = msgspec.structs.replace(order, module=module_alias(link_name))
-                other.link.write_management(management.encode(named), urgent=True)
+                other.link.send_management(management.encode(named), urgent=True)
             elif not known:
                 known = link_name in other.link.discovery.modules
                 refused = reason if known else refused or reason
         if refused and (known or not passed):
             self._refuse(port, order, refused, known=known)
+
+    def refuse(self, port: BridgePort, order: management.Order, reason: int) -> None:
+        """Refuse an order that came without the key of its link; answer if it was for this module, or one behind it."""
+        known = order.module == module_alias(self._module)
+        name = None if known else self._names.to_canonical(order.module, port.name)
+        if name is not None:
+            others = (each for each in self._ports.values() if each is not port)
+            known = any(self._names.to_link_name(name, each.name) in each.link.discovery.modules for each in others)
+        self._refuse(port, order, reason, known=known)
 
     def forward_denial(self, port: BridgePort, denied: management.Denied) -> None:
         """Forward a DENIED to all links: the sender of the order may be anywhere."""
@@ -144,6 +156,8 @@ class OrderRelay:
         harmless = isinstance(order, management.Stop)
         if harmless and is_booting(other.link, link_name):
             return management.DENIED_BOOT
+        if other.link.guard is not None and port.link.guard is None:
+            return management.DENIED_OPEN_LINK  # this gateway does not lend its key
         return self._policy.order_denied(port.name, other.name, harmless=harmless)
 
     def _refuse(self, port: BridgePort, order: management.Order, reason: int, *, known: bool) -> None:

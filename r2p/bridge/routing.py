@@ -22,7 +22,7 @@ from r2p.log_lines import LineLimit, get_logger
 from r2p.names import LOADER_PREFIX, TOPIC
 from r2p.protocols.discovery.events import TopicType
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.transports.link import NOTHING, Announcement
+from r2p.transports.announcement import NOTHING, Announcement
 from r2p.transports.stats import count_internal_error
 
 logger = get_logger("r2p.bridge")

@@ -1,11 +1,15 @@
-"""Fields inside the messages of gateways (PROTOCOL.md 9): parts, counts and serials, acknowledgements, neighbours.
+"""The messages of gateways (PROTOCOL.md 9), and their fields: parts, counts and serials, acknowledgements, neighbours.
 
-`r2p.codecs.management` has their messages, and exports these functions.
+`r2p.codecs.management` has their bytes, and exports all of this.
 """
 
 import struct
 from collections.abc import Iterable
 
+import msgspec
+
+BRIDGE_ACKS = 2  # acks in a Bridge
+LEAF_ACKS = 3  # acks in a Leaf
 MESH_HEARD = 3  # entries in Mesh.heard
 PARTS_MAX = 16
 """Parts of a Name or a Mesh: the number of a part has four bits."""
@@ -14,6 +18,47 @@ _PART_BITS = 4
 _SERIALS = 0x10000  # counts of Bridge and Leaf, and serials of Mesh, start again at 0 after this many
 _ACK = struct.Struct("<IH")
 _HEARD = struct.Struct("<BIB")
+
+
+class Bridge(msgspec.Struct, frozen=True, gc=False):
+    """A gateway lives: `count` numbers its messages, `agreement` is the hash of the mesh as the gateway sees it.
+
+    `root` is the lowest gateway of its mesh. `acks` are 2 times the sender (u32) and `count` (u16) of the last BRIDGE
+    or LEAF that it received on this network.
+    """
+
+    gateway: int
+    port: int
+    count: int
+    agreement: int
+    root: int
+    acks: bytes
+
+
+class Mesh(msgspec.Struct, frozen=True, gc=False):
+    """The gateways that a gateway hears at its ports, again with a new `serial` when they change.
+
+    `part` has the number of this part and of the last one: see `make_part`. `heard` is 3 times the own port (u8), the
+    other gateway (u32) and its port (u8).
+    """
+
+    gateway: int
+    serial: int
+    part: int
+    heard: bytes
+
+
+class Leaf(msgspec.Struct, frozen=True, gc=False):
+    """A module that is not a gateway has links to several networks with gateways: `module` is its instance.
+
+    `count` numbers its messages; `acks` are 3 times the gateway (u32) and `count` (u16) of the last BRIDGE that it
+    received on this network.
+    """
+
+    module: int
+    port: int
+    count: int
+    acks: bytes
 
 
 def make_part(number: int, last: int) -> int:

@@ -33,8 +33,13 @@ import functools
 import msgspec
 
 from r2p.codecs import PublisherClass, UnknownType
+from r2p.codecs._gateway_fields import BRIDGE_ACKS as BRIDGE_ACKS
+from r2p.codecs._gateway_fields import LEAF_ACKS as LEAF_ACKS
 from r2p.codecs._gateway_fields import MESH_HEARD as MESH_HEARD
 from r2p.codecs._gateway_fields import PARTS_MAX as PARTS_MAX
+from r2p.codecs._gateway_fields import Bridge as Bridge
+from r2p.codecs._gateway_fields import Leaf as Leaf
+from r2p.codecs._gateway_fields import Mesh as Mesh
 from r2p.codecs._gateway_fields import decode_acks as decode_acks
 from r2p.codecs._gateway_fields import decode_heard as decode_heard
 from r2p.codecs._gateway_fields import encode_acks as encode_acks
@@ -52,6 +57,9 @@ from r2p.codecs._long_names import alias_messages as alias_messages
 from r2p.codecs._long_names import long_name_messages as long_name_messages
 from r2p.codecs._long_names import long_name_number as long_name_number
 from r2p.codecs._records import Codec, Record
+from r2p.codecs.keys import Challenge as Challenge
+from r2p.codecs.keys import Proof as Proof
+from r2p.codecs.keys import Seal as Seal
 from r2p.errors import MessageError
 
 SIZE = 32
@@ -85,6 +93,9 @@ class ManagementType(enum.IntEnum):
     DENIED = 0x55
     NAME = 0x56
     LONG_NAME = 0x57
+    CHALLENGE = 0x58
+    PROOF = 0x59
+    SEAL = 0x5A
     BRIDGE = 0x60
     MESH = 0x61
     LEAF = 0x62
@@ -100,6 +111,8 @@ ORDER_TYPES = (ManagementType.STOP, ManagementType.REBOOT, ManagementType.BOOTLO
 """The orders that a gateway may deny."""
 GATEWAY_TYPES = (ManagementType.BRIDGE, ManagementType.MESH, ManagementType.LEAF)
 """The types of messages between gateways about their tree."""
+SEALED_TYPES = (*ORDER_TYPES, *GATEWAY_TYPES)
+"""The types that count on a link with a key only behind their SEAL."""
 
 # Alive.flags
 FLAG_STOPPED = 1
@@ -157,6 +170,9 @@ DENIED_READ_ONLY = 2  # the gateway sends nothing on the link of the module
 DENIED_CLIENTS = 3  # the server of a debug line serves as many clients as it may: `order` is 0
 DENIED_BOOT = 4  # STOP would hang a module in boot mode
 DENIED_GATEWAYS = 5  # the server of a debug line accepts no gateway: `order` is 0
+DENIED_NO_KEY = 6  # the order lacks the seal of the link's key; `order` 0: the other end of the line has no key
+DENIED_OTHER_KEY = 7  # the seal of the order, or the proof of the other end of the line, was made with another key
+DENIED_OPEN_LINK = 8  # the order crossed a link without a key, and the link of the module has one
 
 # Claim.flags
 CLAIM_FIXED = 1  # the module can't take another id8
@@ -185,8 +201,6 @@ RENEW_MAX = 24  # high bytes in a Renew
 NO_UTC = 0xFFFF  # Network.utc_error: the offset is unknown
 
 _VERSION = 1
-BRIDGE_ACKS = 2  # acks in a Bridge
-LEAF_ACKS = 3  # acks in a Leaf
 _MARK = b"r2p"
 _MARKED = slice(22, 25)  # of an encoded message: in its params, behind RTCAN's message id
 
@@ -312,54 +326,13 @@ class Conflict(msgspec.Struct, frozen=True, gc=False):
 class Denied(msgspec.Struct, frozen=True, gc=False):
     """A gateway does not let an order through to a module: `order` is the type byte of the order, `reason` DENIED_...
 
-    Or the server of a debug line does not accept a connection: `order` is 0.
+    Or the other end of a debug line does not accept the connection: `order` is 0.
     """
 
     gateway: str
     module: str
     order: int
     reason: int
-
-
-class Bridge(msgspec.Struct, frozen=True, gc=False):
-    """A gateway lives: `count` numbers its messages, `agreement` is the hash of the mesh as the gateway sees it.
-
-    `root` is the lowest gateway of its mesh. `acks` are 2 times the sender (u32) and `count` (u16) of the last BRIDGE
-    or LEAF that it received on this network.
-    """
-
-    gateway: int
-    port: int
-    count: int
-    agreement: int
-    root: int
-    acks: bytes
-
-
-class Mesh(msgspec.Struct, frozen=True, gc=False):
-    """The gateways that a gateway hears at its ports, again with a new `serial` when they change.
-
-    `part` has the number of this part and of the last one: see `make_part`. `heard` is 3 times the own port (u8), the
-    other gateway (u32) and its port (u8).
-    """
-
-    gateway: int
-    serial: int
-    part: int
-    heard: bytes
-
-
-class Leaf(msgspec.Struct, frozen=True, gc=False):
-    """A module that is not a gateway has links to several networks with gateways: `module` is its instance.
-
-    `count` numbers its messages; `acks` are 3 times the gateway (u32) and `count` (u16) of the last BRIDGE that it
-    received on this network.
-    """
-
-    module: int
-    port: int
-    count: int
-    acks: bytes
 
 
 class Network(msgspec.Struct, frozen=True, gc=False):
@@ -458,8 +431,9 @@ class Renewed(msgspec.Struct, frozen=True, gc=False):
 FirmwareMessage = Alive | Order | Advertise | SubscribeRequest | SubscribeResponse | Path
 RtcanMessage = Network | Claim | Reserve | Grant | Refuse | Release | Renew | Renewed
 R2pMessage = Hello | TypeInfo | Unsubscribe | Endpoint | Conflict | Denied | Name | LongName
+KeyMessage = Challenge | Proof | Seal
 GatewayMessage = Bridge | Mesh | Leaf
-Management = FirmwareMessage | RtcanMessage | R2pMessage | GatewayMessage
+Management = FirmwareMessage | RtcanMessage | R2pMessage | KeyMessage | GatewayMessage
 
 _PUBSUB = "16s H H 10s"
 _CODEC = Codec[Management](
@@ -488,6 +462,9 @@ _CODEC = Codec[Management](
     Record(Denied, ManagementType.DENIED, "7s 7s B B", version=_VERSION),
     Record(Name, ManagementType.NAME, "7s B 22s", version=_VERSION),
     Record(LongName, ManagementType.LONG_NAME, "B B I 24s", version=_VERSION),
+    Record(Challenge, ManagementType.CHALLENGE, "I 16s", version=_VERSION),
+    Record(Proof, ManagementType.PROOF, "I I B 16s", version=_VERSION),
+    Record(Seal, ManagementType.SEAL, "I I I H 16s", version=_VERSION),
     Record(Bridge, ManagementType.BRIDGE, "I B H I I 12s", version=_VERSION),
     Record(Mesh, ManagementType.MESH, "I H B 18s", version=_VERSION),
     Record(Leaf, ManagementType.LEAF, "I B H 18s", version=_VERSION),

@@ -12,7 +12,19 @@ import msgspec
 
 from r2p.bridge import Bridge, BridgeOptions, MultihomedModule
 from r2p.clock import in_background, random_of
-from r2p.codecs.management import DENIED_BOOT, DENIED_READ_ONLY, KIND_NODE, ROLE_PUBLISHES, WIRE_VERSION
+from r2p.codecs import management
+from r2p.codecs.management import (
+    DENIED_BOOT,
+    DENIED_CLIENTS,
+    DENIED_GATEWAYS,
+    DENIED_NO_KEY,
+    DENIED_OPEN_LINK,
+    DENIED_OTHER_KEY,
+    DENIED_READ_ONLY,
+    KIND_NODE,
+    ROLE_PUBLISHES,
+    WIRE_VERSION,
+)
 from r2p.errors import Error
 from r2p.log_lines import LineLimit, get_logger
 from r2p.names import module_alias
@@ -31,8 +43,10 @@ from r2p.protocols.discovery.events import (
     ModuleInfo,
     NameConflict,
 )
+from r2p.protocols.keys import Verdict
 from r2p.runtime.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.runtime.topic import Topic, TopicSpace
+from r2p.transports.guard import OTHER_END_WANTS_KEY, OTHER_KEY
 from r2p.transports.link import Link, is_booting
 from r2p.transports.stats import LinkStats
 from r2p.units import SECOND
@@ -46,9 +60,19 @@ _DENIAL_EXPECTED = 5 * SECOND  # ns after a command in which gateways may answer
 _MISMATCH_LINES = 1  # of the log in a second about one topic whose types differ
 _ACCEPTED_AFTER = 3.0  # seconds that a connection lasts which the other end did not refuse: it would have said so
 _OTHER_VERSIONS_MAX = 64  # modules of another wire version that are reported, each once
+_DENIED_APART = SECOND // 5  # ns between two DENIED on one link
 _REFUSED_APART = 60 * SECOND  # ns between two lines about connections that one URL refuses, or that are refused
 
+_CONNECTION_DENIED = {
+    DENIED_CLIENTS: "{server} has no connection left (max_clients= of its tcp-listen:); trying again",
+    DENIED_GATEWAYS: "{server} lets no gateway join by this line: have it listen with ?gateways=yes",
+}
+_KEY_DENIED = {DENIED_NO_KEY: OTHER_END_WANTS_KEY, DENIED_OTHER_KEY: OTHER_KEY}
+_KEY_REASONS = {Verdict.NO_KEY: DENIED_NO_KEY, Verdict.OTHER_KEY: DENIED_OTHER_KEY}
 _DENIED = {
+    DENIED_NO_KEY: "the order lacks the key of the link: add ?key=FILE to the URL",
+    DENIED_OTHER_KEY: "the link has another key than this URL: give both ends copies of one file",
+    DENIED_OPEN_LINK: "the link there has a key, and the order came by one without: give that one a key, too",
     DENIED_READ_ONLY: "the link there is read-only",
     DENIED_BOOT: "the module is in its boot loader, where a STOP hangs its management until its power is cut",
 }
@@ -105,6 +129,7 @@ class LinkManager:
         self._limits: dict[Link, LineLimit] = {}
         self._clients = LineLimit()
         self._refusals = LineLimit(1, _REFUSED_APART)
+        self._denials = LineLimit(1, _DENIED_APART)
         self._refused: dict[Link, _RefusedLink] = {}
         space.changed = self._topic_changed
         if bridge is not None:
@@ -227,6 +252,22 @@ class LinkManager:
             case ModuleGone():
                 self._report_gone(link, event)
 
+    def concerns_order(self, module: str) -> bool:
+        """Return whether an order for this module (by its alias) is to be obeyed or passed on here."""
+        return self.bridge is not None or module == module_alias(self.space.module)
+
+    def message_refused(self, link: Link, message: management.Management, verdict: Verdict) -> None:
+        """Report that an order, or a message of a gateway, does not count, as it lacks the link's key."""
+        reason = _KEY_REASONS.get(verdict)
+        if reason is None:
+            return  # it was sent twice: nothing that its sender could mend
+        if not isinstance(message, management.Order):
+            self._report_key(link, "messages of gateways are ignored", reason)
+        elif self.bridge is not None:
+            self.bridge.order_refused(link, message, reason)
+        else:
+            self._refuse_order(link, message, reason)
+
     # Called by the bridge
 
     def _port_changed(self, link: Link, kind: str, text: str, trouble: bool) -> None:
@@ -286,14 +327,31 @@ class LinkManager:
     def _report_command_denied(self, link: Link, event: CommandDenied) -> None:
         """Report that a gateway does not pass on a command of this module."""
         at, name = self._commands.get((event.command, event.module), (-_DENIAL_EXPECTED, ""))
+        if event.reason == DENIED_NO_KEY and link.guard is not None:
+            return  # only the seal was lost: the order is sent again
         if self.space.clock.monotonic() - at < _DENIAL_EXPECTED:
             what = f"{event.command.name} of {name}"
             reason = _DENIED.get(event.reason, "it lacks --allow-control")
             text = f"gateway {event.gateway} does not let {what} through: {reason}"
+            if event.gateway == event.module:
+                text = f"{name} refuses {event.command.name}: {reason}"
             notice = LinkNotice(link.name, f"{event.command.name} denied", text)
             if not self.observer:  # a tool ends with this text
                 logger.warning("link %s: %s", link.title, text)
             self._events.emit(notice)
+
+    def _refuse_order(self, link: Link, order: management.Order, reason: int) -> None:
+        """Refuse an order for this module, and let its sender know why."""
+        self._report_key(link, f"{type(order).__name__.upper()} refused", reason)
+        if self._denials.suffix(link.name, self.space.clock.monotonic()) is not None:
+            denied = management.Denied(order.module, order.module, management.order_type(order), reason)
+            link.write_management(management.encode(denied))
+
+    def _report_key(self, link: Link, what: str, reason: int) -> None:
+        suffix = self._refusals.suffix(f"{link.name} {what}", self.space.clock.monotonic())
+        if suffix is not None:
+            key = "lacks the link's key" if reason == DENIED_NO_KEY else "has another key than this link"
+            self.link_notice(link, "without key", f"{what}{suffix}: the sender {key} (?key= of its URL)", trouble=True)
 
     def _report_gone(self, link: Link, event: ModuleGone) -> None:
         """Report that a module on the link itself is gone, while the link is up; without a good-bye, as trouble."""
@@ -321,13 +379,15 @@ class LinkManager:
 
     def _connection_denied(self, link: Link, event: ConnectionDenied) -> None:
         """Note that the other end refuses this connection; the transport tries again and again."""
-        if not event.gateway:
+        if event.reason != DENIED_GATEWAYS:
             self._refused.setdefault(link, _RefusedLink())
             link.denied = True
-        if self._refusals.suffix(link.name, self.space.clock.monotonic()) is not None:
-            text = f"{event.server} has no connection left (max_clients= of its tcp-listen:); trying again"
-            if event.gateway:
-                text = f"{event.server} lets no gateway join by this line: have it listen with ?gateways=yes"
+        if self._refusals.suffix(link.name, self.space.clock.monotonic()) is None:
+            return
+        if event.reason in _KEY_DENIED:
+            link.refuse_key(_KEY_DENIED[event.reason])
+        else:
+            text = _CONNECTION_DENIED[event.reason].format(server=event.server)
             self.link_notice(link, "connection refused", text, trouble=True)
 
     def _tried_again(self, link: Link, refused: _RefusedLink, lost: int) -> None:

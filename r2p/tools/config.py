@@ -7,6 +7,7 @@ is rejected.
 
 import difflib
 import os
+import re
 import socket
 import stat
 import tomllib
@@ -163,9 +164,14 @@ def _located(text: str, directory: Path) -> str:
 
 def _local_peer(url: str) -> str:
     """Return the URL by which a tool on the same machine reaches a program that has opened this one."""
-    scheme, _, address = url.partition(":")
+    scheme, _, rest = url.partition(":")
     if scheme != "tcp-listen":
         return url
+    address, *options = re.split("[?,&]", rest)
+    return _loopback(address) + "".join(f"?{each}" for each in options if each.startswith("key="))
+
+
+def _loopback(address: str) -> str:
     host, colon, port = address.rpartition(":")
     if not colon or not port.isdecimal():  # only a host (and the usual port), or only a port
         return f"tcp:127.0.0.1:{address}" if address.isdecimal() else f"tcp:{_LOOPBACK.get(address, address)}"

@@ -22,6 +22,7 @@ GROUPS = {
     "node": ("r2p.tools.node", "List and inspect nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
     "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),
+    "key": ("r2p.tools.key", "Make a shared key for links."),
     "config": ("r2p.tools.config_show", "Show the settings, and where they come from."),
 }
 COMMANDS = {

@@ -248,6 +248,13 @@ class Session:
                 raise r2p.TransportError(f"no connection on {self.network_name}")
             await asyncio.sleep(_SETTLE_POLL)
 
+    async def fail_without_key(self) -> None:
+        """Raise r2p.TransportError when the other end of each link has refused it for its key; the log says why."""
+        events = self.module.events()
+        while not self.module.links or not all(link.key_refused for link in self.module.links):
+            await anext(events)
+        raise r2p.TransportError(f"no connection on {self.network_name}")
+
     async def settled(self) -> bool:
         """Wait until no new announcements arrive; False if they still did after the longest time."""
         quiet = _SETTLED_ON_BUS if any(link.has_slots for link in self.module.links) else _SETTLED
@@ -415,9 +422,10 @@ def _with_options(run: Callable[..., None], body: Callable[..., object], *, sess
 async def _while_connected(session: Session, body: Awaitable[None]) -> None:
     """Run a command. Raises r2p.TransportError if no link can come up."""
     async with asyncio.TaskGroup() as tasks:
-        watching = tasks.create_task(session.fail_unless_connected())
+        watching = [tasks.create_task(session.fail_unless_connected()), tasks.create_task(session.fail_without_key())]
         await body
-        watching.cancel()
+        for each in watching:
+            each.cancel()
 
 
 _COMMON = [

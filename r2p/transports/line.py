@@ -14,20 +14,25 @@ import contextlib
 from array import array
 from bisect import bisect_right
 from collections import deque
+from collections.abc import Hashable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 
-from r2p.codecs import debug
+from r2p.codecs import debug, management
 from r2p.codecs.management import FLAG_BOOT
 from r2p.errors import MessageError
-from r2p.names import LOADER_PREFIX, MANAGEMENT
+from r2p.keys import SharedKey
+from r2p.names import LOADER_PREFIX, MANAGEMENT, module_alias
 from r2p.protocols.discovery.negotiation import GRACE
+from r2p.protocols.keys import LinkEnd
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
+from r2p.transports.announcement import NOTHING
 from r2p.transports.buffered_link import TOO_LONG, BufferedLink, SenderLookup
-from r2p.transports.link import NOTHING, Hub, is_booting
+from r2p.transports.guard import LineGate
+from r2p.transports.link import Hub, is_booting
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -139,7 +144,20 @@ class LineLink(BufferedLink):
         self._messages_given = 0  # samples that have been given to carriers, as `stats.sent` counts them
         self._unsent: tuple[str, Sample] | None = None
         """The sample of a real-time publisher that the carrier has not sent entirely, and its topic."""
+        self._gate: LineGate | None = None
         self._loader_topics: set[str] = set()  # those that flow without a handshake now
+
+    def use_key(self, key: SharedKey | None, end: LinkEnd = LinkEnd.SERIAL) -> None:
+        super().use_key(key, end)
+        if self.guard is not None:
+            self._gate = LineGate(self._space, self.guard, self._open, self._deny_key)
+
+    def _deny_key(self, reason: int, text: str) -> None:
+        """Report that the other end has not proven the key, and let it know the reason (DENIED_..., 0: it does)."""
+        if reason:
+            name = module_alias(self._space.module)
+            self.write_management(management.encode(management.Denied(name, name, 0, reason)), urgent=True)
+        self.refuse_key(text)
 
     # For the carrier
 
@@ -154,16 +172,33 @@ class LineLink(BufferedLink):
         self._unconfirmed = UnconfirmedBytes()
         self._messages_given = self.stats.sent
         self._send(debug.OPENING)
-        if self._carrier is carrier:  # else it broke at the first bytes
-            self._begin_grace()
-            self.on_up()
+        if self._carrier is not carrier:  # it broke at the first bytes
+            return
+        if self._gate is None:
+            self._open()
+        else:
+            self._gate.connected(at_once=carrier.flow_controlled)
+
+    def _open(self) -> None:
+        """Begin to exchange messages: the connection is up, and its other end has proven the key, if there is one."""
+        if self._gate is not None:
+            self.denied = self.key_refused = False
+        self._begin_grace()
+        self.on_up()
+
+    def _begin_session(self) -> None:
+        """Do nothing: with a key, the session has begun with the connection."""
 
     def disconnect(self, reason: str) -> None:
         """Give up the carrier: its connection has ended."""
         self._count_unknown()
         self._carrier = None
         self._end_grace()
+        if self._gate is not None:
+            self._gate.close()
         self.on_down(reason)
+        if self._gate is not None:
+            self._clear_buffer()  # of what proves the key: it is of use for this connection only
         self._lose_unsent()  # after `on_down`, so that it counts as lost in this outage
 
     def feed(self, data: bytes | memoryview) -> None:
@@ -175,6 +210,8 @@ class LineLink(BufferedLink):
         except Exception as error:  # noqa: BLE001 - counted and logged; the other lines follow
             self.stats.lost.internal_error(error)
             lines = self._readable_lines(bytes(data))
+        if self._gate is not None and not self._gate.is_open:  # else data would pass by subscriptions of before
+            lines = [line for line in lines if line.topic == _MANAGEMENT]
         if self._arrivals:  # lines of an earlier connection, say: they keep their stamp
             self.receive([_NewStamp(received_at)])
         else:
@@ -261,6 +298,12 @@ class LineLink(BufferedLink):
         self._buffered_bytes += len(line)
         (self._urgent if urgent else self._management).append(line)
 
+    def manage(self, data: bytes, source: Hashable) -> None:
+        if self._gate is None or self._gate.is_open:
+            super().manage(data, source)
+        else:
+            self._gate.receive(data, source)
+
     def sample(self, topic: str, arrival: debug.Line) -> Sample:
         return Sample(arrival.data, self._senders.source(topic), self._received_at, stamped=False)
 
@@ -297,6 +340,8 @@ class LineLink(BufferedLink):
             self._carrier.resume()
 
     def close(self) -> None:
+        if self._gate is not None:
+            self._gate.close()
         self._end_grace()
         self._flush(closing=True)  # the carrier gets all that waits, and after it the announcement of the end
         super().close()

@@ -16,15 +16,13 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from r2p.clock import Alarm
+from r2p.codecs import management
 from r2p.codecs.management import (
-    ANY_TYPE,
-    CLASS_LATCHES,
     FLAG_BOOT,
     NO_PARAMS,
     QUEUE,
-    ROLE_PUBLISHES,
-    ROLE_SUBSCRIBES,
 )
+from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
 from r2p.names import TOPIC_MAX
 from r2p.protocols.discovery.announcer import Relayed
@@ -40,65 +38,20 @@ from r2p.protocols.discovery.events import (
     Send,
     SubscriberJoined,
     SubscribersGone,
-    TopicType,
     possible_senders,
 )
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
+from r2p.protocols.keys import LinkEnd, Verdict
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
+from r2p.transports.announcement import NOTHING, Announcement, announcement_of
+from r2p.transports.guard import LinkGuard, key_protocol
 from r2p.transports.stats import RETRY_AFTER_ERROR, LinkStats, LoggedCounter
 from r2p.units import SECOND
 
 MESSAGES_PER_TURN = 64
 """Messages that a link delivers before it lets the event loop run once."""
-
-
-class Announcement(msgspec.Struct, frozen=True):
-    """The other ends' view of a topic of this module; `asked` is the type in which it subscribes to the topic.
-
-    `queue`: how many messages a publisher keeps, or has on the way, for this module; independent of its subscribers'
-    queues.
-    """
-
-    publishes: bool = False
-    subscribes: bool = False
-    size: int = 0
-    fingerprint: bytes = ANY_TYPE
-    varies: bool = False
-    asked: TopicType = TopicType()
-    queue: int = QUEUE
-    params: bytes = NO_PARAMS
-    endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
-
-
-NOTHING = Announcement()
-
-
-def type_of(topic: Topic) -> TopicType:
-    """The size and fingerprint of a topic's messages, as far as this module knows them."""
-    layout = topic.layout
-    return TopicType() if layout is None else TopicType(layout.size, layout.fingerprint, layout.varies)
-
-
-def _announcement_of(topic: Topic) -> Announcement:
-    """Return what the other ends should know of a topic that only this module uses."""
-    publishers: dict[tuple[str, int], int] = {}
-    for each in topic.publishers:
-        key = each.node.name, ROLE_PUBLISHES
-        publisher_class = int(each.publisher_class) | (CLASS_LATCHES if each.latch else 0)
-        publishers[key] = max(publisher_class, publishers.get(key, 0))  # a node may have several, of several classes
-    subscribers = {(each.owner, ROLE_SUBSCRIBES): 0 for each in topic.queues}
-    topic_type = type_of(topic)
-    return Announcement(
-        publishes=bool(publishers),
-        subscribes=bool(subscribers),
-        size=topic_type.size,
-        fingerprint=topic_type.fingerprint,
-        varies=topic_type.varies,
-        asked=topic_type,
-        endpoints=publishers | subscribers,
-    )
 
 
 class Hub(Protocol):
@@ -142,6 +95,12 @@ class Hub(Protocol):
 
     def discovered(self, link: "Link", event: Event) -> None:
         """Handle what the discovery of a link has found."""
+
+    def concerns_order(self, module: str) -> bool:
+        """Return whether an order for a module (by its alias) is for this one, or to be passed on."""
+
+    def message_refused(self, link: "Link", message: management.Management, verdict: Verdict) -> None:
+        """Report that a message does not count, as it lacks the link's key."""
 
 
 class GatewayHooks(Protocol):
@@ -210,6 +169,10 @@ class Link(abc.ABC):
         """True if a gateway at the other end joins the mesh of this module's gateway; else the link is for clients."""
         self.gateway_hooks: GatewayHooks | None = None
         """Decisions of the module about this link, where gateways join networks."""
+        self.guard: LinkGuard | None = None
+        """The guard of a link with a key."""
+        self.key_refused = False
+        """True if the two ends of the line do not have one key."""
         self.denied = False
         """True if the other end has refused the link, and no connection has been of use since; set by the module."""
         self.transient = False
@@ -236,6 +199,11 @@ class Link(abc.ABC):
 
     # For the transport that owns the link
 
+    def use_key(self, key: SharedKey | None, end: LinkEnd = LinkEnd.SHARED) -> None:
+        """Guard the link with the key of its URL, if there is one; before the link comes up."""
+        if key is not None:
+            self.guard = LinkGuard(key_protocol(self._space, key, end), self._clock, self._hub, self)
+
     def on_up(self) -> None:
         """Begin to send, and announce everything, as the other end can be reached."""
         outage = (self._clock.monotonic() - self._down_at) / SECOND
@@ -244,16 +212,29 @@ class Link(abc.ABC):
         self.unreachable_reason = ""
         self.stats.ups += 1
         self._hub.link_changed(self, "", outage, lost)
+        self._begin_session()
         for name in self._lapsed:  # before discovery finds the present subscribers
             self._remove_subscriber(name)
         self._lapsed.clear()
         self._apply(self.discovery.link_up(self._clock.monotonic()))
+
+    def _begin_session(self) -> None:
+        """Prove the key anew: what others have proven before may be recorded."""
+        if self.guard is not None:
+            self.guard.link_up()
 
     def unreachable(self, reason: str) -> None:
         """Report that the other end can't be reached yet, once for each reason."""
         if reason != self.unreachable_reason:
             self.unreachable_reason = reason
             self._hub.link_waits(self, reason)
+
+    def refuse_key(self, reason: str) -> None:
+        """Report that the two ends do not have one key, once for each reason."""
+        self.denied = self.key_refused = True
+        if reason != self.unreachable_reason:
+            self.unreachable_reason = reason
+            self._hub.link_notice(self, "key refused", reason, trouble=True)
 
     def on_down(self, reason: str) -> None:
         """Stop sending, as the other end is gone; discard and count what waits: no stale command arrives late."""
@@ -287,8 +268,24 @@ class Link(abc.ABC):
 
     def manage(self, data: bytes, source: Hashable) -> None:
         """Handle a management message from this address."""
+        if self.guard is None or self.guard.admits(data, self.sealer(source)):
+            self.handle_management(data, source)
+
+    def sealer(self, source: Hashable) -> Hashable:
+        """Return what seals and what they seal have in common: the address they come from."""
+        return source
+
+    def handle_management(self, data: bytes, source: Hashable) -> None:
+        """Handle a management message that counts, also on a link with a key."""
         if self.gateway_hooks is None or not self.gateway_hooks.handle_management(data):
             self._apply(self.discovery.receive(self._clock.monotonic(), data, source))
+
+    def send_management(self, data: bytes, *, urgent: bool = False) -> None:
+        """Send a management message, behind its seal on a link with a key: see `write_management`."""
+        if self.guard is None:
+            self.write_management(data, urgent=urgent)
+        else:
+            self.guard.send(data, urgent=urgent)
 
     # For the two kinds of links
 
@@ -410,7 +407,7 @@ class Link(abc.ABC):
 
     def topic_changed(self, topic: Topic) -> None:
         """Announce a topic that this module publishes or subscribes to, after a possible change."""
-        desired = _announcement_of(topic)
+        desired = announcement_of(topic)
         if self.gateway_hooks is not None:
             desired = self.gateway_hooks.desired_state(topic, desired)
         is_used = bool(desired.publishes or desired.subscribes or desired.endpoints)
@@ -495,7 +492,7 @@ class Link(abc.ABC):
         match event:
             case Send(data, urgent):
                 if self.up and (self.gateway_hooks is None or self.gateway_hooks.may_announce):
-                    self.write_management(data, urgent=urgent)
+                    self.send_management(data, urgent=urgent)
             case SubscriberJoined():
                 self._subscriber_joined(event)
             case SubscribersGone(topic) if self.up or self._closed:

@@ -16,13 +16,14 @@ import msgspec
 
 from r2p.clock import check_seconds, in_background, random_of
 from r2p.errors import TransportError
+from r2p.keys import SharedKey
 from r2p.messages import SIZE_MAX, ClockOffset
 from r2p.names import MANAGEMENT
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.transports.buffered_link import BufferedLink
 from r2p.transports.link import Hub, Transport
-from r2p.transports.url import Url, duration
+from r2p.transports.url import Url, duration, key_file
 
 IN_FLIGHT = 1024
 """Places for messages on their way, without which the network is full for senders."""
@@ -288,8 +289,15 @@ class MemoryLink(BufferedLink):
 class MemoryTransport(Transport):
     """A place on a memory network for one module: on the given one, or on the running loop's network of that name."""
 
-    def __init__(self, name: str, network: MemoryNetwork | None = None, faults: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        network: MemoryNetwork | None = None,
+        faults: dict[str, Any] | None = None,
+        key: SharedKey | None = None,
+    ) -> None:
         self._name = name
+        self._key = key
         self._network = network
         self._faults = faults or {}
 
@@ -298,6 +306,7 @@ class MemoryTransport(Transport):
         for fault, value in self._faults.items():
             setattr(shared, fault, value)
         link = MemoryLink(f"memory:{self._name}", hub, shared)
+        link.use_key(self._key)
         hub.attach(link)
         try:
             link.connect()
@@ -311,11 +320,12 @@ class MemoryTransport(Transport):
 def from_url(url: Url) -> MemoryTransport:
     """`memory:NAME`; options `loss`, `duplicate`, `reorder` (0..1), `delay`, `jitter` (durations), `seed`.
 
-    The options hold for the whole network, from now on.
+    These hold for the whole network, from now on; `key` for this module.
     """
     if not url.address:
         raise TransportError(f"{url}: give the network a name: memory:lab")
-    return MemoryTransport(url.address, None, dict(url.parsed(_OPTIONS)))
+    faults = url.parsed(_OPTIONS)
+    return MemoryTransport(url.address, None, faults, faults.pop("key", None))
 
 
 def _probability(text: str) -> float:
@@ -334,7 +344,8 @@ def _seed(text: str) -> int:
     return int(text)
 
 
-_OPTIONS: dict[str, Callable[[str], float]] = {
+_OPTIONS: dict[str, Callable[[str], Any]] = {
+    "key": key_file,
     "loss": _probability,
     "duplicate": _probability,
     "reorder": _probability,

@@ -20,7 +20,7 @@ from r2p.clock import Backoff
 from r2p.errors import TransportError
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
-from r2p.transports.url import Url
+from r2p.transports.url import Url, key_file
 
 if TYPE_CHECKING:
     import serial
@@ -43,14 +43,16 @@ _BACKOFF_MAX_S = 0.5  # seconds between attempts to open a device that is not th
 
 
 class SerialTransport(Transport):
-    """`serial:DEVICE`, option `baud` (115200)."""
+    """`serial:DEVICE`, options `baud` (115200) and `key`."""
 
     def __init__(self, url: Url) -> None:
-        options = url.parsed({"baud": _baud})
+        known: dict[str, Callable[[str], Any]] = {"baud": _baud, "key": key_file}
+        options = url.parsed(known)
         if not url.address:
             raise TransportError(f"{url}: give the device, for example serial:/dev/ttyUSB0")
         self._device = url.address
-        self._baud = options.get("baud", BAUD)
+        self._baud: int = options.get("baud", BAUD)
+        self._key = options.get("key")
         self._serial = _pyserial()
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
@@ -62,6 +64,7 @@ class SerialTransport(Transport):
             buffer=max(_LINE_MAX, int(bytes_a_second * BUFFERED)),
             piecemeal=True,
         )
+        link.use_key(self._key)
         backoff = Backoff(hub.random, longest=_BACKOFF_MAX_S)
         hub.attach(link)
         opened()

@@ -15,7 +15,7 @@ import re
 import socket
 import sys
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 if sys.platform == "linux":
     import fcntl
@@ -25,10 +25,11 @@ from r2p.clock import Backoff
 from r2p.codecs import debug, management
 from r2p.errors import TransportError
 from r2p.names import MANAGEMENT, module_alias
+from r2p.protocols.keys import LinkEnd
 from r2p.transports.identify import ServerKind, identify_server
 from r2p.transports.line import Connection, LineLink
 from r2p.transports.link import Hub, Transport
-from r2p.transports.url import Url, yes_or_no
+from r2p.transports.url import Url, key_file, yes_or_no
 
 PORT = 2323
 """The port where `tcp-listen:` listens, and `tcp:HOST` connects, unless the URL says otherwise."""
@@ -159,7 +160,7 @@ class TcpTransport(Transport):
     """`tcp:HOST:PORT`: connects, and reconnects."""
 
     def __init__(self, url: Url) -> None:
-        url.parsed({})
+        self._key = url.parsed({"key": key_file}).get("key")
         self._host, self._port = _host_port(url)
         if not self._host:
             raise TransportError(f"{url}: give the other end's address: tcp:HOST:PORT")
@@ -167,6 +168,7 @@ class TcpTransport(Transport):
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         link = LineLink(f"tcp:{_address(self._host, self._port)}", hub)
+        link.use_key(self._key, LinkEnd.CLIENT)
         backoff = Backoff(hub.random)
         hub.attach(link)
         opened()
@@ -246,10 +248,12 @@ class TcpListenTransport(Transport):
     """
 
     def __init__(self, url: Url) -> None:
-        options = url.parsed({"max_clients": _client_count, "gateways": yes_or_no})
+        known: dict[str, Callable[[str], Any]] = {"max_clients": _client_count, "gateways": yes_or_no, "key": key_file}
+        options = url.parsed(known)
         self.url = url
         self.max_clients = options.get("max_clients", MAX_CLIENTS)
         self.admits_gateways = bool(options.get("gateways", False))
+        self.key = options.get("key")
         self.served: set[_ServerConnection] = set()
         self.refused: set[_ServerConnection] = set()
         """Refused connections that are being sent the reason, and have not closed yet."""
@@ -278,6 +282,17 @@ class TcpListenTransport(Transport):
             await server.wait_closed()
 
 
+class _ClientLink(LineLink):
+    """The link of a server to one client; `close` ends the connection of one without the key."""
+
+    def __init__(self, peer: str, hub: Hub, close: Callable[[str], None]) -> None:
+        super().__init__(peer, hub)
+        self._close_connection = close
+
+    def refuse_key(self, reason: str) -> None:
+        self._close_connection(reason)
+
+
 class _ServerConnection(_TcpConnection):
     """A connection of the server, with a link of its own if it is served."""
 
@@ -295,7 +310,8 @@ class _ServerConnection(_TcpConnection):
         if len(self._server.served) >= self._server.max_clients:
             self._refuse(transport)
             return None
-        link = LineLink(peer, self._hub)
+        link = _ClientLink(peer, self._hub, self._key_refused)
+        link.use_key(self._server.key, LinkEnd.SERVER)
         link.transient = True
         link.admits_gateways = self._server.admits_gateways
         self._server.served.add(self)
@@ -325,6 +341,13 @@ class _ServerConnection(_TcpConnection):
         transport.write(debug.encode(MANAGEMENT.encode(), management.encode(denied), 0))
         transport.write_eof()
         asyncio.get_running_loop().call_later(_REFUSED_S, self.abort)
+
+    def _key_refused(self, text: str) -> None:
+        """Close the connection, which holds the place of another client."""
+        self._hub.connection_refused(str(self._server.url), text)
+        loop = asyncio.get_running_loop()
+        loop.call_soon(self.close)  # behind the reason, which may wait for the end of this turn
+        loop.call_later(_REFUSED_S, self.abort)
 
     async def leave(self) -> None:
         """Close the link and the connection, as the server closes."""

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import msgspec
 
+from r2p import keys
 from r2p.clock import duration as duration  # for the options of URLs
 from r2p.errors import TransportError
+from r2p.keys import SharedKey
 from r2p.transports.link import Transport
 
 if TYPE_CHECKING:
@@ -98,6 +100,11 @@ def open_transport(text: str) -> Transport:
 def schemes() -> list[str]:
     """Return all available schemes, those of other packages included."""
     return sorted({*BUILT_IN, *(entry.name for entry in _entry_points())})
+
+
+def key_file(text: str) -> SharedKey:
+    """Return the key in this file, of the option `key`."""
+    return keys.load(text)
 
 
 def yes_or_no(text: str) -> bool:

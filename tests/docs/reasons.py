@@ -13,6 +13,7 @@ from itertools import product
 from pathlib import Path
 
 from r2p.protocols.can_orders import Outcome
+from r2p.protocols.keys import Verdict
 from r2p.protocols.rtcan.events import Fate
 from r2p.transports.can import rawsocket
 from tests.docs.blocks import ROOT
@@ -37,6 +38,11 @@ ELSEWHERE = {
     ("r2p/transports/can/socketcan.py", "kind"): _ERROR_FRAMES,
     ("r2p/protocols/rtcan/engine.py", "fate.value"): _FATES | {Fate.DISCARDED.value},
     ("r2p/transports/rtcan/tx.py", "done.fate.value"): _FATES,
+    ("r2p/transports/guard.py", "verdict.value"): {
+        Verdict.NO_KEY.value,
+        Verdict.OTHER_KEY.value,
+        Verdict.REPEATED.value,
+    },
 }
 """(File, key): what the key may be."""
 

@@ -61,6 +61,7 @@ def test_the_command_line_goes_before_the_environment_before_the_file(
         ("tcp-listen:0.0.0.0:2323", "tcp:127.0.0.1:2323"),
         ("tcp-listen:[::]:2323", "tcp:[::1]:2323"),
         ("tcp-listen:10.0.0.5:2323", "tcp:10.0.0.5:2323"),
+        ("tcp-listen:2323?gateways=yes,key=robot.key", "tcp:127.0.0.1:2323?key=robot.key"),
         ("serial:/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
     ],
 )

@@ -205,12 +205,12 @@ class CommandDenied(msgspec.Struct, frozen=True):
 
 
 class ConnectionDenied(msgspec.Struct, frozen=True):
-    """The server at the other end does not accept this connection: it has its maximum of clients, or this module is a
-    `gateway` and the server accepts none.
+    """The other end of the line does not accept this connection: `reason` is DENIED_CLIENTS, DENIED_GATEWAYS,
+    DENIED_NO_KEY or DENIED_OTHER_KEY.
     """
 
     server: str
-    gateway: bool = False
+    reason: int
 
 
 class EchoDetected(msgspec.Struct, frozen=True):

@@ -55,6 +55,13 @@ M = TypeVar("M")
 
 _SUSPENDED = SECOND
 """Ns by which `poll` is late only when this program did not run: its computer slept, or a debugger held it."""
+_CONNECTION_DENIED = (
+    management.DENIED_CLIENTS,
+    management.DENIED_GATEWAYS,
+    management.DENIED_NO_KEY,
+    management.DENIED_OTHER_KEY,
+)
+"""Reasons for which a connection is denied, not an order."""
 _HEARD_AGAIN = 2 * SECOND
 """Ns in which every live peer repeats itself."""
 
@@ -493,7 +500,7 @@ class Discovery(DiscoveryProtocol):
                 self._directory.forget_endpoint((instance, node, topic, role))
 
     def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
-        if message.reason in (management.DENIED_CLIENTS, management.DENIED_GATEWAYS):
-            self._outbox.emit(ConnectionDenied(message.gateway, message.reason == management.DENIED_GATEWAYS))
+        if message.order == 0 and message.reason in _CONNECTION_DENIED:
+            self._outbox.emit(ConnectionDenied(message.gateway, message.reason))
         else:
             super()._denied(now, message, source)

@@ -247,6 +247,9 @@ class RtcanLink(BufferedLink):
         if self.up:  # before, only the message ids of others matter
             self.manage(data, source)
 
+    def sealer(self, source: Hashable) -> Hashable:
+        return None if source in (FIRMWARE, R2P) else source  # nothing shows which of the two an order comes from
+
     def _renumber(self, names: Sequence[str]) -> None:
         """Announce topics of this module that need another high byte, or may find one now."""
         for name in names:

@@ -11,12 +11,13 @@ from typing import Any
 import msgspec
 
 from r2p.errors import TransportError
+from r2p.keys import SharedKey
 from r2p.protocols.rtcan.cycle import Timing, timing
 from r2p.protocols.rtcan.events import EngineSettings, Profile
 from r2p.transports.can.port import CanPort
 from r2p.transports.link import Hub, Transport
 from r2p.transports.rtcan.link import RtcanLink
-from r2p.transports.url import Url, duration
+from r2p.transports.url import Url, duration, key_file
 from r2p.units import SECOND
 
 # fmt: off
@@ -41,7 +42,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     `id`: 1 to 255; None: claim a free one. `priority`: 0 to 255, to be the master; 0: never. `slots`, `cycle` (nominal)
     and `bitrate` must be the same in the whole network. `profile`: auto, rtcan or firmware-2014. `utc`: how far the
-    module's UTC may be off, if it is known: as the master it distributes UTC.
+    module's UTC may be off, if it is known: as the master it distributes UTC. `key`: shared by those that give orders.
     """
 
     id: int | None = None
@@ -51,6 +52,7 @@ class RtcanOptions(msgspec.Struct, frozen=True, kw_only=True):
     bitrate: int = 1_000_000
     profile: Profile = Profile.AUTO
     utc: float | None = None
+    key: SharedKey | None = None
 
     @property
     def timing(self) -> Timing:
@@ -111,6 +113,7 @@ async def run_link(name: str, hub: Hub, opened: Callable[[], object], port: CanP
     settings = options.settings(hub.random.getrandbits(64), port)
     utc_error = None if options.utc is None else round(options.utc * SECOND)
     link = RtcanLink(name, hub, port, settings, utc_error)
+    link.use_key(options.key)
     hub.attach(link)
     running = asyncio.create_task(port.run(link.driver, opened), name=f"{name} port")
     try:
@@ -204,5 +207,6 @@ OPTIONS: dict[str, Callable[[str], Any]] = {
     "bitrate": _bitrate,
     "profile": _profile,
     "utc": duration,
+    "key": key_file,
 }
 """Converters for `Url.parsed`."""

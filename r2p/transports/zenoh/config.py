@@ -9,12 +9,13 @@ import re
 import socket
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from r2p.errors import TransportError
-from r2p.transports.url import Url
+from r2p.keys import SharedKey
+from r2p.transports.url import Url, key_file
 from r2p.transports.zenoh.diagnose import ConnectionSettings, Tls
 
 if TYPE_CHECKING:  # imported when it is used: a URL can be checked without zenoh, and loading it takes long
@@ -45,6 +46,7 @@ class ZenohOptions(msgspec.Struct, frozen=True):
     batching: bool = True
     """True if several messages may share a payload."""
     config: Path | None = None
+    key: SharedKey | None = None
 
     def error(self, text: str) -> TransportError:
         """Return an error that begins with the URL."""
@@ -73,6 +75,7 @@ def parse_options(url: Url) -> ZenohOptions:
         scouting=None if "scouting" not in given else given["scouting"] == "on",
         batching=given.get("batching") != "off",
         config=None if config is None else Path(config),
+        key=given.get("key"),
     )
 
 
@@ -149,13 +152,14 @@ def _endpoint_text(text: str) -> str:
     return text
 
 
-_PARSERS: dict[str, Callable[[str], str]] = {
+_PARSERS: dict[str, Callable[[str], Any]] = {
     "mode": _one_of(*MODES),
     "listen": _endpoint_text,
     "network": _network_name,
     "scouting": _one_of("on", "off"),
     "batching": _one_of("on", "off"),
     "config": _file_name,
+    "key": key_file,
 }
 
 

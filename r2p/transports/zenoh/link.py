@@ -23,7 +23,8 @@ from r2p.protocols.discovery.events import Declare, Event, QueryTokens, Subscrib
 from r2p.protocols.liveliness.session import TOKENS_MAX, LivelinessDiscovery
 from r2p.runtime.sample import PublisherClass
 from r2p.runtime.topic import Topic
-from r2p.transports.link import NOTHING, Hub, Link, unique_name
+from r2p.transports.announcement import NOTHING
+from r2p.transports.link import Hub, Link, unique_name
 from r2p.transports.stats import LoggedCounter
 from r2p.transports.zenoh.sender import ZenohSender
 from r2p.transports.zenoh.session import LoopQueue, ZenohSession

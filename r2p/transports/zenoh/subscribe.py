@@ -23,7 +23,8 @@ from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
-from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link, type_of
+from r2p.transports.announcement import type_of
+from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link
 from r2p.transports.receive_backpressure import Backlog
 from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 

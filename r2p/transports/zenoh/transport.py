@@ -57,6 +57,7 @@ class ZenohTransport(Transport):
         config = build_config(options)
         connects = bool(connection_settings(config).endpoints)
         link = ZenohLink(options.name, hub, connects=connects, batching=options.batching)
+        link.use_key(options.key)
         hub.attach(link)
         session = None
         try:

@@ -1,0 +1,54 @@
+"""What a link announces of a topic of this module."""
+
+import msgspec
+
+from r2p.codecs.management import ANY_TYPE, CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.protocols.discovery.events import TopicType
+from r2p.runtime.topic import Topic
+
+
+class Announcement(msgspec.Struct, frozen=True):
+    """The other ends' view of a topic of this module; `asked` is the type in which it subscribes to the topic.
+
+    `queue`: how many messages a publisher keeps, or has on the way, for this module; independent of its subscribers'
+    queues.
+    """
+
+    publishes: bool = False
+    subscribes: bool = False
+    size: int = 0
+    fingerprint: bytes = ANY_TYPE
+    varies: bool = False
+    asked: TopicType = TopicType()
+    queue: int = QUEUE
+    params: bytes = NO_PARAMS
+    endpoints: dict[tuple[str, int], int] = {}  # node and role -> publisher class
+
+
+NOTHING = Announcement()
+
+
+def type_of(topic: Topic) -> TopicType:
+    """The size and fingerprint of a topic's messages, as far as this module knows them."""
+    layout = topic.layout
+    return TopicType() if layout is None else TopicType(layout.size, layout.fingerprint, layout.varies)
+
+
+def announcement_of(topic: Topic) -> Announcement:
+    """Return what the other ends should know of a topic that only this module uses."""
+    publishers: dict[tuple[str, int], int] = {}
+    for each in topic.publishers:
+        key = each.node.name, ROLE_PUBLISHES
+        publisher_class = int(each.publisher_class) | (CLASS_LATCHES if each.latch else 0)
+        publishers[key] = max(publisher_class, publishers.get(key, 0))  # a node may have several, of several classes
+    subscribers = {(each.owner, ROLE_SUBSCRIBES): 0 for each in topic.queues}
+    topic_type = type_of(topic)
+    return Announcement(
+        publishes=bool(publishers),
+        subscribes=bool(subscribers),
+        size=topic_type.size,
+        fingerprint=topic_type.fingerprint,
+        varies=topic_type.varies,
+        asked=topic_type,
+        endpoints=publishers | subscribers,
+    )
