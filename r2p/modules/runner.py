@@ -39,12 +39,13 @@ def run(
     module: str | None = None,
     via: str | Transport | Iterable[str | Transport] | None = None,
     remap: dict[str, str] | None = None,
+    aliases: dict[str, str] | None = None,
     restart: bool = False,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended or a signal ends them.
 
-    A node has the name of its function, or another: `run(line_follower, name="follower")`, and
-    of several `run(blink, ("follower", line_follower))`. `module` is the module's name; `via` and `remap` are as for
+    A node has the name of its function, or another: `run(line_follower, name="follower")`, and of several
+    `run(blink, ("follower", line_follower))`. `module` is the module's name; `via`, `remap` and `aliases` are as for
     `Module`, `restart` as for `Module.start`.
 
     Meanwhile logging writes to stderr, unless the root logger or the logger `r2p` has handlers: `r2p` from INFO up, all
@@ -56,7 +57,7 @@ def run(
 
     async def main() -> None:
         nodes = _named(functions, name)
-        async with Module(module, via=via, remap=remap) as host:
+        async with Module(module, via=via, remap=remap, aliases=aliases) as host:
             for node, function in nodes:
                 host.start(function, name=node, restart=restart)
             await host.wait()

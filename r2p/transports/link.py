@@ -24,7 +24,7 @@ from r2p.codecs.management import (
 )
 from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
-from r2p.names import TOPIC_MAX
+from r2p.names import TOPIC_FIELD, TOPIC_MAX
 from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.events import (
     AliasConflict,
@@ -407,13 +407,15 @@ class Link(abc.ABC):
 
     def topic_changed(self, topic: Topic) -> None:
         """Announce a topic that this module publishes or subscribes to, after a possible change."""
-        desired = announcement_of(topic)
+        desired = own = announcement_of(topic)
         if self.gateway_hooks is not None:
             desired = self.gateway_hooks.desired_state(topic, desired)
         is_used = bool(desired.publishes or desired.subscribes or desired.endpoints)
         is_used = is_used and len(topic.name) <= self.max_name
-        # First, as it may change other topics: two can't have one alias.
-        self._apply(self.discovery.claim(topic.name) if is_used else self.discovery.release(topic.name))
+        # First, as it may change other topics: two can't have one alias. What a gateway only forwards under a short
+        # name may be an alias whose name was not received yet, so that is no claim.
+        claims = is_used and (own.publishes or own.subscribes or len(topic.name) > TOPIC_FIELD)
+        self._apply(self.discovery.claim(topic.name) if claims else self.discovery.release(topic.name))
         if not is_used or self.discovery.rival(topic.name):
             desired = NOTHING
         known = self._announced.pop(topic.name, NOTHING)

@@ -12,6 +12,7 @@ import r2p
 from r2p.bridge.routing import LONG_NAMES
 from r2p.codecs import management
 from r2p.msg import Led
+from r2p.names import topic_alias
 from r2p.sim.transport import SimCan, SimTransport
 from r2p.testing.network import Network, node_in
 from r2p.transports.memory import Datagram
@@ -55,6 +56,32 @@ async def test_a_topic_that_no_other_link_can_name_is_not_relayed(name: str) -> 
         await asyncio.sleep(1.0)
         assert not [each for each in tap.heard if isinstance(each, management.Advertise)]
         assert name not in module.space.topics
+
+
+def say(tap: Tap, *messages: management.Management) -> None:
+    for message in messages:
+        tap.say(message)
+
+
+async def test_what_was_forwarded_as_an_alias_is_forwarded_by_its_name_once_that_is_known() -> None:
+    name = "front_left/wheel/velocity_estimate"
+    alias = topic_alias(name)
+    async with gateway() as module:
+        a, b = Tap("a"), Tap("b")
+        say(a, management.Hello("A", 7), management.Advertise(alias, 5))
+        await asyncio.sleep(0.5)
+        assert alias in module.space.topics
+        say(a, *management.long_name_messages(management.KIND_TOPIC, name))
+        await asyncio.sleep(0.5)
+        assert name in module.space.topics
+        assert alias not in module.space.topics
+        names = [each for each in b.heard if isinstance(each, management.LongName)]
+        assert names[:2] == management.long_name_messages(management.KIND_TOPIC, name)
+        b.heard.clear()
+        say(a, management.Hello("A", 7), management.Advertise(alias, 5))
+        await asyncio.sleep(1.0)
+        assert alias in {each.topic for each in b.heard if isinstance(each, management.Advertise)}
+        assert set(module.space.topics) == {name, "log"}
 
 
 async def test_names_too_long_for_a_link_are_told_once_and_floods_of_them_once_a_second(

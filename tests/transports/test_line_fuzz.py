@@ -15,7 +15,7 @@ from r2p.codecs import management as m
 from r2p.errors import MessageError
 from r2p.msg import Led, Text
 from r2p.names import module_alias
-from r2p.protocols.discovery import directory, negotiation
+from r2p.protocols.discovery import aliases, directory, negotiation
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.testing.network import node_in
 from tests.transports.conversation import Script, line, manage
@@ -46,6 +46,13 @@ def anything(chance: random.Random, kind: type[msgspec.Struct]) -> bytes:
             return m.encode(kind(**values))  # type: ignore[arg-type]
         except MessageError:
             continue  # a number or a text that does not fit
+
+
+def a_long_name(chance: random.Random) -> m.LongName:
+    """A piece of a name that is valid, of 400 topics and nodes, some with chosen aliases."""
+    name = f"{chance.choice(['', 'leds=', 'other='])}long_names/of_topics/{chance.randint(0, 200)}"
+    kind = chance.choice([m.KIND_TOPIC, m.KIND_NODE])
+    return chance.choice(m.long_name_messages(kind, name if kind == m.KIND_TOPIC else name.replace("/", "_")))
 
 
 def _value(chance: random.Random, name: str, kind: object) -> Any:
@@ -91,6 +98,9 @@ def _slots(base: type) -> tuple[str, ...]:
 @pytest.mark.parametrize("seed", range(4))
 async def test_nothing_grows_whatever_a_peer_says(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(directory, "TABLE_MAX", MOST)
+    monkeypatch.setattr(aliases, "NAMES_MAX", MOST)
+    monkeypatch.setattr(aliases, "_UNFINISHED_MAX", MOST)
+    monkeypatch.setattr(aliases, "_RIVALS_MAX", MOST)
     monkeypatch.setattr(negotiation, "PEERS_MAX", MOST)
     chance = random.Random(seed)
     script = Script()
@@ -103,6 +113,7 @@ async def test_nothing_grows_whatever_a_peer_says(seed: int, monkeypatch: pytest
         for _ in range(60):
             for _ in range(50):
                 script.hear(manage_bytes(anything(chance, chance.choice(KINDS))))
+                script.hear(manage_bytes(m.encode(a_long_name(chance))))
                 script.hear(line(chance.choice(["leds", "text", "other"]), chance.randbytes(chance.randint(1, 64))))
             text.publish_nowait(Text())
             await asyncio.sleep(chance.choice([0.0, 0.01, 1.0]))

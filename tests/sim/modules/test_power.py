@@ -74,6 +74,27 @@ async def test_by_a_wire_under_virtual_time() -> None:
 
 
 @pytest.mark.virtual_time
+async def test_firmware_uses_topics_of_long_names_by_their_aliases() -> None:
+    """As docs/PROTOCOL.md 1 says; one of the aliases is chosen."""
+    command, echo = "front_left/wheel/velocity_command", "front_left/wheel/velocity_estimate"
+    firmware = FirmwareModule(
+        "WHEEL1",
+        publishers=[Publishes("front_left_w446v", Velocity3)],
+        subscribers=[Subscribes("fl_cmd", Velocity3, answer=lambda said: [("front_left_w446v", said)])],
+    )
+    async with Powered(firmware) as power, r2p.Module("PC1", via=power.wire(), aliases={command: "fl_cmd"}) as module:
+        node = module.start(hold)
+        commands, echoes = node.advertise(command, Velocity3), node.subscribe(echo, Velocity3)
+        await commands.wait_subscriber()
+        await echoes.wait_publisher()
+        await commands.publish(Velocity3(x=0.5))
+        sample = await anext(echoes.samples())
+        assert (sample.message, sample.source.module) == (Velocity3(x=0.5), "WHEEL1")
+        assert set(module.network.topics()) == {command, echo, "log"}
+        assert not firmware.drops
+
+
+@pytest.mark.virtual_time
 async def test_nothing_is_lost_on_a_wire() -> None:
     async with wired(imu()) as (power, _, module):
         leds = module.start(hold).subscribe("leds", Led, queue=1000)
