@@ -289,7 +289,7 @@ class LinkManager:
         # A module that said good-bye is forgotten by now.
         lost_modules = any(not info.observer for info in link.discovery.modules.values())
         unused = link.transient and link not in self._used_clients
-        level = logging.WARNING if lost_modules else logging.DEBUG if unused else logging.INFO
+        level = logging.WARNING if lost_modules else logging.DEBUG if unused or link.key_refused else logging.INFO
         self._log_change(link, level, "down", f"is down: {reason}")
         self._events.emit(LinkDown(link.name, reason))
 

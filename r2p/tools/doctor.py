@@ -371,11 +371,17 @@ async def try_link(session: Session) -> AsyncIterator[Check]:
     listening = asyncio.create_task(_collect_notices(session.module, notices))
     try:
         reason = await _reason_unreachable(session)
+        if keys := _refused_keys(session):
+            yield keys
+            return
         if reason:
             yield Check("connects", False, reason, _advice(url, _CONNECTING))
             return
         yield Check("connects", True, f"after {asyncio.get_running_loop().time() - started:.1f} s")
         await session.settled()
+        if keys := _refused_keys(session):
+            yield keys
+            return
         await wait_until(lambda: bool(_named(session)) or not session.may_have_firmware(), _ROUND)
         for check in (*_received(session, url), *_losses(session), *map(_notice, notices.values())):
             yield check
@@ -398,6 +404,11 @@ async def _reason_unreachable(session: Session) -> str:
         reasons = [link.unreachable_reason for link in session.module.links if link.unreachable_reason]
         return "; ".join(reasons) or f"nothing has connected within {_CONNECT:g} s"
     return ""
+
+
+def _refused_keys(session: Session) -> Check | None:
+    reasons = [link.key_refused for link in session.module.links if link.key_refused]
+    return Check("key", False, "; ".join(reasons), _KEYS) if reasons else None
 
 
 def _named(session: Session) -> list[r2p.ModuleView]:
@@ -486,6 +497,7 @@ _SILENCE = {
 """Remedies if nothing arrives."""
 
 _GOOD = {"master", "own parameters"}  # notices that are no problem
+_KEYS = "copy the key file of the other end (scp -p), or make one for both with r2p key new (docs: Keys)"
 _NOTICES = {
     "no master": "firmware needs its master's board; of r2p modules, one must have priority= (docs: RTCAN)",
     "other parameters": "give slots, slot length and bit rate as the other nodes have them (docs: RTCAN)",

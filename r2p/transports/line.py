@@ -182,7 +182,7 @@ class LineLink(BufferedLink):
     def _open(self) -> None:
         """Begin to exchange messages: the connection is up, and its other end has proven the key, if there is one."""
         if self._gate is not None:
-            self.denied = self.key_refused = False
+            self.denied, self.key_refused = False, ""
         self._begin_grace()
         self.on_up()
 

@@ -171,8 +171,8 @@ class Link(abc.ABC):
         """Decisions of the module about this link, where gateways join networks."""
         self.guard: LinkGuard | None = None
         """The guard of a link with a key."""
-        self.key_refused = False
-        """True if the two ends of the line do not have one key."""
+        self.key_refused = ""
+        """The reason if the two ends of the line do not have one key; empty if they have, or have not tried."""
         self.denied = False
         """True if the other end has refused the link, and no connection has been of use since; set by the module."""
         self.transient = False
@@ -231,7 +231,7 @@ class Link(abc.ABC):
 
     def refuse_key(self, reason: str) -> None:
         """Report that the two ends do not have one key, once for each reason."""
-        self.denied = self.key_refused = True
+        self.denied, self.key_refused = True, reason
         if reason != self.unreachable_reason:
             self.unreachable_reason = reason
             self._hub.link_notice(self, "key refused", reason, trouble=True)

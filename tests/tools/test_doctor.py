@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import sys
@@ -12,14 +13,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 import r2p
+from r2p import keys
 from r2p.codecs import management
 from r2p.msg import Led
 from r2p.sim.modules import FirmwareModule, Powered, Publishes
 from r2p.tools import doctor
 from r2p.tools.doctor import Check
 from r2p.tools.output import Output
-from r2p.tools.session import Session, Settings
+from r2p.tools.session import Session, Settings, join
 from r2p.transports.can.netlink import Interface
+from r2p.transports.tcp import TcpListenTransport
+from r2p.transports.url import parse
 from tests.ports import free_port
 from tests.tools.rig import printed, process, robot, tool
 from tests.transports.conversation import Script
@@ -281,6 +285,20 @@ async def test_a_link_that_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
     assert (name["check"], name["ok"], connects["check"], connects["ok"]) == ("name", True, "connects", False)
     assert connects["found"].startswith("Connection refused: nothing listens there")
     assert connects["do"].startswith("on the other computer: ss -ltn")
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_a_link_that_wants_a_key(tmp_path: Path) -> None:
+    keys.create(tmp_path / "key")
+    server = TcpListenTransport(parse(f"tcp-listen:127.0.0.1:0,key={tmp_path / 'key'}"))
+    async with contextlib.AsyncExitStack() as stack:
+        await stack.enter_async_context(r2p.Module("BOT", via=server, watchdog=False))
+        session = await stack.enter_async_context(join(Settings(via=[f"tcp:127.0.0.1:{server.port}"])))
+        *_, check = [check async for check in doctor.try_link(session)]
+    assert (check.what, check.ok) == ("key", False)
+    assert check.found == "the other end wants a key, and this URL has none: add ?key=FILE to it"
+    assert "r2p key new" in check.do
 
 
 @pytest.mark.anyio
