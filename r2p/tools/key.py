@@ -17,7 +17,8 @@ app = group("Make a shared key for links.")
 async def new(file: Annotated[Path, typer.Argument(metavar="FILE", show_default=False)]) -> None:
     """Write a new key to a file that only you can read.
 
-    The key is 32 random bytes; an existing file is never overwritten. Copy the file to each computer that is to have the key, and add ?key=FILE to the URLs of the links.
+    The key is 32 random bytes; an existing file is never overwritten. Copy the file to each computer that is to have
+    the key, and add ?key=FILE to the URLs of the links.
     """
     keys.create(file)
     notify(f"{file} has a new key: copy it to the robot's computers (scp -p), and add ?key={file} to the URLs of links")
