@@ -21,6 +21,9 @@ from r2p.errors import (
     MessageError,
     NameTooLong,
     NodeCrashed,
+    NoServer,
+    ServiceBusy,
+    ServiceError,
     TooLong,
     TransportError,
     TypeMismatch,
@@ -56,6 +59,9 @@ from r2p.runtime.publishers import PeriodicPublisher, Publisher, SporadicPublish
 from r2p.runtime.qos import Missed, NonRealTime, Periodic, Sporadic
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.subscriber import Subscriber
+from r2p.services.client import ServiceClient
+from r2p.services.definition import Service
+from r2p.services.server import ServiceServer
 from r2p.version import __version__ as __version__
 
 __all__ = [
@@ -93,6 +99,7 @@ __all__ = [
     "NameConflict",
     "NameTooLong",
     "NetworkView",
+    "NoServer",
     "Node",
     "NodeCrashed",
     "NodeFunction",
@@ -104,6 +111,11 @@ __all__ = [
     "PublisherClass",
     "RouteStatistics",
     "Sample",
+    "Service",
+    "ServiceBusy",
+    "ServiceClient",
+    "ServiceError",
+    "ServiceServer",
     "Source",
     "Sporadic",
     "SporadicPublisher",

@@ -10,6 +10,9 @@
     ├── TransportError               a transport that can't be made from its URL
     │   ├── Closed                   used after it was closed, or before it was opened
     │   └── Broken                   a transport that failed for good
+    ├── ServiceError                 the handler of a service raised, or the service ended
+    ├── ServiceBusy                  a server with as many requests as it accepts
+    ├── NoServer                     a service that no module on the network serves
     ├── NodeCrashed(ExceptionGroup)  the exceptions of a module's nodes
     └── Deadlock                     virtual time with nothing left to wait for
 
@@ -64,6 +67,22 @@ class Broken(TransportError):
     The links of r2p never raise it: they report that they are down, and are tried again for ever. A transport of your
     own raises it from `run` when its device or connection is gone for good.
     """
+
+
+class ServiceError(Error):
+    """A call that its server answered with an error: its handler raised, was cancelled there, or the server ended.
+
+    A handler raises it itself for what a caller should expect: the caller gets the text, and the server's log one line
+    without a traceback.
+    """
+
+
+class ServiceBusy(Error):
+    """A call that its server refused: `limit` handlers run, and 64 requests wait already."""
+
+
+class NoServer(Error):
+    """A call of a service that no module serves, or not the module that was asked for."""
 
 
 class NodeCrashed(Error, ExceptionGroup[Exception]):

@@ -17,7 +17,7 @@ import sys
 import textwrap
 import traceback
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -147,6 +147,34 @@ def node_logger(module: str, node: str) -> logging.Logger:
     logger = logging.getLogger(f"r2p.{module}.{node}")
     logger.addFilter(_SHORT_TRACEBACKS)
     return logger
+
+
+class NodeLogger(logging.LoggerAdapter[logging.Logger]):
+    """A logger named `r2p.MODULE.NODE`; its records from INFO up also go to the module's `log` topic."""
+
+    def __init__(self, logger: logging.Logger, publish: Callable[[int, str], None]) -> None:
+        super().__init__(logger)
+        self._publish = publish
+
+    def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
+        kwargs["stacklevel"] = kwargs.get("stacklevel", 1) + 1
+        super().log(level, msg, *args, **kwargs)
+        if level >= logging.INFO:
+            self._publish(level, _text(level, msg, args, kwargs.get("exc_info")))
+
+
+def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -> str:
+    """Return a log record as `logging` would print it, traceback included."""
+    try:
+        text = logging.LogRecord("", level, "", 0, msg, args, None).getMessage()
+    except (TypeError, ValueError):  # arguments that do not fit; logging itself says so on stderr
+        text = f"{msg} {args}"
+    if not exc_info:
+        return text
+    error = exc_info[1] if isinstance(exc_info, tuple) else exc_info
+    if not isinstance(error, BaseException):  # True: the one that is being handled
+        error = sys.exception()
+    return text if error is None else f"{text}\n{short_traceback(error)}"
 
 
 # Output

@@ -44,6 +44,36 @@ async def talk(node: r2p.Node) -> None:
     assert_type(await raw.fetch(timeout=1.0), bytes)
 
 
+class Dim(r2p.Service):
+    class Request(r2p.Message):
+        level: r2p.u8 = 0
+
+    class Response(r2p.Message):
+        before: r2p.u8 = 0
+
+
+async def dim(request: Dim.Request) -> Dim.Response:
+    return Dim.Response(before=request.level)
+
+
+async def ask(node: r2p.Node) -> None:
+    assert_type(node.serve("dim", Dim, dim), r2p.ServiceServer[Dim.Request, Dim.Response])
+    one, two = node.client("dim", Dim), node.client("dim", Dim.Request, Dim.Response)
+    assert_type(one, r2p.ServiceClient[Dim.Request, Dim.Response])
+    assert_type(two, r2p.ServiceClient[Dim.Request, Dim.Response])
+    assert_type(await one.call(Dim.Request(level=3), timeout=2.0), Dim.Response)
+
+    @node.service("undim", Dim)
+    async def undim(request: Dim.Request) -> Dim.Response:
+        return Dim.Response(before=request.level)
+
+    assert_type(await undim(Dim.Request()), Dim.Response)
+    with pytest.raises(r2p.MessageError):
+        await one.call(Dim.Response())  # type: ignore[arg-type]
+    with pytest.raises(r2p.MessageError):
+        node.client("lamp", Lamp)  # type: ignore[arg-type]
+
+
 async def mistake(node: r2p.Node) -> None:
     with pytest.raises(r2p.MessageError):
         node.subscribe("leds", int)  # type: ignore[type-var]
@@ -61,6 +91,7 @@ def last_stamp(samples: list[r2p.Sample]) -> int:
 async def test_what_type_checkers_see_is_what_there_is() -> None:
     async with r2p.Module("PC1", via=[]) as module:
         module.start(talk)
+        module.start(ask)
         module.start(mistake)
         await module.wait()
     assert last_stamp([r2p.Sample(b"", r2p.Source(), 5)]) == 5

@@ -6,6 +6,7 @@ of the caller (`MessageError`). Bytes that are not such a message raise `DecodeE
 - `debug`: the lines of the debug transport; `rtcan`: the identifiers and frames of RTCAN; `can_bits`: their length.
 - `management`: the messages of the topic `R2P`; `loader`: those of `BOOT_<module>`; both in terms of `_records`.
 - `attachment`, `liveliness`: what accompanies messages on zenoh, and the tokens there.
+- `services`: the header of requests and responses, and the texts of errors.
 - `schemas`: answers to requests for a type; `probes`: messages by which gateways find loops.
 """
 

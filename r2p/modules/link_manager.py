@@ -108,6 +108,7 @@ class LinkManager:
         self.observer = observer
         self.instance = self.random.getrandbits(32)
         """Random number of this run of the module."""
+        space.instance = self.instance
         self.flags = 0
         """The module's state, as in ALIVE."""
         self.bridge: Bridge | None = None

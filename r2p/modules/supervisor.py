@@ -214,6 +214,7 @@ class Supervisor:
         finally:
             self._attempt = None
             attempt.close()
+            await _ended(self.node.end_handlers())
             self.node.close()
         return attempt.result(None)
 
@@ -289,6 +290,18 @@ class _Attempt:
             log.error("node %s crashed while it ended: %r", self._node.name, self.error, exc_info=self.error)
             return error
         return self.error
+
+
+async def _ended(handlers: list[asyncio.Task[None]]) -> None:
+    """Wait until the handlers of a node's services have cleaned up, and hand on a cancellation afterwards."""
+    cancelled: asyncio.CancelledError | None = None
+    while pending := [each for each in handlers if not each.done()]:
+        try:
+            await asyncio.wait(pending)
+        except asyncio.CancelledError as error:
+            cancelled = error
+    if cancelled is not None:
+        raise cancelled
 
 
 def _from_inside(cancelled: asyncio.CancelledError) -> Error:

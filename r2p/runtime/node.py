@@ -5,14 +5,12 @@ closed when its function ends, for any reason.
 """
 
 import asyncio
-import logging
-import sys
 from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar, overload
 
 from r2p.clock import SHORTEST, Alarm, Ticker, check_seconds, check_timeout
 from r2p.errors import Closed, Error, InvalidName, TransportError
-from r2p.log_lines import node_logger, short_traceback
+from r2p.log_lines import NodeLogger, node_logger
 from r2p.messages import Layout, Message, layout
 from r2p.names import MANAGEMENT, topic_name
 from r2p.runtime.events import EventHub, ModuleEvent
@@ -21,6 +19,9 @@ from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
 from r2p.runtime.queues import QUEUE_BYTES, checkpoint
 from r2p.runtime.subscriber import Callback, Keep, Subscriber, SubscriberOptions
 from r2p.runtime.topic import TopicSpace
+from r2p.services.client import ServiceClient
+from r2p.services.definition import Definition, Q, R, ServiceType, define
+from r2p.services.server import LIMIT, Handler, ServiceServer
 from r2p.units import SECOND
 
 M = TypeVar("M", bound=Message)
@@ -32,6 +33,8 @@ QUEUE = 16
 _OF_ROS = {
     "create_publisher": "node.advertise(topic, type)",
     "create_subscription": "node.subscribe(topic, type)",
+    "create_service": "node.serve(name, Request, Response, handler)",
+    "create_client": "node.client(name, Request, Response)",
     "create_timer": "async for tick in node.every(seconds):",
     "create_rate": "async for tick in node.every(seconds):",
     "get_logger": "node.log",
@@ -47,34 +50,6 @@ class Tick(NamedTuple):
     due: int
     late: float
     skipped: int
-
-
-class NodeLogger(logging.LoggerAdapter[logging.Logger]):
-    """A logger named `r2p.MODULE.NODE`; its records from INFO up also go to the module's `log` topic."""
-
-    def __init__(self, logger: logging.Logger, publish: Callable[[int, str], None]) -> None:
-        super().__init__(logger)
-        self._publish = publish
-
-    def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
-        kwargs["stacklevel"] = kwargs.get("stacklevel", 1) + 1
-        super().log(level, msg, *args, **kwargs)
-        if level >= logging.INFO:
-            self._publish(level, _text(level, msg, args, kwargs.get("exc_info")))
-
-
-def _text(level: int, msg: object, args: tuple[object, ...], exc_info: object) -> str:
-    """Return a log record as `logging` would print it, traceback included."""
-    try:
-        text = logging.LogRecord("", level, "", 0, msg, args, None).getMessage()
-    except (TypeError, ValueError):  # arguments that do not fit; logging itself says so on stderr
-        text = f"{msg} {args}"
-    if not exc_info:
-        return text
-    error = exc_info[1] if isinstance(exc_info, tuple) else exc_info
-    if not isinstance(error, BaseException):  # True: the one that is being handled
-        error = sys.exception()
-    return text if error is None else f"{text}\n{short_traceback(error)}"
 
 
 def no_log(level: int, node: str, text: str) -> None:
@@ -105,6 +80,8 @@ class Node:
         """Open publishers, in order (the values mean nothing)."""
         self.subscribers: dict[Subscriber[Any], None] = {}
         """Open subscribers, in order."""
+        self.services: dict[ServiceServer[Any, Any] | ServiceClient[Any, Any], None] = {}
+        """Open servers and clients of services, in order."""
         self.closed = False
         self.crash_handler: Callable[[Exception], None] = self._log_crash
         """Handles an error outside the node's own task; set by its supervisor."""
@@ -252,15 +229,89 @@ class Node:
             self._reminder = _SpinReminder(self, self._space)
         return subscriber
 
+    @overload
+    def service(
+        self, name: str, request: type[Q], response: type[R], *, limit: int = ...
+    ) -> Callable[[Handler[Q, R]], Handler[Q, R]]: ...
+
+    @overload
+    def service(
+        self, name: str, request: type[ServiceType[Q, R]], *, limit: int = ...
+    ) -> Callable[[Handler[Q, R]], Handler[Q, R]]: ...
+
+    def service(
+        self, name: str, request: Any, response: Any = None, *, limit: int = LIMIT
+    ) -> Callable[[Handler[Any, Any]], Handler[Any, Any]]:
+        """Serve a service with the coroutine function that this decorates: `serve`, as a decorator.
+
+        @node.service("calibrate", Calibrate)
+        async def calibrate(request: Calibrate.Request) -> Calibrate.Response: ...
+        """
+        definition = self._define(name, request, response)
+
+        def serve(handler: Handler[Any, Any]) -> Handler[Any, Any]:
+            self._serve_with(definition, handler, limit)
+            return handler
+
+        return serve
+
+    @overload
+    def serve(
+        self, name: str, request: type[Q], response: type[R], handler: Handler[Q, R], *, limit: int = ...
+    ) -> ServiceServer[Q, R]: ...
+
+    @overload
+    def serve(
+        self, name: str, request: type[ServiceType[Q, R]], response: Handler[Q, R], /, *, limit: int = ...
+    ) -> ServiceServer[Q, R]: ...
+
+    def serve(
+        self, name: str, request: Any, response: Any, handler: Any = None, *, limit: int = LIMIT
+    ) -> ServiceServer[Any, Any]:
+        """Serve a service: `handler(request)`, a coroutine function, returns the response.
+
+        The types are two message classes, or one subclass of `r2p.Service`, which stands for both. At most `limit`
+        handlers run at the same time, each in a task of its own, and 64 requests wait; one more is answered with
+        ServiceBusy. A handler that waits for a call of its own does not count. When its caller gives up, the handler is
+        cancelled; what it raises is a ServiceError at the caller, and a line of the log here.
+
+        The service ends with its node: keep the node's function running, for example by `await node.spin()`.
+
+        Raises InvalidName or NameTooLong for the name, MessageError for types or a limit that are not valid,
+        TypeMismatch if the service has other types, Error if the handler is not a coroutine function or the module
+        serves the service already, and Closed once the node has ended.
+        """
+        if handler is None:
+            response, handler = None, response
+        return self._serve_with(self._define(name, request, response), handler, limit)
+
+    @overload
+    def client(self, name: str, request: type[Q], response: type[R]) -> ServiceClient[Q, R]: ...
+
+    @overload
+    def client(self, name: str, request: type[ServiceType[Q, R]]) -> ServiceClient[Q, R]: ...
+
+    def client(self, name: str, request: Any, response: Any = None) -> ServiceClient[Any, Any]:
+        """Return a client that calls a service; its types are given as in `serve`. Make it once, and call it often.
+
+        Raises InvalidName or NameTooLong for the name, MessageError for types that are not valid, TypeMismatch if the
+        service has other types, and Closed once the node has ended.
+        """
+        definition = self._define(name, request, response)
+        self._check_service_links(definition)
+        client = ServiceClient(self._space, self, definition)
+        self.services[client] = None
+        return client
+
     async def spin(self, timeout: float | None = None) -> bool:
         """Wait for messages of subscriptions with a callback, and call it for each; return False if there was none.
 
         Callbacks run in this node's task, one at a time; a coroutine function is awaited. The wait ends without a
         message after `timeout` seconds, or when a subscription without `on_timeout` has had none for its own `timeout`.
-        A node with only periodic publishers may spin as well: their `fill` is called meanwhile.
+        A node with only periodic publishers or services may spin as well: they work meanwhile.
 
-        Raises Error if the node has neither, as nothing would ever be called, and MessageError for a time-out that is
-        not a number of seconds.
+        Raises Error if the node has none of these, as nothing would ever be called, and MessageError for a time-out
+        that is not a number of seconds.
         """
         check_timeout("the time-out of spin", timeout)
         if self._reminder is not None:
@@ -342,22 +393,39 @@ class Node:
         return self._ending or self.is_unwinding()
 
     def end(self) -> None:
-        """Begin the end: silence periodic publishers, so that nothing contradicts what the clean-up publishes."""
+        """Begin the end: silence periodic publishers and end handlers, so that nothing contradicts what the clean-up
+        publishes.
+        """
         self._ending = True
+        self.end_handlers()
         for publisher in self.publishers:
             if isinstance(publisher, PeriodicPublisher):
                 publisher.silence()
 
+    def end_handlers(self) -> list[asyncio.Task[None]]:
+        """Cancel the handlers of the node's services; return the tasks of those that still clean up."""
+        servers = [each for each in self.services if isinstance(each, ServiceServer)]
+        return [task for server in servers for task in server.stop("its node ends")]
+
     def forget(self, endpoint: object) -> None:
-        """Drop a closed publisher or subscriber of the node."""
-        # In one of the two at most; the type checker wants a key for both.
+        """Drop a closed publisher, subscriber, server or client of the node."""
+        # In one of them at most; the type checker wants a key for each.
+        self.services.pop(endpoint, None)  # type: ignore[call-overload]
         self.publishers.pop(endpoint, None)  # type: ignore[call-overload]
         self.subscribers.pop(endpoint, None)  # type: ignore[call-overload]
 
     def returned(self) -> None:
-        """Warn of callbacks that were never called: its function has returned without `spin`."""
+        """Warn of callbacks that were never called, and of services that end: the function has returned."""
         if self._reminder is not None:
             self._reminder.returned()
+        served = [each.name for each in self.services if isinstance(each, ServiceServer)]
+        if served:
+            self.log.warning(
+                "node %s has returned, so nothing serves %s any more; end its function with `while True: await "
+                "node.spin()`",
+                self.name,
+                ", ".join(sorted(served)),
+            )
 
     def started(self) -> None:
         """Note that the node's function starts: from now on its priority holds back less important nodes."""
@@ -365,10 +433,10 @@ class Node:
         self._space.wake_scheduler.node_started(self.priority)
 
     def close(self) -> None:
-        """Close all publishers and subscribers. The module does so when the node's function has ended."""
+        """Close all publishers, subscribers and services. The module does so when the node's function has ended."""
         self.closed = self._ending = True
         self._forget_reminder()
-        for each in (*self.publishers, *self.subscribers, *self._tickers):
+        for each in (*self.services, *self.publishers, *self.subscribers, *self._tickers):
             each.close()
         if self._started:
             self._started = False
@@ -387,6 +455,29 @@ class Node:
         def __getattr__(self, name: str) -> NoReturn:
             instead = f": write `{_OF_ROS[name]}`" if name in _OF_ROS else ""
             raise AttributeError(f"a node has no {name}{instead}", name=name, obj=self)
+
+    def _define(self, name: str, request: Any, response: Any) -> Definition[Any, Any]:
+        """Return the definition of a service under its name after remapping."""
+        definition = define(self._resolve(name), request, response)
+        topic_name(definition.request_topic)
+        return definition
+
+    def _serve_with(
+        self, definition: Definition[Any, Any], handler: Handler[Any, Any], limit: int
+    ) -> ServiceServer[Any, Any]:
+        self._check_service_links(definition)
+        server = ServiceServer(self._space, self, definition, handler, limit)
+        server.open()
+        self.services[server] = None
+        return server
+
+    def _check_service_links(self, definition: Definition[Any, Any]) -> None:
+        """Warn of links that can't carry a service."""
+        for topic, shape in (
+            (definition.request_topic, definition.requests),
+            (definition.response_topic, definition.responses),
+        ):
+            self._warn_of_links(topic, shape, "is not sent on")
 
     def _resolve(self, topic: str) -> str:
         if self.closed:
@@ -434,7 +525,8 @@ class Node:
     async def _arrival(self) -> None:
         """Wait for a message of a subscription with a callback."""
         subscribers = self._with_callback()
-        if not subscribers and not any(isinstance(each, PeriodicPublisher) for each in self.publishers):
+        works = self.services or any(isinstance(each, PeriodicPublisher) for each in self.publishers)
+        if not subscribers and not works:
             raise Error(f"node {self.name} spins without a callback: give subscribe() one, or iterate the subscription")
         waiter = self._space.loop.create_future()
         try:

@@ -13,6 +13,7 @@ from weakref import WeakValueDictionary
 from r2p.clock import Clock
 from r2p.errors import TypeMismatch
 from r2p.messages import Layout
+from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.backpressure import Sink, WaitQueue
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import LastReceived, PublisherClass, Sample
@@ -173,6 +174,14 @@ class Topic:
             blocked = self._send(self.remote_subscribers, sample, blocked, slot_link)
         return blocked if blocked is None else self._remaining(blocked)
 
+    def deliver_by(self, link: str, sample: Sample) -> list[Sink] | None:
+        """Offer the sample only to the subscribers behind one link, or to all if there are none; as `deliver`."""
+        behind = [each for each in self.remote_subscribers if each.link_name == link]
+        if not behind:
+            return self.deliver(sample)
+        blocked = self._send(behind, sample, None, None)
+        return blocked if blocked is None else self._remaining(blocked)
+
     def _remaining(self, sinks: list[Sink]) -> list[Sink] | None:
         """Leave out sinks that left meanwhile: they would never have room."""
         return [sink for sink in sinks if sink in self.queues or sink in self.remote_subscribers] or None
@@ -251,10 +260,23 @@ class Topic:
 
 
 class LinkView(Protocol):
-    """A link as publishers see it."""
+    """A link as nodes see it."""
+
+    title: str
+    """The name for texts."""
+    discovery: DiscoveryProtocol
+    """What is known of the modules and nodes behind the link."""
 
     @property
     def name(self) -> str: ...
+
+    @property
+    def up(self) -> bool:
+        """Return whether the other end can be reached."""
+
+    @property
+    def lossless(self) -> bool:
+        """Return whether what is sent also arrives at the other end of the link, while it is up."""
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
         """Describe, for people, how well this link serves the topic in this class."""
@@ -282,6 +304,10 @@ class TopicSpace:
         self, module: str, loop: asyncio.AbstractEventLoop, clock: Clock, aliases: Mapping[str, str] | None = None
     ) -> None:
         self.module = module
+        self.instance = 0
+        """The random 32-bit number of this run of the module."""
+        self.call_numbers: dict[str, int] = {}
+        """The number of the last call of each service: kept here, as no restart of a node may begin anew."""
         self.loop = loop
         self.clock = clock
         self.aliases = aliases or {}

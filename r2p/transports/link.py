@@ -152,6 +152,8 @@ class Link(abc.ABC):
     """True if firmware gateways may be on the link."""
     point_to_point: ClassVar[bool] = False
     """True if the link has only one other end."""
+    lossless: bool = False
+    """True if what is sent also arrives at the other end, while the link is up."""
     has_slots: ClassVar[bool] = False
     """True if periodic messages have slots of their own, which a publisher has to ask for."""
 

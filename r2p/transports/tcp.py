@@ -169,6 +169,7 @@ class TcpTransport(Transport):
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
         link = LineLink(f"tcp:{_address(self._host, self._port)}", hub)
         link.use_key(self._key, LinkEnd.CLIENT)
+        link.lossless = True
         backoff = Backoff(hub.random)
         hub.attach(link)
         opened()
@@ -312,6 +313,7 @@ class _ServerConnection(_TcpConnection):
             return None
         link = _ClientLink(peer, self._hub, self._key_refused)
         link.use_key(self._server.key, LinkEnd.SERVER)
+        link.lossless = True
         link.transient = True
         link.admits_gateways = self._server.admits_gateways
         self._server.served.add(self)

@@ -28,6 +28,10 @@ class Numbered(r2p.Message):
     number: r2p.u32
 
 
+NUMBERED = 4
+"""Bytes of such a message."""
+
+
 def number_of(data: bytes) -> int:
     return int(struct.unpack("<I", data)[0])
 
@@ -62,7 +66,7 @@ class TestNetwork(MemoryNetwork):
         duplicate, self.duplicate, lost = self.duplicate, 0.0, self.counts["lost"]
         super()._send_to(address, frame)
         self.duplicate = duplicate
-        if self.counts["lost"] != lost:
+        if self.counts["lost"] != lost and len(frame.data) == NUMBERED:
             self.hurt.add(number_of(frame.data))
 
 
@@ -130,6 +134,12 @@ class World:
         via = [self.networks[name].transport(f"{name}{index}") for index, name in enumerate(gateway.networks)]
         gateway.module = r2p.Module(gateway.name, via=via, bridge=True, watchdog=False)
         await self._stack.enter_async_context(gateway.module)
+
+    async def open(self, name: str, networks: str) -> r2p.Node:
+        """A module starts, with a node for the test."""
+        via = [self.networks[network].transport(network) for network in networks]
+        module = await self._stack.enter_async_context(r2p.Module(name, via=via, watchdog=False))
+        return await self._stack.enter_async_context(node_in(module))
 
     async def crash(self, gateway: Gateway) -> None:
         """It is gone without a word: what it still sends is lost."""

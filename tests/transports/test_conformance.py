@@ -8,6 +8,8 @@ from contextlib import asynccontextmanager
 from itertools import count
 from typing import TypeVar
 
+import pytest
+
 import r2p
 import r2p.msg
 from r2p.messages import Message
@@ -17,7 +19,8 @@ from r2p.protocols.discovery.events import Mismatched, ModuleGone, NameConflict
 from r2p.runtime.events import ModuleEvent
 from r2p.testing.network import node_in
 from r2p.transports.line import LineLink
-from tests.transports.cables import Cable, conforms, conforms_lines
+from tests.services.common import Add, Desk, add
+from tests.transports.cables import GUARD, Cable, conforms, conforms_lines
 from tests.transports.exchange import EVERY, filled
 
 E = TypeVar("E")
@@ -101,6 +104,47 @@ async def test_the_handshake_when_both_were_there_before_the_link(cable: Cable) 
         await publisher.wait_subscriber()
         await publisher.publish(Led(led=1))
         assert await subscriber.fetch() == Led(led=1)
+
+
+@conforms
+async def test_calls_both_ways_their_errors_and_their_end(cable: Cable) -> None:
+    desk = Desk()
+
+    async def fail(_request: Add.Request) -> Add.Response:
+        raise r2p.ServiceError("no sensor")
+
+    async with two_nodes(cable) as (alice, bob):
+        for server, client in ((alice, bob), (bob, alice)):
+            name = f"add{server.module}"
+            server.serve(name, Add, add)
+            calls = client.client(name, Add)
+            await calls.ready()
+            answers = await asyncio.gather(*(calls.call(Add.Request(a=n), timeout=GUARD) for n in range(20)))
+            assert [each.total for each in answers] == list(range(20))
+        alice.serve("fail", Add, fail)
+        alice.serve("wait", Add, desk.handle)
+        with pytest.raises(r2p.ServiceError, match=r"service fail of A: no sensor"):
+            await bob.client("fail", Add).call(Add.Request(), timeout=GUARD)
+        call = asyncio.create_task(bob.client("wait", Add).call(Add.Request(a=1), timeout=GUARD))
+        await until(lambda: desk.begun)
+        call.cancel()
+        await until(lambda: desk.cancelled)
+        assert desk.begun == [1]
+
+
+@conforms
+async def test_a_call_goes_on_after_a_reconnect(cable: Cable) -> None:
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        alice.serve("add", Add, add)
+        calls = bob.client("add", Add)
+        await calls.ready()
+        await acquainted(a, b)
+        await cable.cut()
+        await until(lambda: not calls.servers)
+        call = asyncio.create_task(calls.ready())
+        await cable.mend()
+        await call
+        assert await calls.call(Add.Request(a=5), timeout=GUARD, server="A") == Add.Response(total=5)
 
 
 @conforms

@@ -52,11 +52,7 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         blocked = self._topic.deliver(sample)
         if blocked is None:
             return True
-        reachable = [sink for sink in blocked if sink.reachable]
-        if reachable:
-            self._wait(_EventDelivery(self, sample, reachable, self._clock.monotonic() + self._deadline))
-        if len(reachable) < len(blocked):
-            self._miss_unreachable(sample, [sink for sink in blocked if sink not in reachable])
+        self._deliver_later(sample, blocked, self._deadline)
         return False
 
     def close(self) -> None:
@@ -64,6 +60,14 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         while self._pending:
             self._give_up(self._pending[0], "publisher closed")
         self._alarm.close()
+
+    def _deliver_later(self, sample: Sample, blocked: list[Sink], lifetime: int) -> None:
+        """Let the sample wait for room for `lifetime` (ns); what is behind links that are down misses it."""
+        reachable = [sink for sink in blocked if sink.reachable]
+        if reachable:
+            self._wait(_EventDelivery(self, sample, reachable, self._clock.monotonic() + lifetime))
+        if len(reachable) < len(blocked):
+            self._miss_unreachable(sample, [sink for sink in blocked if sink not in reachable])
 
     def _wait(self, event: "_EventDelivery[M]") -> None:
         self._pending.append(event)

@@ -48,6 +48,7 @@ class ZenohLink(Link):
 
     max_payload: ClassVar[int] = SIZE_MAX
     passes_probes: ClassVar[bool] = False
+    lossless = True
 
     def __init__(self, name: str, hub: Hub, *, connects: bool, batching: bool) -> None:
         """`connects`: up while it is connected; otherwise it accepts connections, and is up even alone.

@@ -1,0 +1,104 @@
+"""The definition of a service: its name, and the types of its request and its response.
+
+On the network a service is a pair of topics whose messages are the header of `r2p.codecs.services` and one field, the
+request or the response. Their layouts are ordinary ones, so discovery compares the types, gateways pass the topics on,
+and tools decode them.
+"""
+
+import types
+from typing import Any, Generic, Protocol, TypeVar
+
+import msgspec
+
+from r2p.codecs.services import HEADER_SIZE, REQUESTS, RESPONSES
+from r2p.errors import MessageError
+from r2p.messages import Layout, Message, layout, show, u8, u16, u32
+
+Q = TypeVar("Q", bound=Message)
+R = TypeVar("R", bound=Message)
+Q_co = TypeVar("Q_co", bound=Message, covariant=True)
+R_co = TypeVar("R_co", bound=Message, covariant=True)
+
+TEXT_ROOM = 200
+"""Bytes of the text of an error for which there is room where the length of responses varies: on any link."""
+
+_HEADER: list[tuple[str, Any]] = [("instance", u32), ("number", u16), ("kind", u8), ("version", u8), ("server", u32)]
+
+
+class Service:
+    """The base of classes that name the two types of a service:
+
+        class Calibrate(r2p.Service):
+            class Request(r2p.Message):
+                gain: r2p.f32 = 1.0
+
+            class Response(r2p.Message):
+                offset: r2p.f32 = 0.0
+
+    The class stands for both types in `Node.service`, `Node.serve` and `Node.client`, and after --type.
+    """
+
+
+class ServiceType(Protocol[Q_co, R_co]):
+    """A class with nested classes Request and Response, as type checkers see it."""
+
+    @property
+    def Request(self) -> type[Q_co]:  # noqa: N802 - the name of the nested class
+        """The class of requests."""
+
+    @property
+    def Response(self) -> type[R_co]:  # noqa: N802
+        """The class of responses."""
+
+
+class Definition(msgspec.Struct, Generic[Q, R], frozen=True):
+    """A service: its name, its types, and the layouts of its two topics."""
+
+    name: str
+    request: Layout[Q]
+    response: Layout[R]
+    requests: Layout[Any]
+    responses: Layout[Any]
+
+    @property
+    def request_topic(self) -> str:
+        return self.name + REQUESTS
+
+    @property
+    def response_topic(self) -> str:
+        return self.name + RESPONSES
+
+
+def define(name: str, request: Any, response: Any = None) -> Definition[Any, Any]:
+    """Return the definition of a service by two message classes, or one class with Request and Response.
+
+    Raises MessageError for anything else.
+    """
+    if response is None:
+        request, response = _nested(name, request, "Request"), _nested(name, request, "Response")
+    asked, answered = layout(request), layout(response)
+    requests, responses = _topic_layout(asked, REQUESTS, "request"), _topic_layout(answered, RESPONSES, "response")
+    if responses.varies:  # the text of an error takes the place of a response
+        responses = msgspec.structs.replace(responses, size=max(responses.size, HEADER_SIZE + TEXT_ROOM))
+    return Definition(name, asked, answered, requests, responses)
+
+
+def _nested(name: str, service: Any, part: str) -> type[Message]:
+    """Return the nested class Request or Response."""
+    found = getattr(service, part, None)
+    if isinstance(found, type) and issubclass(found, Message):
+        return found
+    what = service.__name__ if isinstance(service, type) else show(service)
+    if isinstance(service, type) and issubclass(service, Message):
+        raise MessageError(f"service {name}: {what} is the type of one message: give those of request and response")
+    raise MessageError(f"service {name}: {what} lacks a message class {part}: nest `class {part}(r2p.Message)` in it")
+
+
+def _topic_layout(body: Layout[Any], end: str, field: str) -> Layout[Any]:
+    """Return the layout of a topic of the pair: the header, then one field. Its type is called after the field's."""
+    path = body.cls.__qualname__.rpartition("<locals>.")[2]  # with the classes that it is nested in
+    name, package = path.replace(".", "_") + end, body.name.partition("/")[0]
+    members = {"__annotations__": dict([*_HEADER, (field, body.cls)]), "__module__": __name__}
+    return msgspec.structs.replace(
+        layout(types.new_class(name, (Message,), {}, lambda space: space.update(members))), name=f"{package}/{name}"
+    )

@@ -1,0 +1,111 @@
+"""The two topics of a service as one end uses them: it publishes on one, and handles each message of the other.
+
+A received message does not wait in a queue for a task to read it: it is handled at once, within `Topic.deliver`. So an
+answer wakes its caller directly, a call costs no task, and a call from a handler or a subscriber's callback never waits
+for the task that it runs in.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from r2p.messages import Layout
+from r2p.runtime.backpressure import Sink
+from r2p.runtime.publishers import SporadicPublisher
+from r2p.runtime.qos import Sporadic
+from r2p.runtime.queues import EndpointOwner, SubscriberQueue
+from r2p.runtime.sample import PublisherClass, Sample
+from r2p.runtime.topic import Topic, TopicSpace
+from r2p.units import MILLISECOND
+
+PENDING_MAX = 64
+"""Messages of one end that wait for room in a link; one more drops the oldest of them."""
+
+
+class _HandledAtOnce(deque[Sample]):
+    """The queue of an `Inlet`: always empty, as each message is handled when it comes."""
+
+    def __init__(self, handle: Callable[[Sample], None]) -> None:
+        super().__init__()
+        self.append = handle  # type: ignore[method-assign]
+
+
+class Inlet(SubscriberQueue):
+    """Subscribes to one topic of a service, and calls `handle` with each message."""
+
+    __slots__ = ("changed", "end", "space", "topic")
+
+    def __init__(self, space: TopicSpace, node: EndpointOwner, end: object, handle: Callable[[Sample], None]) -> None:
+        super().__init__(space.wake_scheduler, node, PENDING_MAX, lossy=False, keep_oldest=False)
+        self.queue = _HandledAtOnce(handle)
+        self.end = end
+        """The server or the client."""
+        self.changed: Callable[[], None] = lambda: None
+        """Callback when the topic gets a publisher."""
+        self.space = space
+        self.topic: Topic | None = None
+
+    def open(self, name: str, layout: Layout[Any]) -> Topic:
+        """Join the topic. Raises TypeMismatch if it has another type."""
+        self.topic = self.space.open(name, layout)
+        self.topic.join(self)
+        self.space.changed(self.topic)
+        return self.topic
+
+    def close(self) -> None:
+        """Leave the topic."""
+        if self.topic is not None:
+            topic, self.topic = self.topic, None
+            topic.leave(self)
+            self.space.release(topic)
+
+    def publisher_joined(self) -> None:
+        super().publisher_joined()
+        self.changed()
+
+
+class Outlet(SporadicPublisher[Any]):
+    """Publishes packed messages on one topic of a service, each with a lifetime of its own."""
+
+    def __init__(self, space: TopicSpace, node: EndpointOwner, name: str, layout: Layout[Any]) -> None:
+        """Open the topic. Raises TypeMismatch if it has another type."""
+        topic = space.open(name, layout)
+        super().__init__(space, node, topic, layout, Sporadic(1.0, pending=PENDING_MAX), latch=False)
+        self.changed: Callable[[], None] = lambda: None
+        """Callback when the topic gets a subscriber."""
+        topic.publishers.append(self)
+        for queue in topic.queues:
+            queue.publisher_joined()
+        space.changed(topic)
+
+    @property
+    def where(self) -> Topic:
+        """The topic."""
+        return self._topic
+
+    def send(self, data: bytes, lifetime: int, link: str = "") -> None:
+        """Publish a packed message that is worth nothing after `lifetime` (ns); only by this link, if one is given."""
+        self.sent = sequence = self.sent + 1
+        stamp = self._now()
+        sample = Sample(data, self._source, stamp, stamp + lifetime, sequence, PublisherClass.SPORADIC)
+        blocked = self._topic.deliver_by(link, sample) if link else self._topic.deliver(sample)
+        if blocked is not None:
+            self._deliver_later(sample, blocked, lifetime)
+
+    def subscriber_joined(self, sink: Sink) -> None:
+        super().subscriber_joined(sink)
+        self.changed()
+
+    def link_degraded(self, link: str, reason: str) -> None:
+        """Report nothing: the link says in the log that it is down, and calls say what they lack."""
+
+
+def lifetime_of(sample: Sample, now: int) -> tuple[int, int]:
+    """Return the ns that a sample's sender gave it in all, and that are left at `now` (UTC); 0, 0 if unknown.
+
+    The laxity of a CAN frame says less: what was left when the frame was sent, up to 61 ms, and with firmware not what
+    its caller waits.
+    """
+    if not (sample.deadline and sample.sequence):
+        return 0, 0
+    return max(MILLISECOND, sample.deadline - sample.stamp), max(0, sample.due - now)
