@@ -5,6 +5,7 @@ request or the response. Their layouts are ordinary ones, so discovery compares 
 and tools decode them.
 """
 
+import re
 import types
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -18,6 +19,9 @@ Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
 Q_co = TypeVar("Q_co", bound=Message, covariant=True)
 R_co = TypeVar("R_co", bound=Message, covariant=True)
+
+_NOT_IN_NAMES = re.compile(r"^[^A-Za-z]+|[^A-Za-z0-9_]", re.ASCII)
+"""What a class may have in its name, and the full name of a type may not."""
 
 TEXT_ROOM = 200
 """Bytes of the text of an error for which there is room where the length of responses varies: on any link."""
@@ -98,7 +102,6 @@ def _topic_layout(body: Layout[Any], end: str, field: str) -> Layout[Any]:
     """Return the layout of a topic of the pair: the header, then one field. Its type is called after the field's."""
     path = body.cls.__qualname__.rpartition("<locals>.")[2]  # with the classes that it is nested in
     name, package = path.replace(".", "_") + end, body.name.partition("/")[0]
+    full_name = f"{re.sub(_NOT_IN_NAMES, '', package) or 'r2p'}/{re.sub(_NOT_IN_NAMES, '', name)}"
     members = {"__annotations__": dict([*_HEADER, (field, body.cls)]), "__module__": __name__}
-    return msgspec.structs.replace(
-        layout(types.new_class(name, (Message,), {}, lambda space: space.update(members))), name=f"{package}/{name}"
-    )
+    return layout(types.new_class(name, (Message,), {"name": full_name}, lambda space: space.update(members)))

@@ -19,6 +19,7 @@ from r2p.tools.output import INTERRUPTED, abandon_stdout, notify
 
 GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
+    "service": ("r2p.tools.service", "List, inspect and call services."),
     "node": ("r2p.tools.node", "List and inspect nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
     "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),

@@ -15,6 +15,7 @@ from typing import Any
 import r2p
 from r2p.codecs.management import decode_size, encode_size
 from r2p.messages import SIZE_MAX
+from r2p.services.definition import Definition, define
 from r2p.tools.run import load_module
 from r2p.tools.session import Session, Settings, UsageError, wait_until
 from r2p.tools.session import settings as read_settings
@@ -58,6 +59,47 @@ def _by_full_name(text: str, known: list[type[r2p.Message]]) -> type[r2p.Message
         advice = f"did you mean {close[0]}?" if close else "write package.module:Class or FILE.py:Class"
         raise UsageError(f"neither r2p.msg nor [types] of r2p.toml has a type {text}; {advice}")
     return found
+
+
+def load_service(name: str, text: str) -> Definition[Any, Any]:
+    """Return the service of `package.module:Class`, a subclass of r2p.Service, or of two types with a comma between.
+
+    Raises UsageError.
+    """
+    try:
+        if "," in text:
+            request, response = text.split(",", 1)
+            return define(name, load_type(request.strip()), load_type(response.strip()))
+        service = _find_service(text)
+        if service is None:
+            where = text.rpartition(":")[0] or STANDARD
+            raise UsageError(
+                f"{text} is not a service: {where} has no class {text.rpartition(':')[2]!r} with classes "
+                "Request and Response; or give two types of messages with a comma"
+            )
+        return define(name, service)
+    except r2p.MessageError as error:
+        raise UsageError(f"{text}: {error}") from error
+
+
+def _find_service(text: str) -> Any:
+    """Return the class with nested classes Request and Response, if the text names one."""
+    where, _, name = (text if ":" in text else f"{STANDARD}:{text}").rpartition(":")
+    found = getattr(load_module(where), name, None)
+    return found if hasattr(found, "Request") and hasattr(found, "Response") else None
+
+
+def is_service(text: str) -> bool:
+    """Return whether a text names the types of a service, not of a message."""
+    return "," in text or _find_service(text) is not None
+
+
+def _load_all(text: str) -> list[type[r2p.Message]]:
+    """Return the types of topics that an entry of [types] names: one type, or the two of a service."""
+    if is_service(text):
+        definition = load_service("service", text)
+        return [definition.requests.cls, definition.responses.cls]
+    return [load_type(text)]
 
 
 def _similar(where: str, name: str) -> str:
@@ -106,15 +148,15 @@ class Types:
     @property
     def named(self) -> list[type[r2p.Message]]:
         """The classes that r2p.toml names. Raises UsageError."""
-        return [self._load_named(topic) for topic in self._by_topic]
+        return [cls for topic in self._by_topic for cls in self._load_named(topic)]
 
     def load(self, text: str) -> type[r2p.Message]:
         """Return the class that the user names. Raises UsageError."""
         return load_type(text, self.named if "/" in text and ":" not in text else ())
 
-    def _load_named(self, topic: str) -> type[r2p.Message]:
+    def _load_named(self, topic: str) -> list[type[r2p.Message]]:
         try:
-            return load_type(self._by_topic[topic])
+            return _load_all(self._by_topic[topic])
         except UsageError as error:
             raise UsageError(f"[types] {topic}: {error}") from error
 
@@ -122,7 +164,13 @@ class Types:
         """Return the type that the user states: `given` by --type, or in r2p.toml. Raises UsageError."""
         if given:
             return self.load(given)
-        return self._load_named(topic) if topic in self._by_topic else None
+        found = self._load_named(topic) if topic in self._by_topic else []
+        return found[0] if len(found) == 1 else None
+
+    def stated_service(self, name: str, given: str | None) -> Definition[Any, Any] | None:
+        """Return the types of a service that the user states: `given` by --type, or in r2p.toml. Raises UsageError."""
+        text = given or self._by_topic.get(name)
+        return None if text is None else load_service(name, text)
 
     def of(self, view: r2p.TopicView) -> type[r2p.Message] | None:
         """Return the type of a topic if it is stated or known. Raises UsageError for an invalid name in r2p.toml."""

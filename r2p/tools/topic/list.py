@@ -1,12 +1,13 @@
 """`r2p topic list`, `info` and `find`: what is known about topics."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Annotated, Any
 
 import typer
 
 import r2p
+from r2p.codecs.services import REQUESTS, RESPONSES
 from r2p.names import chosen_alias, topic_name
 from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output, notify
@@ -14,22 +15,36 @@ from r2p.tools.session import Session, alias_or_none
 from r2p.tools.topic.watching import Topic, suggest_topics
 from r2p.tools.types import Types, of_size, size_text
 
+AllTopics = Annotated[
+    bool, typer.Option("--all", "-a", help="Include the two topics of each service, NAME_q and NAME_r.")
+]
+
 _COLUMNS = ["topic", "type", "size", "varies", "publishers", "subscribers"]
 
 
-async def list_(session: Session, *, wait: Wait = None, format: Format = None) -> None:
+async def list_(session: Session, *, all: AllTopics = False, wait: Wait = None, format: Format = None) -> None:
     """List topics, types, publishers and subscribers.
 
     With -v also the alias of each long name, which travels on RTCAN and debug lines.
     """
     output = Output(format)
     await session.settle(wait)
-    views, types = session.module.network.topics().values(), Types(session.settings)
+    known, types = session.module.network.topics(), Types(session.settings)
+    views = [view for name, view in known.items() if all or not is_of_service(name, known)]
     await types.learn_all(session, views)
     rows = [_row(session, view, types) for view in views]
     await _print(output, rows, session.columns(*_COLUMNS))
-    if not rows:
+    if not rows and known:
+        notify(f"no topics yet on {session.network_name}, except for those of services; use --all to include these")
+    elif not rows:
         session.report_none("topics")
+
+
+def is_of_service(name: str, topics: Collection[str]) -> bool:
+    """Return whether a topic is one of the pair of a service, by its name and that of the other one."""
+    base, end = name[: -len(REQUESTS)], name[-len(REQUESTS) :]
+    other = {REQUESTS: RESPONSES, RESPONSES: REQUESTS}.get(end)
+    return other is not None and base + other in topics
 
 
 async def info(session: Session, topic: Topic, *, wait: Wait = None, format: Format = None) -> None:
@@ -123,13 +138,13 @@ def _row(session: Session, view: r2p.TopicView, types: Types) -> dict[str, Any]:
         types.describe(view)
         | _alias(session, view)
         | {
-            "publishers": [each["node"] for each in _endpoints(session, view.publishers, view.published_on)],
-            "subscribers": [each["node"] for each in _endpoints(session, view.subscribers, view.subscribed_on)],
+            "publishers": [each["node"] for each in endpoints_of(session, view.publishers, view.published_on)],
+            "subscribers": [each["node"] for each in endpoints_of(session, view.subscribers, view.subscribed_on)],
         }
     )
 
 
-def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) -> list[dict[str, Any]]:
+def endpoints_of(session: Session, known: list[r2p.Endpoint], links: list[str]) -> list[dict[str, Any]]:
     """Return the known endpoints, and for each other link the only module there, or `?`."""
     found = [
         {
@@ -146,8 +161,8 @@ def _endpoints(session: Session, known: list[r2p.Endpoint], links: list[str]) ->
 async def _details(session: Session, view: r2p.TopicView) -> dict[str, Any]:
     types = Types(session.settings)
     cls = await types.learn(session, view)
-    publishers = _endpoints(session, view.publishers, view.published_on)
-    subscribers = _endpoints(session, view.subscribers, view.subscribed_on)
+    publishers = endpoints_of(session, view.publishers, view.published_on)
+    subscribers = endpoints_of(session, view.subscribers, view.subscribed_on)
     details = types.describe(view) | {
         "fingerprint": None if view.fingerprint is None else view.fingerprint.hex(),
         "publishers": publishers,

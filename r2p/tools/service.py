@@ -1,0 +1,269 @@
+"""`r2p service`: list, inspect and call services.
+
+A service is a pair of topics. Its server subscribes to the requests and publishes the responses; who does it the other
+way around calls it.
+"""
+
+import difflib
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+import r2p
+from r2p.codecs.services import REQUESTS, RESPONSES
+from r2p.messages import Nested
+from r2p.names import topic_name
+from r2p.services.definition import Definition, define
+from r2p.tools import session
+from r2p.tools.options import Format, Wait, time_option
+from r2p.tools.output import Output, notify
+from r2p.tools.session import Session, TimedOut, UsageError
+from r2p.tools.topic.list import endpoints_of, is_of_service
+from r2p.tools.types import Types, complete_type, is_service, load_service, load_type
+from r2p.tools.values import parse, to_plain
+
+app = session.group("List, inspect and call services.")
+
+_COLUMNS = ["service", "type", "servers", "callers"]
+_REQUEST, _RESPONSE = "request", "response"
+"""The fields of the two topics' messages that hold request and response."""
+_TIMEOUT = 5.0  # seconds
+
+Name = Annotated[str, typer.Argument(metavar="SERVICE", show_default=False)]
+ServiceTypeName = Annotated[
+    str | None,
+    typer.Option(
+        "--type",
+        metavar="TYPE",
+        autocompletion=complete_type,
+        help="package.module:Class or FILE.py:Class, a subclass of r2p.Service, or the types of request and response, "
+        "with a comma; default: from r2p.toml or the server.",
+    ),
+]
+
+
+class _Pair(msgspec.Struct):
+    """A service as the network has it: its two topics."""
+
+    name: str
+    requests: r2p.TopicView
+    responses: r2p.TopicView
+
+
+@session.command(app, "list")
+async def list_(session: Session, *, wait: Wait = None, format: Format = None) -> None:
+    """List services, their types, servers and callers."""
+    output = Output(format)
+    pairs, types = await _discover(session, wait)
+    rows = [_row(session, pair, types) for pair in pairs.values()]
+    await output.table(rows, _COLUMNS)
+    if not rows:
+        session.report_none("services")
+
+
+@session.command(app, "info")
+async def info(session: Session, service: Name, *, wait: Wait = None, format: Format = None) -> None:
+    """Show who serves and calls a service, and the fields of its types."""
+    output = Output(format)
+    pairs, types = await _discover(session, wait)
+    pair = pairs.get(topic_name(service))
+    if pair is None:
+        raise r2p.Error(f"there is no service {service}; services found: {', '.join(pairs) or 'none'}")
+    if pair.requests.mismatch or pair.responses.mismatch:
+        notify(f"{service} has different types: some of these nodes can't call each other")
+    details = _row(session, pair, types)
+    details |= {f"{field}_fields": _fields(_body(types, pair, field)) for field in (_REQUEST, _RESPONSE)}
+    await output.put(details)
+
+
+@session.command(app, "find")
+async def find(
+    session: Session,
+    type: Annotated[str, typer.Argument(metavar="TYPE", help="A subclass of r2p.Service, or a type of message.")],
+    *,
+    wait: Wait = None,
+    format: Format = None,
+) -> None:
+    """Find services by their type, or that of request or response.
+
+    Firmware does not announce types: then only the sizes are compared, and the match is "size".
+    """
+    output = Output(format)
+    wanted, both = _wanted(type)
+    pairs, types = await _discover(session, wait)
+    found = [(pair, match) for pair in pairs.values() if (match := _match(pair, wanted, both=both)) is not None]
+    await output.table([_row(session, pair, types) | {"match": match} for pair, match in found], [*_COLUMNS, "match"])
+    if not found:
+        raise r2p.Error(f"no services of type {type} found on {session.network_name}")
+
+
+@session.command(app, "call")
+async def call(
+    session: Session,
+    service: Name,
+    request: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="REQUEST...", help="'{gain: 1.5}' as YAML or JSON, or gain=1.5 limit=3."),
+    ] = None,
+    *,
+    type: ServiceTypeName = None,
+    server: Annotated[str | None, typer.Option("--server", metavar="MODULE", help="Which of several to call.")] = None,
+    timeout: Annotated[
+        float | None, time_option("--timeout", "Give up (exit code 3) without an answer after this long; default: 5 s.")
+    ] = None,
+    format: Format = None,
+) -> None:
+    """Call a service, and print its response.
+
+    Fields that are left out are zero. An error of the server ends with exit code 1, no server or no answer with 3.
+    """
+    output = Output(format)
+    name = topic_name(service)
+    timeout = _TIMEOUT if timeout is None else timeout
+    definition = await _definition(session, name, type)
+    try:
+        message = parse(definition.request.cls, request or [])
+    except r2p.MessageError as error:
+        raise UsageError(str(error)) from error
+    client = session.node.client(name, definition.request.cls, definition.response.cls)
+    try:
+        with session.waiting(f"an answer of service {name}"):
+            if server is None:
+                await client.ready(timeout)
+            response = await client.call(message, timeout=timeout, server=server)
+    except (r2p.NoServer, TimeoutError) as error:
+        raise TimedOut(str(error)) from error
+    await output.put(to_plain(response))
+
+
+# What the network has
+
+
+async def _discover(session: Session, wait: float | None) -> tuple[dict[str, _Pair], Types]:
+    """Return the services by name, and their types as far as they are known or can be learnt."""
+    await session.settle(wait, of="services")
+    pairs, types = _pairs(session), Types(session.settings)
+    await types.learn_all(session, (view for pair in pairs.values() for view in (pair.requests, pair.responses)))
+    return pairs, types
+
+
+def _pairs(session: Session) -> dict[str, _Pair]:
+    topics = session.module.network.topics()
+    names = [topic.removesuffix(REQUESTS) for topic in topics if topic.endswith(REQUESTS)]
+    return {
+        name: _Pair(name, topics[name + REQUESTS], topics[name + RESPONSES])
+        for name in names
+        if is_of_service(name + REQUESTS, topics)
+    }
+
+
+def _row(session: Session, pair: _Pair, types: Types) -> dict[str, Any]:
+    """Return a service as a record; None is what is unknown."""
+    return {
+        "service": pair.name,
+        "type": _type_name(types, pair),
+        "servers": _nodes(session, pair, serving=True),
+        "callers": _nodes(session, pair, serving=False),
+    }
+
+
+def _nodes(session: Session, pair: _Pair, *, serving: bool) -> list[str]:
+    """Return the nodes that serve, or call: those that have both topics, each in the right way."""
+    requests, responses = pair.requests, pair.responses
+    if serving:
+        ends = (requests.subscribers, requests.subscribed_on), (responses.publishers, responses.published_on)
+    else:
+        ends = (requests.publishers, requests.published_on), (responses.subscribers, responses.subscribed_on)
+    one, other = ([each["node"] for each in endpoints_of(session, known, links)] for known, links in ends)
+    return [node for node in one if node in other]
+
+
+def _body(types: Types, pair: _Pair, field: str) -> type[r2p.Message] | None:
+    """Return the type of request or response: stated in r2p.toml, or the field in the type of the topic."""
+    stated = types.stated_service(pair.name, None)
+    if stated is not None:
+        cls: type[r2p.Message] = (stated.request if field == _REQUEST else stated.response).cls
+        return cls
+    topic_type = types.of(pair.requests if field == _REQUEST else pair.responses)
+    return None if topic_type is None else body_of(topic_type, field)
+
+
+def body_of(cls: type[r2p.Message], field: str) -> type[r2p.Message] | None:
+    """Return the type of the field of a topic's messages that holds request or response, if it has one."""
+    for each in r2p.layout(cls).fields:
+        if each.name == field and isinstance(each.shape, Nested):
+            found: type[r2p.Message] = each.shape.layout.cls
+            return found
+    return None
+
+
+def _type_name(types: Types, pair: _Pair) -> str | None:
+    """Return the name of a service's type, or the names of request and response if these are not of one class."""
+    stated = types.stated_service(pair.name, None)
+    if stated is not None:
+        layouts = stated.requests, stated.responses
+    else:
+        requests, responses = types.of(pair.requests), types.of(pair.responses)
+        if requests is None or responses is None:
+            return None
+        layouts = r2p.layout(requests), r2p.layout(responses)
+    request, response = layouts[0].name.removesuffix(REQUESTS), layouts[1].name.removesuffix(RESPONSES)
+    one = request.removesuffix("_Request")
+    return one if one != request and f"{one}_Response" == response else f"{request}, {response}"
+
+
+def _fields(cls: type[r2p.Message] | None) -> dict[str, str] | None:
+    """Return the kind of each field by its path."""
+    if cls is None:
+        return None
+    pairs = (field.rpartition(":") for field in r2p.layout(cls).schema.split())
+    return {path: kind for path, _, kind in pairs}
+
+
+# Types
+
+
+async def _definition(session: Session, name: str, given: str | None) -> Definition[Any, Any]:
+    """Return the types of a service: stated, or the server's. Raises UsageError if they are unknown."""
+    types = Types(session.settings)
+    stated = types.stated_service(name, given)
+    if stated is not None:
+        return stated
+    await session.settle(of="services")
+    pair = _pairs(session).get(name)
+    if pair is None:
+        close = difflib.get_close_matches(name, _pairs(session), n=1)
+        question = f"; did you mean {close[0]}?" if close else ""
+        raise TimedOut(f"there is no service {name} on {session.network_name}{question}")
+    bodies = []
+    for view, field in ((pair.requests, _REQUEST), (pair.responses, _RESPONSE)):
+        learnt = await types.learn(session, view)
+        bodies.append(None if learnt is None else body_of(learnt, field))
+    if None in bodies:
+        raise UsageError(f"the types of service {name} are unknown: give --type package.module:Class")
+    return define(name, *bodies)
+
+
+def _wanted(text: str) -> tuple[list[r2p.Layout[Any]], bool]:
+    """Return the layouts to find, of requests and of responses, and whether both have to match."""
+    if is_service(text):
+        service = load_service("service", text)
+        return [service.requests, service.responses], True
+    cls = load_type(text)
+    either = define("service", cls, cls)
+    return [either.requests, either.responses], False
+
+
+def _match(pair: _Pair, wanted: list[r2p.Layout[Any]], *, both: bool) -> str | None:
+    """Return how the types of a service match: by their "type", by "size" where that is all that is known, or None."""
+    matches = [_match_topic(view, layout) for view, layout in zip((pair.requests, pair.responses), wanted, strict=True)]
+    if None in matches and (both or matches == [None, None]):
+        return None
+    return "size" if "size" in matches else "type"
+
+
+def _match_topic(view: r2p.TopicView, layout: r2p.Layout[Any]) -> str | None:
+    if view.fingerprint is not None:
+        return "type" if view.fingerprint == layout.fingerprint else None
+    return "size" if view.size == layout.size else None

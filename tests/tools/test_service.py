@@ -1,0 +1,116 @@
+"""`r2p service`: what is served and called, and calls from the shell."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+import r2p
+from r2p.codecs import management
+from r2p.msg import Led
+from r2p.tools.service import call, find, info, list_
+from r2p.tools.session import TimedOut, UsageError
+from r2p.tools.topic.list import list_ as topics
+from tests.services.common import Add, add
+from tests.tools.rig import Firmware, printed, robot, tool
+
+pytestmark = pytest.mark.virtual_time
+
+TYPE = "tests.services.common:Add"
+TYPES = {"add": TYPE}
+
+
+async def serve(node: r2p.Node) -> None:
+    @node.service("add", Add)
+    async def handle(request: Add.Request) -> Add.Response:
+        if request.a == 13:
+            raise r2p.ServiceError("unlucky")
+        return await add(request)
+
+    await node.spin()
+
+
+async def ask(node: r2p.Node) -> None:
+    node.client("add", Add)
+    await asyncio.Event().wait()
+
+
+async def test_list_info_and_find(capsys: pytest.CaptureFixture[str]) -> None:
+    row = {
+        "service": "add",
+        "type": "tests/Add",
+        "servers": ["BOT/serve"],
+        "callers": ["BOT/ask"],
+    }
+    async with robot(serve, ask), tool(types=TYPES) as session:
+        await list_(session)
+        assert printed(capsys) == [row]
+        await info(session, "add")
+        fields = {"request_fields": {"a": "u32", "b": "u32"}, "response_fields": {"total": "u64", "spare": "u64[3]"}}
+        assert printed(capsys) == [row | fields]
+        await find(session, TYPE)
+        assert printed(capsys) == [row | {"match": "type"}]
+        with pytest.raises(r2p.Error, match=r"no services of type r2p\.msg:Led found on memory:lab"):
+            await find(session, "r2p.msg:Led")
+        with pytest.raises(r2p.Error, match="there is no service sub; services found: add"):
+            await info(session, "sub")
+    async with robot(serve), tool() as session:
+        await list_(session)
+        assert printed(capsys) == [row | {"type": None, "callers": []}]
+
+
+async def test_topics_of_services_are_hidden(capsys: pytest.CaptureFixture[str]) -> None:
+    async def other(node: r2p.Node) -> None:
+        node.advertise("imu_q", Led)
+        await asyncio.Event().wait()
+
+    async with robot(serve, other), tool() as session:
+        await topics(session)
+        assert [row["topic"] for row in printed(capsys)] == ["imu_q", "log"]
+        await topics(session, all=True)
+        assert [row["topic"] for row in printed(capsys)] == ["add_q", "add_r", "imu_q", "log"]
+
+
+@pytest.mark.parametrize("request_", [["{a: 1, b: 2}"], ['{"a": 1, "b": 2}'], ["a=1", "b=2"]])
+async def test_call_prints_the_response(capsys: pytest.CaptureFixture[str], request_: list[str]) -> None:
+    async with robot(serve), tool(types=TYPES) as session:
+        await call(session, "add", request_)
+    assert printed(capsys) == [{"total": 3, "spare": [0, 0, 0]}]
+
+
+async def test_call_takes_the_type_and_the_server_as_options(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(serve), tool() as session:
+        await call(session, "add", type=TYPE, server="BOT")
+        assert printed(capsys) == [{"total": 0, "spare": [0, 0, 0]}]
+        with pytest.raises(UsageError, match=r"the types of service add are unknown: give --type"):
+            await call(session, "add")
+        with pytest.raises(UsageError, match=r"tests\.services\.common:Desk is not a service"):
+            await call(session, "add", type="tests.services.common:Desk")
+        with pytest.raises(UsageError, match="has no field x"):
+            await call(session, "add", ["x=1"], type=TYPE)
+
+
+async def test_how_a_call_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(serve), tool(types=TYPES | {"ad": TYPE}) as session:
+        with pytest.raises(TimedOut, match=r"there is no service ads on memory:lab; did you mean add\?"):
+            await call(session, "ads")
+        with pytest.raises(r2p.ServiceError, match="service add of BOT: unlucky"):
+            await call(session, "add", ["a=13"])
+        with pytest.raises(TimedOut, match=r"^service ad has no server within 5 s; did you mean add\?$"):
+            await call(session, "ad")
+        with pytest.raises(TimedOut, match="service add is not served by module IMU1: it is by BOT"):
+            await call(session, "add", server="IMU1")
+    assert not capsys.readouterr().out
+
+
+async def test_firmware_that_serves_is_a_question_mark(capsys: pytest.CaptureFixture[str]) -> None:
+    async with tool(types=TYPES) as session:
+        firmware = Firmware("IMU1")
+        firmware.alive()
+        firmware.advertise("add_r", 44)
+        firmware.send(management.SubscribeRequest("add_q", 20, 5))
+        await list_(session)
+        await find(session, TYPE)
+    listed, found = printed(capsys)
+    assert (listed["servers"], listed["callers"], found["match"]) == (["IMU1/?"], [], "size")
