@@ -3,12 +3,13 @@
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import r2p
 import r2p.msg
-from r2p.codecs import loader, management
+from r2p.codecs import loader, management, services
 from tests.docs.blocks import LANGUAGES, NOTES, Block, blocks, of_page, pages
 from tests.vectors import cases
 
@@ -16,6 +17,7 @@ _NAMES = {
     "management": vars(management),
     "loader": vars(loader),
     "messages": vars(r2p.msg),
+    "services": vars(services),
 }
 
 
@@ -64,13 +66,17 @@ def test_frames_are_what_the_codecs_make_of_them(block: Block) -> None:
 def _encode(codec: str, message: object) -> bytes:
     if isinstance(message, r2p.Message):
         return message.encode()
-    return management.encode(message) if codec == "management" else loader.encode(message)  # type: ignore[arg-type]
+    encode: Any = {"management": management, "loader": loader, "services": services}[codec].encode
+    data: bytes = encode(message)
+    return data
 
 
 def _decode(codec: str, message: object, data: bytes) -> object:
     if isinstance(message, r2p.Message):
         return message.decode(data)
-    return management.decode(data) if codec == "management" else loader.decode(data)
+    decode: Any = {"management": management, "loader": loader, "services": services}[codec].decode
+    found: object = decode(data)
+    return found
 
 
 @pytest.mark.golden

@@ -45,10 +45,19 @@ async def test_every_counter_of_publishers_and_subscribers_exists() -> None:
     async with r2p.Module("PC1") as module:
         node = module.start(_idle)
         publisher = node.advertise("ticks", r2p.msg.Led, r2p.Periodic(1.0, fill=r2p.msg.Led))
-        owners = {"publisher": publisher, "subscriber": node.subscribe("leds", r2p.msg.Led)}
+        owners = {
+            "publisher": publisher,
+            "subscriber": node.subscribe("leds", r2p.msg.Led),
+            "server": node.serve("turn", r2p.msg.Led, r2p.msg.Led, _turn),
+            "client": node.client("turn", r2p.msg.Led, r2p.msg.Led),
+        }
         for name in _named("counter"):
             owner, _, counter = name.partition(".")
             assert getattr(owners[owner], counter) == 0, name
+
+
+async def _turn(led: r2p.msg.Led) -> r2p.msg.Led:
+    return led
 
 
 async def _idle(node: r2p.Node) -> None:
