@@ -320,6 +320,54 @@ async def once(subscriber: r2p.Subscriber[bytes]) -> AsyncIterator[bytes]:
         return
 
 
+class Image(r2p.Message):
+    data: Annotated[bytes, r2p.Max(1000)] = b""
+
+
+def sizes_in(subscriber: r2p.Subscriber[Image]) -> list[int]:
+    return [len(sample.data) - 4 for sample in subscriber.queue]
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("timeout", [None, 10.0])
+async def test_a_queue_is_full_by_its_bytes_too(timeout: float | None) -> None:
+    """The next message finds room while there are fewer: so one message always does, and may exceed them."""
+    async with local() as module:
+        node = module.start(hold)
+        images = node.subscribe("image", Image, queue=4, lossy=True, queue_bytes=1000, timeout=timeout)
+        oldest = node.subscribe("image", Image, queue=4, lossy=True, queue_bytes=1000, keep="oldest")
+        publisher = module.start(hold, name="pub").advertise("image", Image)
+        for size in (100, 100, 996, 200, 50, 0, 0, 0, 0):
+            await publisher.publish(Image(data=bytes(size)))
+            if size == 996:
+                assert sizes_in(images) == [100, 100, 996]
+            if size == 200:
+                assert sizes_in(images) == [200]  # the long one takes the places of all before it
+        assert sizes_in(images) == [0, 0, 0, 0]
+        assert (images.lost, sizes_in(oldest), oldest.lost) == (5, [100, 100, 996], 6)
+        assert len((await oldest.fetch()).data) == 100
+        assert sizes_in(oldest) == [100, 996]
+        images.queue.clear()
+        for size in (10, 20, 30, 40, 50):
+            await publisher.publish(Image(data=bytes(size)))
+        assert sizes_in(images) == [20, 30, 40, 50]
+
+
+@pytest.mark.virtual_time
+async def test_publishers_wait_for_bytes() -> None:
+    async with local() as module:
+        images = module.start(hold).subscribe("image", Image, queue_bytes=1500)
+        publisher = module.start(hold, name="pub").advertise("image", Image, r2p.NonRealTime(stall=5.0))
+        for _ in range(2):
+            await publisher.publish(Image(data=bytes(800)))
+        waiting = asyncio.create_task(publisher.publish(Image(data=bytes(1))))
+        await settle(1.0)
+        assert (waiting.done(), len(images.queue)) == (False, 2)
+        await images.fetch()
+        await waiting
+        assert (sizes_in(images), images.lost, publisher.missed) == ([800, 1], 0, 0)
+
+
 @pytest.mark.virtual_time
 async def test_what_does_not_decode_is_counted_and_skipped() -> None:
     async with joined("A") as a, joined("B") as b:

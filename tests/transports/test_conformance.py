@@ -6,7 +6,7 @@ import functools
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import count
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import pytest
 
@@ -322,6 +322,90 @@ async def _mismatch(cable: Cable, ours: type[Message], theirs: type[Message]) ->
         assert await right.fetch() == Led(led=1)
         assert not subscriber.queue
         assert not publisher.subscribers
+
+
+class Note(r2p.Message):
+    """A text that fits the shortest link, and one that fits none but memory and zenoh."""
+
+    text: Annotated[str, r2p.Max(240)] = ""
+    ranges: Annotated[r2p.Array[r2p.f32], r2p.Max(1000)] = r2p.Array(())
+
+
+class Go(r2p.Message):
+    """An empty message."""
+
+
+@conforms
+async def test_messages_of_every_length_both_ways(cable: Cable) -> None:
+    """From the shortest to the longest that fits, and so on; each arrives as it was sent, in its place."""
+    sizes = [0, 1, 2, 3, 4, 5, 11, 12, 13, 60, 61, 200, 239, 240]
+    async with two_nodes(cable) as (alice, bob):
+        for sender, receiver in ((alice, bob), (bob, alice)):
+            topic = f"{sender.module}notes"
+            publisher, subscriber = sender.advertise(topic, Note), receiver.subscribe(topic, Note, queue=99)
+            await publisher.wait_subscriber()
+            await subscriber.wait_publisher()
+            for size in sizes:
+                await publisher.publish(Note(text="x" * size))
+            assert [len((await subscriber.fetch()).text) for _ in sizes] == sizes
+            assert (subscriber.lost, subscriber.undecodable, subscriber.too_long) == (0, 0, 0)
+
+
+@conforms
+async def test_empty_messages(cable: Cable) -> None:
+    async with two_nodes(cable) as (alice, bob):
+        publisher, subscriber = alice.advertise("go", Go), bob.subscribe("go", Go, queue=99)
+        await publisher.wait_subscriber()
+        await subscriber.wait_publisher()
+        for _ in range(3):
+            await publisher.publish(Go())
+        assert [await subscriber.fetch() for _ in range(3)] == [Go()] * 3
+
+
+@conforms
+async def test_what_is_too_long_for_the_link_is_counted_and_reported_and_the_others_pass(cable: Cable) -> None:
+    missed: list[r2p.Missed] = []
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        publisher = alice.advertise("notes", Note, r2p.NonRealTime(on_missed=missed.append))
+        subscriber = bob.subscribe("notes", Note)
+        await publisher.wait_subscriber()
+        await subscriber.wait_publisher()
+        long = Note(ranges=r2p.Array(range(1000)))
+        await publisher.publish(long)
+        await publisher.publish(Note(text="short"))
+        first = await subscriber.fetch()
+        if a.links[0].longest(varies=True) > publisher.size:
+            assert first == long
+            first = await subscriber.fetch()
+        else:
+            assert (a.links[0].losses, publisher.missed) == ({"too long": 1}, 1)
+            assert missed == [r2p.Missed("notes", "too long", where=a.links[0].name)]
+        assert first == Note(text="short")
+
+
+@conforms
+async def test_the_bound_of_the_receiver(cable: Cable) -> None:
+    """It is no part of the type: what exceeds it is counted."""
+
+    class Long(r2p.Message):
+        text: Annotated[str, r2p.Max(64)] = ""
+
+    class Short(r2p.Message):
+        text: Annotated[str, r2p.Max(8)] = ""
+
+    async with two_nodes(cable) as (alice, bob):
+        publisher, subscriber = alice.advertise("words", Long), bob.subscribe("words", Short)
+        await publisher.wait_subscriber()
+        await subscriber.wait_publisher()
+        for text in ("12345678", "123456789", "1"):
+            await publisher.publish(Long(text=text))
+        assert [await subscriber.fetch(), await subscriber.fetch()] == [Short(text="12345678"), Short(text="1")]
+        assert (subscriber.too_long, subscriber.undecodable) == (1, 0)
+
+
+@conforms
+async def test_variable_length_does_not_match_a_fixed_one(cable: Cable) -> None:
+    await _mismatch(cable, Go, Led)
 
 
 @conforms

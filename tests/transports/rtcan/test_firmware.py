@@ -1,12 +1,15 @@
 """Among modules of 2014, which know nothing of sync, claims or leases."""
 
 import asyncio
+from typing import Annotated
 
 import pytest
 
 import r2p
 from r2p.codecs import management, rtcan
+from r2p.modules.link_manager import describe_mismatch
 from r2p.msg import PWM2, Led, Velocity3
+from r2p.protocols.discovery.events import Mismatched
 from r2p.protocols.rtcan.events import Profile
 from tests.transports.rtcan.firmware import MESSAGE, Firmware, recorded_data
 from tests.transports.rtcan.networks import Lab, until
@@ -101,3 +104,28 @@ async def test_stop_of_a_firmware_module_is_what_it_expects() -> None:
         made.host("PC1").command(r2p.Command.STOP, "IMU1")
         await asyncio.sleep(0.2)
         assert management.Stop("IMU1") in firmware.received
+
+
+class Words(r2p.Message):
+    text: Annotated[str, r2p.Max(8)] = ""
+
+
+async def test_topics_of_variable_length_are_none_for_firmware_and_r2p_says_why() -> None:
+    made = Lab()
+    async with Firmware(made.can) as firmware, made.module("PC1") as node:
+        publisher, subscriber = node.advertise("cmd", Words), node.subscribe("leds", Words)
+        events, reasons = node.events(), {}
+        while len(reasons) < 2:
+            event = await anext(events)
+            if isinstance(event, Mismatched):
+                reasons[event.topic] = describe_mismatch(event)
+        await publisher.publish(Words(text="twelve"))
+        await asyncio.sleep(2.0)
+        assert reasons == {
+            topic: f"others {what} messages of {size} bytes, here their length varies, which firmware can't send or "
+            "receive; use one message type on both sides, or another topic"
+            for topic, what, size in (("cmd", "subscribe to", 12), ("leds", "publish", 5))
+        }
+        announced = management.Advertise | management.SubscribeRequest | management.SubscribeResponse
+        assert {each.topic for each in firmware.received if isinstance(each, announced)} <= {"log"}
+        assert (firmware.commands, len(subscriber.queue), publisher.subscribers) == ([], 0, 0)
