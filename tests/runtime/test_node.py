@@ -6,7 +6,7 @@ import asyncio
 import logging
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 
@@ -385,3 +385,35 @@ async def test_a_node_of_periodic_publishers_spins() -> None:
         publisher = node.advertise("a", Led, r2p.Periodic(0.1, Led))
         assert not await node.spin(timeout=1.05)
         assert publisher.sent == 10
+
+
+# Links that can't carry a type
+
+
+class Blob(r2p.Message):
+    data: Annotated[bytes, r2p.Len(2000)] = bytes(2000)
+
+
+class Text(r2p.Message):
+    text: Annotated[str, r2p.Max(2000)] = ""
+
+
+@pytest.mark.virtual_time
+async def test_links_that_do_not_carry_a_type_or_its_longest_messages_are_named(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with r2p.Module("A", via=["sim:bus", "memory:lab"]) as module:
+        node = module.start(hold)
+        for cls in (Blob, Text):
+            node.advertise(f"{cls.__name__}1", cls)
+            node.subscribe(f"{cls.__name__}2", cls)
+        blob = "2000 bytes, and it carries at most 1024 in a message"
+        text = "up to 2004 bytes, and it carries at most 1020 in a message"
+        assert warnings(caplog) == [
+            f"topic Blob1 is not sent on link sim:bus: {blob}",
+            f"topic Blob2 can't be received on link sim:bus: {blob}",
+            f"topic Text1: link sim:bus can't carry its longest messages ({text}); they are counted as too long",
+            f"topic Text2: link sim:bus can't carry its longest messages ({text}); they are counted as too long",
+        ]
+        with pytest.raises(r2p.TransportError, match="topic Text3 on link sim:bus: up to 2004 bytes"):
+            node.advertise("Text3", Text, strict=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 
@@ -146,6 +146,29 @@ async def test_what_varies_in_length(capsys: pytest.CaptureFixture[str], monkeyp
     assert "type: sensor_msgs/LaserScan\nsize: up to 131 380 bytes\nvaries: true\n" in out
     assert "\n  ranges: f32[]\n" in out
     assert re.search(rf"\nscan +sensor_msgs/LaserScan +up to {size} ", out)
+
+
+class Words(r2p.Message):
+    text: Annotated[str, r2p.Max(300)] = ""
+
+
+@pytest.mark.virtual_time
+async def test_info_says_what_a_link_does_not_carry(capsys: pytest.CaptureFixture[str]) -> None:
+    async def speak(node: r2p.Node) -> None:
+        node.advertise("words", Words)
+        await asyncio.Event().wait()
+
+    async with robot(speak), tool() as session:
+        await info(session, "words")
+        link: Any = session.module.links[0]
+        link.max_payload = 100
+        await info(session, "words")
+        await info(session, "log")
+    words, short, log = (next(iter(each["guarantees"].values())) for each in printed(capsys))
+    assert "carr" not in words
+    reason = "up to 304 bytes, and it carries at most 100 in a message"
+    assert short == f"{words}; its longest messages are not carried: {reason}"
+    assert log == "not carried: 152 bytes, and it carries at most 100 in a message"
 
 
 @pytest.mark.virtual_time

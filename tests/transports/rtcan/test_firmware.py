@@ -114,7 +114,8 @@ async def test_topics_of_variable_length_are_none_for_firmware_and_r2p_says_why(
     made = Lab()
     async with Firmware(made.can) as firmware, made.module("PC1") as node:
         publisher, subscriber = node.advertise("cmd", Words), node.subscribe("leds", Words)
-        events, reasons = node.events(), {}
+        events = node.events()
+        reasons: dict[str, str] = {}
         while len(reasons) < 2:
             event = await anext(events)
             if isinstance(event, Mismatched):
