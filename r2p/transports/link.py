@@ -213,8 +213,8 @@ class Link(abc.ABC):
         self.up = True
         self.unreachable_reason = ""
         self.stats.ups += 1
+        self._begin_session()  # before anything is sealed
         self._hub.link_changed(self, "", outage, lost)
-        self._begin_session()
         for name in self._lapsed:  # before discovery finds the present subscribers
             self._remove_subscriber(name)
         self._lapsed.clear()

@@ -63,7 +63,7 @@ def test_a_file_decides_what_the_url_does_not() -> None:
         ("zenoh:?network=a/b", "letters"),
         ("zenoh:?network=", "letters"),
         ("zenoh:tcp/localhost:7447?listen=tcp/0.0.0.0:7447", "a client does not listen"),
-        ("zenoh:?speed=9600", "batching, config, listen, mode, network, scouting"),
+        ("zenoh:?speed=9600", "batching, config, key, listen, mode, network, scouting"),
     ],
 )
 def test_what_it_does_not_take(url: str, says: str) -> None:
