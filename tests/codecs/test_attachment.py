@@ -20,7 +20,7 @@ HEADER = Header(ORIGIN, serial=7, sequence=9, stamp=1_700_000_000_000_000_000, d
 U32 = st.integers(0, 0xFFFFFFFF)
 I64 = st.integers(-(2**63), 2**63 - 1)
 NAME = "ABCxyz019_"
-TOPICS = st.from_regex(r"([A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}", fullmatch=True)
+TOPICS = st.from_regex(r"[A-Za-z0-9_]{1,60}(/[A-Za-z0-9_]{1,60}){0,3}", fullmatch=True)
 HEADERS = st.builds(
     Header,
     origin=st.builds(
@@ -29,8 +29,8 @@ HEADERS = st.builds(
         sender=U32,
         instance=U32,
         fingerprint=st.binary(min_size=8, max_size=8),
-        module=st.text(NAME, max_size=7),
-        node=st.text(NAME, max_size=8),
+        module=st.text(NAME, max_size=64),
+        node=st.text(NAME, max_size=64),
     ),
     serial=U32,
     sequence=st.integers(0, 2**64 - attachment.PACKET_MAX),

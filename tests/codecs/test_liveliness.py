@@ -10,11 +10,12 @@ from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 
 U32 = st.integers(0, 0xFFFFFFFF)
+TOPICS = st.from_regex(r"[A-Za-z0-9_]{1,60}(/[A-Za-z0-9_]{1,60}){0,3}", fullmatch=True)
 TOKENS = st.one_of(
     st.builds(
         ModuleToken,
         session=U32,
-        name=st.from_regex(r"[A-Za-z0-9_]{1,7}", fullmatch=True),
+        name=st.from_regex(r"([A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,64}", fullmatch=True),
         instance=st.none() | U32,
         flags=st.integers(0, 0x7F),
         observer=st.booleans(),
@@ -31,9 +32,9 @@ TOKENS = st.one_of(
         TopicToken,
         session=U32,
         role=st.sampled_from([ROLE_PUBLISHES, ROLE_SUBSCRIBES]),
-        topic=st.from_regex(r"([A-Za-z0-9_]{1,16}/)?[A-Za-z0-9_]{1,16}", fullmatch=True),
+        topic=TOPICS,
         instance=st.none() | U32,
-        node=st.from_regex(r"[A-Za-z0-9_]{0,8}", fullmatch=True),
+        node=st.from_regex(r"[A-Za-z0-9_]{0,64}", fullmatch=True),
         publisher_class=st.integers(0, 255),
         size=st.integers(0, 1024),
         fingerprint=st.binary(min_size=8, max_size=8),
@@ -58,6 +59,8 @@ def test_keys_as_people_see_them() -> None:
     token = TopicToken(0xAB, ROLE_PUBLISHES, "leds", 0xAB, "blink", 1, 5, bytes.fromhex("9ef58fbde4f40142"))
     assert liveliness.encode(token) == "1/ab/pub/leds/ab/blink/1/5/9ef58fbde4f40142/0/0"
     assert liveliness.encode(TopicToken(1, ROLE_SUBSCRIBES, "a/leds", None)) == "1/1/sub/a%leds/-/-/0/0/-/0/0"
+    long = TopicToken(1, ROLE_SUBSCRIBES, "front_left/wheel/velocity", 1, "velocity_estimator")
+    assert liveliness.encode(long) == "1/1/sub/front_left%wheel%velocity/1/velocity_estimator/0/0/-/0/0"
 
 
 @pytest.mark.parametrize(

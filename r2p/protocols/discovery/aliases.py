@@ -101,6 +101,8 @@ class LinkNames:
         self._timers = KeyedTimers() if timers is None else timers
         self._own: dict[_Key, str] = {}
         """The name of this module that has an alias; a short name is its own."""
+        self._long: set[_Key] = set()
+        """The aliases among those of `_own`: of names that are longer."""
         self._waiting: dict[_Key, dict[str, None]] = {}
         """Other names of this module with that alias, which the link does not carry."""
         self._learnt: dict[_Key, str] = {}
@@ -130,11 +132,13 @@ class LinkNames:
 
     def from_wire(self, message: M) -> M:
         """Return a message with the names of topics and nodes behind known aliases."""
-        changes = {
-            field: name
-            for field, kind in _FIELDS.get(type(message), ())
-            if (name := self.name(kind, getattr(message, field))) != getattr(message, field)
-        }
+        if not (self._long or self._learnt):  # on most links: then each message costs no more than this
+            return message
+        changes: dict[str, Any] = {}
+        for field, kind in _FIELDS.get(type(message), ()):
+            alias: str = getattr(message, field)
+            if (name := self.name(kind, alias)) != alias:
+                changes[field] = name
         return msgspec.structs.replace(message, **changes) if changes else message
 
     def alias(self, kind: int, name: str) -> str:
@@ -164,8 +168,7 @@ class LinkNames:
         if owner == name:
             return
         if owner is None or name == key[1]:
-            self._own[key] = name
-            self._drop_waiting(key, name)
+            self._give(key, name)
             loser, winner = owner, name
         else:
             loser, winner = name, owner
@@ -180,10 +183,10 @@ class LinkNames:
         if self._own.get(key) != name:
             return
         del self._own[key]
+        self._long.discard(key)
         heir = next(iter(self._waiting.get(key, ())), None)
         if heir is not None:
-            self._own[key] = heir
-            self._drop_waiting(key, heir)
+            self._give(key, heir)
             self.emit(AliasFreed(heir))
 
     def rival(self, topic: str) -> str:
@@ -194,6 +197,15 @@ class LinkNames:
             return owner
         rival = self._rivals.get(key, "")
         return "" if key[1] in (topic, rival) else rival
+
+    def _give(self, key: _Key, name: str) -> None:
+        """Give an alias to a name of this module."""
+        self._own[key] = name
+        if name == key[1]:
+            self._long.discard(key)
+        else:
+            self._long.add(key)
+        self._drop_waiting(key, name)
 
     def _drop_waiting(self, key: _Key, name: str) -> None:
         waiting = self._waiting.get(key, {})

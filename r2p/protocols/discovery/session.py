@@ -261,7 +261,8 @@ class DiscoveryProtocol(ABC):
     def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
         if message.order in COMMAND_OF_TYPE:
             command = COMMAND_OF_TYPE[message.order]
-            self._outbox.emit(CommandDenied(message.gateway, command, message.module, message.reason))
+            gateway = self.module_behind(message.gateway)
+            self._outbox.emit(CommandDenied(gateway, command, message.module, message.reason))
 
 
 class Discovery(DiscoveryProtocol):
@@ -501,6 +502,6 @@ class Discovery(DiscoveryProtocol):
 
     def _denied(self, now: int, message: management.Denied, source: PeerAddress) -> None:
         if message.order == 0 and message.reason in _CONNECTION_DENIED:
-            self._outbox.emit(ConnectionDenied(message.gateway, message.reason))
+            self._outbox.emit(ConnectionDenied(self.module_behind(message.gateway), message.reason))
         else:
             super()._denied(now, message, source)

@@ -79,6 +79,9 @@ class LivelinessDiscovery(DiscoveryProtocol):
         self._own.remove_node(topic, role, node)
         return self._outbox.drain()
 
+    def module_behind(self, alias: str) -> str:
+        return next((name for name in self.modules if module_alias(name) == alias), self._aliases.name_of(alias))
+
     # For gateways
 
     def demand(self) -> Demand:
