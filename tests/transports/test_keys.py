@@ -6,16 +6,19 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import r2p
 from r2p import keys
-from r2p.codecs import management
+from r2p.codecs import debug, management
 from r2p.codecs.debug import Reader
 from r2p.keys import SharedKey
 from r2p.msg import Led
 from r2p.protocols.keys import PROOF_VALID, LinkEnd
+from r2p.sim import run
 from r2p.testing.network import node_in
-from r2p.transports.memory import Datagram, MemoryNetwork, network
+from r2p.transports.memory import Datagram, MemoryNetwork, MemoryTransport, network
 from r2p.transports.tcp import TcpListenTransport
 from r2p.transports.url import parse
 from r2p.units import SECOND
@@ -126,6 +129,23 @@ async def test_data_flows_with_modules_that_have_no_key_and_these_obey_those_tha
         assert await subscriber.fetch() == Led(led=3)
         bot.command(r2p.Command.STOP, "OLD")
         await until(lambda: old.stopped)
+
+
+@pytest.mark.virtual_time
+async def test_orders_among_firmware_of_2014_where_all_modules_share_one_id(key: str) -> None:
+    bus = "sim:lab,profile=firmware-2014"
+    async with (
+        r2p.Module("BOT", via=bus + key) as bot,
+        r2p.Module("PC", via=bus) as pc,
+        r2p.Module("PC2", via=bus + key) as holder,
+    ):
+        await asyncio.sleep(10)
+        events = pc.events()
+        pc.command(r2p.Command.STOP, "BOT")
+        assert "BOT refuses STOP" in await notice(events, "STOP denied")
+        holder.command(r2p.Command.STOP, "BOT")
+        async with asyncio.timeout(1):
+            await until(lambda: bot.stopped)
 
 
 def record(lab: MemoryNetwork) -> list[Datagram]:
@@ -432,3 +452,32 @@ async def line_with(reader: asyncio.StreamReader, kind: type) -> bytes:
 def payload(line: bytes) -> bytes:
     (read,) = Reader().feed(line)
     return read.data
+
+
+# Strangers
+
+STRANGE = st.one_of(
+    st.binary(min_size=32, max_size=32),
+    st.builds(
+        lambda body, kind: b"\1" + body + bytes((kind,)),
+        st.binary(min_size=30, max_size=30),
+        st.sampled_from([*management.ManagementType]),
+    ),
+    st.sampled_from([management.encode(management.Stop("A")), management.encode(management.Hello("B", 7))]),
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(STRANGE, max_size=30))
+def test_whatever_a_stranger_says_a_line_stays_closed_and_a_bus_obeys_nothing(messages: list[bytes]) -> None:
+    async def scenario() -> None:
+        lab, (a, _) = MemoryNetwork(), line(KEY, KEY)
+        async with r2p.Module("A", via=[a, MemoryTransport("lab", lab, None, KEY)]) as alice:
+            for data in messages:
+                a.arrive(debug.encode(b"R2P", data, 0))
+                lab.send(Datagram(99, b"R2P", data))
+                await asyncio.sleep(0.05)
+            assert not alice.links[0].up
+            assert not alice.stopped | alice.rebooted | bool(alice.refused)
+
+    run(scenario)
