@@ -22,6 +22,7 @@ GROUPS = {
     "service": ("r2p.tools.service", "List, inspect and call services."),
     "node": ("r2p.tools.node", "List and inspect nodes."),
     "module": ("r2p.tools.module", "List, stop and restart modules."),
+    "msg": ("r2p.tools.msg", "Show message types, and export them to C."),
     "bus": ("r2p.tools.bus", "Inspect an RTCAN bus: load, frames, slots."),
     "key": ("r2p.tools.key", "Make a shared key for links."),
     "config": ("r2p.tools.config_show", "Show the settings, and where they come from."),

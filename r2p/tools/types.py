@@ -16,6 +16,7 @@ import r2p
 from r2p.codecs.management import decode_size, encode_size
 from r2p.messages import SIZE_MAX
 from r2p.services.definition import Definition, define
+from r2p.tools.output import Output
 from r2p.tools.run import load_module
 from r2p.tools.session import Session, Settings, UsageError, wait_until
 from r2p.tools.session import settings as read_settings
@@ -135,6 +136,14 @@ def size_text(size: int, *, varies: bool) -> str:
     if varies and size == SIZE_CUT:
         return f"{text} or more"
     return f"up to {text}" if varies else text
+
+
+async def put_sizes(output: Output, rows: list[dict[str, Any]], columns: list[str]) -> None:
+    """Print a table with the columns `size` and `varies`; at a terminal `varies` is a word before the size."""
+    if output.format == "text":
+        columns = [name for name in columns if name != "varies"]
+        rows = [row | {"size": f"up to {row['size']}"} if row["varies"] else row for row in rows]
+    await output.table(rows, columns)
 
 
 class Types:

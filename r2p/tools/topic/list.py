@@ -13,7 +13,7 @@ from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, alias_or_none
 from r2p.tools.topic.watching import Topic, suggest_topics
-from r2p.tools.types import Types, of_size, size_text
+from r2p.tools.types import Types, of_size, put_sizes, size_text
 
 AllTopics = Annotated[
     bool, typer.Option("--all", "-a", help="Include the two topics of each service, NAME_q and NAME_r.")
@@ -33,7 +33,7 @@ async def list_(session: Session, *, all: AllTopics = False, wait: Wait = None, 
     views = [view for name, view in known.items() if all or not is_of_service(name, known)]
     await types.learn_all(session, views)
     rows = [_row(session, view, types) for view in views]
-    await _print(output, rows, session.columns(*_COLUMNS))
+    await put_sizes(output, rows, session.columns(*_COLUMNS))
     if not rows and known:
         notify(f"no topics yet on {session.network_name}, except for those of services; use --all to include these")
     elif not rows:
@@ -95,7 +95,7 @@ async def find(
     found = [(view, match) for view in views if (match := _match(view, size, fingerprint)) is not None]
     await types.learn_all(session, (view for view, _ in found))
     rows = [_row(session, view, types) | {"match": match} for view, match in found]
-    await _print(output, rows, session.columns(*_COLUMNS, "match"))
+    await put_sizes(output, rows, session.columns(*_COLUMNS, "match"))
     if not rows:
         raise r2p.Error(session.none_yet(f"topics of type {what}"))
 
@@ -107,14 +107,6 @@ def _alias(session: Session, view: r2p.TopicView) -> dict[str, Any]:
 def _with_alias(session: Session, alias: str, views: Iterable[r2p.TopicView]) -> r2p.TopicView | None:
     """Return the topic with this alias, if there is one."""
     return next((view for view in views if chosen_alias(view.name, session.settings.aliases) == alias), None)
-
-
-async def _print(output: Output, rows: list[dict[str, Any]], columns: list[str]) -> None:
-    """Print the table of topics; a terminal gets `varies` as a word before the size."""
-    if output.format == "text":
-        columns = [name for name in columns if name != "varies"]
-        rows = [row | {"size": f"up to {row['size']}"} if row["varies"] else row for row in rows]
-    await output.table(rows, columns)
 
 
 def _wanted(what: str, types: Types) -> tuple[int, bytes | None]:
