@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator
 import r2p
 from benchmarks.table import Row, rate, typical
 from r2p.codecs import debug
-from r2p.msg import StampedIMURaw9
+from r2p.msg import Header, LaserScan, StampedIMURaw9
 
 PAYLOAD = bytes(range(32))
 NUMBER = 50_000
+RAYS = 720
 
 
 def seconds(function: Callable[[], object], number: int = NUMBER) -> float:
@@ -20,6 +21,7 @@ def seconds(function: Callable[[], object], number: int = NUMBER) -> float:
 
 def rows() -> Iterator[Row]:
     yield from _messages()
+    yield from _scans()
     yield from _lines()
 
 
@@ -41,6 +43,30 @@ def _messages() -> Iterator[Row]:
             "within 3x",
             ours <= 3 * base,
         )
+
+
+def _scans() -> Iterator[Row]:
+    """A message of variable length against rosbags, which packs the same bytes."""
+    import numpy as np
+    from rosbags.typesys import Stores, get_typestore
+
+    layout = r2p.layout(LaserScan)
+    ranges = np.linspace(0.1, 30.0, RAYS, dtype=np.float32)
+    scan = layout.decode(layout.encode(LaserScan(Header(frame_id="laser"), scan_time=0.025, ranges=r2p.Array(ranges))))
+    data, encode, decode = layout.encode(scan), layout.encode, layout.decode
+    store, name = get_typestore(Stores.ROS1_NOETIC), "sensor_msgs/msg/LaserScan"
+    theirs = store.deserialize_ros1(data, name)
+    assert bytes(store.serialize_ros1(theirs, name)) == data
+    packed = seconds(lambda: encode(scan)), seconds(lambda: store.serialize_ros1(theirs, name), NUMBER // 5)
+    unpacked = seconds(lambda: decode(data)), seconds(lambda: store.deserialize_ros1(data, name), NUMBER // 5)
+    ours, base = (sum(pair) for pair in zip(packed, unpacked, strict=True))
+    yield Row(
+        f"encode + decode of a LaserScan of {RAYS} ranges",
+        f"{packed[0] * 1e6:.2f} + {unpacked[0] * 1e6:.2f} us",
+        f"rosbags {packed[1] * 1e6:.2f} + {unpacked[1] * 1e6:.2f} us: {base / ours:.1f}x",
+        "5x",
+        base >= 5 * ours,
+    )
 
 
 def _lines() -> Iterator[Row]:

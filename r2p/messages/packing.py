@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from r2p.errors import DecodeError, MessageError, TooLong
-from r2p.messages.array import Array
+from r2p.messages.array import Array, from_view
 from r2p.messages.parts import bad_count, bytes_of, pack_chars, part, sharing_of_fields, unpack_chars, view_of
 from r2p.messages.shapes import (
     Chars,
@@ -213,11 +213,14 @@ class _SourceCode:
         local, code = self.local(value), repr(item.format)
         is_array = f"{local}.__class__ is Array and {local}._code == {code}"
         packed = f"{local}._view if {is_array} else view_of({local}, {code})"
-        slot = self._add_counted(packed, limit, item.size, "new(Array)")
+        empty = f"empty_{item.format if item.format != '?' else 'bool'}"
+        self.names[empty] = from_view(memoryview(b"").cast(item.format), item.format)
+        slot = self._add_counted(packed, limit, item.size, empty)
         if "view = memoryview(data)" not in self._reads:
             self._reads.insert(0, "view = memoryview(data)")
         cast = "" if item.format == "B" else f".cast({code})"
-        self._reads += [f"{slot}._code = {code}", f"{slot}._view = view[begin:at]{cast}"]
+        made = [f"{slot} = new(Array)", f"{slot}._code = {code}", f"{slot}._view = view[begin:at]{cast}"]
+        self._reads[-1:] = ["if begin < at:", *(f"    {line}" for line in made), "else:", f"    {self._reads[-1]}"]
         return slot
 
     def _add_counted(self, packed: str, limit: int, item_size: int, read: str) -> str:
@@ -226,13 +229,13 @@ class _SourceCode:
         local = self.local(packed)
         self.checks.append(f"if len({local}) > {limit}: raise ValueError")
         count = self._add_fixed("I", f"len({local})")
-        self._end_run()
+        size = self._end_run()
         self._pieces.append(local)
         slot = f"v{self._slot_count}"
         self._slot_count += 1
+        self._reads[-1] = f"begin = at + {size}"  # instead of the sum that it ends with, which is slower
         self._reads += [
-            "begin = at",
-            f"at += {count}" + f" * {item_size}" * (item_size > 1),
+            f"at = begin + {count}" + f" * {item_size}" * (item_size > 1),
             f"if {count} > {limit} or at > size: raise bad_count({count}, {limit}, size - begin, {item_size})",
             f"{slot} = {read}",
         ]
@@ -249,16 +252,17 @@ class _SourceCode:
         self._reads.append(f"{slot}, at = read{number}(data, at)")
         return slot
 
-    def _end_run(self) -> None:
-        """Pack the fields since the last part as one struct."""
+    def _end_run(self) -> int:
+        """Pack the fields since the last part as one struct; return its bytes."""
         if not self._formats:
-            return
+            return 0
         packed, number = struct.Struct("<" + "".join(self._formats)), len(self.names)
         self.names |= {f"pack{number}": packed.pack, f"unpack{number}": packed.unpack_from}
         self._pieces.append(f"pack{number}({', '.join(self._values)})")
         self._reads += [f"{', '.join(self._slots)}, = unpack{number}(data, at)", f"at += {packed.size}"]
         for run in (self._formats, self._values, self._slots):
             run.clear()
+        return packed.size
 
     def _slot(self) -> str:
         self._slots.append(f"v{self._slot_count}")
