@@ -214,7 +214,7 @@ class _SourceCode:
         is_array = f"{local}.__class__ is Array and {local}._code == {code}"
         packed = f"{local}._view if {is_array} else view_of({local}, {code})"
         empty = f"empty_{item.format if item.format != '?' else 'bool'}"
-        self.names[empty] = from_view(memoryview(b"").cast(item.format), item.format)
+        self.names[empty] = from_view(memoryview(b"").cast(item.format), item.format)  # type: ignore[call-overload]
         slot = self._add_counted(packed, limit, item.size, empty)
         if "view = memoryview(data)" not in self._reads:
             self._reads.insert(0, "view = memoryview(data)")
