@@ -3,7 +3,7 @@
 A session is the time from one start of the link to the next. Its sender seals each order and each message between
 gateways, under a counter that grows. A receiver believes a seal once it knows that the session is no recording: it
 sends a CHALLENGE, whose PROOF says how far the counter has come. So nothing that was recorded counts a second time, and
-what was held back on its way counts for PROOF_VALID at most.
+what was held back on its way counts for two times PROOF_VALID at most.
 
     sent       seal_order -> SEAL, then the message
     received   note_seal, then admit -> Verdict; a CHALLENGE may wait in `pop_messages`
@@ -101,7 +101,7 @@ class _ProvenSession(msgspec.Struct):
 
     def use(self, counter: int, first: int) -> bool:
         """Note that a message counts; return False if it counted before, now or when it was sent first."""
-        if counter <= self.floor or self.is_used(counter) or self.is_used(first):
+        if first > counter or counter <= self.floor or self.is_used(counter) or self.is_used(first):
             return False
         if counter > self.last:
             self.used = (self.used << min(counter - self.last, WINDOW)) & _WINDOW_MASK

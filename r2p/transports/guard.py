@@ -1,8 +1,8 @@
 """The guard of a link with a shared key: seals what needs it, and refuses what lacks it (PROTOCOL.md 9).
 
 Orders and the messages between gateways count only behind their seal. Everything else passes: on a bus or a network,
-nothing shows who sent it. On a line there is only one other end, so `LineGuard` lets the link come up only when that
-end has proven the key.
+nothing shows who sent it. On a line there is only one other end, so `LineGate` lets the link come up only when that end
+has proven the key.
 """
 
 import os

@@ -74,6 +74,15 @@ def test_nothing_counts_twice_nor_from_before_a_proof() -> None:
     assert hears(receiver, 0, seals[0]) is not ADMITTED  # out of the window
 
 
+def test_a_seal_of_a_holder_that_counts_wrongly_is_refused() -> None:
+    sender, receiver = part(), part()
+    introduce(sender, receiver, 0)
+    for counter, first in ((5, 6), (5, 0xFFFFFFFF), (0, 0)):
+        wrong = keys.seal(KEY, sender.session, counter, first, (b"R2P", STOP))
+        assert hears(receiver, 0, wrong) is REPEATED
+    assert hears(receiver, 0, keys.seal(KEY, sender.session, 0xFFFFFFFF, 1, (b"R2P", STOP))) is ADMITTED
+
+
 def test_a_message_may_overtake_its_seal() -> None:
     sender, receiver = part(), part()
     introduce(sender, receiver, 0)
