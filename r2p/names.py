@@ -15,6 +15,9 @@ from r2p.errors import InvalidName, NameTooLong
 MODULE_MAX = 64
 NODE_MAX = 64
 TOPIC_MAX = 255
+"""Of a topic or a service that a program names."""
+CARRIED_MAX = TOPIC_MAX + 2
+"""Of a topic on a link: the two topics of a service have two characters more than its name."""
 NAMESPACE_MAX = 16
 """Characters of the namespace of a robot at most: `robot1` in `robot1/MOTOR1`."""
 MODULE_PATH_MAX = NAMESPACE_MAX + 1 + MODULE_MAX
@@ -30,7 +33,7 @@ MODULE_PATH = rf"(?:[A-Za-z0-9_]{{1,{NAMESPACE_MAX}}}/)?[A-Za-z0-9_]{{1,{MODULE_
 NODE = rf"[A-Za-z0-9_]{{1,{NODE_MAX}}}"
 """The name of a node as a regular expression."""
 TOPIC = r"[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*"
-"""The name of a topic from a wire as a regular expression; at most TOPIC_MAX characters."""
+"""The name of a topic from a wire as a regular expression; at most CARRIED_MAX characters."""
 
 MANAGEMENT = "R2P"
 """The topic of management messages."""

@@ -32,7 +32,7 @@ import msgspec
 from r2p.codecs import PublisherClass, UnknownType
 from r2p.errors import DecodeError
 from r2p.messages import ClockOffset
-from r2p.names import MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC, TOPIC_MAX, module_alias
+from r2p.names import CARRIED_MAX, MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC, module_alias
 
 T = TypeVar("T")
 
@@ -234,7 +234,7 @@ def decode_credit(data: bytes) -> Credit:
     _check_version(data, "credit")
     if len(data) < _CREDIT.size:
         raise _too_short("credit", data, _CREDIT.size + 1)
-    if len(data) - _CREDIT.size > TOPIC_MAX or _TOPIC.fullmatch(data, _CREDIT.size) is None:
+    if len(data) - _CREDIT.size > CARRIED_MAX or _TOPIC.fullmatch(data, _CREDIT.size) is None:
         raise DecodeError(f"credit for {data[_CREDIT.size :][:_SHOWN_MAX]!r}, which is not a valid topic")
     _, publisher_class, session, serial = _CREDIT.unpack_from(data)
     leaving = bool(publisher_class & _LEAVING)

@@ -26,7 +26,7 @@ from r2p.codecs import UnknownType
 from r2p.codecs.management import ANY_TYPE, RELEASE_MAX, ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.errors import DecodeError
 from r2p.messages import SIZE_MAX
-from r2p.names import MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC, TOPIC_MAX
+from r2p.names import CARRIED_MAX, MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC
 
 VERSION = "1"
 _SOFTWARE_VERSION = "2"
@@ -135,7 +135,7 @@ def decode(key: str) -> Token:
             int(hops),
         )
     found = _TOPIC.fullmatch(rest)
-    if found and len(found[3]) <= TOPIC_MAX and int(found[6]) <= _BYTE_MAX and int(found[8]) <= SIZE_MAX:
+    if found and len(found[3]) <= CARRIED_MAX and int(found[6]) <= _BYTE_MAX and int(found[8]) <= SIZE_MAX:
         session, role, topic, instance, node, publisher_class, varies, size, fingerprint, window, hops = found.groups()
         return TopicToken(
             int(session, 16),

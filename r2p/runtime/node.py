@@ -458,9 +458,7 @@ class Node:
 
     def _define(self, name: str, request: Any, response: Any) -> Definition[Any, Any]:
         """Return the definition of a service under its name after remapping."""
-        definition = define(self._resolve(name), request, response)
-        topic_name(definition.request_topic)
-        return definition
+        return define(self._resolve(name), request, response)
 
     def _serve_with(
         self, definition: Definition[Any, Any], handler: Handler[Any, Any], limit: int

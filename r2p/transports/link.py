@@ -24,7 +24,7 @@ from r2p.codecs.management import (
 )
 from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
-from r2p.names import TOPIC_FIELD, TOPIC_MAX
+from r2p.names import CARRIED_MAX, TOPIC_FIELD
 from r2p.protocols.discovery.announcer import Relayed
 from r2p.protocols.discovery.events import (
     AliasConflict,
@@ -146,7 +146,7 @@ class Link(abc.ABC):
     """Bytes of the longest message."""
     max_variable: ClassVar[int | None] = None
     """Bytes of the longest message of those whose length varies; None: the same."""
-    max_name: ClassVar[int] = TOPIC_MAX
+    max_name: ClassVar[int] = CARRIED_MAX
     """Characters of the longest topic's name."""
     passes_probes: ClassVar[bool] = True
     """True if firmware gateways may be on the link."""

@@ -92,11 +92,11 @@ async def test_names_too_long_for_a_link_are_told_once_and_floods_of_them_once_a
         port = routing._ports["memory:a"]
         for number in range(2 * LONG_NAMES):
             for _ in range(2):
-                assert not routing._carries(f"{'a' * 255}/{number}", port)
+                assert not routing._carries(f"{'a' * 257}/{number}", port)
         warnings = [each for each in caplog.records if each.levelno == logging.WARNING]
         assert len(warnings) - 1 == len(routing._too_long) == LONG_NAMES
         await asyncio.sleep(1.0)
-        assert not routing._carries(f"{'a' * 255}/more", port)
+        assert not routing._carries(f"{'a' * 257}/more", port)
         assert len(caplog.records) == len(warnings) + 1
         assert caplog.messages[-1].endswith(f" ({LONG_NAMES - 1} more since the last such line)")
 

@@ -115,7 +115,7 @@ async def test_calls_both_ways_their_errors_and_their_end(cable: Cable) -> None:
 
     async with two_nodes(cable) as (alice, bob):
         for server, client in ((alice, bob), (bob, alice)):
-            name = f"add{server.module}"
+            name = "add" if server is alice else "front_left/wheel/" + "a" * 238
             server.serve(name, Add, add)
             calls = client.client(name, Add)
             await calls.ready()

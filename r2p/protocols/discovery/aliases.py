@@ -21,13 +21,13 @@ import msgspec
 from r2p.codecs import management
 from r2p.codecs.management import KIND_NODE, KIND_TOPIC
 from r2p.names import (
+    CARRIED_MAX,
     MODULE_PATH_MAX,
     NODE,
     NODE_FIELD,
     NODE_MAX,
     TOPIC,
     TOPIC_FIELD,
-    TOPIC_MAX,
     chosen_alias,
     fits_field,
     module_alias,
@@ -49,7 +49,7 @@ _RIVALS_MAX = 256
 """Aliases with two names that are remembered."""
 
 _VALID = {
-    KIND_TOPIC: (re.compile(TOPIC), TOPIC_MAX, TOPIC_FIELD),
+    KIND_TOPIC: (re.compile(TOPIC), CARRIED_MAX, TOPIC_FIELD),
     KIND_NODE: (re.compile(NODE), NODE_MAX, NODE_FIELD),
 }
 """Pattern, longest name, and the width of its field."""
