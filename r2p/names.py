@@ -37,6 +37,10 @@ TOPIC = r"[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*"
 
 MANAGEMENT = "R2P"
 """The topic of management messages."""
+CALLS, REPLIES = "R2P_CALL", "R2P_REPLY"
+"""The topics of r2p's own services: requests and answers, which modules know without an announcement."""
+RESERVED = (MANAGEMENT, CALLS, REPLIES)
+"""The topics that programs can't use."""
 LOG = "log"
 """The topic on which each r2p module publishes the log records of its nodes."""
 LOADER_PREFIX = "BOOT_"

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from r2p.bridge.calls import CallRelay
 from r2p.bridge.directory_relay import DirectoryRelay
 from r2p.bridge.forwarding import BridgedTopic, BridgePort, HeldMessages
 from r2p.bridge.options import BridgeOptions, Policy
@@ -104,6 +105,7 @@ class Bridge:
         self.routing = RoutingTable(self.ports, space, self.policy)
         self.directory = DirectoryRelay(instance, self.ports, space, self.policy, self.routing.check_types)
         self.names = ModuleNames(self.policy, self.directory)
+        self.calls = CallRelay(self.ports, self.policy, space.clock)
         self._name = space.module
         self._alias = module_alias(space.module)
         self._instance = instance
@@ -140,6 +142,7 @@ class Bridge:
         """Remove a link that the module no longer has."""
         port = self.ports.pop(link.name)
         del self._by_number[port.number]
+        self.calls.detach(link.name)
         self._close(port)
         self._port_changed(port)
 

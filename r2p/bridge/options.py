@@ -149,6 +149,15 @@ class Policy:
             return DENIED_READ_ONLY
         return 0 if harmless or self._may_control(source) else DENIED_CONTROL
 
+    def call_denied(self, source: str, target: str, *, changes: bool, is_request: bool) -> bool:
+        """Return whether a message of r2p's own services may not go from one link to another.
+
+        What only asks passes wherever its answer may come back; what changes something, where orders may.
+        """
+        if self._is_read_only(source if is_request else target):
+            return True
+        return is_request and changes and bool(self.order_denied(source, target, harmless=False))
+
     def class_of(self, topic: str, source: str) -> ClassOf | None:
         """Return the class of messages from a debug line; None: the one that they carry."""
         is_line = source.partition(":")[0] in {"tcp", "serial"}

@@ -96,6 +96,7 @@ class ManagementType(enum.IntEnum):
     CHALLENGE = 0x58
     PROOF = 0x59
     SEAL = 0x5A
+    CALL_PART = 0x5B
     BRIDGE = 0x60
     MESH = 0x61
     LEAF = 0x62

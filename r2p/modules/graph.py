@@ -12,6 +12,7 @@ import msgspec
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES, WIRE_VERSION
 from r2p.messages import Layout, Message
 from r2p.modules.link_manager import LinkManager
+from r2p.modules.type_lookup import find_type
 from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.sample import PublisherClass
@@ -109,15 +110,13 @@ class NetworkView:
         return dict(sorted(table.items()))
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
-        """Ask the modules on the network for a message class of this layout; None without an answer. May take a second.
+        """Ask the modules on the network for a message class of this layout; None without an answer.
 
-        Only links that carry such questions are asked (zenoh).
+        Modules that publish or subscribe to a topic of the type are asked, on any link and through gateways. It takes
+        as long as its schema on a slow line, and some seconds if the modules are silent.
         """
-        for link in list(self._opened().links):
-            found = await link.message_type(fingerprint) if link.up else None
-            if found is not None:
-                return found
-        return None
+        module = self._opened()
+        return await find_type(module.links, module.own_services, fingerprint)
 
 
 def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:

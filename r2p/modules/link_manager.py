@@ -5,8 +5,9 @@ module, and passes their reports on to the log, to the module's listeners, and t
 """
 
 import asyncio
+import functools
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 
 import msgspec
 
@@ -25,8 +26,11 @@ from r2p.codecs.management import (
     ROLE_PUBLISHES,
     WIRE_VERSION,
 )
+from r2p.codecs.own_services import Operation
 from r2p.errors import Error
 from r2p.log_lines import LineLimit, get_logger
+from r2p.modules.own_services import OwnServices
+from r2p.modules.type_lookup import schema
 from r2p.names import module_alias
 from r2p.protocols.discovery.events import (
     AliasConflict,
@@ -109,6 +113,8 @@ class LinkManager:
         self.instance = self.random.getrandbits(32)
         """Random number of this run of the module."""
         space.instance = self.instance
+        self.own_services = OwnServices(space, self.instance, self.links)
+        self.own_services.serve(Operation.SCHEMA, functools.partial(schema, space))
         self.flags = 0
         """The module's state, as in ALIVE."""
         self.bridge: Bridge | None = None
@@ -136,6 +142,7 @@ class LinkManager:
         if bridge is not None:
             self._bridging = self.bridge = Bridge(space, self.instance, bridge, self._port_changed)
             space.make_topic = self.bridge.make_topic
+            self.own_services.relay = self.bridge.calls
         else:
             self._bridging = MultihomedModule(space, self.instance, self.link_notice)
 
@@ -223,6 +230,10 @@ class LinkManager:
             if refused is not None:
                 refused.since = self.space.clock.monotonic()
         self._bridging.link_changed(link)
+
+    def call_received(self, link: Link, data: bytes, source: Hashable) -> None:
+        """Handle a message of r2p's own services."""
+        self.own_services.receive(link, data, source)
 
     def discovered(self, link: Link, event: Event) -> None:
         """Handle what the discovery of a link found."""

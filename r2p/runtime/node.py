@@ -12,7 +12,7 @@ from r2p.clock import SHORTEST, Alarm, Ticker, check_seconds, check_timeout
 from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.log_lines import NodeLogger, node_logger
 from r2p.messages import Layout, Message, layout
-from r2p.names import MANAGEMENT, topic_name
+from r2p.names import RESERVED, topic_name
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
@@ -482,8 +482,8 @@ class Node:
             raise Closed(f"node {self.name} has ended: it can't use topic {topic} any more")
         name = topic_name(topic)
         name = topic_name(self._remap.get(name, name))
-        if name == MANAGEMENT:
-            raise InvalidName(f"topic {name} is reserved for management messages: choose another name")
+        if name in RESERVED:
+            raise InvalidName(f"topic {name} is reserved for messages of r2p itself: choose another name")
         return name
 
     def _check_links(

@@ -14,8 +14,11 @@ from typing import Any, ClassVar, Protocol
 
 import msgspec
 
-from r2p.codecs.management import ROLE_PUBLISHES
-from r2p.names import LOG, MANAGEMENT
+from r2p.codecs import UnknownType, call_parts, management
+from r2p.codecs.management import ROLE_PUBLISHES, ManagementType
+from r2p.errors import DecodeError
+from r2p.names import CALLS, LOG, MANAGEMENT, REPLIES
+from r2p.protocols.call_parts import CallAssembler
 from r2p.protocols.discovery.events import ModuleInfo, PeerAddress, SubscriberJoined, possible_senders
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
@@ -26,6 +29,8 @@ from r2p.transports.receive_backpressure import LinkBackpressure
 from r2p.units import SECOND
 
 _MANAGEMENT = MANAGEMENT.encode()
+_CALLS = (CALLS.encode(), REPLIES.encode())
+_CALL_PART = ManagementType.CALL_PART
 _EARLY = SECOND  # ns by which a message may come before the answer to its subscription
 _EARLY_MAX = 256  # messages that come early and are kept: any sender can send them, so there is a limit
 _EARLY_LONG = 64 * 1024  # bytes
@@ -77,6 +82,8 @@ class BufferedLink(Link):
         )
         self._early: dict[tuple[bytes, Hashable], tuple[Arrival, int]] = {}
         """The last message of each publisher that is not announced yet, and its arrival (ns)."""
+        self._call_parts = CallAssembler(self.stats.lost)
+        self._call_serial = 0
 
     # For subclasses to implement
 
@@ -118,6 +125,27 @@ class BufferedLink(Link):
 
     def resume(self) -> None:
         """Go on reading."""
+
+    # Management, and r2p's own services: in parts, as every link carries management
+
+    def manage(self, data: bytes, source: Hashable) -> None:
+        if management.type_of(data) != _CALL_PART:
+            super().manage(data, source)
+            return
+        try:
+            message = self._call_parts.receive(self._clock.monotonic(), call_parts.decode(data))
+        except UnknownType:
+            self.stats.lost["unknown type"] += 1
+        except DecodeError:
+            self.stats.lost["undecodable"] += 1
+        else:
+            if message is not None:
+                self.calls.receive(message, source)
+
+    def write_call(self, data: bytes, to: Hashable) -> None:
+        self._call_serial = (self._call_serial + 1) % call_parts.SERIALS
+        for part in call_parts.encode(self._hub.instance, self._call_serial, data):
+            self.write_management(part)
 
     # Out
 
@@ -222,6 +250,8 @@ class BufferedLink(Link):
         """Handle a message of any other topic: management, or something unexpected."""
         if arrival.topic == _MANAGEMENT:
             self.manage(arrival.data, self.sender(arrival))
+        elif arrival.topic in _CALLS:
+            self.calls.receive(arrival.data, self.sender(arrival))
         else:
             self._receive_unexpected(arrival)
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 
-from r2p.codecs import debug, management
+from r2p.codecs import debug, management, own_services
 from r2p.codecs.management import FLAG_BOOT
 from r2p.errors import MessageError
 from r2p.keys import SharedKey
@@ -286,12 +286,19 @@ class LineLink(BufferedLink):
         elif not self._blocked:  # else it is on its way only when the carrier is ready again
             self._unsent = None
 
+    def write_call(self, data: bytes, to: Hashable) -> None:
+        self._write_first(own_services.topic_of(data), data)
+
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
+        self._write_first(_MANAGEMENT, data, urgent=urgent)
+
+    def _write_first(self, topic: bytes, data: bytes, *, urgent: bool = False) -> None:
+        """Send a line before waiting samples, an `urgent` one before all."""
         if len(self._urgent) >= _URGENT_MAX if urgent else self._buffered_bytes >= self._limit + _MANAGEMENT_BUFFER:
             self.stats.lost["management, send buffer full"] += 1
             return
         deadline = self._clock.now() // 1000 + debug.NO_DEADLINE
-        line = debug.encode(_MANAGEMENT, data, deadline)
+        line = debug.encode(topic, data, deadline)
         if not (self._corked or self._blocked):
             self._send_at_once(line)
             return

@@ -46,6 +46,7 @@ from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
 from r2p.transports.announcement import NOTHING, Announcement, announcement_of
+from r2p.transports.call_channel import CallChannel
 from r2p.transports.guard import LinkGuard, key_protocol
 from r2p.transports.stats import RETRY_AFTER_ERROR, LinkStats, LoggedCounter
 from r2p.units import SECOND
@@ -101,6 +102,9 @@ class Hub(Protocol):
 
     def message_refused(self, link: "Link", message: management.Management, verdict: Verdict) -> None:
         """Report that a message does not count, as it lacks the link's key."""
+
+    def call_received(self, link: "Link", data: bytes, source: Hashable) -> None:
+        """Handle a message of r2p's own services from this address."""
 
 
 class GatewayHooks(Protocol):
@@ -198,6 +202,8 @@ class Link(abc.ABC):
         self._down_at = self._clock.monotonic()
         self._lost_at_down = 0
         self._closed = False
+        self.calls = CallChannel(self, hub, management_rate)
+        """The messages of r2p's own services."""
 
     # For the transport that owns the link
 
@@ -245,6 +251,7 @@ class Link(abc.ABC):
         self.up = False
         self._down_at = self._clock.monotonic()
         self._lost_at_down = self.stats.lost[LINK_DOWN]
+        self.calls.clear()
         lost = self.discard()  # which may count some itself
         self.stats.lost[LINK_DOWN] += lost
         self._hub.link_changed(self, reason, 0.0, 0)
@@ -262,6 +269,7 @@ class Link(abc.ABC):
         self._closed = True
         self.up = False
         self._alarm.close()
+        self.calls.clear()
         self._release_topics()
 
     def possible_senders(self) -> set[str]:
@@ -294,6 +302,10 @@ class Link(abc.ABC):
     @abc.abstractmethod
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         """Send a management message before waiting samples, `urgent` ones before all; lost if nothing moves."""
+
+    @abc.abstractmethod
+    def write_call(self, data: bytes, to: Hashable) -> None:
+        """Send a message of r2p's own services, to this address at least."""
 
     @abc.abstractmethod
     def discard(self) -> int:

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from r2p.clock import check_seconds, in_background, random_of
+from r2p.codecs import own_services
 from r2p.errors import TransportError
 from r2p.keys import SharedKey
 from r2p.messages import SIZE_MAX, ClockOffset
@@ -245,6 +246,9 @@ class MemoryLink(BufferedLink):
             sample.clock,
         )
         self.network.send(datagram)
+
+    def write_call(self, data: bytes, to: Hashable) -> None:
+        self.network.send(Datagram(self._address, own_services.topic_of(data), data))
 
     def write_management(self, data: bytes, *, urgent: bool = False) -> None:
         self.network.send(Datagram(self._address, MANAGEMENT.encode(), data))

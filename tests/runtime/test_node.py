@@ -372,7 +372,7 @@ async def test_all_that_a_node_opened_is_closed_however_it_ends() -> None:
 async def test_the_management_topic_is_not_for_nodes() -> None:
     async with local() as module:
         node = module.start(hold)
-        with pytest.raises(r2p.InvalidName, match="R2P is reserved for management"):
+        with pytest.raises(r2p.InvalidName, match="R2P is reserved for messages of r2p"):
             node.advertise("R2P", Led)
         with pytest.raises(r2p.InvalidName):
             node.subscribe("/R2P", None)

@@ -106,6 +106,32 @@ async def test_the_handshake_when_both_were_there_before_the_link(cable: Cable) 
         assert await subscriber.fetch() == Led(led=1)
 
 
+class Gripper(r2p.Message, name="lab_msgs/Gripper"):
+    """A type that only one module has; its schema takes several pages."""
+
+    at: r2p.Timestamp
+    finger_positions: tuple[r2p.f32, r2p.f32, r2p.f32]
+    finger_temperatures: tuple[r2p.f32, r2p.f32, r2p.f32]
+    supply_voltage_of_the_motors: r2p.f32 = 0.0
+    supply_current_of_the_motors: r2p.f32 = 0.0
+    holds_an_object_between_its_fingers: bool = False
+    last_error_of_the_motor_controller: r2p.u16 = 0
+
+
+@conforms
+async def test_a_type_whose_code_is_elsewhere(cable: Cable) -> None:
+    wanted = r2p.layout(Gripper)
+    async with two(cable) as (a, b), node_in(a) as alice:
+        alice.advertise("gripper", Gripper)
+        topics = b.network.topics
+        await until(lambda: "gripper" in topics() and topics()["gripper"].fingerprint and other(b, "A"))
+        found = None
+        while found is None:  # A may not have announced its version yet
+            found = await b.network.message_type(wanted.fingerprint)
+        assert (r2p.layout(found).schema, r2p.layout(found).name) == (wanted.schema, "lab_msgs/Gripper")
+        assert [each.stats.received for each in (*a.links, *b.links)] == [0, 0]
+
+
 @conforms
 async def test_calls_both_ways_their_errors_and_their_end(cable: Cable) -> None:
     desk = Desk()

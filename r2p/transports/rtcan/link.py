@@ -184,6 +184,7 @@ class RtcanLink(BufferedLink):
         if profile is Profile.FIRMWARE:
             rate, burst, quiet = _FIRMWARE_RATE, _BURST_MIN, _FIRMWARE_QUIET
         self._set_pace(rate, burst, quiet)
+        self.calls.rate = rate / 2 if profile is Profile.FIRMWARE else rate  # half of the bus stays for discovery
         self._topic_ids.set_rate(rate)
 
     def _announce(self) -> None:

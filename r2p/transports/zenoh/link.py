@@ -5,6 +5,7 @@ Keys, all under `r2p/NETWORK/`:
     live/...                topics and nodes of each module, as liveliness tokens (r2p.codecs.liveliness)
     topic/TOPIC             messages: one or several, packed; the rest is in the attachment (r2p.codecs.attachment)
     credit/SESSION          a subscriber's progress, to the publisher's module
+    call/SESSION            calls of r2p's own services, and answers, to a module; the attachment names the sender
     control                 management messages, from a module to all; the attachment names the sender
     schema/SESSION/TYPE     asks a module for the fields of a type, by fingerprint
 """
@@ -88,6 +89,7 @@ class ZenohLink(Link):
         session.watch_transports(self._queue(self._on_transport))
         session.watch_tokens(f"{prefix}/{liveliness.KEY_PREFIX}", self._token_changes)
         session.listen(f"{prefix}/control", self._queue(self._on_control))
+        session.listen(f"{prefix}/call/{self.instance:x}", self._queue(self._on_call))
         queue = functools.partial(self._queue, most=_TYPE_QUERIES_MAX)
         session.answer_queries(f"{prefix}/schema/{self.instance:x}/*", self._schema, queue)
 
@@ -110,6 +112,12 @@ class ZenohLink(Link):
         elif self._session is not None:
             sender = encode_sender(self.instance)
             self._session.put(f"{self._prefix}/control", data, attachment=sender, urgent=urgent)
+
+    def write_call(self, data: bytes, to: Hashable) -> None:
+        if self._session is not None and self._session.outbound.full:
+            self.stats.lost["calls, send buffer full"] += 1
+        elif self._session is not None and isinstance(to, int):
+            self._session.put(f"{self._prefix}/call/{to:x}", data, attachment=encode_sender(self.instance))
 
     def discard(self) -> int:
         for subscriber in self.sender.subscribers():
@@ -259,6 +267,13 @@ class ZenohLink(Link):
             self._apply(events)
 
     def _on_control(self, message: tuple[bytes, bytes]) -> None:
+        self._pass_on(message, self.manage)
+
+    def _on_call(self, message: tuple[bytes, bytes]) -> None:
+        self._pass_on(message, self.calls.receive)
+
+    def _pass_on(self, message: tuple[bytes, bytes], handle: Callable[[bytes, Hashable], None]) -> None:
+        """Call `handle` with a message and its sender, as its attachment names it."""
         header, data = message
         try:
             sender = decode_sender(header)
@@ -268,7 +283,7 @@ class ZenohLink(Link):
             self.stats.lost["foreign"] += 1
         else:
             if sender != self.instance and self.up:
-                self.manage(data, sender)
+                handle(data, sender)
 
 
 # Tokens of other modules

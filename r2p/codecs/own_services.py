@@ -1,0 +1,110 @@
+"""The messages of r2p's own services (PROTOCOL.md 9): calls from one module to another, known without announcements.
+
+A request travels on the topic `R2P_CALL`, its answer on `R2P_REPLY`. Both have at most 200 bytes, and begin alike:
+
+| bytes | content |
+| --- | --- |
+| 0..11 | the header of services (`r2p.codecs.services`): caller, number, kind, version, and the module that is called |
+| 12 | `u8 hops`: gateways that the message has crossed |
+| 13 | `u8 operation`; from 128 on, those that change something |
+| 14..15 | `u16 page` that is wanted, or answered |
+| 16..17 | `u16 pages`: how many there are; 0 in a request |
+| 18..19 | `u16 edition` of the content, which all its pages share; 0 in a request for the first page |
+| the rest | of a request: its argument; of a response: the page; of an error: its text |
+"""
+
+import enum
+import struct
+
+import msgspec
+
+from r2p.codecs import services
+from r2p.codecs.services import HEADER_SIZE, Kind, ServiceHeader
+from r2p.errors import DecodeError, MessageError
+from r2p.names import CALLS, REPLIES
+
+MESSAGE_MAX = 200
+"""Bytes of a message: one line of the debug transport, also with the longest name."""
+
+WIRE_MIN = 2
+"""Hello.wire of the modules that know these services, at least."""
+
+CHANGES = 128
+"""The first of the operations that change something: gateways ask for permission to pass them on."""
+
+PAGES_MAX = 1024
+"""Pages of the longest content."""
+
+EDITIONS = 1 << 16
+"""Values of `edition`; the first is 1."""
+
+_HEAD = struct.Struct("<BBHHH")
+_SIZE = HEADER_SIZE + _HEAD.size
+_HOPS = slice(HEADER_SIZE, HEADER_SIZE + 1)
+
+PAGE_MAX = MESSAGE_MAX - _SIZE
+"""Bytes of an argument, of a page, or of the text of an error."""
+
+_TO_SERVER = (Kind.REQUEST, Kind.CANCEL)
+_KIND = 6  # in the header
+_TOPICS = (REPLIES.encode(), CALLS.encode())
+
+
+class Operation(enum.IntEnum):
+    """What a module can be asked for; it answers others with an error."""
+
+    SCHEMA = 1
+    STATISTICS = 2
+
+
+class OwnCall(msgspec.Struct, frozen=True, gc=False):
+    """A request, or its answer: see the table above. `operation` is an Operation, or one of a newer version."""
+
+    header: ServiceHeader
+    operation: int
+    page: int = 0
+    pages: int = 0
+    edition: int = 0
+    body: bytes = b""
+    hops: int = 0
+
+    @property
+    def target(self) -> int:
+        """The instance of the module that the message is for."""
+        return self.header.server if self.is_request else self.header.instance
+
+    @property
+    def is_request(self) -> bool:
+        return self.header.kind in _TO_SERVER
+
+    @property
+    def changes(self) -> bool:
+        """Return whether the operation may change something."""
+        return self.operation >= CHANGES
+
+
+def encode(call: OwnCall) -> bytes:
+    """Encode a message. Raises MessageError for more than `PAGE_MAX` bytes."""
+    if len(call.body) > PAGE_MAX:
+        raise MessageError(f"a message of r2p's own services carries {PAGE_MAX} bytes, not {len(call.body)}")
+    head = _HEAD.pack(call.hops, call.operation, call.page, call.pages, call.edition)
+    return services.encode(call.header, head + call.body)
+
+
+def decode(data: bytes) -> OwnCall:
+    """Decode a message. Raises DecodeError, UnknownType for one of another kind or version."""
+    if not _SIZE <= len(data) <= MESSAGE_MAX:
+        raise DecodeError(f"a message of r2p's own services has {_SIZE} to {MESSAGE_MAX} bytes, not {len(data)}")
+    header = services.decode(data)
+    hops, operation, page, pages, edition = _HEAD.unpack_from(data, HEADER_SIZE)
+    return OwnCall(header, operation, page, pages, edition, bytes(data[_SIZE:]), hops)
+
+
+def topic_of(data: bytes) -> bytes:
+    """Return the topic of an encoded message."""
+    return _TOPICS[data[_KIND] in _TO_SERVER]
+
+
+def with_hops(data: bytes, hops: int) -> bytes:
+    """Return an encoded message with another number of hops (0 to 255)."""
+    return data[: _HOPS.start] + bytes((hops,)) + data[_HOPS.stop :]

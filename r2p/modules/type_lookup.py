@@ -1,0 +1,76 @@
+"""Types that this module has no class for: another module gives the fields of a type, as found by its fingerprint.
+
+Modules that publish or subscribe to a topic of the type are asked first, by r2p's own services, on any link and through
+gateways; then zenoh, for modules of before. An answer is believed if its schema has the fingerprint.
+"""
+
+from collections.abc import Iterator
+
+from r2p.codecs import schemas
+from r2p.codecs.management import ROLE_PUBLISHES
+from r2p.codecs.own_services import Operation
+from r2p.errors import DecodeError, MessageError, ServiceError
+from r2p.messages import Message, message_type
+from r2p.modules.own_services import OwnServices, knows_own_services
+from r2p.protocols.discovery.events import ModuleInfo
+from r2p.runtime.topic import TopicSpace
+from r2p.transports.link import Link
+
+_ASKED_MAX = 4
+"""Modules that are asked for one type: the nearest publishers of its topics, then subscribers, then others."""
+
+
+def schema(space: TopicSpace, fingerprint: bytes) -> bytes:
+    """Return the full name and the schema of a type of this module's topics. Raises LookupError if it has none."""
+    for topic in space.topics.values():
+        if topic.layout is not None and topic.layout.fingerprint == fingerprint:
+            return schemas.encode(topic.layout.name, topic.layout.schema)
+    raise LookupError("no topic of this module has the type")
+
+
+async def find_type(links: list[Link], services: OwnServices, fingerprint: bytes) -> type[Message] | None:
+    """Ask other modules for a message class of this layout; None if none of them has it."""
+    for link, info in _holders(links, fingerprint)[:_ASKED_MAX]:
+        found = await _ask(link, info, services, fingerprint)
+        if found is not None:
+            return found
+    for link in list(links):
+        found = await link.message_type(fingerprint) if link.up else None
+        if found is not None:
+            return found
+    return None
+
+
+async def _ask(link: Link, info: ModuleInfo, services: OwnServices, fingerprint: bytes) -> type[Message] | None:
+    try:
+        answer = await services.fetch(info.instance or 0, Operation.SCHEMA, fingerprint)
+        return message_type(*schemas.decode(answer, fingerprint))
+    except (TimeoutError, ServiceError):
+        return None
+    except (DecodeError, MessageError):
+        link.stats.lost["wrong schema"] += 1
+        return None
+
+
+def _holders(links: list[Link], fingerprint: bytes) -> list[tuple[Link, ModuleInfo]]:
+    """Return the modules that may have the type, the likeliest first, each with a link on which it is known."""
+    ranked = sorted(
+        (each for link in links if link.up for each in _holders_on(link, fingerprint)), key=lambda each: each[:2]
+    )
+    return list({info.instance: (link, info) for *_, link, info in reversed(ranked)}.values())[::-1]
+
+
+def _holders_on(link: Link, fingerprint: bytes) -> Iterator[tuple[int, int, Link, ModuleInfo]]:
+    """Yield rank, hops, the link and each module that may have the type."""
+    topics = {info.name for info in link.discovery.topics.values() if info.fingerprint == fingerprint}
+    if not topics:
+        return
+    roles: dict[int, int] = {}
+    for endpoint in link.discovery.endpoints.values():
+        if endpoint.topic in topics:
+            roles[endpoint.instance] = min(endpoint.role, roles.get(endpoint.instance, endpoint.role))
+    for info in link.discovery.modules.values():
+        if knows_own_services(info):
+            role = roles.get(info.instance or 0)
+            rank = 2 if role is None else 0 if role == ROLE_PUBLISHES else 1
+            yield rank, info.hops, link, info
