@@ -51,6 +51,16 @@ from r2p.messages import (
 from r2p.modules.graph import Endpoint, ModuleView, NetworkView, TopicView
 from r2p.modules.module import Module
 from r2p.modules.runner import run, run_main
+from r2p.modules.statistics import (
+    ForwardedTopic,
+    LinkStatistics,
+    ModuleStatistics,
+    NodeStatistics,
+    PublisherStatistics,
+    ReasonCount,
+    SubscriberStatistics,
+    TopicOnLink,
+)
 from r2p.modules.supervisor import NodeFunction, name_of
 from r2p.protocols.discovery.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
 from r2p.runtime.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
@@ -76,12 +86,14 @@ __all__ = [
     "Duration",
     "Endpoint",
     "Error",
+    "ForwardedTopic",
     "GatewayStatistics",
     "InvalidName",
     "Layout",
     "Len",
     "LinkDown",
     "LinkNotice",
+    "LinkStatistics",
     "LinkUp",
     "LinkWaits",
     "Listening",
@@ -95,6 +107,7 @@ __all__ = [
     "ModuleEvent",
     "ModuleGone",
     "ModuleInfo",
+    "ModuleStatistics",
     "ModuleView",
     "NameConflict",
     "NameTooLong",
@@ -103,12 +116,15 @@ __all__ = [
     "Node",
     "NodeCrashed",
     "NodeFunction",
+    "NodeStatistics",
     "NonRealTime",
     "Periodic",
     "PeriodicPublisher",
     "PortStatistics",
     "Publisher",
     "PublisherClass",
+    "PublisherStatistics",
+    "ReasonCount",
     "RouteStatistics",
     "Sample",
     "Service",
@@ -120,9 +136,11 @@ __all__ = [
     "Sporadic",
     "SporadicPublisher",
     "Subscriber",
+    "SubscriberStatistics",
     "Tick",
     "Timestamp",
     "TooLong",
+    "TopicOnLink",
     "TopicView",
     "TransportError",
     "TypeMismatch",

@@ -10,8 +10,11 @@ from typing import Any
 import msgspec
 
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES, WIRE_VERSION
+from r2p.codecs.own_services import WIRE_MIN, Operation
+from r2p.errors import DecodeError, Error
 from r2p.messages import Layout, Message
 from r2p.modules.link_manager import LinkManager
+from r2p.modules.statistics import ModuleStatistics, decode
 from r2p.modules.type_lookup import find_type
 from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
@@ -108,6 +111,26 @@ class NetworkView:
                     entry = table.setdefault((endpoint.module, endpoint.node), ([], []))
                     _add(entry[index], view.name)
         return dict(sorted(table.items()))
+
+    async def statistics(self, module: str) -> ModuleStatistics:
+        """Fetch what a module has counted, this one or any r2p module on the network.
+
+        Raises Error if there is no such module, or it can't answer, and TimeoutError if it does not.
+        """
+        view = min((each for each in self.modules() if each.name == module), key=lambda each: each.age, default=None)
+        if view is None:
+            raise Error(f"there is no module {module} on the network")
+        if view.instance is None:
+            raise Error(f"{module} is firmware: it counts nothing that others can ask for")
+        if view.link and (view.wire or 0) < WIRE_MIN:
+            known = f"has wire version {view.wire}" if view.wire else "does not say which version of r2p it has"
+            raise Error(f"{module} {known}, statistics need {WIRE_MIN}: update r2p there")
+        try:
+            return decode(await self._opened().own_services.fetch(view.instance, Operation.STATISTICS))
+        except TimeoutError:
+            raise TimeoutError(f"module {module} does not answer, {view.age:.1f} s after its last message") from None
+        except DecodeError as error:
+            raise Error(f"the answer of {module} is not what this version of r2p can read: {error}") from error
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         """Ask the modules on the network for a message class of this layout; None without an answer.

@@ -113,6 +113,8 @@ class LinkManager:
         self.instance = self.random.getrandbits(32)
         """Random number of this run of the module."""
         space.instance = self.instance
+        self.opened_at = space.clock.monotonic()
+        """The start of this run (monotonic ns)."""
         self.own_services = OwnServices(space, self.instance, self.links)
         self.own_services.serve(Operation.SCHEMA, functools.partial(schema, space))
         self.flags = 0

@@ -20,11 +20,13 @@ from typing import Self
 from r2p.bridge import BridgeOptions, GatewayStatistics
 from r2p.clock import clock_of
 from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
+from r2p.codecs.own_services import Operation
 from r2p.errors import Closed, Error, NodeCrashed
 from r2p.log_lines import LineLimit, get_logger
 from r2p.messages import Timestamp
 from r2p.modules.graph import NetworkView
 from r2p.modules.link_manager import LinkManager
+from r2p.modules.statistics import ModuleStatistics, collect, encode
 from r2p.modules.supervisor import NodeFunction, Supervisor, check_function, name_of
 from r2p.modules.watchdog import Watchdog, watch
 from r2p.msg import Log
@@ -130,6 +132,7 @@ class Module:
             observer=self.observer,
             bridge=self._bridge_options,
         )
+        self._opened.own_services.serve(Operation.STATISTICS, lambda _argument: encode(self.statistics()))
         self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
@@ -180,6 +183,13 @@ class Module:
         if bridge is None:
             raise Error(f"module {self.name} is not a gateway: make it with bridge=True")
         return bridge.statistics()
+
+    def statistics(self) -> ModuleStatistics:
+        """Return what the module's publishers, subscribers, nodes and links have counted since they began.
+
+        `NetworkView.statistics` fetches those of other modules. Raises Closed before the module is opened.
+        """
+        return collect(self._opened, self._supervisors)
 
     @property
     def space(self) -> TopicSpace:

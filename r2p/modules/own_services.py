@@ -95,6 +95,8 @@ class OwnServices:
 
         Raises TimeoutError if the module is silent, and ServiceError with the text of its error.
         """
+        if instance == self._instance:
+            return self._handlers[operation](argument)
         for _ in range(_TRIES):
             content = await self._fetch_edition(instance, operation, argument)
             if content is not None:
@@ -233,9 +235,12 @@ class OwnServices:
         return own_services.encode(OwnCall(header, call.operation, call.page, pages, edition, body))
 
 
-def knows_own_services(info: ModuleInfo) -> bool:
-    """Return whether a module answers."""
-    return info.r2p and info.wire >= WIRE_MIN
+def may_answer(link: Link, info: ModuleInfo) -> bool:
+    """Return whether a module knows own services, and gateways on the link, if it is behind any, pass them on."""
+    if not info.r2p or info.wire < WIRE_MIN:
+        return False
+    gateways = [each.wire for each in link.discovery.modules.values() if each.gateway] if info.hops else []
+    return not gateways or max(gateways) >= WIRE_MIN
 
 
 def _with_instance(link: Link, instance: int) -> Iterator[ModuleInfo]:

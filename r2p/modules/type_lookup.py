@@ -11,7 +11,7 @@ from r2p.codecs.management import ROLE_PUBLISHES
 from r2p.codecs.own_services import Operation
 from r2p.errors import DecodeError, MessageError, ServiceError
 from r2p.messages import Message, message_type
-from r2p.modules.own_services import OwnServices, knows_own_services
+from r2p.modules.own_services import OwnServices, may_answer
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.topic import TopicSpace
 from r2p.transports.link import Link
@@ -70,7 +70,7 @@ def _holders_on(link: Link, fingerprint: bytes) -> Iterator[tuple[int, int, Link
         if endpoint.topic in topics:
             roles[endpoint.instance] = min(endpoint.role, roles.get(endpoint.instance, endpoint.role))
     for info in link.discovery.modules.values():
-        if knows_own_services(info):
+        if may_answer(link, info):
             role = roles.get(info.instance or 0)
             rank = 2 if role is None else 0 if role == ROLE_PUBLISHES else 1
             yield rank, info.hops, link, info

@@ -18,6 +18,7 @@ from r2p.tools import session
 from r2p.tools.options import All, Format, Timeout, Wait
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError, alias_or_none, wait_until
+from r2p.tools.values import to_plain
 
 TIMEOUT = 10.0
 """Seconds in which a command must be confirmed: firmware with many topics sends ALIVE that rarely."""
@@ -61,6 +62,42 @@ async def _wait_for_firmware(session: Session) -> None:
 
     with session.waiting("ALIVE of firmware"):
         await wait_until(named, _ROUND)
+
+
+@session.command(app, "info")
+async def info(session: Session, module: Name, *, wait: Wait = None, format: Format = None) -> None:
+    """Show a module's state and its counters.
+
+    Counters of nodes, publishers, subscribers and links, by topic and by reason; laxities are in ms. Firmware has none.
+    """
+    output = Output(format)
+    module_path(module)
+    await session.settle(wait, of="modules")
+    view = _find(session, module)
+    if view is None:
+        raise r2p.Error(_unknown_text(session, module))
+    record = _row(view, for_people=output.format == "text")
+    if view.instance is None:
+        notify(f"{module} is firmware: it counts nothing that others can ask for")
+        await output.put(record)
+        return
+    try:
+        with session.waiting(f"the statistics of {module}"):
+            statistics = await session.module.network.statistics(module)
+    except TimeoutError as error:
+        raise TimedOut(str(error)) from error
+    await output.put(record | _counters(statistics))
+
+
+def _counters(statistics: r2p.ModuleStatistics) -> dict[str, Any]:
+    """Return the statistics with losses by reason, and None for an unknown laxity."""
+    plain = to_plain(statistics)
+    for link in plain["links"]:
+        for name in ("lost", "faults"):
+            link[name] = {each["reason"]: each["count"] for each in link[name]}
+    for topic in plain["topics"]:
+        topic["least_laxity"] = None if topic["least_laxity"] == "NaN" else topic["least_laxity"]
+    return plain
 
 
 @session.command(app, "stop")

@@ -93,6 +93,8 @@ class LinkStats(msgspec.Struct):
     ups: int = 0
     lost: LoggedCounter = msgspec.field(default_factory=LoggedCounter)
     faults: Counter[str] = msgspec.field(default_factory=Counter)
+    least_laxity: dict[str, int] = {}
+    """The least time to the deadline with which a message was on the bus, below 0 after it: ns by topic."""
 
     def add(self, other: "LinkStats", losses: Counter[str]) -> None:
         """Add the counts of another link; its `losses` include those of its discovery."""

@@ -127,6 +127,25 @@ async def test_modules_of_before_are_not_asked() -> None:
         assert not stranger.calls()
 
 
+async def test_a_gateway_of_before_passes_nothing_on_so_nothing_is_asked_through_it() -> None:
+    network = MemoryNetwork()
+    stranger = Stranger(network)
+    async with r2p.Module("B", via=network.transport()) as b:
+        stranger.manage(
+            management.Hello("OLDGW", 6, management.HELLO_GATEWAY, wire=1),
+            management.Hello("NEW", 7, hops=1, wire=2),
+            management.TypeInfo(management.ROLE_PUBLISHES, "wide", WIDE.fingerprint, WIDE.size),
+            management.Advertise("wide", WIDE.size),
+        )
+        await until(lambda: b.network.topics().get("wide"))
+        assert await b.network.message_type(WIDE.fingerprint) is None
+        assert not stranger.calls()
+        stranger.manage(management.Hello("NEWGW", 8, management.HELLO_GATEWAY, wire=2))
+        await until(lambda: any(view.name == "NEWGW" for view in b.network.modules()))
+        assert await b.network.message_type(WIDE.fingerprint) is None
+        assert {call.target for call in stranger.calls()} == {7, 8}
+
+
 async def test_a_silent_module_a_lie_and_an_error() -> None:
     network = MemoryNetwork()
     stranger = Stranger(network)

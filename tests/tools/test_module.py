@@ -15,7 +15,7 @@ import r2p
 from r2p.codecs import management
 from r2p.msg import Led, Velocity3
 from r2p.sim.modules import FirmwareModule, Powered, Publishes, Subscribes
-from r2p.tools.module import bootload, list_, reboot, stop
+from r2p.tools.module import bootload, info, list_, reboot, stop
 from r2p.tools.session import Session, Settings, TimedOut, UsageError
 from r2p.transports.memory import Datagram, network
 from tests.tools.rig import printed, robot, tool
@@ -51,6 +51,31 @@ async def test_r2p_modules_are_listed(capsys: pytest.CaptureFixture[str]) -> Non
         ("ARM", "stopped", "r2p", "memory:lab"),
         ("BOT", "running", "r2p", "memory:lab"),
     ]
+
+
+async def test_what_a_module_has_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    async with robot(hold), tool() as session:
+        await info(session, "BOT")
+        (record,) = printed(capsys)
+        assert (record["module"], record["state"], record["kind"]) == ("BOT", "running", "r2p")
+        assert record["publishers"] == [
+            {"topic": "leds", "node": "hold", "publisher_class": 1, "sent": 0, "missed": 0, "late": 0}
+        ]
+        assert record["links"][0]["lost"] == {}
+        assert record["nodes"] == [{"node": "hold", "running": True, "restarts": 0}]
+        with pytest.raises(r2p.Error, match=r"no module BOTT .*did you mean BOT\?"):
+            await info(session, "BOTT")
+        network("lab").send(Datagram(99, b"R2P", management.encode(management.Hello("EVE", 7, wire=2))))
+        with pytest.raises(TimedOut, match="EVE does not answer"):
+            await info(session, "EVE")
+
+
+async def test_firmware_counts_nothing_that_a_tool_can_ask_for(capsys: pytest.CaptureFixture[str]) -> None:
+    async with board() as (_, session):
+        await info(session, "IMU1", wait=5)
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["kind"] == "firmware"
+    assert "IMU1 is firmware: it counts nothing that others can ask for" in captured.err
 
 
 async def test_versions_are_listed_also_behind_a_gateway(

@@ -10,7 +10,7 @@ from collections import Counter, deque
 
 import msgspec
 
-from r2p.codecs import can_bits, management, rtcan
+from r2p.codecs import call_parts, can_bits, management, rtcan
 from r2p.codecs.rtcan import Frame, Identifier, OtherFrame
 from r2p.errors import DecodeError
 from r2p.protocols.rtcan.cycle import Timing
@@ -133,6 +133,9 @@ class BusDirectory:
     def learn(self, data: bytes, source: int) -> str:
         """Learn from a management message of this id8 (0: firmware, which has none); return its description."""
         try:
+            if management.type_of(data) == management.ManagementType.CALL_PART:
+                part = call_parts.decode(data)
+                return f"CallPart sender={part.sender:08x} serial={part.serial} part={part.part} length={part.length}"
             message = management.decode(data)
         except DecodeError:
             return f"unknown management 0x{management.type_of(data):02x}"

@@ -230,6 +230,7 @@ class SlottedTopics:
 class SampleHandle(msgspec.Struct, eq=False):
     """A sample in the engine. `deadline` is by the engine's clock (ns), NEVER if it does not expire."""
 
+    topic: str
     publisher: PublisherHandle | None
     frames: int
     deadline: int
@@ -285,7 +286,7 @@ class Transmitter:
             self._messages += 1
         self._stats.sent += 1
         self._stats.bytes_sent += len(sample.data)
-        handle = SampleHandle(publisher, frames, deadline)
+        handle = SampleHandle(topic, publisher, frames, deadline)
         return self._engine.publish(now, high, data, deadline=deadline, drop=sample.drop_late, handle=handle)
 
     def completed(self, handle: SampleHandle, done: Done) -> None:
@@ -294,6 +295,9 @@ class Transmitter:
             self._frames -= handle.frames
         else:
             self._messages -= 1
+            if done.fate in _SENT:
+                least, left = self._stats.least_laxity, handle.deadline - done.at
+                least[handle.topic] = min(left, least.get(handle.topic, left))
         if done.missed or done.fate not in _SENT:
             self._report_missed(handle, done)
 
