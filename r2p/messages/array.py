@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 T = TypeVar("T")
 
+_NOTHING: tuple[Any, ...] = ()
 _SHOWN = 3  # elements that `repr` shows
 _LITTLE_ENDIAN = ("", "@", "=", "<")  # in front of the letter of a format
 _CODES: tuple[tuple[str, dict[int, Literal["?", "b", "B", "h", "H", "i", "I", "q", "Q", "f", "d"]]], ...] = (
@@ -34,12 +35,13 @@ class Array(Sequence[T]):
 
     __slots__ = ("_code", "_view")  # in this order for Python 3.11, see below
 
-    def __init__(self, values: Iterable[T] | Any = ()) -> None:
+    def __init__(self, values: Iterable[T] | Any = _NOTHING) -> None:
         """Hold the elements: of the buffer of `values`, which is not copied, else of an iterable of numbers.
 
         Integers are held as i64 or u64, other numbers as f64. Raises TypeError or OverflowError for anything else.
         """
-        enable_buffers()
+        if values is not _NOTHING:  # the default of many fields: a class is to be defined without the cost of this
+            enable_buffers()
         view = buffer_of(values)
         self._view = (_pack(values) if view is None else view).toreadonly()
         self._code = self._view.format
@@ -103,7 +105,7 @@ class Array(Sequence[T]):
 
 @functools.cache
 def enable_buffers() -> None:
-    """Give Arrays their buffer, before the first one is made.
+    """Give Arrays their buffer, before the first one with elements is made.
 
     Only from 3.12 on can a class in Python have one (PEP 688). `pickle.PickleBuffer` hands out the buffer of an object
     that it keeps behind its first field, where an Array has `_view`, its second slot: so its functions serve.
