@@ -33,6 +33,7 @@ from r2p.modules.own_services import OwnServices
 from r2p.modules.type_lookup import schema
 from r2p.names import module_alias
 from r2p.protocols.discovery.events import (
+    KIND_MODULE,
     AliasConflict,
     AliasesDiffer,
     Command,
@@ -161,9 +162,20 @@ class LinkManager:
                 f"module {module} is in its boot loader, where a STOP hangs its management until its power is cut: "
                 f"there is nothing to stop; reboot it (r2p module reboot {module})"
             )
+        self._check_alias(module)
         self._commands[command, module_alias(module)] = self.space.clock.monotonic(), module
         for link in self.links:
             link.command(command, module)
+
+    def _check_alias(self, module: str) -> None:
+        """Raise Error if another module would obey a command as well, as it has the same alias."""
+        alias = module_alias(module)
+        known = {info.name for link in self.links for info in link.discovery.modules.values()} | {self.space.module}
+        others = {link.discovery.other_module(module) for link in self.links} - {""}
+        others |= {name for name in known - {module, alias} if module_alias(name) == alias}
+        if others:
+            text = f"modules {module} and {min(others)} have one alias, {alias}"
+            raise Error(f"{text}: both would obey; rename one (--module)")
 
     def close(self) -> None:
         """Close the bridge; transports detach the links themselves."""
@@ -473,6 +485,8 @@ def describe_alias(event: AliasConflict | AliasesDiffer) -> str:
         )
     if event.kind == KIND_NODE:
         return f"nodes {event.name} and {event.other} have one alias, {event.alias}: rename one"
+    if event.kind == KIND_MODULE:
+        return f"modules {event.name} and {event.other} have one alias, {event.alias}: rename one (--module)"
     refused = f"; until then, {event.refused} is not carried" if event.refused else ""
     return (
         f"topics {event.name} and {event.other} have one alias, {event.alias}: choose another one for either, {choose}"

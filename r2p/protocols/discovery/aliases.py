@@ -315,6 +315,8 @@ class ModuleAliases:
         self._module = module
         self._alias = module_alias(module)
         self._names: dict[str, str] = {}
+        self._others: dict[str, str] = {}
+        """The last other name of each alias with two."""
         self._parts: dict[str, dict[int, str]] = {}
 
     def name_of(self, alias: str) -> str:
@@ -322,9 +324,10 @@ class ModuleAliases:
         return self._module if alias == self._alias else self._names.get(alias, alias)
 
     def receive(self, message: management.Name) -> str | None:
-        """Read a part of a name; return the name if it is complete now, and new."""
-        if message.alias == self._alias:
-            return None
+        """Read a part of a name; return the name if it is complete now, and not known yet.
+
+        It is not entered if the alias has another name: see `other_name`.
+        """
         parts = self._parts.setdefault(message.alias, {})
         number, last = management.split_part(message.part)
         parts[number] = message.piece
@@ -333,11 +336,22 @@ class ModuleAliases:
             return None
         del self._parts[message.alias]
         name = "".join(parts[each] for each in range(last + 1))
-        if len(name) > MODULE_PATH_MAX or module_alias(name) != message.alias or self._names.get(message.alias) == name:
+        if len(name) > MODULE_PATH_MAX or module_alias(name) != message.alias:
             return None
-        self._names[message.alias] = name
-        _bound(self._names, NAMES_MAX)
-        return name
+        known = self.name_of(message.alias)
+        if known == message.alias != self._alias:
+            self._names[message.alias] = name
+            _bound(self._names, NAMES_MAX)
+        elif known != name:
+            self._others[message.alias] = name
+            _bound(self._others, _RIVALS_MAX)
+        return None if known == name else name
+
+    def other_name(self, name: str) -> str:
+        """Return the other name with the alias of a name; an empty string if it is the only one."""
+        alias = module_alias(name)
+        known = self.name_of(alias)
+        return self._others.get(alias, "") if known in (name, alias) else known
 
 
 def _bound(table: dict[Any, Any], most: int) -> None:

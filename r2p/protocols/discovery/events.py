@@ -230,6 +230,10 @@ class ModuleGone(msgspec.Struct, frozen=True):
     silent: bool = False
 
 
+KIND_MODULE = 0
+"""The kind of modules, beside KIND_TOPIC and KIND_NODE of LONG_NAME."""
+
+
 class AliasConflict(msgspec.Struct, frozen=True):
     """Two names have one alias on a link. `refused` is the topic of this module that the link does not carry for that;
     empty if there is none. `kind` is KIND_...

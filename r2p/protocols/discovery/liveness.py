@@ -14,6 +14,8 @@ from r2p.protocols.discovery.aliases import ModuleAliases
 from r2p.protocols.discovery.announcer import Announcer
 from r2p.protocols.discovery.directory import Directory
 from r2p.protocols.discovery.events import (
+    KIND_MODULE,
+    AliasConflict,
     EchoDetected,
     ModuleChanged,
     ModuleGone,
@@ -64,7 +66,10 @@ class PeerLiveness:
         if self._aliases.name_of(message.alias) != message.alias:
             self._unnamed.pop(message.alias, None)
         info = self._directory.modules.get(message.alias)
-        if name is not None and info is not None and (info.hops or not info.r2p):
+        if name is not None and (other := self._aliases.other_name(name)):
+            if self._admit_report(now, f"alias {message.alias}"):
+                self._outbox.emit(AliasConflict(KIND_MODULE, message.alias, other, name))
+        elif name is not None and info is not None and (info.hops or not info.r2p):
             self._remove(now, info)
             self._enter(now, None, msgspec.structs.replace(info, name=name))
 
@@ -147,6 +152,10 @@ class PeerLiveness:
     def module_behind(self, alias: str) -> str:
         """Return the name that an alias stands for; the alias itself if it is a name, or its name is unknown."""
         return self._aliases.name_of(alias)
+
+    def other_module(self, name: str) -> str:
+        """Return the other module with the alias of this one; an empty string if there is none."""
+        return self._aliases.other_name(name)
 
     def _is_possible(self, name: str) -> bool:
         if "/" not in name:

@@ -120,6 +120,10 @@ class DiscoveryProtocol(ABC):
         """Return the module that an alias stands for; the alias itself if that is a name, or is not known."""
         return alias
 
+    def other_module(self, name: str) -> str:
+        """Return another module that the alias of this one stands for as well; an empty string if there is none."""
+        return ""
+
     def claim(self, topic: str) -> list[Event]:
         """Use the name of a topic on this link, before anything is announced about it."""
         return []
@@ -345,6 +349,9 @@ class Discovery(DiscoveryProtocol):
 
     def module_behind(self, alias: str) -> str:
         return self._liveness.module_behind(alias)
+
+    def other_module(self, name: str) -> str:
+        return self._liveness.other_module(name)
 
     def claim(self, topic: str) -> list[Event]:
         self._names.claim(KIND_TOPIC, topic)
