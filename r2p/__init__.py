@@ -58,6 +58,7 @@ from r2p.modules.statistics import (
     NodeStatistics,
     PublisherStatistics,
     ReasonCount,
+    ServiceStatistics,
     SubscriberStatistics,
     TopicOnLink,
 )
@@ -132,6 +133,7 @@ __all__ = [
     "ServiceClient",
     "ServiceError",
     "ServiceServer",
+    "ServiceStatistics",
     "Source",
     "Sporadic",
     "SporadicPublisher",

@@ -179,7 +179,10 @@ class OwnServices:
             if self.relay is not None:
                 self.relay.forward(link, call, data)
         elif call.header.kind is Kind.REQUEST:
-            link.calls.send(self._answer(link, call), source)
+            if link.calls.full:  # do not even make the answer
+                link.stats.lost["calls, send buffer full"] += 1
+            else:
+                link.calls.send(self._answer(link, call), source)
         elif not call.is_request:
             question = self._questions.get(call.header.number)
             if question is not None and question.is_answered_by(call) and not question.answer.done():

@@ -18,6 +18,7 @@ from r2p.modules.supervisor import Supervisor
 from r2p.runtime.node import Node
 from r2p.runtime.subscriber import Subscriber
 from r2p.runtime.topic import RemoteSubscriber
+from r2p.services.server import ServiceServer
 from r2p.transports.link import Link
 from r2p.units import MILLISECOND, SECOND
 
@@ -71,6 +72,21 @@ class SubscriberStatistics(Message, name="r2p_msgs/SubscriberStatistics"):
     timeouts: u64 = 0
 
 
+class ServiceStatistics(Message, name="r2p_msgs/ServiceStatistics"):
+    """A service that a node serves. `running` handlers and `waiting` requests are those of now; the others are counted:
+    requests whose handler has ended, those that failed, that were refused as the server was busy, and that came again.
+    """
+
+    service: _Name = ""
+    node: _Name = ""
+    running: u32 = 0
+    waiting: u32 = 0
+    handled: u64 = 0
+    failed: u64 = 0
+    refused: u64 = 0
+    repeated: u64 = 0
+
+
 class LinkStatistics(Message, name="r2p_msgs/LinkStatistics"):
     """A link. `waiting` messages wait for room; `ups`: how often it came up; `lost` is in both directions."""
 
@@ -118,6 +134,7 @@ class ModuleStatistics(Message, name="r2p_msgs/ModuleStatistics"):
     nodes: Annotated[tuple[NodeStatistics, ...], Max(_MAX)] = ()
     publishers: Annotated[tuple[PublisherStatistics, ...], Max(_MAX)] = ()
     subscribers: Annotated[tuple[SubscriberStatistics, ...], Max(_MAX)] = ()
+    services: Annotated[tuple[ServiceStatistics, ...], Max(_MAX)] = ()
     links: Annotated[tuple[LinkStatistics, ...], Max(_MAX)] = ()
     topics: Annotated[tuple[TopicOnLink, ...], Max(_MAX)] = ()
     forwarded: Annotated[tuple[ForwardedTopic, ...], Max(_MAX)] = ()
@@ -156,6 +173,9 @@ def collect(manager: LinkManager, supervisors: Mapping[str, Supervisor]) -> Modu
             for each in node.publishers
         ),
         subscribers=_limited(_of_subscriber(node, each) for node in nodes for each in node.subscribers),
+        services=_limited(
+            _of_service(node, each) for node in nodes for each in node.services if isinstance(each, ServiceServer)
+        ),
         links=_limited(_of_link(link, [each for _, each in remote]) for link in manager.links),
         topics=_limited(_of_topic(manager, topic, each) for topic, each in remote),
         forwarded=_forwarded(manager),
@@ -165,6 +185,11 @@ def collect(manager: LinkManager, supervisors: Mapping[str, Supervisor]) -> Modu
 def _of_subscriber(node: Node, each: Subscriber[Any]) -> SubscriberStatistics:
     counts = each.undecodable, each.too_long, each.stale, each.timeouts
     return SubscriberStatistics(each.topic, node.name, len(each.queue), each.lost, *counts)
+
+
+def _of_service(node: Node, each: ServiceServer[Any, Any]) -> ServiceStatistics:
+    counts = each.handled, each.failed, each.refused, each.repeated
+    return ServiceStatistics(each.name, node.name, each.running, each.waiting, *counts)
 
 
 def _of_link(link: Link, remote: Iterable[RemoteSubscriber]) -> LinkStatistics:

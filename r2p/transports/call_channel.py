@@ -69,11 +69,16 @@ class CallChannel:
         """Seconds that a longest message takes at the link's rate."""
         return call_parts.count(MESSAGE_MAX) / self.rate
 
+    @property
+    def full(self) -> bool:
+        """Return whether as many messages wait as may."""
+        return len(self._waiting) >= _WAITING_MAX
+
     def send(self, data: bytes, to: Hashable) -> None:
         """Send a message as soon as the rate allows."""
         if (data, to) in self._waiting:
             return
-        if len(self._waiting) >= _WAITING_MAX:
+        if self.full:
             self._lost["calls, send buffer full"] += 1
             return
         self._waiting.append((data, to))

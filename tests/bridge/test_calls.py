@@ -95,7 +95,7 @@ async def test_a_link_onto_which_nothing_may_go_gets_no_answer() -> None:
         assert gate.links[1].stats.lost["call refused"] > 3
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_random_topologies(seed: int) -> None:
     """Whatever happened before, in the end each module reaches each other one."""
     run(lambda: scenario(seed), seed=seed)

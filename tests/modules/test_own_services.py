@@ -14,6 +14,7 @@ from r2p.codecs import call_parts, debug, management, own_services
 from r2p.codecs.own_services import Operation, OwnCall
 from r2p.codecs.services import Kind, ServiceHeader
 from r2p.errors import ServiceError
+from r2p.keys import SharedKey
 from r2p.msg import Led
 from r2p.sim.modules import FirmwareModule, Publishes
 from r2p.testing.network import node_in
@@ -21,6 +22,7 @@ from r2p.transports.memory import Datagram, MemoryNetwork
 from tests.sim.modules.test_firmware import Line
 from tests.transports.rtcan.firmware import Firmware
 from tests.transports.rtcan.networks import Lab, until
+from tests.transports.test_keys import KeyedEnd
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -241,6 +243,21 @@ async def test_hostile_messages(seed: int) -> None:
         assert lost["too many calls"] > 0
         assert len(services(a)._contents) <= 64
         assert await b.network.message_type(WIDE.fingerprint) is not None
+
+
+@pytest.mark.parametrize("given", [None, SharedKey(bytes(32))])
+async def test_a_line_with_a_key_answers_nothing_until_it_is_proven(given: SharedKey | None) -> None:
+    sent: list[bytes] = []
+    end = KeyedEnd(sent.append, given)
+    async with r2p.Module("A", via=end) as a, node_in(a) as node:
+        node.advertise("wide", Wide)
+        header = ServiceHeader(7, 1, Kind.REQUEST, a.instance)
+        request = own_services.encode(OwnCall(header, Operation.SCHEMA, body=WIDE.fingerprint))
+        end.arrive(debug.encode(b"R2P_CALL", request, 0))
+        for part in call_parts.encode(7, 1, request):
+            end.arrive(debug.encode(b"R2P", part, 0))
+        await asyncio.sleep(1.0)
+        assert (b"R2P_REPLY" in b"".join(sent)) == (given is None)
 
 
 async def test_firmware_on_a_line_ignores_calls() -> None:

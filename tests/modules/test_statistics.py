@@ -17,6 +17,7 @@ from r2p.msg import Led
 from r2p.testing.network import node_in
 from r2p.transports.memory import MemoryNetwork
 from tests.modules.test_own_services import Stranger
+from tests.services.common import Add, add
 from tests.transports.rtcan.networks import Lab, until
 
 virtual = pytest.mark.virtual_time
@@ -29,6 +30,9 @@ async def test_counters_by_node_topic_and_link_and_the_least_laxity_on_a_bus() -
         events = alice.advertise("events", Led, r2p.Sporadic(0.030))
         leds = alice.advertise("leds", Led)
         own = alice.subscribe("own", Led, queue=1, lossy=True)
+        alice.serve("add", Add, add)
+        for number in range(2):
+            await bob.client("add", Add).call(Add.Request(a=number), timeout=5.0)
         others = [bob.subscribe("events", Led), bob.subscribe("leds", Led)]
         for publisher in (events, leds):
             await publisher.wait_subscriber()
@@ -45,8 +49,9 @@ async def test_counters_by_node_topic_and_link_and_the_least_laxity_on_a_bus() -
             ("leds", alice.name, 1, 3, 0),
         ]
         assert [(s.topic, s.waiting, s.lost) for s in far.subscribers] == [("own", len(own.queue), own.lost)]
+        assert [(s.service, s.node, s.handled, s.failed) for s in far.services] == [("add", alice.name, 2, 0)]
         (link,) = far.links
-        assert (link.link, link.up, link.ups, link.sent) == ("sim:", True, 1, 6)
+        assert (link.link, link.up, link.ups, link.sent) == ("sim:", True, 1, 6 + 2)
         laxities = {each.topic: each.least_laxity for each in alice_as_seen_by_bob.topics}
         assert 20 < laxities["events"] < 30
         assert math.isnan(laxities["leds"])
