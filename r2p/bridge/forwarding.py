@@ -271,6 +271,12 @@ class BridgedTopic(Topic):
             return None
         return None if subscriber.offer_in_order(sample) else [subscriber]
 
+    def count_unsendable(self, sample: Sample, link: str, reason: str) -> None:
+        route = None if self.relayed is None else self.relayed.route(sample.source.link, link)
+        if route is not None:
+            route.forwarded -= 1
+            route.dropped[reason] += 1
+
     # Subscribers
 
     def join(self, sink: SubscriberQueue | RemoteSubscriber) -> None:

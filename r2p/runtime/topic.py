@@ -238,6 +238,9 @@ class Topic:
                 return publisher
         return None
 
+    def count_unsendable(self, sample: Sample, link: str, reason: str) -> None:
+        """Note that a link can't carry a sample of another one; only a gateway, which passes those on, counts it."""
+
     @property
     def unused(self) -> bool:
         """Return whether no node of this module publishes or subscribes to the topic."""

@@ -157,10 +157,12 @@ class BufferedLink(Link):
             self.wait_queue.recover()
 
     def count_unsendable(self, topic: str, sample: Sample, reason: str) -> None:
-        """Count a message that the link can't carry, and report it to its publisher, if that is of this module."""
+        """Count a message that the link can't carry, and report it to its publisher, or to the gateway."""
         self.stats.lost[reason] += 1
         if (publisher := self.publisher_of(topic, sample)) is not None:
             publisher.link_missed(self.name, reason, sequence=sample.sequence)
+        elif (known := self._space.topics.get(topic)) is not None:
+            known.count_unsendable(sample, self.name, reason)
 
     def publisher_of(self, topic: str, sample: Sample) -> PublisherHandle | None:
         """Return this module's publisher of a sample, to which its fate is reported; None if another module's."""

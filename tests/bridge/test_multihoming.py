@@ -221,6 +221,32 @@ async def test_a_module_that_was_stopped_does_not_go_on_with_both_links() -> Non
         assert drain(ups) == []
 
 
+class Words(r2p.Message):
+    text: Annotated[str, r2p.Max(200)] = ""
+
+
+@pytest.mark.parametrize(("limits", "hops"), [((100, 1000), 0), ((100, 100), 1), ((60, 100), 0), ((1000, 100), 1)])
+async def test_messages_of_variable_length_take_the_link_that_carries_the_longest_or_longer_ones_than_the_others(
+    monkeypatch: pytest.MonkeyPatch, limits: tuple[int, int], hops: int
+) -> None:
+    async with (
+        gateway(),
+        r2p.Module("M", via=["memory:a", "memory:b"]) as module,
+        node_in(module) as one,
+        node("B", "b") as b,
+    ):
+        for link, limit in zip(module.links, limits, strict=True):
+            monkeypatch.setattr(link, "max_payload", limit)
+        words, answers = one.advertise("words", Words), one.subscribe("answers", Words)
+        far, more = b.subscribe("words", Words), b.advertise("answers", Words)
+        await asyncio.sleep(STABLE)
+        words.publish_nowait(Words(text="far"))
+        more.publish_nowait(Words(text="near"))
+        await asyncio.sleep(0.1)
+        assert [sample.hops for sample in far.queue] == [hops]
+        assert [sample.hops for sample in answers.queue] == [hops]
+
+
 async def test_a_bus_that_comes_first_keeps_its_slots() -> None:
     """The other network gets what is periodic there by the gateway, once."""
     async with (

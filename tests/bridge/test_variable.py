@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from contextlib import AsyncExitStack
 from typing import Annotated, Any
 
@@ -31,6 +32,17 @@ class Tag(r2p.Message):
 def bus_of(gateway: r2p.Module) -> RtcanLink:
     (bus,) = [link for link in gateway.links if isinstance(link, RtcanLink)]
     return bus
+
+
+def route(gateway: r2p.Module, source: int, target: int) -> tuple[int, dict[str, int]]:
+    """The messages that passed from one link to another, and what was lost."""
+    names = gateway.links[source].name, gateway.links[target].name
+    (found,) = [
+        each
+        for each in gateway.gateway_statistics().routes
+        if each.topic == "notes" and (each.source, each.target) == names
+    ]
+    return found.forwarded, found.dropped
 
 
 async def nodes(stack: AsyncExitStack, options: BridgeOptions | bool = True) -> tuple[r2p.Module, list[r2p.Node]]:
@@ -67,6 +79,7 @@ async def test_what_fits_the_next_link_passes_and_the_rest_is_counted(speaker: i
             assert received == [size for size in sizes if size <= min(most[each], most[speaker])]
             lost = sum(most[each] < size <= most[speaker] for size in sizes)
             assert gateway.links[each].losses["too long"] == lost
+            assert (len(received), +Counter({"too long": lost})) == route(gateway, speaker, each)
             assert subscribers[each].undecodable == 0
         assert publisher.missed == sum(size > most[speaker] for size in sizes)
 

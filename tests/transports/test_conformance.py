@@ -368,9 +368,10 @@ async def test_messages_of_every_length_both_ways(cable: Cable) -> None:
     async with two_nodes(cable) as (alice, bob):
         for sender, receiver in ((alice, bob), (bob, alice)):
             topic = f"{sender.module}notes"
-            publisher, subscriber = sender.advertise(topic, Note), receiver.subscribe(topic, Note, queue=99)
-            await publisher.wait_subscriber()
-            await subscriber.wait_publisher()
+            publisher = sender.advertise(topic, Note, latch=True)
+            await publisher.publish(Note(text="latched"))
+            subscriber = receiver.subscribe(topic, Note, queue=99)
+            assert (await subscriber.fetch()).text == "latched"
             for size in sizes:
                 await publisher.publish(Note(text="x" * size))
             assert [len((await subscriber.fetch()).text) for _ in sizes] == sizes

@@ -382,6 +382,8 @@ def describe(message: management.Management) -> str:
         for name in message.__struct_fields__
         if name != "params" and getattr(message, name) not in {"", 0}
     }
+    if fields.get("size", 0) >= management.SIZE_VARIES:
+        fields["size"] = f"up to {management.decode_size(fields['size'])[0]}"
     if isinstance(message, management.SubscribeResponse):
         fields["id"] = f"0x{management.rtcan_message_id(message.params):04X}"
     text = " ".join(f"{name}={each.hex() if isinstance(each, bytes) else each}" for name, each in fields.items())

@@ -21,6 +21,7 @@ from r2p.units import NEVER
 TIMEOUT = 100_000_000
 """ns from one frame of a message to the next."""
 _IDLE = -1  # `SourceBuffer.expected` between two messages
+_UNKNOWN = -1  # `SourceBuffer.first` between two messages whose length varies
 
 
 class SourceBuffer(msgspec.Struct, eq=False):
@@ -59,7 +60,7 @@ class Reassembly:
         before = self._buffers.get(message)
         if varies:
             if before is None or (before.varies, before.empty) != (True, not size):
-                self._enter(SourceBuffer(message, 0, 0, varies=True, empty=not size))
+                self._enter(SourceBuffer(message, _UNKNOWN, 0, varies=True, empty=not size))
         elif before is None or before.varies or before.size != size:
             self._enter(SourceBuffer(message, rtcan.fragment_count(size) - 1, size))
 
@@ -91,7 +92,7 @@ class Reassembly:
         if buffer is None:
             return None
         left = identifier & LEFT_MASK
-        if buffer.first or left or buffer.expected != _IDLE or buffer.varies:
+        if buffer.first or left or buffer.expected != _IDLE:
             return self._fragment(buffer, frame, left, stamp)
         if len(data) == buffer.size:
             return Received(identifier, data, stamp)
@@ -142,7 +143,12 @@ class Reassembly:
     def _begin(self, buffer: SourceBuffer, frame: Frame, left: int, stamp: int) -> Received | None:
         """Handle a frame without an open message: a beginning, or part of a message without its beginning."""
         rest = left == buffer.expected  # of something that has been counted as lost
-        if _begins_variable(buffer, frame, left, rest=rest) if buffer.varies else left == buffer.first and not rest:
+        begins = left == buffer.first and not rest
+        if buffer.varies:
+            buffer.size = _size_of_beginning(buffer, frame, left, rest=rest)
+            begins = buffer.size > 0
+            buffer.first = left if begins else _UNKNOWN
+        if begins:
             buffer.identifier, buffer.started = frame.id, stamp
             return self._continue(buffer, frame, stamp)
         if left == 0 and not rest and frame.data == buffer.tail:
@@ -180,14 +186,15 @@ class Reassembly:
 
         That one would else be lost along with the message before it, whose last frame is missing.
         """
-        if buffer.first == 0:
+        alone, buffer.first = buffer.first == 0, _UNKNOWN
+        if alone:
             buffer.tail = b""  # equal messages of one frame are no repeats
         try:
             return Received(buffer.identifier, rtcan.decode_variable(data), buffer.started, data[:HEADER_SIZE])
         except DecodeError:
             self._lose(buffer.message, "damaged")
-        alone, buffer.tail = buffer.first > 0, b""
-        if alone and _begins_variable(buffer, frame, 0, rest=True):
+        buffer.tail = b""
+        if not alone and _size_of_beginning(buffer, frame, 0, rest=True):
             header, payload = frame.data[:HEADER_SIZE], frame.data[HEADER_SIZE:]
             return Received(frame.id, payload, stamp, header)
         return None
@@ -202,17 +209,15 @@ class Reassembly:
         counts[reason] += 1
 
 
-def _begins_variable(buffer: SourceBuffer, frame: Frame, left: int, *, rest: bool) -> bool:
-    """Return whether a frame begins a message whose length varies, and note its size. `rest`: it may be left over from
-    a message that is lost, so one frame alone must be right as a whole.
+def _size_of_beginning(buffer: SourceBuffer, frame: Frame, left: int, *, rest: bool) -> int:
+    """Return the bytes of the message, of those whose length varies, that a frame begins; 0 if it begins none.
+
+    `rest`: it may be left over from a message that is lost, so one frame alone must be right as a whole.
     """
     if left == 0 and frame.data == buffer.tail:
-        return False  # a repeat, whatever it looks like
+        return 0  # a repeat, whatever it looks like
     size = rtcan.beginning_of(frame.data, left, empty=buffer.empty)
-    if not size or (rest and not left and not _is_whole(frame.data)):
-        return False
-    buffer.first, buffer.size = left, size
-    return True
+    return 0 if rest and not left and not _is_whole(frame.data) else size
 
 
 def _is_whole(data: bytes) -> bool:
