@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 import msgspec
 
 import r2p
-from r2p.names import MANAGEMENT
+from r2p.names import LOG, MANAGEMENT, RESERVED
 from r2p.testing.network import node_in
 from r2p.transports.memory import Datagram, MemoryLink, MemoryNetwork
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 _MANAGEMENT = MANAGEMENT.encode()
+_UNNUMBERED = frozenset(name.encode() for name in (*RESERVED, LOG))
 
 
 class Numbered(r2p.Message):
@@ -33,13 +34,14 @@ def numbered(number: int) -> Numbered:
     return Numbered(number, number.to_bytes(4, "little") * (number * number % 1250 if number % 8 == 0 else number % 8))
 
 
-NUMBERED = 4
-"""Bytes of such a message."""
+def number_in(data: bytes) -> int:
+    """The number of a message of any length."""
+    return int(struct.unpack_from("<I", data)[0])
 
 
 def number_of(data: bytes) -> int:
     """The number of a message, which must be as it was sent."""
-    number = int(struct.unpack_from("<I", data)[0])
+    number = number_in(data)
     assert data == numbered(number).encode()
     return number
 
@@ -74,8 +76,8 @@ class TestNetwork(MemoryNetwork):
         duplicate, self.duplicate, lost = self.duplicate, 0.0, self.counts["lost"]
         super()._send_to(address, frame)
         self.duplicate = duplicate
-        if self.counts["lost"] != lost and len(frame.data) == NUMBERED:
-            self.hurt.add(number_of(frame.data))
+        if self.counts["lost"] != lost and frame.topic not in _UNNUMBERED:
+            self.hurt.add(number_in(frame.data))
 
 
 class Gateway:
