@@ -7,7 +7,19 @@ import sys
 
 from benchmarks.table import show
 
-ALL = ("delivery", "priority", "codecs", "network", "zenoh", "gateway", "rtcan", "timers", "start", "socketcan")
+ALL = (
+    "delivery",
+    "priority",
+    "codecs",
+    "network",
+    "zenoh",
+    "zenoh_images",
+    "gateway",
+    "rtcan",
+    "timers",
+    "start",
+    "socketcan",
+)
 
 
 def main() -> None:

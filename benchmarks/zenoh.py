@@ -70,21 +70,22 @@ def _drive_r2p(port: int, pipe: Connection) -> Result:
 
 
 @contextmanager
-def bare_listener() -> Iterator[tuple[zenoh.Session, int]]:
+def bare_listener(*, shm: bool = True) -> Iterator[tuple[zenoh.Session, int]]:
     """A session, and the port where it accepts connections."""
-    with zenoh.open(_config("peer", "listen", 0)) as session:
+    with zenoh.open(_config("peer", "listen", 0, shm=shm)) as session:
         answers = [each.ok for each in session.get(f"@/{session.zid()}/*") if each.ok is not None]
         (locator,) = [each for answer in answers for each in json.loads(answer.payload.to_bytes()).get("locators", [])]
         yield session, int(locator.rpartition(":")[2])
 
 
-def bare_client(port: int) -> zenoh.Session:
+def bare_client(port: int, *, shm: bool = True) -> zenoh.Session:
     """A session that connects to that port."""
-    return zenoh.open(_config("client", "connect", port))
+    return zenoh.open(_config("client", "connect", port, shm=shm))
 
 
-def _config(mode: str, way: str, port: int) -> zenoh.Config:
+def _config(mode: str, way: str, port: int, *, shm: bool) -> zenoh.Config:
     config = zenoh.Config()
+    config.insert_json5("transport/shared_memory/enabled", json.dumps(shm))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("adminspace/enabled", "true")  # it is asked where it listens
     config.insert_json5("mode", json.dumps(mode))

@@ -2,13 +2,13 @@
 
 It travels as zenoh's attachment (PROTOCOL.md 10). A fixed part is followed by the origin, which stays the same from
 message to message of one publisher; so a reader looks it up in a table, and decodes it once. Messages without a pause
-in between may travel together: the payload is then several messages of one size, one after the other, whose serials and
-sequences count on from those in the header. The codecs of credit, and of the sender of management messages, are here,
-too.
+in between may travel together: the payload is then several messages one after the other, whose serials and sequences
+count on from those in the header. They are of one size, or the header has their lengths: then its version is 2, for
+topics whose messages vary in length. The codecs of credit, and of the sender of management messages, are here, too.
 
 | bytes | what |
 | --- | --- |
-| 0 | version, 1 |
+| 0 | version, 1; 2 with lengths |
 | 1 | flags: bit 0 the stamp is not the publisher's, bit 1 there is a clock part |
 | 2 | hops: gateways that the message has crossed |
 | 3 | messages in the payload besides the first one: m |
@@ -18,6 +18,7 @@ too.
 | 24..31 | deadline, UTC in ns; 0: none |
 | 16 more, if flagged | clock: `u32 epoch; i64 offset; u32 error` |
 | 8 m more | stamps of the other messages |
+| 4 (m + 1) more, in version 2 | u32: the length of each message |
 | the rest | origin: `u8 class; u32 sender; u32 instance; u8 fingerprint[8]`, then `module/node` in ASCII |
 """
 
@@ -25,6 +26,7 @@ import functools
 import re
 import struct
 from collections.abc import Callable
+from itertools import accumulate
 from typing import Generic, TypeVar
 
 import msgspec
@@ -37,6 +39,9 @@ from r2p.names import CARRIED_MAX, MODULE_PATH, MODULE_PATH_MAX, NODE, TOPIC, mo
 T = TypeVar("T")
 
 VERSION = 1
+
+VERSION_LENGTHS = 2
+"""The version of a header that carries the length of each message."""
 
 FLAG_RESTAMPED = 1
 FLAG_CLOCK = 2
@@ -57,6 +62,12 @@ _pack_start = struct.Struct("<IIQqq").pack  # as _FIXED, with the first four byt
 
 PACKET_MAX = 256
 """Messages in one payload."""
+
+HEADER_MAX = 4096
+"""Bytes that no header has: with 256 stamps, lengths and the longest names it has about 3300."""
+
+PACKET_BYTES_MAX = 65_536
+"""Bytes of a payload with several messages. A longer message travels alone."""
 
 _TOPIC = re.compile(TOPIC.encode())
 _NAMES = re.compile(rf"((?:{MODULE_PATH})?)/((?:{NODE})?)".encode())
@@ -93,6 +104,8 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     clock: ClockOffset | None = None
     more: tuple[int, ...] = ()
     """The stamps of the later messages in the same payload."""
+    lengths: tuple[int, ...] = ()
+    """The bytes of each message in the payload, on topics whose messages vary in length; else empty."""
 
 
 class Packer:
@@ -119,21 +132,32 @@ class Packer:
         fixed = _pack_start(start | more << 24, serial & SERIAL_WRAP, sequence, first, deadline)
         return fixed + _stamps(more).pack(*others) + self._tail
 
+    def varying(
+        self, start: int, serial: int, sequence: int, deadline: int, stamps: list[int], lengths: list[int]
+    ) -> bytes:
+        """Pack the header of messages with these lengths, PACKET_MAX at most; `start` is of VERSION_LENGTHS."""
+        first, *others = stamps
+        more = len(others)
+        fixed = _pack_start(start | more << 24, serial & SERIAL_WRAP, sequence, first, deadline)
+        return fixed + _stamps(more).pack(*others) + _lengths(more + 1).pack(*lengths) + self._tail
 
-def start_of(hops: int, *, stamped: bool) -> int:
+
+def start_of(hops: int, *, stamped: bool, version: int = VERSION) -> int:
     """Return the first four bytes of the header of one message without a clock part, as a number."""
-    return VERSION | (0 if stamped else FLAG_RESTAMPED << 8) | min(hops, 255) << 16
+    return version | (0 if stamped else FLAG_RESTAMPED << 8) | min(hops, 255) << 16
 
 
 def encode(header: Header) -> bytes:
     """Encode a header; serial and error are cut to their 32 bits, hops to 255."""
     flags = (0 if header.stamped else FLAG_RESTAMPED) | (0 if header.clock is None else FLAG_CLOCK)
     hops, more, serial = min(header.hops, 255), len(header.more), header.serial & SERIAL_WRAP
-    fixed = _FIXED.pack(VERSION, flags, hops, more, serial, header.sequence, header.stamp, header.deadline)
+    version = VERSION_LENGTHS if header.lengths else VERSION
+    fixed = _FIXED.pack(version, flags, hops, more, serial, header.sequence, header.stamp, header.deadline)
     clock = header.clock
     if clock is not None:
         fixed += _CLOCK.pack(clock.epoch, clock.offset, min(clock.error, 0xFFFFFFFF))
-    return fixed + _stamps(more).pack(*header.more) + _encode_origin(header.origin)
+    lengths = _lengths(more + 1).pack(*header.lengths) if header.lengths else b""
+    return fixed + _stamps(more).pack(*header.more) + lengths + _encode_origin(header.origin)
 
 
 class HeaderReader(Generic[T]):
@@ -155,9 +179,11 @@ class HeaderReader(Generic[T]):
         self._recent.pop(key, None)
         self._older.pop(key, None)
 
-    def read(self, data: bytes) -> tuple[T, int, int, tuple[int, ...], int, int, bool, ClockOffset | None]:
+    def read(  # noqa: C901 - one after the other, without calls: this runs for each packet
+        self, data: bytes
+    ) -> tuple[T, int, int, tuple[int, ...], int, int, bool, ClockOffset | None, tuple[int, ...]]:
         """Return the result of `remember` for the origin, serial and sequence of the first message, the stamps of all,
-        then deadline, hops, whether the stamps are the publisher's, and clock.
+        then deadline, hops, whether the stamps are the publisher's, clock, and the lengths of all; () without lengths.
 
         Raises `UnknownType` for a version to ignore, else `DecodeError`.
         """
@@ -166,7 +192,7 @@ class HeaderReader(Generic[T]):
             version, flags, hops, more, serial, sequence, stamp, deadline = _unpack(data)
         except struct.error:  # too short; a header of another version may be
             version = data[0] if data else VERSION
-        if version != VERSION:
+        if version != VERSION and version != VERSION_LENGTHS:  # faster than `in` with both
             raise UnknownType(f"version {version} of the header")
         if len(data) < _FIXED.size:
             raise _too_short("header", data, _FIXED.size)
@@ -183,13 +209,19 @@ class HeaderReader(Generic[T]):
                 raise _too_short("header with stamps", data, at + 8 * more)
             stamps += _stamps(more).unpack_from(data, at)
             at += 8 * more
+        lengths: tuple[int, ...] = ()
+        if version == VERSION_LENGTHS:
+            if len(data) < at + 4 * (more + 1):
+                raise _too_short("header with lengths", data, at + 4 * (more + 1))
+            lengths = _lengths(more + 1).unpack_from(data, at)
+            at += 4 * (more + 1)
         if sequence + more > _SEQUENCE_MAX:
             raise DecodeError(f"sequence {sequence} leaves none for {more} more messages")
         tail = data[at:]  # the key of what is known: the origin of a known publisher is not decoded again
         known = self._recent.get(tail)
         if known is None:
             known = self._remember(tail)
-        return known, serial, sequence, stamps, deadline, hops, not flags & FLAG_RESTAMPED, clock
+        return known, serial, sequence, stamps, deadline, hops, not flags & FLAG_RESTAMPED, clock, lengths
 
     def _remember(self, tail: bytes) -> T:
         known = self._older.pop(tail, None)
@@ -205,8 +237,27 @@ class HeaderReader(Generic[T]):
 
 def decode(data: bytes) -> Header:
     """Decode a header. Raises `UnknownType` for a version to ignore, else `DecodeError`."""
-    origin, serial, sequence, stamps, deadline, hops, stamped, clock = HeaderReader(lambda origin: origin).read(data)
-    return Header(origin, serial, sequence, stamps[0], deadline, hops, stamped, clock, stamps[1:])
+    reader = HeaderReader(lambda origin: origin)
+    origin, serial, sequence, stamps, deadline, hops, stamped, clock, lengths = reader.read(data)
+    return Header(origin, serial, sequence, stamps[0], deadline, hops, stamped, clock, stamps[1:], lengths)
+
+
+def split(size: int, count: int, lengths: tuple[int, ...]) -> list[int]:
+    """Return where the messages of a payload of `size` bytes end. Raises DecodeError if they can't be its messages.
+
+    Without the payload itself: it is copied only if this, and the receiver's bound, let it pass.
+    """
+    if count > 1 and size > PACKET_BYTES_MAX:
+        raise DecodeError(f"{count} messages in {size} bytes, more than {PACKET_BYTES_MAX}")
+    if not lengths:
+        each, odd = divmod(size, count)
+        if odd or not each:
+            raise DecodeError(f"{size} bytes for {count} messages")
+        return list(range(each, size + 1, each))
+    ends = list(accumulate(lengths))
+    if ends[-1] != size:
+        raise DecodeError(f"lengths of {ends[-1]} bytes for a payload of {size}")
+    return ends
 
 
 class Credit(msgspec.Struct, frozen=True, gc=False):
@@ -275,6 +326,11 @@ def _too_short(what: str, data: bytes, needed: int) -> DecodeError:
 @functools.cache
 def _stamps(count: int) -> struct.Struct:
     return struct.Struct(f"<{count}q")
+
+
+@functools.cache
+def _lengths(count: int) -> struct.Struct:
+    return struct.Struct(f"<{count}I")
 
 
 def _encode_origin(origin: Origin) -> bytes:

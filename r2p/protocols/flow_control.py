@@ -4,7 +4,13 @@ Each message of a session on a topic in one class has a serial number. A subscri
 the last serial that its queues accepted, and its window says how many more may be on the way. A publisher waits for a
 subscriber that grants nothing, and skips it when it has waited long enough; the subscriber's next credit ends that.
 Missing serials also show losses on the way.
+
+Where messages may be long, bytes are limited as well, by the publisher, who knows the sizes of its messages: to
+BYTES_MAX on the way, or four messages. So that it need not wait long, a subscriber grants credit also for each
+CREDIT_BYTES of messages above UNCOUNTED_BYTES.
 """
+
+from collections import deque
 
 import msgspec
 
@@ -17,6 +23,18 @@ SHARE = 1024
 """Messages from one credit to the next without a window. When a link breaks, this many messages at most are
 of unknown fate, beside those that were on the way.
 """
+
+BYTES_MAX = 192 * 1024
+"""Bytes on the way to the slowest subscriber from which on nothing more is sent: five topics at full speed fit into
+zenoh's own queue of 1 MB. A message counts as a quarter of this at most, so four large ones may be on their way, or
+wait for one another.
+"""
+
+CREDIT_BYTES = 16 * 1024
+"""Bytes of accepted messages from one credit to the next. A longer message is granted credit at once."""
+
+UNCOUNTED_BYTES = 1024
+"""Bytes of the longest message that does not count: the window is enough to limit such messages."""
 
 _HALF = SERIAL_WRAP // 2 + 1  # a distance of this or more is one backwards
 
@@ -42,6 +60,23 @@ class SendWindow:
         """The last serial for which all subscribers have room, except skipped ones."""
         self.subscribers: dict[int, _SubscriberWindow] = {}
         """Windows by session."""
+        self._bytes: deque[tuple[int, int]] = deque()  # serials whose bytes are on the way, and what they count as
+        self._bytes_sum = 0
+
+    def add_bytes(self, size: int) -> None:
+        """Count the bytes of the last message, on a topic whose messages may be long."""
+        if size > UNCOUNTED_BYTES:
+            size = min(size, BYTES_MAX // 4)
+            self._bytes.append((self.serial, size))
+            self._bytes_sum += size
+            if self._bytes_sum >= BYTES_MAX:
+                self._update()
+
+    def rewind(self, count: int) -> None:
+        """Take back the last serials, whose messages are not sent."""
+        self.serial -= count
+        if self._bytes:
+            self._update()
 
     def add(self, session: int, window: int) -> None:
         """Add a subscriber, or change its window; 0: never wait for it."""
@@ -66,26 +101,34 @@ class SendWindow:
         if known is not None:
             known.leaving = leaving
 
-    def acknowledge(self, session: int, serial: int) -> None:
-        """Note that a subscriber has accepted everything up to this serial (its low 32 bits)."""
+    def acknowledge(self, session: int, serial: int) -> int:
+        """Note that a subscriber has accepted everything up to this serial (its low 32 bits); return that of all it
+        has accepted so far, or 0 if it does not subscribe.
+        """
         known = self.subscribers.get(session)
         if known is None:
-            return
+            return 0
         behind = (self.serial - serial) & SERIAL_WRAP
         if behind < _HALF:  # else it was never sent: a credit of an earlier run, or a forged one
             known.acknowledged = max(known.acknowledged, self.serial - behind)  # one credit may overtake another
             known.answered = known.waited_for = True
         self._update()
+        return known.acknowledged
 
     def skip_full(self) -> list[int]:
         """Stop waiting for subscribers without room, until their next credit; return their sessions."""
         skipped = []
         for session, each in self.subscribers.items():
-            if each.window and each.waited_for and self.serial >= each.acknowledged + each.window:
+            if each.window and each.waited_for and self._is_full(each):
                 each.waited_for = False
                 skipped.append(session)
         self._update()
         return skipped
+
+    def _is_full(self, subscriber: _SubscriberWindow) -> bool:
+        if self._bytes_sum >= BYTES_MAX and subscriber.acknowledged < self._bytes[0][0]:
+            return True
+        return self.serial >= subscriber.acknowledged + subscriber.window
 
     def unacknowledged(self) -> list[int]:
         """Return the sessions that got messages, and have not answered since they joined."""
@@ -93,11 +136,30 @@ class SendWindow:
             session for session, each in self.subscribers.items() if not each.answered and self.serial > each.joined_at
         ]
 
+    @property
+    def accepted(self) -> int:
+        """The last serial that all subscribers have accepted, except skipped ones, and those without a window."""
+        waited_for = [each.acknowledged for each in self.subscribers.values() if each.window and each.waited_for]
+        return min(waited_for, default=self.serial)
+
     def _update(self) -> None:
-        self.limit = min(
-            (each.acknowledged + each.window for each in self.subscribers.values() if each.window and each.waited_for),
-            default=NO_LIMIT,
-        )
+        self.limit = NO_LIMIT
+        acknowledged = self.serial
+        for each in self.subscribers.values():
+            if each.window and each.waited_for:
+                self.limit = min(self.limit, each.acknowledged + each.window)
+                acknowledged = min(acknowledged, each.acknowledged)
+        if self._bytes:
+            self._limit_bytes(acknowledged)
+
+    def _limit_bytes(self, acknowledged: int) -> None:
+        counted = self._bytes
+        while counted and counted[0][0] <= acknowledged:
+            self._bytes_sum -= counted.popleft()[1]
+        while counted and counted[-1][0] > self.serial:
+            self._bytes_sum -= counted.pop()[1]
+        if self._bytes_sum >= BYTES_MAX:
+            self.limit = min(self.limit, self.serial)
 
 
 class ReceiveWindow:
@@ -110,6 +172,7 @@ class ReceiveWindow:
         """The expected serial; -1: any."""
         self.until_credit = 1
         """Messages that the queues accept before credit is granted; the first message is answered at once."""
+        self._bytes_until_credit = CREDIT_BYTES
 
     def advance(self, serial: int) -> int:
         """Expect the next serial; return how many are missing before this one, or -1 if it arrived before."""
@@ -132,9 +195,17 @@ class ReceiveWindow:
         """Count lost messages towards the next credit, so that it is in time."""
         self.until_credit = max(1, self.until_credit - count)
 
+    def accept(self, size: int) -> bool:
+        """Count a message of this size that the queues accepted; return whether credit is to be granted for it."""
+        self.until_credit -= 1
+        if size > UNCOUNTED_BYTES:
+            self._bytes_until_credit -= size
+        return not self.until_credit or self._bytes_until_credit <= 0
+
     def credit_sent(self) -> None:
         """Start to count towards the next credit."""
         self.until_credit = self._share
+        self._bytes_until_credit = CREDIT_BYTES
 
     @property
     def _share(self) -> int:

@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Generator
 from typing import Protocol
 
+from r2p.messages import SIZE_MAX
 from r2p.runtime.backpressure import NO_ROOM, Sink, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample
 
@@ -179,6 +180,8 @@ class SubscriberQueue(Sink):
         "priority",
         "publisher_came",
         "queue",
+        "size_max",
+        "too_long",
         "wait_queue",
         "waiter",
     )
@@ -196,6 +199,10 @@ class SubscriberQueue(Sink):
         self.blocks_publishers = not lossy
         self.queue: deque[Sample] = deque()
         """Unread messages. A link or a publisher appends to it itself, after a look at `limit`."""
+        self.size_max = SIZE_MAX
+        """Bytes of the longest message that the subscriber's type allows."""
+        self.too_long = 0
+        """Messages longer than the subscriber's type allows."""
         self.waiter: asyncio.Future[None] | None = None
         """The reader's future, while it waits for a message."""
         self.publisher_came = Pulse()

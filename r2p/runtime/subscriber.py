@@ -89,8 +89,6 @@ class Subscriber(Generic[T]):
         """The function that `Node.spin` calls with each message; None for iteration or `fetch`."""
         self.undecodable = 0
         """Messages whose bytes don't decode as the type; skipped."""
-        self.too_long = 0
-        """Messages with more elements than the `r2p.Max` of the type here; skipped."""
         self.stale = 0
         """Messages older than `max_age` when their turn came; skipped."""
         self.timeouts = 0
@@ -98,6 +96,8 @@ class Subscriber(Generic[T]):
         self._sink = SubscriberQueue(
             space.wake_scheduler, node, options.queue, lossy=options.lossy, keep_oldest=options.keep == "oldest"
         )
+        if layout is not None:
+            self._sink.size_max = layout.size
         self._node = node
         self._space = space
         self._topic = topic
@@ -123,6 +123,11 @@ class Subscriber(Generic[T]):
     def lost(self) -> int:
         """Messages that a full queue dropped."""
         return self._sink.lost
+
+    @property
+    def too_long(self) -> int:
+        """Messages with more elements than the `r2p.Max` of the type here; skipped."""
+        return self._sink.too_long
 
     @property
     def publishers(self) -> int:
@@ -297,7 +302,7 @@ class Subscriber(Generic[T]):
             message = self._layout.decode(sample.data)
         except DecodeError as error:
             if isinstance(error, TooLong):
-                self.too_long += 1
+                self._sink.too_long += 1
             else:
                 self.undecodable += 1
             return None

@@ -42,6 +42,9 @@ with the time since that stall, up to STALL_MAX_S. 0.05 is a choice: 20 blocked 
 BACKLOG_MAX = 16_384
 """Messages that wait behind one that is blocked: what eight publishers may send meanwhile."""
 
+BACKLOG_BYTES_MAX = 64 << 20
+"""Bytes of those messages from which on no more are accepted."""
+
 
 class ReceiveBackpressure(abc.ABC):
     """The owner of a `BlockedMessage`: delivers a link's messages in order, and decides how long each waits."""
@@ -219,6 +222,7 @@ class Backlog(ReceiveBackpressure, Generic[P]):
         self._resume = resume
         self._blocked_serial: tuple[P, int]  # whose message is blocked, and its serial
         self._queue: deque[tuple[P, int, Sample | None]] = deque()
+        self._bytes = 0
 
     def block(self, publisher: P, serial: int, sample: Sample, sinks: list[Sink]) -> None:
         """Wait for room in these sinks."""
@@ -227,15 +231,18 @@ class Backlog(ReceiveBackpressure, Generic[P]):
 
     def append(self, publisher: P, serial: int, sample: Sample | None) -> bool:
         """Append a message, or None in place of one that is only acknowledged; return False if there is no room."""
-        if len(self._queue) >= BACKLOG_MAX:
+        if len(self._queue) >= BACKLOG_MAX or self._bytes >= BACKLOG_BYTES_MAX:
             return False
         self._queue.append((publisher, serial, sample))
+        if sample is not None:
+            self._bytes += len(sample.data)
         return True
 
     def clear(self) -> int:
         """Drop everything; return how many messages waited behind the blocked one."""
         count = sum(sample is not None for _, _, sample in self._queue)
         self._queue.clear()
+        self._bytes = 0
         blocked, self.blocked = self.blocked, None
         if blocked is not None:
             blocked.withdraw()
@@ -257,7 +264,10 @@ class Backlog(ReceiveBackpressure, Generic[P]):
         self.blocked = None
         self._deliver(*self._blocked_serial, None)
         while self._queue and self.blocked is None:
-            self._deliver(*self._queue.popleft())
+            publisher, serial, sample = self._queue.popleft()
+            if sample is not None:
+                self._bytes -= len(sample.data)
+            self._deliver(publisher, serial, sample)
         if self.blocked is None:
             self.holds = False
             self._resume()

@@ -43,9 +43,24 @@ HEADERS = st.builds(
 )
 
 
-@given(HEADERS)
+LENGTHS = st.just(0) | st.integers(0, 2**32 - 1)
+
+
+@st.composite
+def varying_headers(draw: st.DrawFn) -> Header:
+    """With a length for each message."""
+    header = draw(HEADERS)
+    count = len(header.more) + 1
+    lengths = draw(st.lists(LENGTHS, min_size=count, max_size=count))
+    return msgspec.structs.replace(header, lengths=tuple(lengths))
+
+
+@given(HEADERS | varying_headers())
 def test_what_is_encoded_is_decoded(header: Header) -> None:
-    assert attachment.decode(attachment.encode(header)) == header
+    data = attachment.encode(header)
+    assert attachment.decode(data) == header
+    assert data[0] == (2 if header.lengths else 1)
+    assert len(data) <= attachment.HEADER_MAX
 
 
 _PREFIXES = st.from_regex(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_", fullmatch=True)
@@ -97,6 +112,55 @@ def test_the_bytes_of_a_header_of_several_messages() -> None:
         data
         == single[:3] + b"\2" + single[4:48] + bytes([4, 0, 0, 0, 0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0]) + single[48:]
     )
+
+
+def test_the_bytes_of_a_header_with_lengths() -> None:
+    """As docs/PROTOCOL.md has it; all but the version, and the lengths in front of the origin, is as without."""
+    header = msgspec.structs.replace(HEADER, more=(4, 5))
+    data = attachment.encode(msgspec.structs.replace(header, lengths=(0, 3, 70_000)))
+    without = attachment.encode(header)
+    assert data == b"\2" + without[1:48] + bytes.fromhex("00000000 03000000 70110100") + without[48:]
+    packer = attachment.Packer(ORIGIN)
+    start = attachment.start_of(0, stamped=True, version=2)
+    args = start, HEADER.serial, HEADER.sequence, HEADER.deadline
+    assert packer.varying(*args, [HEADER.stamp, 4, 5], [0, 3, 70_000]) == data
+    assert attachment.decode(packer.varying(*args, [HEADER.stamp], [0])).lengths == (0,)
+    for cut in range(48, 60):
+        with pytest.raises(DecodeError, match="lengths"):
+            attachment.decode(data[:cut])
+
+
+@given(st.binary(min_size=28, max_size=140))
+def test_any_bytes_are_a_header_with_lengths_or_counted(data: bytes) -> None:
+    data = b"\2" + data[:2] + bytes([data[3] % 8]) + data[3:]
+    try:
+        header = attachment.decode(data)
+    except DecodeError:
+        return
+    assert len(header.lengths) == len(header.more) + 1
+    assert attachment.decode(attachment.encode(header)) == header
+
+
+@given(st.integers(0, 70_000), st.integers(1, 8), st.data())
+def test_a_payload_is_split_into_all_its_bytes_or_counted(size: int, count: int, data: st.DataObject) -> None:
+    bounds = st.just(()) | st.lists(LENGTHS | st.integers(0, size), min_size=count, max_size=count).map(tuple)
+    lengths = data.draw(bounds)
+    try:
+        ends = attachment.split(size, count, lengths)
+    except DecodeError:
+        assert sum(lengths) != size or not lengths or (count > 1 and size > attachment.PACKET_BYTES_MAX)
+        return
+    assert (len(ends), ends[-1], ends) == (count, size, sorted(ends))
+    assert lengths == () or [end - at for at, end in zip([0, *ends], ends, strict=False)] == list(lengths)
+
+
+def test_lengths_that_are_not_those_of_the_payload() -> None:
+    assert attachment.split(10, 3, (3, 0, 7)) == [3, 3, 10]
+    with pytest.raises(DecodeError, match="lengths of 10 bytes for a payload of 11"):
+        attachment.split(11, 3, (3, 0, 7))
+    with pytest.raises(DecodeError, match="2 messages in 65537 bytes, more than 65536"):
+        attachment.split(65_537, 2, (1, 65_536))
+    assert attachment.split(64 << 20, 1, (64 << 20,)) == [64 << 20]
 
 
 def test_what_is_too_large_is_cut() -> None:
@@ -182,8 +246,8 @@ def test_a_sequence_that_ends_in_the_packet() -> None:
 
 
 def test_another_version_is_left_alone() -> None:
-    for data in (b"\2", b"\2" + attachment.encode(HEADER)[1:]):
-        with pytest.raises(UnknownType, match="version 2"):
+    for data in (b"\3", b"\3" + attachment.encode(HEADER)[1:]):
+        with pytest.raises(UnknownType, match="version 3"):
             attachment.decode(data)
 
 
@@ -218,8 +282,8 @@ def test_without_bytes_there_is_no_version_to_ignore(decode: Callable[[bytes], o
     with pytest.raises(DecodeError) as caught:
         decode(b"")
     assert caught.type is DecodeError
-    with pytest.raises(UnknownType, match="version 2"):
-        decode(b"\2")
+    with pytest.raises(UnknownType, match="version 3"):
+        decode(b"\3")
 
 
 @pytest.mark.parametrize(

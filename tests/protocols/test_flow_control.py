@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r2p.protocols.flow_control import NO_LIMIT, SHARE, ReceiveWindow, SendWindow
+from r2p.protocols.flow_control import BYTES_MAX, NO_LIMIT, SHARE, ReceiveWindow, SendWindow
 
 A, B = 1, 2
 
@@ -197,3 +197,64 @@ def test_another_window_leaves_nobody_waiting(before: int, after: int, sent: int
             arrive()
         send()
         assert flying
+
+
+def test_of_large_messages_four_are_on_the_way() -> None:
+    flow = SendWindow()
+    flow.add(A, 100)
+    flow.add(B, 100)
+    sent = 0
+    while flow.serial < flow.limit:
+        flow.serial += 1
+        flow.add_bytes(64 << 20)
+        sent += 1
+    assert sent == 4
+    flow.acknowledge(A, 4)
+    assert flow.limit == flow.serial
+    flow.acknowledge(B, 2)
+    assert flow.limit > flow.serial
+    flow.serial += 2
+    flow.add_bytes(1 << 20)
+    flow.add_bytes(1 << 20)
+    assert (flow.skip_full(), flow.limit > flow.serial) == ([B], True)
+
+
+def test_bytes_of_messages_that_are_not_sent_are_forgotten() -> None:
+    flow = SendWindow()
+    flow.add(A, 100)
+    for _ in range(4):
+        flow.serial += 1
+        flow.add_bytes(BYTES_MAX)
+    assert flow.limit == 4
+    flow.rewind(4)
+    assert (flow.serial, flow.limit) == (0, 100)
+
+
+def test_without_a_window_bytes_are_not_limited() -> None:
+    flow = SendWindow()
+    flow.add(A, 0)
+    for _ in range(9):
+        flow.serial += 1
+        flow.add_bytes(BYTES_MAX)
+    assert flow.limit == NO_LIMIT
+
+
+_SIZES = st.sampled_from([0, 1, 500, 1024, 1025, 5_000, 16_384, 16_385, 100_000, 1_000_000, 64 << 20])
+
+
+@given(st.sampled_from([32, 186, 2048]), st.lists(_SIZES, min_size=1, max_size=60), st.data())
+def test_messages_of_any_size_never_stick(window: int, sizes: list[int], data: st.DataObject) -> None:
+    """Whenever the publisher may not go on, credit is under way for what is on the way."""
+    out, inward = SendWindow(), ReceiveWindow(window)
+    out.add(A, window)
+    on_the_way: list[int] = []
+    for size in sizes * 8:
+        while out.serial >= out.limit or (on_the_way and data.draw(st.booleans())):
+            assert on_the_way, "everything has arrived, and nothing may be sent"
+            if inward.accept(on_the_way.pop(0)):
+                inward.credit_sent()
+                out.acknowledge(A, out.serial - len(on_the_way))
+        out.serial += 1
+        out.add_bytes(size)
+        on_the_way.append(size)
+        assert sum(min(each, 49_152) for each in on_the_way if each > 1024) < 2 * BYTES_MAX

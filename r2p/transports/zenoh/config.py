@@ -45,6 +45,8 @@ class ZenohOptions(msgspec.Struct, frozen=True):
     scouting: bool | None = None
     batching: bool = True
     """True if several messages may share a payload."""
+    shm: bool | None = None
+    """Whether messages may go through shared memory."""
     config: Path | None = None
     key: SharedKey | None = None
 
@@ -74,6 +76,7 @@ def parse_options(url: Url) -> ZenohOptions:
         listen=given.get("listen"),
         scouting=None if "scouting" not in given else given["scouting"] == "on",
         batching=given.get("batching") != "off",
+        shm=None if "shm" not in given else given["shm"] == "on",
         config=None if config is None else Path(config),
         key=given.get("key"),
     )
@@ -158,6 +161,7 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
     "network": _network_name,
     "scouting": _one_of("on", "off"),
     "batching": _one_of("on", "off"),
+    "shm": _one_of("on", "off"),
     "config": _file_name,
     "key": key_file,
 }
@@ -169,6 +173,8 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
 LEASE_MS = 1000
 """Milliseconds without a sign of life after which a peer is gone: a hanging one is noticed within two seconds."""
 
+_DROP_AFTER = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"  # microseconds
+
 _NEEDED: dict[str, object] = {
     "scouting/delay": 0,  # else opening a session takes half a second
     "transport/link/tx/lease": LEASE_MS,
@@ -179,6 +185,17 @@ _NEEDED: dict[str, object] = {
     # Each urgent message is a batch of its own: this many fit while zenoh's threads do not get to run.
     "transport/link/tx/queue/size/interactive_high": 16,
     "transport/link/tx/queue/size/real_time": 16,
+    # Of topics with large messages: batches of 64 kB, too (r2p.transports.zenoh.large).
+    "transport/link/tx/queue/size/data_low": 16,
+    "transport/link/tx/queue/size/data_high": 16,
+    "transport/link/tx/queue/size/interactive_low": 16,
+    # How long a large message waits for room before all of it is dropped: 64 MiB on a network of 500 Mbit/s. One that
+    # this session passes on from another one holds up what else comes from there for as long.
+    _DROP_AFTER: 1_000_000,
+}
+
+_NEEDED_OF_CLIENT: dict[str, object] = {
+    _DROP_AFTER: 10_000_000,  # it passes nothing on: the thread of large messages waits, 64 MiB on 50 Mbit/s
 }
 
 _DEFAULT_LISTEN = ["tcp/[::]:7447"]
@@ -264,7 +281,7 @@ def _from_file(options: ZenohOptions) -> "zenoh.Config":
     import zenoh
 
     config = zenoh.Config()
-    needed = _NEEDED if options.mode == "client" else _NEEDED | _NEEDED_TO_LISTEN
+    needed = _NEEDED | (_NEEDED_OF_CLIENT if options.mode == "client" else _NEEDED_TO_LISTEN)
     for key, value in needed.items():
         config.insert_json5(key, json.dumps(value))
     if options.config is None:
@@ -291,6 +308,8 @@ def _from_url(options: ZenohOptions) -> dict[str, object]:
         settings["listen/endpoints"] = [options.listen]
     elif _may_choose(options):
         settings["listen/endpoints"] = _DEFAULT_LISTEN
+    if options.shm is not None:
+        settings["transport/shared_memory/enabled"] = options.shm
     if options.scouting is not None:
         settings["scouting/multicast/enabled"] = options.scouting
     return settings

@@ -20,13 +20,22 @@ from r2p.codecs import UnknownType, liveliness, schemas
 from r2p.codecs.attachment import decode_sender, encode_sender
 from r2p.errors import DecodeError, MessageError
 from r2p.messages import SIZE_MAX, Message, message_type
-from r2p.protocols.discovery.events import Declare, Event, QueryTokens, SubscriberJoined, SubscriberLeft, Undeclare
+from r2p.protocols.discovery.events import (
+    Declare,
+    Event,
+    QueryTokens,
+    SubscriberJoined,
+    SubscriberLeft,
+    TopicType,
+    Undeclare,
+)
 from r2p.protocols.liveliness.session import TOKENS_MAX, LivelinessDiscovery
 from r2p.runtime.sample import PublisherClass
 from r2p.runtime.topic import Topic
-from r2p.transports.announcement import NOTHING
+from r2p.transports.announcement import NOTHING, Announcement
 from r2p.transports.link import Hub, Link, unique_name
 from r2p.transports.stats import LoggedCounter
+from r2p.transports.zenoh.large import LARGE
 from r2p.transports.zenoh.sender import ZenohSender
 from r2p.transports.zenoh.session import LoopQueue, ZenohSession
 from r2p.transports.zenoh.subscribe import ZenohReceiver
@@ -42,6 +51,16 @@ _GUARANTEES = {
     PublisherClass.SPORADIC: "best effort, in order, sent at once; zenoh priority interactive high",
     PublisherClass.PERIODIC: "best effort, sent at once; zenoh priority real time",
 }
+
+_LARGE_GUARANTEES = {
+    PublisherClass.NON_REAL_TIME: "in order, waits for room in every subscriber; zenoh priority data low",
+    PublisherClass.SPORADIC: "best effort, in order, large messages by a thread; zenoh priority data high",
+    PublisherClass.PERIODIC: "best effort, large messages by a thread; zenoh priority interactive low",
+}
+
+
+def _type_of(announced: Announcement) -> TopicType:
+    return TopicType(announced.size, announced.fingerprint, announced.varies)
 
 
 class ZenohLink(Link):
@@ -65,7 +84,7 @@ class ZenohLink(Link):
         self._session: ZenohSession | None = None
         self._prefix = ""
         self._queues: list[LoopQueue] = []
-        self._transports: set[str] = set()  # the zenoh sessions that it is connected to, by id
+        self._transports: dict[str, bool] = {}  # the zenoh sessions that it is connected to, by id: by shared memory?
         self._tokens = TokenDebouncer(hub.space.loop, self._on_token_settled, self._on_token_refused)
         self._token_changes = self._queue(self._on_token)
         self._token_answers = self._queue(self._on_token_answer, most=_ANSWERS_MAX)
@@ -83,7 +102,7 @@ class ZenohLink(Link):
         self.receiver.connect(session, prefix)
         for name, announced in self._announced.items():
             if announced.publishes:
-                self.sender.publishers.declare(self._space.topics[name])
+                self.sender.declare(self._space.topics[name], _type_of(announced))
         if not self._connects:  # before tokens come: they are believed only on a link that is up
             self.on_up()
         session.watch_transports(self._queue(self._on_transport))
@@ -122,18 +141,19 @@ class ZenohLink(Link):
     def discard(self) -> int:
         for subscriber in self.sender.subscribers():
             subscriber.get_wait_queue().reject_all("link down")
-        return self.sender.batcher.discard()
+        return self.sender.discard()
 
     def guarantee(self, topic: str, publisher_class: PublisherClass) -> str:
-        return _GUARANTEES[publisher_class]
+        known = self.sender.types.get(topic)
+        return (_LARGE_GUARANTEES if known is not None and known.size > LARGE else _GUARANTEES)[publisher_class]
 
     def topic_changed(self, topic: Topic) -> None:
         super().topic_changed(topic)
         announced = self._announced.get(topic.name, NOTHING)
         if announced.publishes:
-            self.sender.publishers.declare(topic)
+            self.sender.declare(topic, _type_of(announced))
         else:
-            self.sender.publishers.undeclare(topic.name)
+            self.sender.undeclare(topic.name)
         if announced.subscribes:
             self.receiver.subscribe(topic)
 
@@ -170,7 +190,7 @@ class ZenohLink(Link):
         self.sender.add_subscriber(event.topic, cast("int", event.source), event.queue)
 
     def _remove_subscriber(self, name: str) -> None:
-        self.sender.batcher.flush()  # before the publishers that it is sent with are undeclared
+        self.sender.flush(name)
         super()._remove_subscriber(name)
 
     def _release_topics(self) -> None:
@@ -215,18 +235,21 @@ class ZenohLink(Link):
 
     # Received; in the loop
 
-    def _on_transport(self, change: tuple[str, bool]) -> None:
-        other, opened = change
-        if self._closed or not self._connects:  # one that takes connections is up even alone
+    def _on_transport(self, change: tuple[str, bool, bool]) -> None:
+        other, opened, shared = change
+        if self._closed:
             return
         if opened:
-            self._transports.add(other)
-            if not self.up:
-                self.on_up()
+            self._transports[other] = shared
         else:
-            self._transports.discard(other)
-            if not self._transports:
-                self.on_down("the connection is lost")
+            self._transports.pop(other, None)
+        self.sender.large.shared = all(self._transports.values())
+        if not self._connects:  # one that takes connections is up even alone
+            return
+        if opened and not self.up:
+            self.on_up()
+        elif not self._transports:
+            self.on_down("the connection is lost")
 
     def _on_token(self, change: tuple[str, bool]) -> None:
         if self._closed:

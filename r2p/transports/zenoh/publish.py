@@ -10,15 +10,17 @@ import functools
 from collections.abc import Callable, Iterator
 from itertools import groupby
 
+import msgspec
 import zenoh
 
-from r2p.codecs.attachment import PACKET_MAX, Header, Origin, Packer, encode, start_of
+from r2p.codecs.attachment import PACKET_MAX, VERSION, VERSION_LENGTHS, Header, Origin, Packer, encode, start_of
 from r2p.codecs.management import ANY_TYPE
 from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.backpressure import LINK_DOWN
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.stats import LinkStats
+from r2p.transports.zenoh.large import LARGE, LargePacket, LargeSender
 from r2p.transports.zenoh.session import ZenohSession
 from r2p.transports.zenoh.threads import PENDING_MAX, PENDING_URGENT_MAX
 
@@ -46,10 +48,14 @@ def put_nowhere(data: bytes, *, attachment: bytes) -> None:
 class TxStream:
     """The messages of one topic and class on their way out, of one publisher at a time."""
 
-    __slots__ = ("_packer", "_put", "samples", "source", "urgent", "window")
+    __slots__ = ("_direct_put", "_packer", "_put", "large", "samples", "source", "urgent", "varies", "window")
 
     def __init__(self, window: SendWindow, *, urgent: bool) -> None:
         self.window = window
+        self.varies = False
+        """True if the messages vary in length, so that headers carry the lengths."""
+        self.large: LargeSender | None = None
+        """Sends large packets; None if all messages are so short that nobody need count their bytes."""
         self.urgent = urgent
         """True if messages never wait, not even for the end of the loop's turn."""
         self.source: Source | None = None
@@ -57,12 +63,14 @@ class TxStream:
         """Waiting samples. Each already has its serial in the window: the last one here has the window's last."""
         self._packer = _NO_PACKER
         self._put: Put = put_nowhere
+        self._direct_put: Put = put_nowhere
 
-    def prepare(self, source: Source, origin: Origin, put: Put) -> None:
-        """Switch to another publisher, after sending the previous one's messages."""
+    def prepare(self, source: Source, origin: Origin, put: Put, direct_put: Put = put_nowhere) -> None:
+        """Switch to another publisher, after sending the previous one's messages. `direct_put` is for large ones."""
         self.source = source
         self._packer = Packer(origin)
         self._put = put
+        self._direct_put = direct_put
 
     def send(self, stats: LinkStats, *, batching: bool) -> None:
         """Send waiting messages; zenoh drops them if the network is too slow.
@@ -72,10 +80,15 @@ class TxStream:
         """
         all_samples, self.samples = self.samples, []
         serial = self.window.serial - len(all_samples) + 1  # each was given one when it was offered
-        for samples in _packets(all_samples) if batching and len(all_samples) > 1 else [[each] for each in all_samples]:
+        packets = _varying_packets if self.varies else _packets
+        for samples in packets(all_samples) if batching and len(all_samples) > 1 else [[each] for each in all_samples]:
             try:
                 data = samples[0].data if len(samples) == 1 else b"".join([each.data for each in samples])
-                self._put(data, attachment=self._header(samples, serial))
+                header = self._header(samples, serial)
+                if self.large is not None and self.large.accepts(self.window, len(data)):
+                    self._send_large(self.large, samples, serial, data, header)
+                else:
+                    self._put(data, attachment=header)
             except zenoh.ZError:  # the session is closed
                 stats.lost[LINK_DOWN] += len(samples)
             except BlockingIOError:  # the thread that sends is behind
@@ -86,13 +99,23 @@ class TxStream:
                 stats.sent += len(samples)
                 stats.bytes_sent += len(data)
                 serial += len(samples)
-        self.window.serial = serial - 1
+        if self.window.serial != serial - 1:
+            self.window.rewind(self.window.serial - serial + 1)
+
+    def _send_large(self, large: LargeSender, samples: list[Sample], serial: int, data: bytes, header: bytes) -> None:
+        count = len(samples)
+        publisher_class = self._packer.origin.publisher_class
+        last = serial + count - 1
+        large.send(LargePacket(self.window, publisher_class, last, count, data, header, self._direct_put))
 
     def _header(self, samples: list[Sample], serial: int) -> bytes:
         first = samples[0]
         hops = first.hops + bool(first.source.link)  # messages from another link cross this gateway
         if first.clock is None:  # nearly always: packed in one call, without a `Header`
-            start = start_of(hops, stamped=first.stamped)
+            start = start_of(hops, stamped=first.stamped, version=VERSION_LENGTHS if self.varies else VERSION)
+            if self.varies:
+                stamps, lengths = [each.stamp for each in samples], [len(each.data) for each in samples]
+                return self._packer.varying(start, serial, first.sequence, first.deadline, stamps, lengths)
             if len(samples) == 1:
                 return self._packer.one(start, serial, first.sequence, first.stamp, first.deadline)
             stamps = [each.stamp for each in samples]
@@ -100,6 +123,8 @@ class TxStream:
         more = tuple([each.stamp for each in samples[1:]])
         origin, clock = self._packer.origin, first.clock
         header = Header(origin, serial, first.sequence, first.stamp, first.deadline, hops, first.stamped, clock, more)
+        if self.varies:
+            header = msgspec.structs.replace(header, lengths=tuple([len(each.data) for each in samples]))
         return encode(header)
 
 
@@ -112,11 +137,25 @@ def _packets(samples: list[Sample]) -> Iterator[list[Sample]]:
             yield run[at : at + most]
 
 
-def _header_key(numbered: tuple[int, Sample]) -> object:
-    """Equal for neighbours that may share a header."""
+def _varying_packets(samples: list[Sample]) -> Iterator[list[Sample]]:
+    """Group messages of any size that may share a packet."""
+    for _, alike in groupby(enumerate(samples), lambda numbered: _header_key(numbered, sized=False)):
+        packet: list[Sample] = []
+        size = 0
+        for _, sample in alike:
+            size += len(sample.data)
+            if packet and size > _BATCH_BYTES_MAX:
+                yield packet
+                packet, size = [], len(sample.data)
+            packet.append(sample)
+        yield packet
+
+
+def _header_key(numbered: tuple[int, Sample], *, sized: bool = True) -> object:
+    """Equal for neighbours that may share a header; which must be of one size, if `sized`."""
     position, each = numbered
     counts_from = each.sequence - position if each.sequence else None
-    return counts_from, len(each.data), each.deadline, each.hops, each.stamped, each.clock
+    return counts_from, sized and len(each.data), each.deadline, each.hops, each.stamped, each.clock
 
 
 class Batcher:
@@ -147,6 +186,11 @@ class Batcher:
         if self._streams.pop(stream, stream) is None:
             stream.send(self._stats, batching=self._batching)
 
+    def send_now(self, stream: TxStream) -> None:
+        """Send the messages of this stream: the last one is too large to wait for others."""
+        self._streams.pop(stream, None)
+        stream.send(self._stats, batching=self._batching)
+
     def flush(self) -> None:
         """Send the waiting messages of all streams."""
         streams, self._streams = self._streams, {}
@@ -159,7 +203,7 @@ class Batcher:
         streams, self._streams = self._streams, {}
         count = sum(len(stream.samples) for stream in streams)
         for stream in streams:
-            stream.window.serial -= len(stream.samples)
+            stream.window.rewind(len(stream.samples))
             stream.samples.clear()
         return count
 
@@ -187,6 +231,7 @@ class PublisherCache:
         self._session: ZenohSession | None = None
         self._prefix = ""
         self._publishers: dict[tuple[str, PublisherClass], zenoh.Publisher] = {}
+        self._large: set[str] = set()  # topics whose messages may be large
         self._asked: set[str] = set()
         self._answers: dict[str, bool] = {}
         self._windows: dict[tuple[str, PublisherClass], SendWindow] = {}
@@ -200,18 +245,26 @@ class PublisherCache:
         """Stop sending; declarations end with the session."""
         self._session = None
 
-    def declare(self, topic: Topic) -> None:
-        """Declare the publishers of a newly published topic."""
+    def declare(self, topic: Topic, size: int) -> bool:
+        """Declare the publishers of a published topic, whose messages have at most `size` bytes (0: unknown).
+
+        Return True if earlier publishers of the topic were replaced: large messages have priorities of their own.
+        """
+        replaced = (topic.name in self._large) != (size > LARGE)
+        if replaced:
+            self.undeclare(topic.name)
+            self._large ^= {topic.name}
         classes = {publisher.publisher_class for publisher in topic.publishers}
         for publisher_class in classes or {PublisherClass.NON_REAL_TIME}:  # none in this module: a gateway passes it on
             self._publisher(topic.name, publisher_class)
+        return replaced
 
     def undeclare(self, topic: str) -> None:
         """Undeclare the publishers of a topic."""
         for key in [key for key in self._publishers if key[0] == topic]:
             publisher = self._publishers.pop(key)
             if self._session is not None:
-                self._session.undeclare_publisher(publisher)
+                self._session.undeclare_publisher(publisher, large=topic in self._large)
 
     def reaches(self, topic: str) -> bool:
         """Return whether zenoh knows a subscriber that messages of the topic reach; False until zenoh answers."""
@@ -248,10 +301,17 @@ class PublisherCache:
 
         return put
 
+    def direct_put(self, topic: str, publisher_class: PublisherClass) -> Put:
+        """Return zenoh's function for packets of the topic, which may wait."""
+        publisher = self._publisher(topic, publisher_class)
+        return put_nowhere if publisher is None else publisher.put
+
     def _publisher(self, topic: str, publisher_class: PublisherClass) -> zenoh.Publisher | None:
         key = topic, publisher_class
         if key not in self._publishers and self._session is not None:
-            self._publishers[key] = self._session.declare_publisher(f"{self._prefix}{topic}", publisher_class)
+            self._publishers[key] = self._session.declare_publisher(
+                f"{self._prefix}{topic}", publisher_class, large=topic in self._large
+            )
         return self._publishers.get(key)
 
     def window(self, topic: str, publisher_class: PublisherClass) -> SendWindow:

@@ -18,10 +18,13 @@ from r2p.codecs import UnknownType
 from r2p.codecs.attachment import Credit, Origin, decode_credit, name_for
 from r2p.codecs.management import ANY_TYPE
 from r2p.errors import DecodeError
+from r2p.protocols.discovery.events import TopicType
+from r2p.protocols.flow_control import UNCOUNTED_BYTES, SendWindow
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic
 from r2p.transports.link import Hub, Link, LinkSubscriber
+from r2p.transports.zenoh.large import LARGE, LargeSender
 from r2p.transports.zenoh.publish import BATCH_MAX, Batcher, PublisherCache, TxStream
 from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 
@@ -57,6 +60,7 @@ class ZenohSubscriber(LinkSubscriber):
             each: TxStream(sender.publishers.window(topic.name, each), urgent=each is not _NRT)
             for each in PublisherClass
         }
+        self.set_type(sender.types.get(topic.name, TopicType()))
         self.resending = False
         """True if latched values are being sent to a new subscriber, even if others have no room."""
         self.silent_checks: Counter[int] = Counter()
@@ -75,8 +79,15 @@ class ZenohSubscriber(LinkSubscriber):
                 return False
             if sample.source is not stream.source:
                 self._prepare(stream, sample)
+        if stream.large is not None and stream.large.is_full(window) and not self.resending:
+            return False
         window.serial += 1
         stream.samples.append(sample)
+        if stream.large is not None:
+            window.add_bytes(len(sample.data))
+            if len(sample.data) > LARGE:
+                self._batcher.send_now(stream)
+                return True
         if stream.urgent or len(stream.samples) in (1, BATCH_MAX):
             self._batcher.add(stream)
         return True
@@ -111,6 +122,22 @@ class ZenohSubscriber(LinkSubscriber):
 
     # For the sender
 
+    def set_type(self, topic_type: TopicType, *, restart: bool = False) -> None:
+        """Adapt to the type of the topic; `restart`: its zenoh publishers have been replaced."""
+        long = topic_type.varies or not 0 < topic_type.size <= UNCOUNTED_BYTES
+        for stream in self._streams.values():
+            if stream.samples and (restart or stream.varies != topic_type.varies):
+                self._batcher.send(stream)
+            if restart:
+                stream.source = None
+            stream.varies = topic_type.varies
+            stream.large = self._sender.large if long else None
+
+    @property
+    def windows(self) -> list[SendWindow]:
+        """The windows of all classes."""
+        return [stream.window for stream in self._streams.values()]
+
     def has_session(self, session: int) -> bool:
         """Return whether a session subscribes."""
         return session in self._streams[_NRT].window.subscribers
@@ -132,7 +159,9 @@ class ZenohSubscriber(LinkSubscriber):
 
     def acknowledge(self, credit: Credit) -> None:
         """Note a session's progress; a waiting publisher goes on with `refill`."""
-        self._streams[credit.publisher_class].window.acknowledge(credit.session, credit.serial)
+        window = self._streams[credit.publisher_class].window
+        acknowledged = window.acknowledge(credit.session, credit.serial)
+        self._sender.large.confirm(window, acknowledged)
         self.set_leaving(credit.session, leaving=credit.leaving)
 
     def set_leaving(self, session: int, *, leaving: bool) -> None:
@@ -157,15 +186,16 @@ class ZenohSubscriber(LinkSubscriber):
 
     def unacknowledged(self) -> set[int]:
         """Return the sessions that got messages, and have acknowledged none in any class."""
-        windows = [stream.window for stream in self._streams.values()]
+        windows = self.windows
         answered = {number for window in windows for number, each in window.subscribers.items() if each.answered}
         return {number for window in windows for number in window.unacknowledged()} - answered
 
     def _prepare(self, stream: TxStream, sample: Sample) -> None:
         """Switch to another publisher."""
         self._batcher.send(stream)
-        put = self._sender.publishers.put(self.topic.name, sample.publisher_class)
-        stream.prepare(sample.source, self._sender.origin(self.topic, sample), put)
+        publishers, name, publisher_class = self._sender.publishers, self.topic.name, sample.publisher_class
+        put, direct_put = publishers.put(name, publisher_class), publishers.direct_put(name, publisher_class)
+        stream.prepare(sample.source, self._sender.origin(self.topic, sample), put, direct_put)
 
 
 class ZenohSender:
@@ -177,11 +207,16 @@ class ZenohSender:
         self.loop = hub.space.loop
         self.publishers = PublisherCache()
         self.batcher = Batcher(self.loop, link.stats, batching=batching)
+        self.large = LargeSender(self.loop, link.stats.lost)
         self.credits = CreditReader(self)
         self.reachability = Reachability(self)
         self.final_credits = FinalCredits(self)
         self.topics = hub.space.topics
         """Topics that this module publishes, subscribes to or forwards."""
+        self.types: dict[str, TopicType] = {}
+        """The types of the topics that this module publishes or forwards on the link."""
+        self.large.on_wait = self.credits.wait
+        self.large.on_room = self.credits.serve
         self._hub = hub
         self._subscribers = subscribers
         self._prefix = ""
@@ -191,8 +226,34 @@ class ZenohSender:
         self._prefix = prefix
         self.publishers.connect(session, f"{prefix}/topic/")
         self.credits.connect(session, f"{prefix}/credit/{self._hub.instance:x}")
+        self.large.connect(session.large, session.outbound)
+
+    def declare(self, topic: Topic, topic_type: TopicType) -> None:
+        """Declare the zenoh publishers of a topic, or adapt to another type of it."""
+        self.types[topic.name] = topic_type
+        subscriber = self.subscriber(topic.name)
+        restart = self.publishers.declare(topic, topic_type.size)
+        if subscriber is not None:
+            subscriber.set_type(topic_type, restart=restart)
+
+    def undeclare(self, topic: str) -> None:
+        """Undeclare the zenoh publishers of a topic."""
+        self.types.pop(topic, None)
+        self.publishers.undeclare(topic)
+
+    def flush(self, topic: str) -> None:
+        """Send what waits, before the zenoh publishers of this topic are undeclared."""
+        self.batcher.flush()
+        subscriber = self.subscriber(topic)
+        if subscriber is not None:
+            self.large.flush(subscriber.windows)
+
+    def discard(self) -> int:
+        """Drop what waits, and return the number of these messages."""
+        return self.batcher.discard() + self.large.discard()
 
     def close(self) -> None:
+        self.large.close()
         self.reachability.close()
         self.final_credits.close()
         self.credits.close()
@@ -303,7 +364,7 @@ class CreditReader:
             first = self._reader.receive()
             if first is not None:
                 self._read(first)
-                self._loop.call_soon(self._serve)
+                self._loop.call_soon(self.serve)
 
     def wait(self) -> None:
         """Read the next credit as soon as it arrives: a publisher waits."""
@@ -321,7 +382,7 @@ class CreditReader:
     def _on_credit(self, first: zenoh.Sample | None) -> None:
         self._waits = False
         self._read(first)
-        self._serve()
+        self.serve()
 
     def _read(self, sample: zenoh.Sample | None) -> None:
         while sample is not None and self._reader is not None:
@@ -343,7 +404,7 @@ class CreditReader:
                 self._sender.final_credits.receive(credit.topic, credit.session)
                 self._sender.reachability.set_leaving(credit.topic, credit.session)
 
-    def _serve(self) -> None:
+    def serve(self) -> None:
         """Let waiting publishers go on."""
         if self._reader is None:
             return

@@ -43,6 +43,13 @@ _PRIORITIES: dict[PublisherClass, zenoh.Priority] = {
     PublisherClass.PERIODIC: zenoh.Priority.REAL_TIME,
 }
 
+_LARGE_PRIORITIES: dict[PublisherClass, zenoh.Priority] = {
+    PublisherClass.NON_REAL_TIME: zenoh.Priority.DATA_LOW,
+    PublisherClass.SPORADIC: zenoh.Priority.DATA_HIGH,
+    PublisherClass.PERIODIC: zenoh.Priority.INTERACTIVE_LOW,
+}
+"""Of topics with large messages: apart from the others, for whom zenoh's queue is locked while one goes in."""
+
 
 class Unreachable(Exception):
     """Raised while there is nothing to connect to."""
@@ -192,16 +199,21 @@ class ZenohSession:
     def __init__(self, session: zenoh.Session, on_error: Callable[[Exception], object]) -> None:
         self._session = session
         self.outbound = OutboundThread(asyncio.get_running_loop(), on_error)
+        self.large = OutboundThread(asyncio.get_running_loop(), on_error)
+        """The thread that hands large messages to zenoh."""
         self._declared: list[Any] = []  # kept, as zenoh undeclares what Python collects
         self._publishers: set[zenoh.Publisher] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_count = 0
 
     def watch_transports(self, queue: LoopQueue) -> None:
-        """Report each transport to another session, open ones included: (its id, whether it opened)."""
+        """Report each transport to another session, open ones included: (its id, whether it opened, and whether it uses
+        shared memory).
+        """
 
         def changed(event: zenoh.TransportEvent) -> None:
-            queue.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
+            shared: object = getattr(event.transport, "is_shm", False)  # not in zenoh's stubs
+            queue.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT, bool(shared)))
 
         events: FifoChannel[zenoh.TransportEvent] = FifoChannel(_CHANNEL_MAX)
         self._forward(self._session.info.declare_transport_events_listener(events, history=True), changed, queue)
@@ -307,23 +319,28 @@ class ZenohSession:
         subscriber = self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE)
         return SubscriptionReader(subscriber, asyncio.get_running_loop(), on_sample)
 
-    def declare_publisher(self, key: str, publisher_class: PublisherClass) -> zenoh.Publisher:
-        """Declare a publisher with the priority of the class. Never BLOCK: that would stop the loop."""
+    def declare_publisher(self, key: str, publisher_class: PublisherClass, *, large: bool = False) -> zenoh.Publisher:
+        """Declare a publisher with the priority of the class, and whether its messages may be large.
+
+        Never BLOCK: that would stop the loop. In the thread of large messages, too: where it does not get room for a
+        whole message in 5 s, zenoh closes the connection, and so does each router on the way.
+        """
         periodic = publisher_class == PublisherClass.PERIODIC
         publisher = self._session.declare_publisher(
             key,
-            priority=_PRIORITIES[publisher_class],
+            priority=(_LARGE_PRIORITIES if large else _PRIORITIES)[publisher_class],
             congestion_control=zenoh.CongestionControl.DROP,
             reliability=zenoh.Reliability.BEST_EFFORT if periodic else zenoh.Reliability.RELIABLE,
-            express=publisher_class != PublisherClass.NON_REAL_TIME,  # zenoh would wait for more to fill a batch
+            # Without it, zenoh would wait for more to fill a batch.
+            express=large or publisher_class != PublisherClass.NON_REAL_TIME,
             allowed_destination=zenoh.Locality.REMOTE,
         )
         self._publishers.add(publisher)
         return publisher
 
-    def undeclare_publisher(self, publisher: zenoh.Publisher) -> None:
+    def undeclare_publisher(self, publisher: zenoh.Publisher, *, large: bool = False) -> None:
         self._publishers.discard(publisher)
-        self.outbound.call(publisher.undeclare)
+        (self.large if large else self.outbound).call(publisher.undeclare)
 
     def put(
         self, key: str, data: bytes, *, attachment: bytes | None = None, urgent: bool = False, final: bool = False
@@ -405,6 +422,7 @@ class ZenohSession:
 
     def _close(self, publishers: Iterable[zenoh.Publisher]) -> None:
         self.outbound.finish()
+        self.large.finish()
         with contextlib.suppress(zenoh.ZError):  # it is closed already
             for publisher in publishers:  # zenoh keeps 34 kB for ever of each session that is closed with one
                 publisher.undeclare()

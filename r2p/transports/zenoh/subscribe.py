@@ -15,10 +15,18 @@ import msgspec
 import zenoh
 
 from r2p.codecs import UnknownType
-from r2p.codecs.attachment import SERIAL_WRAP, Credit, HeaderReader, Origin, encode_credit
+from r2p.codecs.attachment import (
+    HEADER_MAX,
+    SERIAL_WRAP,
+    Credit,
+    HeaderReader,
+    Origin,
+    encode_credit,
+    split,
+)
 from r2p.errors import DecodeError
 from r2p.protocols.discovery.events import TopicType
-from r2p.protocols.flow_control import ReceiveWindow
+from r2p.protocols.flow_control import CREDIT_BYTES, UNCOUNTED_BYTES, ReceiveWindow
 from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
@@ -26,15 +34,22 @@ from r2p.runtime.topic import Topic
 from r2p.transports.announcement import type_of
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link
 from r2p.transports.receive_backpressure import Backlog
+from r2p.transports.zenoh.large import LARGE, keep_freed_memory
 from r2p.transports.zenoh.session import SubscriptionReader, ZenohSession
 
 RING = 4096
 """Packets of one topic that zenoh keeps; of more, it loses the oldest."""
 
+_RING_MIN = 64  # ... where messages may be long: two packets of one publisher are on the way, or 192 kB of short ones
+_RING_BYTES = 64 << 20  # bytes of those, if all were as long as the topic's messages may be
+_RING_UNKNOWN = 512  # ... without a type, when all that is known of the messages is that they have 64 MiB at most
+
 WINDOW = 2048
 """Messages of one publisher on the way to one subscriber's module, at most."""
 
+_WINDOW_MIN = 32  # ... where messages may be long: the publisher limits their bytes
 _WINDOW_BYTES = 192 * 1024  # bytes of those: five topics at full speed fit into zenoh's own queue of 1 MB
+_UNKNOWN_SIZE = 1024  # bytes that the messages of a topic without a type are expected to have, at most
 _OVERHEAD = 32  # bytes of a message besides its payload, in a packet of several: its stamp and its share of the header
 _FINAL_CREDITS_MAX = 256  # sessions that learn that a topic is no longer subscribed to; older ones may be long gone
 _SENDERS_MAX = 4096  # senders whose serials a stream remembers, and topics whose serials outlast an outage
@@ -49,7 +64,8 @@ ReceiveWindows = dict[tuple[int, PublisherClass], ReceiveWindow]
 class RemotePublisher(msgspec.Struct, eq=False):
     """A publisher in another module, by one sender of its messages: its own module, or a gateway.
 
-    `size` is that of its messages in bytes, -1: any; `last_size` and `sequence` are those of the last message.
+    `size` is that of its messages in bytes, -1: any; `last_size` and `sequence` are those of the last message (but
+    `last_size` only if its bytes need not be counted).
     `last_received` is shared by all ways of its messages, by other gateways and other links.
     """
 
@@ -82,10 +98,12 @@ class RxStream:
         self._loop = receiver.loop
         self._paused = False
         self._type = type_of(topic)
+        self._bound, self._long = self._limits()
         self._headers = HeaderReader(self._new_publisher)
 
     def update(self) -> None:
         """Apply a change of the topic's type, or of the number of messages on the way."""
+        self._bound, self._long = self._limits()
         topic_type = type_of(self.topic)
         if topic_type != self._type:
             self._type = topic_type
@@ -95,6 +113,17 @@ class RxStream:
         for (_, publisher_class), window in self.windows.items():
             if publisher_class == _NRT and window.size != size:
                 window.resize(size)
+
+    def _limits(self) -> tuple[int, bool]:
+        """Return the bytes of the longest message, and whether messages may be so long that their bytes are counted."""
+        layout, link = self.topic.layout, self._receiver.link
+        if layout is None:
+            return link.max_payload, True
+        if not layout.varies:
+            return layout.size, layout.size > UNCOUNTED_BYTES
+        if link.gateway_hooks is not None:  # other modules may have other bounds: no part of the type
+            return link.max_payload, True
+        return max((queue.size_max for queue in self.topic.queues), default=layout.size), True
 
     def add_session(self, session: int) -> None:
         """Remember a publisher's module, which gets a final credit even if none of its messages has arrived yet."""
@@ -140,7 +169,8 @@ class RxStream:
         while packet is not None and left > 0:
             try:
                 attachment = packet.attachment
-                left -= self._unpack(packet.payload.to_bytes(), b"" if attachment is None else attachment.to_bytes())
+                header = b"" if attachment is None or len(attachment) > HEADER_MAX else attachment.to_bytes()
+                left -= self._unpack(packet.payload, header)
             except Exception as error:  # noqa: BLE001 - counted and logged; the next packet follows
                 self._stats.lost.internal_error(error)
                 left -= 1
@@ -170,14 +200,20 @@ class RxStream:
             else:
                 self.on_packet(packet)
 
-    def _unpack(self, data: bytes, header: bytes) -> int:
+    def _unpack(self, payload: zenoh.ZBytes, header: bytes) -> int:
         """Deliver the messages of one packet; return how many they are."""
+        size = len(payload)
         try:
-            publisher, serial, sequence, stamps, deadline, hops, stamped, clock = self._headers.read(header)
-            parts = (data,) if len(stamps) == 1 else _split(data, len(stamps))
+            publisher, serial, sequence, stamps, deadline, hops, stamped, clock, lengths = self._headers.read(header)
+            if 0 < size <= self._bound and not lengths and len(stamps) == 1:
+                parts = [payload.to_bytes()]
+            else:
+                parts = _split(payload, len(stamps), lengths, self._bound)
         except DecodeError as error:
             self._stats.lost["unknown type" if isinstance(error, UnknownType) else "undecodable"] += 1
             return 1
+        if not parts:
+            return self._refuse(publisher, serial, size)
         # Sequence 0 means that it is not known, so it is 0 in each message of the packet.
         source, publisher_class, step = publisher.source, publisher.publisher_class, 1 if sequence else 0
         samples: list[Sample] = []
@@ -192,6 +228,7 @@ class RxStream:
         # The hot path: the expected next message, of the same size as before. All others are checked one by one.
         if (
             len(first.data) == publisher.last_size
+            and (not lengths or len(samples) == 1)
             and serial == publisher.window.next_serial
             and (first.sequence > publisher.last_received.sequence or not sequence)
             and self.backlog.blocked is None
@@ -200,12 +237,23 @@ class RxStream:
         else:
             for number, sample in enumerate(samples, serial):
                 if self._is_new(publisher, number, sample):
-                    self.last = sample
+                    self.last = sample if self._keeps(sample) else None
                     if self.backlog.blocked is None:
                         self._deliver(publisher, number, sample)
                     else:
                         self._queue(publisher, number, sample)
         return len(samples)
+
+    def _keeps(self, sample: Sample) -> bool:
+        """Return whether to keep a message as the last one: a large one only if its publisher latches it."""
+        return len(sample.data) <= LARGE or self._receiver.link.latched(self.topic.name)
+
+    def _refuse(self, publisher: RemotePublisher, serial: int, size: int) -> int:
+        """Count a message that is longer than any of this topic can be, or empty without lengths that say so."""
+        if self._size_fits(publisher, size):
+            self._stats.lost["wrong size"] += 1
+        self._reject(publisher, serial)
+        return 1
 
     def _set_expiry(self, publisher: RemotePublisher, samples: list[Sample]) -> None:
         """Translate the deadline to this computer's clock."""
@@ -247,9 +295,12 @@ class RxStream:
 
     def _deliver(self, publisher: RemotePublisher, serial: int, sample: Sample | None) -> None:
         """Deliver a message, or wait for room for it; None is only acknowledged."""
-        sinks = None if sample is None else self._deliver_to_topic(sample)
-        if sample is None or sinks is None:
-            self._acknowledge(publisher, serial)
+        if sample is None:  # of unknown size: where it may be long, with credit at once
+            self._acknowledge(publisher, serial, CREDIT_BYTES if self._long else 0)
+            return
+        sinks = self._deliver_to_topic(sample)
+        if sinks is None:
+            self._acknowledge(publisher, serial, len(sample.data))
         else:
             self.backlog.block(publisher, serial, sample, sinks)
 
@@ -266,7 +317,7 @@ class RxStream:
         if publisher.publisher_class != _NRT and self.backlog.holds:
             for sink in self._deliver_to_topic(sample) or ():
                 self._stats.lost.guard(sink.force, sample)
-            self._acknowledge(publisher, serial)
+            self._acknowledge(publisher, serial, len(sample.data))
         elif not self._append(publisher, serial, sample):
             self._stats.lost["receive queue full"] += 1
 
@@ -276,10 +327,9 @@ class RxStream:
             publisher.window.skip(1)  # it gets no acknowledgement of its own, so the next credit comes earlier
         return fits
 
-    def _acknowledge(self, publisher: RemotePublisher, serial: int) -> None:
+    def _acknowledge(self, publisher: RemotePublisher, serial: int, size: int) -> None:
         """Note that the queues accepted a message, and grant its publisher credit now and then."""
-        publisher.window.until_credit -= 1
-        if not publisher.window.until_credit:
+        if publisher.window.accept(size):
             self._send_credit(publisher, serial)
 
     def _send_credit(self, publisher: RemotePublisher, serial: int) -> None:
@@ -291,10 +341,12 @@ class RxStream:
         """Return whether the sample is a new message of the right type; all else is counted here."""
         size, sequence, stamp = len(sample.data), sample.sequence, sample.stamp
         window = publisher.window
-        if size != publisher.last_size and not self._size_fits(publisher, size):
-            self._reject(publisher, serial)
-            return False
-        publisher.last_size = size
+        if size != publisher.last_size:
+            if not self._size_fits(publisher, size):
+                self._reject(publisher, serial)
+                return False
+            if size <= UNCOUNTED_BYTES:
+                publisher.last_size = size
         if serial == window.next_serial:  # `advance` inlined; where serials wrap it is called, and finds no gap
             window.next_serial = serial + 1
         elif not self._advance(publisher, serial):
@@ -315,8 +367,12 @@ class RxStream:
         """Return whether a publisher's messages may have this many bytes; those that may not are counted."""
         if not publisher.type_fits:
             self._stats.lost["wrong type"] += 1
-        elif size != publisher.size and (publisher.size >= 0 or not 0 < size <= self._receiver.link.max_payload):
+        elif publisher.size >= 0 and size != publisher.size:
             self._stats.lost["wrong size"] += 1
+        elif size > self._bound:
+            self._stats.lost["too long"] += 1
+            for queue in self.topic.queues:
+                queue.too_long += 1
         else:
             return True
         return False
@@ -336,7 +392,7 @@ class RxStream:
         if publisher.window.next_serial >= 0 and not self._advance(publisher, serial):
             return  # serials are counted from the first message that is of use
         if self.backlog.blocked is None or publisher.publisher_class != _NRT:
-            self._acknowledge(publisher, serial)
+            self._acknowledge(publisher, serial, CREDIT_BYTES if self._long else 0)
         else:
             self._append(publisher, serial, None)
 
@@ -348,7 +404,7 @@ class RxStream:
         else:
             publisher.sequence = sequence
             self._stats.lost["seen before"] += 1
-            self._acknowledge(publisher, serial)
+            self._acknowledge(publisher, serial, CREDIT_BYTES if self._long else 0)
 
     # Publishers
 
@@ -418,7 +474,7 @@ class ZenohReceiver:
     def _start_reading(self, stream: RxStream) -> None:
         if self._session is not None:
             key = f"{self._prefix}/topic/{stream.topic.name}"
-            stream.reader = self._session.subscribe(key, RING, stream.on_packet)
+            stream.reader = self._session.subscribe(key, _ring(stream.topic), stream.on_packet)
 
     def send_credit(
         self, topic: str, session: int, publisher_class: PublisherClass, serial: int, *, leaving: bool = False
@@ -454,8 +510,8 @@ class ZenohReceiver:
         """Return how many messages may be on the way; 0: any number, as the subscribers are lossy."""
         if topic.queues and all(queue.lossy for queue in topic.queues):
             return 0
-        size = self.link.max_payload if topic.layout is None else topic.layout.size
-        return min(WINDOW, _WINDOW_BYTES // (size + _OVERHEAD))
+        size = _UNKNOWN_SIZE if topic.layout is None else topic.layout.size
+        return min(WINDOW, max(_WINDOW_MIN, _WINDOW_BYTES // (size + _OVERHEAD)))
 
     # Publishers
 
@@ -499,12 +555,28 @@ class ZenohReceiver:
         self._session = None
 
 
-def _split(data: bytes, count: int) -> list[bytes]:
-    """Split a payload into its messages. Raises DecodeError if they can't be of one size."""
-    size, odd = divmod(len(data), count)
-    if odd or not size:
-        raise DecodeError(f"{len(data)} bytes for {count} messages")
-    return [data[at : at + size] for at in range(0, len(data), size)]
+def _split(payload: zenoh.ZBytes, count: int, lengths: tuple[int, ...], bound: int) -> list[bytes]:
+    """Return the messages of a payload; none, and no copy of it, if it is longer than they can be, or empty where no
+    lengths say so. Raises DecodeError.
+    """
+    size = len(payload)
+    if count == 1 and not lengths:
+        return []
+    ends = split(size, count, lengths)
+    if count == 1 and size > bound:
+        return []
+    if size > LARGE:
+        keep_freed_memory()
+    data = payload.to_bytes()  # the only copy of a large message, which travels alone
+    return [data] if count == 1 else [data[at:end] for at, end in zip([0, *ends], ends, strict=False)]
+
+
+def _ring(topic: Topic) -> int:
+    """Return how many packets zenoh keeps for a topic."""
+    if topic.layout is None:
+        return _RING_UNKNOWN
+    size = topic.layout.size
+    return RING if size * RING <= _RING_BYTES else max(_RING_MIN, _RING_BYTES // size)
 
 
 def _progress(windows: ReceiveWindows) -> dict[tuple[int, PublisherClass], int]:

@@ -42,6 +42,7 @@ def test_a_router() -> None:
     assert (found.mode, found.listen, found.scouting) == ("router", "tcp/0.0.0.0:7447", False)
     assert found.batching
     assert not options("zenoh:?batching=off").batching
+    assert [options(f"zenoh:{shm}").shm for shm in ("", "?shm=on", "?shm=off")] == [None, True, False]
 
 
 def test_a_file_decides_what_the_url_does_not() -> None:
@@ -136,6 +137,23 @@ async def test_what_the_file_says_counts(tmp_path: Path) -> None:
     assert connection_settings(config).tls.root == "ca.pem"
     ours = build_config(options("zenoh:"))
     assert ours.get_json("transport/link/tx/lease") == "1000"
+
+
+@pytest.mark.anyio
+async def test_what_large_messages_need() -> None:
+    """Only a client may wait long for room: others hold up what they pass on."""
+    from r2p.transports.zenoh.config import build_config
+
+    queue, shared = "transport/link/tx/queue", "transport/shared_memory/enabled"
+    router = build_config(options("zenoh:?mode=router&listen=tcp/127.0.0.1:0&shm=off"))
+    client = build_config(options("zenoh:tcp/127.0.0.1:7447"))
+    waits = [
+        int(config.get_json(f"{queue}/congestion_control/drop/max_wait_before_drop_fragments"))
+        for config in (router, client)
+    ]
+    assert waits == [1_000_000, 10_000_000]
+    assert json.loads(client.get_json(f"{queue}/size"))["data_low"] == 16
+    assert (router.get_json(shared), client.get_json(shared)) == ("false", "true")
 
 
 @pytest.mark.parametrize(("url", "listens"), [("zenoh:tcp/robot:7447", False), ("zenoh:", True)])

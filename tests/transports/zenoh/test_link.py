@@ -5,7 +5,7 @@ import contextlib
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import pytest
@@ -640,6 +640,59 @@ async def test_an_address_that_is_taken_is_an_error() -> None:
         with pytest.raises(r2p.TransportError, match="the port is in use"):
             async with module("B", net.listen):
                 pass
+
+
+class Picture(r2p.Message):
+    data: Annotated[bytes, r2p.Max(64_000_000)] = b""
+
+
+@pytest.mark.parametrize("shm", ["on", "off"])
+@guarded
+async def test_messages_of_any_length_keep_their_order_and_none_is_lost(shm: str) -> None:
+    """From the loop and from the thread, with and without fragments, and in packets of several."""
+    net = Net()
+    sizes = [0, 100, 3_000_000, 0, 20_000, 17, 5_000_000, 16_000, 16_000, 100_000, 1]
+    async with (
+        module("A", f"{net.listen}&shm={shm}") as a,
+        module("B", f"{net.join}&shm={shm}") as b,
+        node_in(a) as alice,
+        node_in(b) as bob,
+    ):
+        for sender, receiver in ((alice, bob), (bob, alice)):
+            topic = f"images{sender.module}"
+            publisher = sender.advertise(topic, Picture, r2p.NonRealTime(stall=20.0))
+            subscriber = receiver.subscribe(topic, Picture, queue=2)
+            leds = f"leds{sender.module}"
+            other_publisher, other = sender.advertise(leds, Led), receiver.subscribe(leds, Led)
+            await publisher.wait_subscriber()
+            await other_publisher.wait_subscriber()
+
+            async def publish(publisher: r2p.Publisher[Picture] = publisher) -> None:
+                for number, size in enumerate(2 * sizes):
+                    await publisher.publish(Picture(bytes([number]) * size))
+
+            publishing = asyncio.create_task(publish())
+            for number, size in enumerate(2 * sizes):
+                assert (await subscriber.fetch()).data == bytes([number]) * size
+            await publishing
+            await other_publisher.publish(Led(1))
+            assert await other.fetch() == Led(1)
+            guarantees = publisher.guarantees[sender._space.links[0].name]
+            assert guarantees == "in order, waits for room in every subscriber; zenoh priority data low"
+        assert not link_of(alice).losses + link_of(bob).losses
+
+
+@guarded
+async def test_a_periodic_and_a_sporadic_message_may_be_large() -> None:
+    async with nodes(Net(), "A", "B") as (alice, bob):
+        events, states = bob.subscribe("events", Picture), bob.subscribe("states", Picture)
+        event = alice.advertise("events", Picture, r2p.Sporadic(deadline=10.0))
+        state = alice.advertise("states", Picture, r2p.Periodic(0.05, lambda: Picture(bytes(200_000))))
+        for publisher in (event, state):
+            await publisher.wait_subscriber()
+        await event.publish(Picture(bytes(2_000_000)))
+        assert len((await events.fetch()).data) == 2_000_000
+        assert len((await states.fetch()).data) == 200_000
 
 
 @guarded

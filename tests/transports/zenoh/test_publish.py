@@ -25,13 +25,14 @@ ORIGIN = Origin(PublisherClass.NON_REAL_TIME, 1, 1, bytes(8), "PC1", "talk")
 class Wire:
     """Stands for zenoh: notes the payload of each packet, and the serials and sequences that its header stands for."""
 
-    def __init__(self, *, batching: bool = True) -> None:
+    def __init__(self, *, batching: bool = True, varies: bool = False) -> None:
         self.sent: list[bytes] = []
         self.headers: list[attachment.Header] = []
         self.stats = LinkStats()
         self.batcher = Batcher(asyncio.get_running_loop(), self.stats, batching=batching)
         self.streams = {urgent: TxStream(SendWindow(), urgent=urgent) for urgent in (False, True)}
         for stream in self.streams.values():
+            stream.varies = varies
             stream.prepare(HERE, ORIGIN, self.put)
         self.sequence = 0
 
@@ -193,6 +194,19 @@ async def test_long_messages_go_alone() -> None:
         wire.add(bytes(size))
     wire.batcher.flush()
     assert [len(each) for each in wire.sent] == [1, 15_000, 5000, 20_000, 20_000]
+
+
+async def test_messages_of_any_length_share_a_packet_whose_header_has_the_lengths() -> None:
+    wire = Wire(varies=True)
+    for data in (b"1", b"", b"22", b"333", bytes(16_383), b"4", bytes(20_000), b"5"):
+        wire.add(data)
+    wire.add(b"late", clock=CLOCK)
+    wire.batcher.flush()
+    lengths = [(1,), (0, 2, 3), (16_383, 1), (20_000,), (1,), (4,)]
+    assert [each.lengths for each in wire.headers] == lengths
+    assert [len(each) for each in wire.sent] == [sum(each) for each in lengths]
+    assert [each.serial for each in wire.headers] == [1, 2, 5, 7, 8, 9]
+    assert wire.headers[-1].clock == CLOCK
 
 
 @pytest.mark.internal_errors

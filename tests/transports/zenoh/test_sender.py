@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.flow_control import SendWindow
 from r2p.runtime.queues import WakeScheduler
 from r2p.runtime.sample import PublisherClass, Sample, Source
@@ -90,6 +91,7 @@ def subscriber_of(topic: Topic) -> ZenohSubscriber:
         batcher=SimpleNamespace(add=lambda stream: None),
         credits=SimpleNamespace(receive=lambda: None, wait=lambda: None),
         publishers=SimpleNamespace(window=lambda topic, publisher_class: windows[publisher_class]),
+        types={topic.name: TopicType(4)},
     )
     return ZenohSubscriber(sender, topic)
 

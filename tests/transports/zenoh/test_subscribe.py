@@ -3,19 +3,22 @@
 import asyncio
 from collections import Counter, deque
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
+import zenoh
 
+import r2p
 from r2p.clock import clock_of
 from r2p.codecs import PublisherClass, attachment
 from r2p.codecs.attachment import Header, Origin
-from r2p.messages import layout
+from r2p.messages import SIZE_MAX, layout
 from r2p.msg import Led
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.queues import SubscriberQueue, WakeScheduler
 from r2p.runtime.sample import Sample
 from r2p.runtime.topic import Topic
+from r2p.transports import receive_backpressure
 from r2p.transports.stats import LinkStats
 from r2p.transports.zenoh.subscribe import WINDOW, RxStream, ZenohReceiver
 
@@ -24,25 +27,52 @@ pytestmark = pytest.mark.virtual_time
 SIZE = layout(Led).size
 
 
+class Note(r2p.Message):
+    """Up to 100 bytes with the count."""
+
+    text: Annotated[str, r2p.Max(96)] = ""
+
+
+class Long(r2p.Message):
+    """The same, with another bound."""
+
+    text: Annotated[str, r2p.Max(1_000_000)] = ""
+
+
+class Uncopied:
+    """A payload that is too long to be copied."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+
+    def __len__(self) -> int:
+        return self._size
+
+
 class Ring:
     """A topic `leds` with a subscriber, and what waits for it in zenoh."""
 
-    def __init__(self, queue: int, *, typed: bool = True, topic: type[Topic] = Topic) -> None:
+    def __init__(
+        self, queue: int, *, typed: bool = True, topic: type[Topic] = Topic, kind: type[r2p.Message] = Led
+    ) -> None:
         loop = asyncio.get_running_loop()
         self.credits: list[tuple[int, int]] = []
         self.last_words = 0
         self.stats = LinkStats()
         self.wake_scheduler = WakeScheduler(loop)
         self.topic = topic("leds", self.wake_scheduler)
-        self.topic.layout = layout(Led) if typed else None
+        self.topic.layout = layout(kind) if typed else None
         self._ring: deque[Any] = deque()
         self._idle = True
         hub: Any = SimpleNamespace(space=SimpleNamespace(loop=loop, clock=clock_of(loop)), instance=1)
-        link: Any = SimpleNamespace(name="zenoh:", stats=self.stats, max_payload=1024, latched=lambda _: False)
+        link: Any = SimpleNamespace(
+            name="zenoh:", stats=self.stats, max_payload=SIZE_MAX, latched=lambda _: False, gateway_hooks=None
+        )
         self.receiver = ZenohReceiver(link, hub)
         session: Any = SimpleNamespace(subscribe=self._subscribe, put=self._put_credit)
         self.receiver.connect(session, "r2p/lab")
         self.sink = self.subscribe(queue)
+        self.sink.size_max = self.topic.layout.size if self.topic.layout is not None else SIZE_MAX
         self.receiver.subscribe(self.topic)
 
     def subscribe(self, queue: int) -> SubscriberQueue:
@@ -87,9 +117,20 @@ class Ring:
         stamps = [10 * (serial + at) for at in range(count)]
         header = attachment.encode(Header(origin, serial, serial, stamps[0], deadline, more=tuple(stamps[1:])))
         data = b"".join([(serial + at).to_bytes(size, "little") for at in range(count)])
-        sample = SimpleNamespace(
-            payload=SimpleNamespace(to_bytes=lambda: data), attachment=SimpleNamespace(to_bytes=lambda: header)
-        )
+        self.put_packet(data, header)
+
+    def put_varying(self, serial: int, *messages: bytes, lengths: tuple[int, ...] = (), payload: object = None) -> None:
+        """Messages in one packet, with their lengths; or with others."""
+        origin = Origin(PublisherClass(1), 7, 7, bytes(8), "A", "node")
+        lengths = lengths or tuple([len(each) for each in messages])
+        stamps = tuple([10 * (serial + at) for at in range(len(lengths))])
+        header = Header(origin, serial, serial, stamps[0], more=stamps[1:], lengths=lengths)
+        self.put_packet(b"".join(messages) if payload is None else payload, attachment.encode(header))
+
+    def put_packet(self, data: object, header: bytes) -> None:
+        """A packet in zenoh's own objects."""
+        payload = zenoh.ZBytes(data) if isinstance(data, bytes) else data
+        sample = SimpleNamespace(payload=payload, attachment=zenoh.ZBytes(header))
         if self._idle:
             self._idle = False
             self._arrived(sample)
@@ -220,7 +261,7 @@ async def test_what_was_heard_is_still_known_when_the_type_is() -> None:
     await turns()
     assert ring.stats.lost == {"wrong size": 1}
     again = attachment.encode(Header(Origin(PublisherClass.NON_REAL_TIME, 8, 7, bytes(8), "A", "node"), 1, 4, 40))
-    ring.receiver._streams["leds"]._unpack(bytes(SIZE), again)  # by another gateway
+    ring.receiver._streams["leds"]._unpack(zenoh.ZBytes(bytes(SIZE)), again)  # by another gateway
     assert numbers(ring.sink) == [1, 2, 4]
     assert ring.stats.lost["seen before"] == 1
 
@@ -275,8 +316,8 @@ async def test_a_packet_that_raises_does_not_stop_the_others(monkeypatch: pytest
     ring = Ring(queue=99)
     unpack, stream = RxStream._unpack, ring.receiver._streams["leds"]
 
-    def faulty(data: bytes, header: bytes) -> int:
-        if data[0] == 2:
+    def faulty(data: zenoh.ZBytes, header: bytes) -> int:
+        if data.to_bytes()[0] == 2:
             raise RuntimeError(data)
         return unpack(stream, data, header)
 
@@ -418,3 +459,125 @@ async def test_who_unsubscribes_tells_those_who_publish_and_counts_what_waits() 
     assert ring.credits[-1] == (1, 4)
     assert ring.stats.received == 4
     assert (len(ring.sink.queue), ring.stats.lost) == (2, Counter({"not subscribed": 1}))  # one was being placed
+
+
+def texts(ring: Ring) -> list[str]:
+    """What waits in the queue, decoded."""
+    return [layout(Note).decode(each.data).text for each in ring.sink.queue]
+
+
+def note(text: str) -> bytes:
+    return layout(Note).encode(Note(text))
+
+
+async def test_a_packet_of_messages_of_several_lengths() -> None:
+    ring = Ring(queue=20, kind=Note)
+    ring.put_varying(1, note(""), note("two"), note("three"))
+    ring.put_varying(4, note("four"))
+    ring.put_varying(5, note("six"), note("s"))
+    await turns()
+    assert texts(ring) == ["", "two", "three", "four", "six", "s"]
+    assert numbers(ring.sink) == [1, 2, 3, 4, 5, 6]
+    assert ring.stats.bytes_received == sum(4 + len(each) for each in texts(ring))
+    assert not ring.stats.lost
+
+
+async def test_messages_without_bytes() -> None:
+    class Go(r2p.Message): ...
+
+    ring = Ring(queue=20, kind=Go)
+    ring.put_varying(1, b"")
+    ring.put_varying(2, b"", b"", b"")
+    ring.put_varying(5, b"", b"surplus")
+    await turns()
+    assert numbers(ring.sink) == [1, 2, 3, 4, 5]
+    assert ring.stats.lost == {"too long": 1}
+
+
+async def test_lengths_that_lie_are_counted() -> None:
+    ring = Ring(queue=20, kind=Note)
+    ring.put_varying(1, note("a"), lengths=(4,))
+    ring.put_varying(1, note("a"), note("b"), lengths=(5, 6))
+    ring.put_varying(1, lengths=(2**32 - 1,) * 256, payload=Uncopied(2**32 - 1))
+    ring.put_varying(1, lengths=(1, 65_536), payload=Uncopied(65_537))
+    ring.put_varying(1, note("fine"))
+    await turns()
+    assert texts(ring) == ["fine"]
+    assert ring.stats.lost == {"undecodable": 4}
+
+
+async def test_what_is_too_long_is_counted_without_a_copy_and_granted_credit() -> None:
+    ring = Ring(queue=20, kind=Note)
+    ring.put_varying(1, note("a"))
+    for serial in (2, 3):
+        ring.put_varying(serial, lengths=(64 << 20,), payload=Uncopied(64 << 20))
+    ring.put_varying(4, note("b"), bytes(101), note("c"))  # among others, of which none is lost
+    await turns()
+    assert texts(ring) == ["a", "b", "c"]
+    assert ring.stats.lost == {"too long": 3}
+    assert ring.sink.too_long == 3
+    assert ring.credits == [(1, 1), (1, 2), (1, 3), (1, 5)]
+
+
+async def test_the_bound_is_that_of_the_subscriber_with_the_highest() -> None:
+    ring = Ring(queue=20, kind=Note)
+    other = ring.subscribe(20)
+    other.size_max = layout(Long).size
+    ring.receiver.subscribe(ring.topic)
+    ring.put_varying(1, bytes(1_000_000))
+    ring.put_varying(2, lengths=(1_000_005,), payload=Uncopied(1_000_005))
+    await turns()
+    assert [len(each.data) for each in other.queue] == [1_000_000]
+    assert (ring.sink.too_long, other.too_long) == (1, 1)
+
+
+async def test_a_large_message_is_one_object_from_zenoh_to_the_fields() -> None:
+    class Picture(r2p.Message):
+        values: Annotated[r2p.Array[r2p.u8], r2p.Max(1_000_000)]
+
+    ring = Ring(queue=20, kind=Picture)
+    ring.put_varying(1, layout(Picture).encode(Picture(values=r2p.Array(bytes(500_000)))))
+    await turns()
+    (sample,) = ring.sink.queue
+    fields = layout(Picture).decode(sample.data)
+    assert fields.values.view.obj is sample.data
+    assert ring.receiver.latched_value(ring.topic) is None  # not kept either, as nobody latches it
+    assert ring.credits == [(1, 1)]
+
+
+async def test_large_messages_get_credit_one_by_one() -> None:
+    ring = Ring(queue=99, kind=Long)
+    for serial in range(1, 5):
+        ring.put_varying(serial, bytes(20_000))
+    for serial in range(5, 15):
+        ring.put_varying(serial, bytes(5_000))
+    await turns()
+    assert [serial for _, serial in ring.credits] == [1, 2, 3, 4, 8, 12]
+
+
+async def test_what_waits_for_a_slow_subscriber_is_limited_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(receive_backpressure, "BACKLOG_BYTES_MAX", 60_000)
+    ring = Ring(queue=1, kind=Long)
+    for serial in range(1, 9):
+        ring.put_varying(serial, bytes(20_000))
+    await turns()
+    assert ring.stats.lost == {"receive queue full": 3}
+    received = 0
+    while ring.sink.queue:
+        received += 1
+        ring.sink.queue.popleft()
+        ring.sink.refill()
+        await turns()
+    assert received == 5
+    ring.put_varying(9, bytes(20_000))
+    await turns()
+    assert numbers(ring.sink) == [9]
+
+
+@pytest.mark.parametrize(
+    ("kind", "window"), [(Led, WINDOW), (Note, 1489), (Long, 32), (None, 186)], ids=["short", "varies", "long", "raw"]
+)
+async def test_the_window_follows_from_the_bound(kind: type[r2p.Message] | None, window: int) -> None:
+    """It is never 0: that would be no flow control."""
+    ring = Ring(queue=9, kind=kind or Led, typed=kind is not None)
+    assert ring.receiver.window(ring.topic) == window

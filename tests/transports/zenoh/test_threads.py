@@ -48,7 +48,8 @@ def outbound(on_error: Callable[[Exception], object] = unexpected) -> OutboundTh
 
 def putting(out: OutboundThread, busy: Busy) -> Callable[..., None]:
     """What sends the packets of events."""
-    session: Any = SimpleNamespace(outbound=out, declare_publisher=lambda *_: SimpleNamespace(put=busy.call))
+    publisher = SimpleNamespace(put=busy.call)
+    session: Any = SimpleNamespace(outbound=out, declare_publisher=lambda *_, large: publisher)
     publishers = PublisherCache()
     publishers.connect(session, "r2p/lab/topic/")
     return publishers.put("leds", PublisherClass.SPORADIC)
@@ -176,7 +177,7 @@ async def test_it_takes_half_the_crowd_to_go_back() -> None:
 
 async def test_whether_messages_reach_a_subscriber_is_asked_in_the_thread() -> None:
     out, busy, publishers = outbound(), Busy(), PublisherCache()
-    session: Any = SimpleNamespace(outbound=out, declare_publisher=lambda *_: Publisher(busy))
+    session: Any = SimpleNamespace(outbound=out, declare_publisher=lambda *_, **_options: Publisher(busy))
     publishers.connect(session, "r2p/lab/topic/")
     assert not publishers.reaches("leds")
     publishers._publisher("leds", PublisherClass.NON_REAL_TIME)
