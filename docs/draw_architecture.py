@@ -28,7 +28,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "protocols.bridge",
     ),
     "Bytes": ("codecs", "messages", "msg"),
-    "Basics": ("names", "clock", "log_lines", "keys", "units", "errors", "version"),
+    "Basics": ("names", "clock", "log_lines", "keys", "units", "errors", "startup", "version"),
 }
 """What each layer is called in the picture, and its packages; a layer imports only from itself and from those below."""
 

@@ -10,6 +10,9 @@ Nodes are coroutine functions that exchange typed messages on topics; modules ru
     r2p.run(blink, via="tcp:192.168.0.10:23")
 """
 
+import r2p.startup as _startup  # noqa: F401 - first: Ctrl-C may come during what follows
+
+# isort: split
 from r2p.bridge import BridgeOptions, ClassOf, GatewayStatistics, PortStatistics, RouteStatistics
 from r2p.errors import (
     Broken,

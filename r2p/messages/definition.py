@@ -1,9 +1,12 @@
 """The metaclass of messages: its errors name the class, the field and what to write, where msgspec's name neither.
 
-It works when a class is defined, and on assignments to a message, which always fail. Packing does not pass here.
+It works when a class is defined, and on assignments to a message, which always fail. Packing does not pass here, nor
+does making a message: a `__call__` would take ten times as long, so `explain_arguments` names the class afterwards.
 """
 
+import linecache
 import re
+from types import TracebackType
 from typing import Any
 
 import msgspec
@@ -14,6 +17,10 @@ from r2p.messages.shapes import show
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 _REQUIRED = re.compile(r"Required field '(\w+)' cannot follow optional fields")
 _OPTION = re.compile(r"'(\w+)' is an invalid keyword argument for StructMeta")
+_ARGUMENTS = re.compile(
+    r"(Unexpected keyword|Missing required) argument '\w+'|Extra positional arguments|Argument '\w+' given by name and"
+)
+_CALLED = re.compile(r"[\w.]+(?=\s*\()")
 _TWO_BASES = "multiple bases have instance lay-out conflict"
 
 
@@ -89,3 +96,34 @@ def _mutable_default(name: str, namespace: dict[str, Any]) -> str | None:
         if isinstance(value, dict) and value and not field.startswith("__"):
             return f"{name}.{field}: a message can't hold a dict: nest a Message with a field for each key"
     return None
+
+
+def explain_arguments(error: BaseException) -> None:
+    """Let an error of msgspec about the arguments of a message class name the class and its fields."""
+    trace = error.__traceback__
+    if trace is None or not (isinstance(error, TypeError) and _ARGUMENTS.match(str(error))):
+        return
+    while trace.tb_next is not None:
+        trace = trace.tb_next  # up to the call of the class, which has no frame
+    cls = _called(trace)
+    if isinstance(cls, MessageMeta):
+        error.args = (f"{error}: {cls.__name__} {_fields(cls)}",)
+
+
+def _fields(cls: MessageMeta) -> str:
+    names = cls.__struct_fields__
+    return f"has the field{'' if len(names) == 1 else 's'} {', '.join(names)}" if names else "has no fields"
+
+
+def _called(trace: TracebackType) -> object:
+    """Return what the code of a frame was calling, by its source; None if that is unknown."""
+    frame = trace.tb_frame
+    line, _, column, _ = list(frame.f_code.co_positions())[trace.tb_lasti // 2]
+    source = linecache.getline(frame.f_code.co_filename, line or 0, frame.f_globals).encode()[column or 0 :]
+    if (name := _CALLED.match(source.decode(errors="replace"))) is None:
+        return None
+    first, *rest = name[0].split(".")
+    found: object = (frame.f_globals | frame.f_locals).get(first)
+    for part in rest:
+        found = getattr(found, part, None)
+    return found

@@ -23,7 +23,6 @@ from r2p.codecs.management import (
     DENIED_OTHER_KEY,
     DENIED_READ_ONLY,
     KIND_NODE,
-    ROLE_PUBLISHES,
     WIRE_VERSION,
 )
 from r2p.codecs.own_services import Operation
@@ -256,7 +255,7 @@ class LinkManager:
                 self._on_command(event.command)
             case Mismatched():
                 # Within a limit of its own: another type in each message would fill the log.
-                text = f"topic {event.topic} is refused: {describe_mismatch(event)}"
+                text = f"topic {event.topic} is refused: {event.describe()}"
                 self._log_limited(link, logging.ERROR, f"type of {event.topic}", text, _MISMATCH_LINES)
                 self._events.emit(event)
             case CommandDenied():
@@ -492,20 +491,3 @@ def describe_alias(event: AliasConflict | AliasesDiffer) -> str:
         f"topics {event.name} and {event.other} have one alias, {event.alias}: choose another one for either, {choose}"
         f"{refused}"
     )
-
-
-def describe_mismatch(event: Mismatched) -> str:
-    """Describe how the types differ, and what to do about it."""
-    role = "publish" if event.role == ROLE_PUBLISHES else "subscribe to"
-    ours, theirs = event.ours, event.theirs
-    if ours.varies and theirs.varies:
-        what = "another layout"
-    elif ours.varies:
-        what = f"messages of {theirs.size} bytes, here their length varies, which firmware can't send or receive"
-    elif theirs.varies:
-        what = f"messages of variable length, here they have {ours.size} bytes"
-    elif ours.size != theirs.size:
-        what = f"messages of {theirs.size} bytes, here they have {ours.size}"
-    else:
-        what = f"another layout of the same {ours.size} bytes"
-    return f"others {role} {what}; use one message type on both sides, or another topic"

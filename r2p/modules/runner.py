@@ -16,6 +16,7 @@ import os
 import signal
 import sys
 import threading
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable
 from types import FrameType, TracebackType
 from typing import Any, Self, TypeVar
@@ -80,7 +81,11 @@ def _named(
         raise Error("r2p.run has no function to run: pass at least one, as in r2p.run(blink)")
     if name is not None and len(named) != 1:
         raise Error(f"name={name!r} names one function, not {len(named)}: write (name, function) for each")
-    return [(node_name(node), function) for node, function in named]
+    nodes = [(node_name(node), function) for node, function in named]
+    for node, count in Counter(node for node, _ in nodes).items():
+        if count > 1:
+            raise Error(f'r2p.run has {count} nodes named {node}: write ("another_name", {node}) for one of them')
+    return nodes
 
 
 def _pair(each: NodeFunction | tuple[str, NodeFunction], name: str | None) -> tuple[str, NodeFunction]:

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 from r2p.clock import Backoff, in_background, random_of
 from r2p.errors import Error, NameTooLong
+from r2p.messages.definition import explain_arguments
 from r2p.modules.unwinding import cleans_up, ends
 from r2p.names import NODE_MAX, node_name
 from r2p.runtime.node import Node
@@ -179,6 +180,7 @@ class Supervisor:
             error = await self._try()
             if error is None:
                 return
+            explain_arguments(error)
             self.node.log.error("node %s crashed: %s: %s", self.node.name, type(error).__name__, error, exc_info=error)
             if self._stopping or not self._restart:
                 error.add_note(f"in node {self.node.name} of module {self.node.module}")

@@ -326,7 +326,11 @@ class Subscriber(Generic[T]):
         count = self.publishers
         known = "its publisher is silent" if count == 1 else f"its {count} publishers are silent"
         stale = f", and {self.stale} messages so far were older than max_age" if self.stale else ""
-        return f"{text}; {known if count else 'it has no publisher yet'}{stale}"
+        return f"{text}; {known if count else self._without_publisher()}{stale}"
+
+    def _without_publisher(self) -> str:
+        differ = (link.publishers_differ(self._topic) for link in self._space.links)
+        return next(filter(None, differ), "it has no publisher yet")
 
     def _two_readers(self) -> RuntimeError:
         return RuntimeError(f"two tasks read one subscription of {self.topic}: subscribe once for each task")

@@ -293,6 +293,9 @@ class LinkView(Protocol):
     def inadmissible(self, size: int, period: float, *, varies: bool = False) -> str | None:
         """Return the reason why slots for `size` bytes each `period` seconds are impossible, if there is one."""
 
+    def publishers_differ(self, topic: Topic) -> str | None:
+        """Describe how the type of the publishers behind the link differs, if it does, so that nothing is received."""
+
     def network_time(self) -> int | None:
         """Return the time (ns) that all nodes of the link's network share; None without one, or if it is unknown."""
 

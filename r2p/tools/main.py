@@ -15,7 +15,8 @@ import typer
 from typer.core import TyperGroup
 
 from r2p.log_lines import wrapped
-from r2p.tools.output import INTERRUPTED, abandon_stdout, notify
+from r2p.startup import INTERRUPTED, raise_on_interrupt
+from r2p.tools.output import abandon_stdout, notify
 
 GROUPS = {
     "topic": ("r2p.tools.topic", "List, watch, publish and measure topics."),
@@ -114,8 +115,9 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line: the entry point of the `r2p` script."""
-    _open_missing_streams()
     try:
+        raise_on_interrupt()
+        _open_missing_streams()
         app(prog_name="r2p")
     except OSError as error:
         if error.errno != errno.ENOSPC:

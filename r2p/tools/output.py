@@ -37,10 +37,6 @@ _PART = re.compile(r"[^/?&,:]*[/?&,:]+|[^/?&,:]+")  # of a URL or a path, with t
 _ATOMIC = 4096  # bytes that a writable pipe accepts without blocking (POSIX: at least 512)
 
 
-INTERRUPTED = 130
-"""The exit code of a command that a signal ended before it was done, as shells have it for SIGINT."""
-
-
 class PipeClosed(Exception):
     """The reader of the output has closed the pipe: the command ends with exit code 0."""
 

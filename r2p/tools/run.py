@@ -68,9 +68,9 @@ async def command(
     """
     chosen = settings(via)
     check_urls(chosen.via, chosen.via_source)
+    names = chosen.remap | _parse_remap(remap or ())
     programs = load(functions)
     priorities = _parse_priorities(priority or (), programs)
-    names = chosen.remap | _parse_remap(remap or ())
     async with r2p.Module(module or chosen.module, via=chosen.via, remap=names, aliases=chosen.aliases) as host:
         for program in programs:
             host.start(program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart)
@@ -148,7 +148,9 @@ def _parse_remap(remap: Iterable[str]) -> dict[str, str]:
         old, found, new = each.partition(":=")
         if not found:
             raise UsageError(f"--remap {each}: write it as OLD:=NEW, for example encoder:=encoder1")
-        names[topic_name(old)] = topic_name(new)
+        topic, other = topic_name(old), topic_name(new)
+        if names.setdefault(topic, other) != other:
+            raise UsageError(f"--remap renames {topic} twice, to {names[topic]} and to {other}: leave out one of them")
     return names
 
 

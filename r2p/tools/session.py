@@ -36,11 +36,12 @@ import typer
 import r2p
 from r2p.clock import random_of
 from r2p.log_lines import printable
+from r2p.startup import INTERRUPTED
 from r2p.tools.config import Settings as Settings
 from r2p.tools.config import UsageError as UsageError
 from r2p.tools.config import settings as settings
 from r2p.tools.options import Quiet, Verbose, Via
-from r2p.tools.output import INTERRUPTED, PipeClosed, Unwritable, abandon_stdout, log_to_stderr, notify
+from r2p.tools.output import PipeClosed, Unwritable, abandon_stdout, log_to_stderr, notify
 from r2p.transports.url import open_transport
 
 B = TypeVar("B", bound=Callable[..., Awaitable[None]])
@@ -48,6 +49,8 @@ Opening = Callable[[Settings], contextlib.AbstractAsyncContextManager[Any]]
 """Opens what a command works on instead of a Session."""
 Endless = Callable[[Mapping[str, Any]], bool]
 """Says of the arguments and options of a command whether it goes on until a signal ends it."""
+Check = Callable[[Settings, Mapping[str, Any]], object]
+"""Raises UsageError for arguments and options that can't be right, whatever the network has."""
 
 REPORT_WAITING_AFTER = 1.0
 """Seconds that a command waits before it reports what it waits for."""
@@ -350,8 +353,18 @@ def counts_without_end(given: Mapping[str, Any]) -> bool:
     return "count" in given and given["count"] is None and not given.get("once")
 
 
+def _check_count(given: Mapping[str, Any]) -> None:
+    if given.get("once") and given.get("count") not in (None, 1):
+        raise UsageError(f"--once is -n 1, not -n {given['count']}: leave out one of them")
+
+
 def command(
-    app: typer.Typer, name: str, *, opening: Opening | None = None, endless: Endless = counts_without_end
+    app: typer.Typer,
+    name: str,
+    *,
+    opening: Opening | None = None,
+    endless: Endless = counts_without_end,
+    check: Check | None = None,
 ) -> Callable[[B], B]:
     """Make a command of `app` from the coroutine function that this decorates, and return the function unchanged.
 
@@ -359,7 +372,7 @@ def command(
     """
 
     def register(body: B) -> B:
-        app.command(name)(joined(body, opening=opening, endless=endless))
+        app.command(name)(joined(body, opening=opening, endless=endless, check=check))
         return body
 
     return register
@@ -371,9 +384,11 @@ def joined(
     opening: Opening | None = None,
     endless: Endless = counts_without_end,
     keep_trying: bool = False,
+    check: Check | None = None,
 ) -> Callable[..., None]:
     """Make a command for `main.COMMANDS` of a coroutine function that takes a Session, or what `opening` opens.
 
+    `check` comes before any link is opened, whose warnings would stand above its error.
     Unless it is to `keep_trying`, the command fails as soon as no link can come up.
     """
     node = body.__name__.strip("_")
@@ -381,6 +396,9 @@ def joined(
     def run(*, via: list[str] | None, verbose: int, quiet: int, **given: Any) -> None:
         async def main() -> None:
             chosen = settings(via, tool=True)
+            _check_count(given)
+            if check is not None:
+                check(chosen, given)
             async with join(chosen, name=node, verbose=verbose) if opening is None else opening(chosen) as opened:
                 if opening is not None or keep_trying:
                     await body(opened, **given)

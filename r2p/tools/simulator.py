@@ -141,7 +141,9 @@ async def simulate(
     bridge = BridgeOptions(allow_control=allow_control)
     robot = Triskar2(f"sim:{_NAME}", seed=seed, world=world, outside=[*outside, _INSIDE], options=bridge)
     async with robot, r2p.Module("PC1", via=_INSIDE, watchdog=False) as pc:
-        screen.print(f"Triskar2 starts: {len(robot.modules)} modules on a simulated RTCAN bus")
+        screen.print(
+            f"Triskar2 starts: {len(robot.modules)} modules on a simulated RTCAN bus, which settles in about 2 s"
+        )
         with contextlib.suppress(TimeoutError):  # on a computer that is too slow: show the robot as it is
             await robot.ready(_READY)
         reader = FiguresReader(robot, can, [pc])

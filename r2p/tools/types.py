@@ -104,7 +104,8 @@ def _load_all(text: str) -> list[type[r2p.Message]]:
 
 
 def _similar(where: str, name: str) -> str:
-    classes = [key for key, value in vars(load_module(where)).items() if isinstance(value, type)]
+    values = vars(load_module(where)).items()
+    classes = [key for key, value in values if isinstance(value, type) and issubclass(value, r2p.Message)]
     close = difflib.get_close_matches(name, classes, n=1)
     return f"; did you mean {where}:{close[0]}?" if close else "; write package.module:Class or FILE.py:Class"
 

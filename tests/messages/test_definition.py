@@ -2,13 +2,15 @@
 
 import dataclasses
 import traceback
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import msgspec
 import pytest
 
 import r2p
 from r2p import MessageError
+from r2p.messages.definition import explain_arguments
 
 NAMES = {"r2p": r2p, "Message": r2p.Message, "u8": r2p.u8, "dataclass": dataclasses.dataclass, "ClassVar": ClassVar}
 BASE = """
@@ -86,3 +88,36 @@ def test_tracebacks_of_packing_have_no_frames_without_source() -> None:
         with pytest.raises(r2p.Error) as caught:
             fails()
         assert all(frame.line for frame in traceback.extract_tb(caught.tb))
+
+
+MODULE: Any = r2p
+
+
+class Lamp(r2p.Message):
+    red: r2p.u8
+    green: r2p.u8 = 0
+
+
+ANY_LAMP: Any = Lamp  # whose wrong arguments a type checker does not find
+
+
+def not_a_lamp(**fields: int) -> None:
+    raise TypeError(f"Unexpected keyword argument {next(iter(fields))!r}")
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        (lambda: (1, ANY_LAMP(idx=1)), "Unexpected keyword argument 'idx': Lamp has the fields red, green"),
+        (lambda: ANY_LAMP(1, 2, 3), "Extra positional arguments provided: Lamp has the fields red, green"),
+        (lambda: ANY_LAMP(), "Missing required argument 'red': Lamp has the fields red, green"),
+        (lambda: MODULE.Timestamp(red=2), "Unexpected keyword argument 'red': Timestamp has the fields sec, nsec"),
+        (lambda: not_a_lamp(idx=1), "Unexpected keyword argument 'idx'"),
+    ],
+)
+def test_wrong_arguments_of_a_message_name_its_class_and_fields(make: Callable[[], object], error: str) -> None:
+    with pytest.raises(TypeError) as caught:
+        make()
+    explain_arguments(caught.value)
+    assert str(caught.value).startswith(error)
+    assert str(caught.value).count("has the fields") == error.count("has the fields")

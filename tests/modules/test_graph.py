@@ -9,7 +9,6 @@ from r2p.codecs import management
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES, WIRE_VERSION
 from r2p.messages import layout
 from r2p.modules.graph import Endpoint, ModuleView
-from r2p.modules.link_manager import describe_mismatch
 from r2p.msg import Led
 from r2p.protocols.discovery.events import Mismatched, TopicType
 from tests.bench import hold, joined, local, settle
@@ -120,7 +119,7 @@ async def test_another_wire_version_is_reported_once(caplog: pytest.LogCaptureFi
 
 def test_a_mismatch_is_described_with_what_to_do() -> None:
     ours, longer, other = TopicType(5, b"12345678"), TopicType(9), TopicType(5, b"abcdefgh")
-    by_size = describe_mismatch(Mismatched("leds", None, ROLE_PUBLISHES, ours, longer))
+    by_size = Mismatched("leds", None, ROLE_PUBLISHES, ours, longer).describe()
     assert by_size.startswith("others publish messages of 9 bytes, here they have 5; use one message type")
-    by_type = describe_mismatch(Mismatched("leds", None, ROLE_SUBSCRIBES, ours, other))
+    by_type = Mismatched("leds", None, ROLE_SUBSCRIBES, ours, other).describe()
     assert by_type.startswith("others subscribe to another layout of the same 5 bytes")

@@ -340,6 +340,8 @@ async def test_another_layout_is_refused_and_both_sides_report_it(caplog: pytest
         await publisher.publish(led(1))
         await settle(1.0)
         assert not leds.queue
+        with pytest.raises(TimeoutError, match=r"within 1 s; others publish messages of 5 bytes, "):
+            await leds.fetch(timeout=1)
         assert (a.network.topics()["leds"].mismatch, b.network.topics()["leds"].mismatch) == (True, True)
     for stream in events:
         assert [event.topic async for event in stream if isinstance(event, Mismatched)] == ["leds"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -39,6 +40,11 @@ def test_every_command_has_help(name: str) -> None:
         (["topic", "list", "--format", "xml"], "Invalid value for '--format': 'xml' is not one of 'yaml'"),
         (["topic", "hz", "leds", "-n", "x"], "Invalid value for '--count' / '-n': write a whole number\n"),
         (["topic", "hz", "leds", "-n", "0"], "Invalid value for '--count' / '-n': write a number of at least 1\n"),
+        (["topic", "hz", "leds", "--once", "-n", "5"], "--once is -n 1, not -n 5: leave out one of them"),
+        (
+            ["run", "r2p.sim:run", "--remap", "a:=b", "--remap", "a:=c"],
+            "--remap renames a twice, to b and to c: leave out one of them",
+        ),
         (["bus", "admit", "imu:1@1s", "--slots", "65"], "'--slots': write a number of at most 64\n"),
         (["bus", "admit", "imu:1@1MHz"], "'1MHz': write a rate as in 200Hz"),
     ],
@@ -47,6 +53,30 @@ def test_mistakes_are_usage_errors(arguments: list[str], hint: str) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert hint in result.stderr
+
+
+@pytest.mark.parametrize("program", ["r2p", "-m"])
+def test_ctrl_c_while_the_command_is_imported_ends_it_in_silence(program: str, tmp_path: Path) -> None:
+    (tmp_path / "msgspec.py").write_text(
+        "import os, signal\n\nos.kill(os.getpid(), signal.SIGINT)\nprint('survived')\n"
+    )
+    script = tmp_path / "bin" / "r2p"
+    script.parent.mkdir()
+    script.write_text("from r2p.tools.main import main\n\nmain()\n")
+    arguments = [str(script)] if program == "r2p" else ["-m", "r2p"]
+    path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    ended = subprocess.run(
+        [sys.executable, *arguments], env=os.environ | {"PYTHONPATH": path}, capture_output=True, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, b"", b"")
+
+
+@pytest.mark.parametrize("command", ["echo", "pub"])
+def test_a_wrong_type_is_reported_before_links_are_opened(command: str) -> None:
+    result = CliRunner().invoke(app, ["topic", command, "leds", "--type", "Lde", "--via", "tcp:127.0.0.1:1"])
+    assert result.exit_code == 2
+    assert "r2p.msg has no message class 'Lde'; did you mean r2p.msg:Led?" in result.stderr
+    assert "link tcp:" not in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -186,6 +186,26 @@ class Mismatched(msgspec.Struct, frozen=True):
     ours: TopicType
     theirs: TopicType
 
+    def describe(self) -> str:
+        """Describe how the types differ, and what to do about it."""
+        return describe_mismatch(self.role, self.ours, self.theirs)
+
+
+def describe_mismatch(role: int, ours: TopicType, theirs: TopicType) -> str:
+    """Describe how the type of peers in a role differs from this module's, and what to do about it."""
+    verb = "publish" if role == management.ROLE_PUBLISHES else "subscribe to"
+    if ours.varies and theirs.varies:
+        what = "another layout"
+    elif ours.varies:
+        what = f"messages of {theirs.size} bytes, here their length varies, which firmware can't send or receive"
+    elif theirs.varies:
+        what = f"messages of variable length, here they have {ours.size} bytes"
+    elif ours.size != theirs.size:
+        what = f"messages of {theirs.size} bytes, here they have {ours.size}"
+    else:
+        what = f"another layout of the same {ours.size} bytes"
+    return f"others {verb} {what}; use one message type on both sides, or another topic"
+
 
 class NameConflict(msgspec.Struct, frozen=True):
     """Two modules have the same name; `instance_a` or `instance_b` is None for firmware."""

@@ -6,7 +6,7 @@ A command reports what it waits for, and suggests other topics where the name ma
 import asyncio
 import contextlib
 import difflib
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -15,8 +15,8 @@ import r2p
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
 from r2p.tools.options import valid_topic
 from r2p.tools.output import notify
-from r2p.tools.session import Session, UsageError, call_after, settings, wait_until
-from r2p.tools.types import complete_type, describe_other
+from r2p.tools.session import Session, Settings, UsageError, call_after, settings, wait_until
+from r2p.tools.types import Types, complete_type, describe_other
 
 
 def _complete_topic(incomplete: str) -> list[str]:
@@ -45,6 +45,12 @@ TypeName = Annotated[
         "default: from r2p.toml or the peer.",
     ),
 ]
+
+
+def check_type(settings: Settings, given: Mapping[str, Any]) -> None:
+    """Raise UsageError if --type names no message class."""
+    if given["type"]:
+        Types(settings).load(given["type"])
 
 
 AnyPublisher = r2p.Publisher[Any] | r2p.SporadicPublisher[Any] | r2p.PeriodicPublisher[Any]

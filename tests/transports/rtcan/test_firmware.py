@@ -7,7 +7,6 @@ import pytest
 
 import r2p
 from r2p.codecs import management, rtcan
-from r2p.modules.link_manager import describe_mismatch
 from r2p.msg import PWM2, Led, Velocity3
 from r2p.protocols.discovery.events import Mismatched
 from r2p.protocols.rtcan.events import Profile
@@ -119,7 +118,7 @@ async def test_topics_of_variable_length_are_none_for_firmware_and_r2p_says_why(
         while len(reasons) < 2:
             event = await anext(events)
             if isinstance(event, Mismatched):
-                reasons[event.topic] = describe_mismatch(event)
+                reasons[event.topic] = event.describe()
         await publisher.publish(Words(text="twelve"))
         await asyncio.sleep(2.0)
         assert reasons == {
