@@ -286,7 +286,7 @@ class Robot:
         ([LONG], None, r2p.NameTooLong, f"pass name='{SHORT}', or ('{SHORT}', {LONG.__name__}) to r2p.run"),
         ([wink, ("L" * 65, wink)], None, r2p.NameTooLong, "has 65 characters, at most 64 are possible: shorten it"),
         ([wink], "", r2p.InvalidName, "node name ''"),
-        ([wink, wink], None, r2p.Error, r"2 nodes named wink: write \(\"another_name\", wink\)"),
+        ([wink, wink], None, r2p.Error, '2 nodes named wink: write ("another_name", wink) for one'),
         ([wink, line_follower], "x", r2p.Error, "name='x' names one function, not 2: write (name, function)"),
         ([], None, r2p.Error, "has no function to run"),
         ([mock.Mock], None, r2p.Error, "class Mock is not a coroutine function: pass a method, Mock().METHOD"),
