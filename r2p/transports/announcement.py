@@ -3,7 +3,8 @@
 import msgspec
 
 from r2p.codecs.management import ANY_TYPE, CLASS_LATCHES, NO_PARAMS, QUEUE, ROLE_PUBLISHES, ROLE_SUBSCRIBES
-from r2p.protocols.discovery.events import TopicType
+from r2p.protocols.discovery.directory import TopicInfo
+from r2p.protocols.discovery.events import TopicType, describe_mismatch
 from r2p.runtime.topic import Topic
 
 
@@ -32,6 +33,12 @@ def type_of(topic: Topic) -> TopicType:
     """The size and fingerprint of a topic's messages, as far as this module knows them."""
     layout = topic.layout
     return TopicType() if layout is None else TopicType(layout.size, layout.fingerprint, layout.varies)
+
+
+def refused_publishers(topic: Topic, info: TopicInfo | None) -> str | None:
+    """Describe how the type of the publishers at the other end of a link differs from this module's, if it does."""
+    ours, theirs = type_of(topic), info.types.get(ROLE_PUBLISHES) if info is not None and info.mismatch else None
+    return None if theirs is None or ours.fits(theirs) else describe_mismatch(ROLE_PUBLISHES, ours, theirs)
 
 
 def announcement_of(topic: Topic) -> Announcement:

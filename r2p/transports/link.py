@@ -17,12 +17,7 @@ import msgspec
 
 from r2p.clock import Alarm
 from r2p.codecs import management
-from r2p.codecs.management import (
-    FLAG_BOOT,
-    NO_PARAMS,
-    QUEUE,
-    ROLE_PUBLISHES,
-)
+from r2p.codecs.management import FLAG_BOOT, NO_PARAMS, QUEUE
 from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
 from r2p.names import CARRIED_MAX, TOPIC_FIELD
@@ -39,7 +34,6 @@ from r2p.protocols.discovery.events import (
     Send,
     SubscriberJoined,
     SubscribersGone,
-    describe_mismatch,
     possible_senders,
 )
 from r2p.protocols.discovery.session import Discovery, DiscoveryProtocol
@@ -47,7 +41,7 @@ from r2p.protocols.keys import LinkEnd, Verdict
 from r2p.runtime.backpressure import LINK_DOWN, WaitQueue
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.topic import RemoteSubscriber, Topic, TopicSpace
-from r2p.transports.announcement import NOTHING, Announcement, announcement_of, type_of
+from r2p.transports.announcement import NOTHING, Announcement, announcement_of, refused_publishers
 from r2p.transports.call_channel import CallChannel
 from r2p.transports.guard import LinkGuard, key_protocol
 from r2p.transports.stats import RETRY_AFTER_ERROR, LinkStats, LoggedCounter
@@ -380,9 +374,7 @@ class Link(abc.ABC):
 
     def publishers_differ(self, topic: Topic) -> str | None:
         """Describe how the type of the publishers at the other end differs from this module's; None if it fits."""
-        info, ours = self.discovery.topics.get(topic.name), type_of(topic)
-        theirs = info.types.get(ROLE_PUBLISHES) if self.up and info is not None and info.mismatch else None
-        return None if theirs is None or ours.fits(theirs) else describe_mismatch(ROLE_PUBLISHES, ours, theirs)
+        return refused_publishers(topic, self.discovery.topics.get(topic.name)) if self.up else None
 
     def network_time(self) -> int | None:
         """Return the time (ns) that all nodes of the network share; None without one, or if it is unknown."""
