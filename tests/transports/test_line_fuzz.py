@@ -61,7 +61,8 @@ def _value(chance: random.Random, name: str, kind: object) -> Any:
             return chance.choice(KNOWN[name])
         return "".join(chance.choices(LETTERS, k=chance.randint(0, LENGTHS[name])))
     if kind is bytes:
-        size = {"params": 10, "fingerprint": 8, "highs": 24, "acks": chance.choice([12, 18])}.get(name, 18)
+        sizes = {"params": 10, "fingerprint": 8, "highs": 24, "acks": chance.choice([12, 18]), "nonce": 16, "tag": 16}
+        size = sizes.get(name, 18)
         return chance.choice([bytes(size), chance.randbytes(size)])
     return chance.getrandbits(chance.choice([0, 1, 2, 3, 8, 16, 32, 64]))
 
