@@ -70,6 +70,11 @@ class Firmware:
         self._network.send(Datagram(self._port, topic.encode(), data))
 
 
+def keep_types(module: r2p.Module) -> None:
+    """Let a module answer as if it had no types: a tool does not learn those of its topics."""
+    module._opened.own_services._handlers.clear()
+
+
 def printed(capsys: pytest.CaptureFixture[str]) -> list[Any]:
     """What was printed as JSON lines since the last call."""
     return [json.loads(line) for line in capsys.readouterr().out.splitlines()]

@@ -13,7 +13,7 @@ from r2p.tools.service import call, find, info, list_
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.list import list_ as topics
 from tests.services.common import Add, add
-from tests.tools.rig import Firmware, printed, robot, tool
+from tests.tools.rig import Firmware, keep_types, printed, robot, tool
 
 pytestmark = pytest.mark.virtual_time
 
@@ -57,6 +57,10 @@ async def test_list_info_and_find(capsys: pytest.CaptureFixture[str]) -> None:
             await info(session, "sub")
     async with robot(serve), tool() as session:
         await list_(session)
+        assert printed(capsys) == [row | {"callers": []}], "the module gives the types"
+    async with robot(serve) as module, tool() as session:
+        keep_types(module)
+        await list_(session)
         assert printed(capsys) == [row | {"type": None, "callers": []}]
 
 
@@ -81,6 +85,10 @@ async def test_call_prints_the_response(capsys: pytest.CaptureFixture[str], requ
 
 async def test_call_takes_the_type_and_the_server_as_options(capsys: pytest.CaptureFixture[str]) -> None:
     async with robot(serve), tool() as session:
+        await call(session, "add", ["a=1"])
+        assert printed(capsys) == [{"total": 1, "spare": [0, 0, 0]}], "the module gives the types"
+    async with robot(serve) as module, tool() as session:
+        keep_types(module)
         await call(session, "add", type=TYPE, server="BOT")
         assert printed(capsys) == [{"total": 0, "spare": [0, 0, 0]}]
         with pytest.raises(UsageError, match=r"the types of service add are unknown: give --type"):

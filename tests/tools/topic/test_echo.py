@@ -12,7 +12,7 @@ import r2p
 from r2p.msg import GatewayStatus, Header, LaserScan, Led, StampedPose3, Velocity3
 from r2p.tools.session import TimedOut, UsageError
 from r2p.tools.topic.echo import QUEUE, echo
-from tests.tools.rig import Firmware, printed, robot, tool
+from tests.tools.rig import Firmware, keep_types, printed, robot, tool
 
 
 class Private(r2p.Message):
@@ -175,11 +175,6 @@ async def test_a_type_whose_code_is_elsewhere_is_asked_for(capsys: pytest.Captur
     async with robot(secrets), tool() as session:
         await echo(session, ["secrets"], once=True)
     assert printed(capsys) == [{"secret": 0x1234}]
-
-
-def keep_types(module: r2p.Module) -> None:
-    """Let a module answer as if it had no types."""
-    module._opened.own_services._handlers.clear()
 
 
 @pytest.mark.virtual_time
