@@ -9,6 +9,7 @@ from benchmarks.table import show
 
 ALL = (
     "delivery",
+    "calls",
     "priority",
     "codecs",
     "network",

@@ -176,11 +176,11 @@ class Topic:
 
     def deliver_by(self, link: str, sample: Sample) -> list[Sink] | None:
         """Offer the sample only to the subscribers behind one link, or to all if there are none; as `deliver`."""
-        behind = [each for each in self.remote_subscribers if each.link_name == link]
-        if not behind:
-            return self.deliver(sample)
-        blocked = self._send(behind, sample, None, None)
-        return blocked if blocked is None else self._remaining(blocked)
+        for remote in self.remote_subscribers:
+            if remote.link_name == link:
+                blocked = self._send([remote], sample, None, None)
+                return blocked if blocked is None else self._remaining(blocked)
+        return self.deliver(sample)
 
     def _remaining(self, sinks: list[Sink]) -> list[Sink] | None:
         """Leave out sinks that left meanwhile: they would never have room."""
@@ -303,6 +303,15 @@ class LinkView(Protocol):
         """Wait until the link has admitted the topic."""
 
 
+class CallNumbers:
+    """The numbers of a module's calls of one service."""
+
+    def __init__(self) -> None:
+        self.last = 0
+        self.open: set[int] = set()
+        """The numbers of calls without an answer."""
+
+
 class TopicSpace:
     """The topics of one module, by name; its links are informed of changes by `changed`."""
 
@@ -312,8 +321,8 @@ class TopicSpace:
         self.module = module
         self.instance = 0
         """The random 32-bit number of this run of the module."""
-        self.call_numbers: dict[str, int] = {}
-        """The number of the last call of each service: kept here, as no restart of a node may begin anew."""
+        self.call_numbers: dict[str, CallNumbers] = {}
+        """Those of each service: kept here, as all clients share them, and no restart of a node may begin anew."""
         self.loop = loop
         self.clock = clock
         self.aliases = aliases or {}

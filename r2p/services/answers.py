@@ -31,6 +31,9 @@ class RememberedAnswers:
     def __len__(self) -> int:
         return len(self._answers)
 
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        return key in self._answers
+
     def __iter__(self) -> Iterator[tuple[int, int]]:
         return iter(self._answers)
 
@@ -47,21 +50,19 @@ class RememberedAnswers:
 
     def put(self, instance: int, number: int, data: bytes, now: int, lifetime: int) -> None:
         """Remember an answer for `lifetime` (ns), as long as there is room."""
-        key = instance, number
-        if key in self._answers:
+        answers, key = self._answers, (instance, number)
+        if key in answers:
             self._forget(key)
-        self._answers[key] = _Answer(data, now + lifetime)
-        numbers = self._of_client.setdefault(instance, {})
+        answers[key] = _Answer(data, now + lifetime)
+        numbers = self._of_client.get(instance)
+        if numbers is None:
+            numbers = self._of_client[instance] = {}
         numbers[number] = None
         self.size += len(data) + _OVERHEAD
         if len(numbers) > CLIENT_MAX:
             self._forget((instance, next(iter(numbers))))
-        while self._answers and (self.size > BYTES_MAX or self._oldest.until < now):
-            self._forget(next(iter(self._answers)))
-
-    @property
-    def _oldest(self) -> _Answer:
-        return next(iter(self._answers.values()))
+        while self.size > BYTES_MAX:
+            self._forget(next(iter(answers)))
 
     def _forget(self, key: tuple[int, int]) -> None:
         instance, number = key

@@ -10,20 +10,20 @@ the calls whose time is over.
 import asyncio
 import difflib
 from types import TracebackType
-from typing import Any, Generic, Self
+from typing import Any, Generic, Self, cast
 
 import msgspec
 
 from r2p.clock import LONGEST, SHORTEST, Alarm, check_seconds, check_timeout
 from r2p.codecs import services
-from r2p.codecs.services import HEADER_SIZE, NUMBERS, Kind, ServiceHeader
+from r2p.codecs.services import HEADER_SIZE, NUMBERS, Kind
 from r2p.errors import Closed, DecodeError, Error, MessageError, NoServer, ServiceBusy, ServiceError
 from r2p.messages import Message
 from r2p.runtime.queues import EndpointOwner, Pulse
 from r2p.runtime.sample import Sample
-from r2p.runtime.topic import TopicSpace
+from r2p.runtime.topic import CallNumbers, TopicSpace
 from r2p.services.definition import Definition, Q, R
-from r2p.services.server import Handling, ServiceServer, current_handling, server_of
+from r2p.services.server import CURRENT, Handling, ServiceServer, server_of
 from r2p.services.servers import KnownServers, RemoteServer
 from r2p.services.topics import Inlet, Outlet
 from r2p.units import MILLISECOND, SECOND
@@ -53,46 +53,28 @@ class Target(msgspec.Struct, frozen=True):
     lossless: bool
 
 
-class Call:
-    """One call, from its request to its answer."""
+class Call(msgspec.Struct, eq=False):
+    """One call, from its request to its answer. All instants are monotonic ns.
 
-    __slots__ = (
-        "data",
-        "deadline",
-        "future",
-        "handling",
-        "key",
-        "kind",
-        "pause",
-        "repeat_at",
-        "response",
-        "server",
-        "target",
-        "text",
-        "tries",
-    )
+    `key` is its number; of a call within the module, the call itself. `server` is the module that was asked for,
+    `handling` the request in this module's server, `target` the server in another module, `data` the packed request.
+    `pause` is how long to wait (ns) after the next repetition, `tries` how many cancellations may still be sent.
+    `kind`, `response` and `text` are the answer.
+    """
 
-    def __init__(self, future: asyncio.Future[None], key: object, deadline: int, server: str | None) -> None:
-        self.future = future
-        self.key: Any = key
-        """Its number; of a call within the module, the call itself."""
-        self.deadline = deadline
-        """Monotonic ns."""
-        self.server = server
-        """The module that was asked for."""
-        self.handling: Handling | None = None
-        """The request in this module's server."""
-        self.target: Target | None = None
-        self.data = b""
-        self.pause = 0
-        """Ns until the next repetition but one."""
-        self.repeat_at = deadline
-        """Monotonic ns."""
-        self.tries = _CANCELS
-        """Cancellations that may still be sent."""
-        self.kind = Kind.ERROR
-        self.response: Any = None
-        self.text = ""
+    future: asyncio.Future[None]
+    key: Any
+    deadline: int
+    server: str | None
+    handling: Handling | None = None
+    target: Target | None = None
+    data: bytes = b""
+    repeat_at: int = 0
+    pause: int = 0
+    tries: int = _CANCELS
+    kind: Kind = Kind.ERROR
+    response: Any = None
+    text: str = ""
 
 
 class ServiceClient(Generic[Q, R]):
@@ -115,6 +97,11 @@ class ServiceClient(Generic[Q, R]):
         self._definition = definition
         self._request_type = definition.request.cls
         self._encode = definition.request.encode
+        self._decode = definition.response.decode
+        self._size = definition.requests.exact_size
+        self._numbers = space.call_numbers.setdefault(definition.name, CallNumbers())
+        self._targets: dict[str | None, Target] = {}
+        """The servers of calls by the module that was asked for, while discovery does not change."""
         self._shares = definition.request.packing.shares
         self._calls: dict[Any, Call] = {}
         self._cancelled: dict[int, Call] = {}
@@ -160,7 +147,9 @@ class ServiceClient(Generic[Q, R]):
                 raise TimeoutError(self._lacks_server(None, f" within {timeout:g} s"))
             await self._look_again(end)
 
-    async def call(self, request: Q, timeout: float = 1.0, server: str | None = None) -> R:
+    async def call(  # noqa: C901 - in one function, as each call passes here
+        self, request: Q, timeout: float = 1.0, server: str | None = None
+    ) -> R:
         """Send a request, and return the response.
 
         `server` names the module to call, where several serve the service; otherwise one in this module comes first,
@@ -179,7 +168,7 @@ class ServiceClient(Generic[Q, R]):
             wanted = self._request_type.__name__
             raise MessageError(f"service {self.name} takes {wanted}, not {type(request).__name__}")
         data = self._encode(request)  # also for a call within the module: what no other could send is refused here, too
-        calling = current_handling()
+        calling = CURRENT.get()
         if calling is not None:
             calling.call_begins()
         try:
@@ -190,11 +179,19 @@ class ServiceClient(Generic[Q, R]):
             if isinstance(found, Target):
                 call = self._call_remote(found, data, left, server)
             else:
-                if self._shares is not None and not self._shares(request):  # somebody could write into it
-                    request = self._definition.request.decode(data)
-                call = self._begin(left, server)
-                call.handling = found.submit(call, request, self._answered_here)
-            return await self._result(call, timeout)
+                call = self._call_here(found, request, data, left)
+            try:
+                await call.future
+            except TimeoutError:
+                raise TimeoutError(f"{self._name_of(call)} did not answer within {timeout:g} s{self._down()}") from None
+            except asyncio.CancelledError:
+                self._give_up(call, "cancelled by its caller")
+                raise
+            finally:
+                self._end(call)
+            if call.kind is Kind.RESPONSE:
+                return cast("R", call.response)
+            raise self._failure(call)
         finally:
             if calling is not None:
                 calling.call_ends()
@@ -209,7 +206,8 @@ class ServiceClient(Generic[Q, R]):
             if not call.future.done():
                 call.future.set_exception(self._is_closed())
         self._calls.clear()
-        self._cancelled.clear()
+        for number in list(self._cancelled):
+            self._forget_cancelled(number)
         self._alarm.close()
         self._inlet.close()
         self._outlet.close()
@@ -226,42 +224,45 @@ class ServiceClient(Generic[Q, R]):
 
     # A call
 
-    def _begin(self, timeout: float, server: str | None, number: int | None = None) -> Call:
-        """Enter a call; without a number, one within the module."""
-        deadline = self._space.clock.monotonic() + round(timeout * SECOND)
-        call = Call(self._space.loop.create_future(), number, deadline, server)
-        if number is None:
-            call.key = call
-        self._calls[call.key] = call
+    def _call_here(self, server: ServiceServer[Any, Any], request: Any, data: bytes, timeout: float) -> Call:
+        """Hand a request to a server in this module."""
+        if self._shares is not None and not self._shares(request):  # somebody could write into it
+            request = self._definition.request.decode(data)
+        deadline = self._space.clock.monotonic() + int(timeout * SECOND)
+        call = Call(self._space.loop.create_future(), None, deadline, None)
+        call.key = call
+        self._calls[call] = call
         if not self._alarm_at or deadline < self._alarm_at:
             self._set_alarm(deadline)
+        call.handling = server.submit(call, request, self._answered_here)
         return call
 
     def _call_remote(self, target: Target, data: bytes, timeout: float, server: str | None) -> Call:
-        call = self._begin(timeout, server, self._next_number())
-        call.target = target
-        call.data = data
-        share = min(max(round(timeout * SECOND) // _REPEATS, _FIRST_MIN), _FIRST_MAX)
-        call.pause = _LOSSLESS if target.lossless else share
-        self._send(call)
+        """Send a request to a server in another module."""
+        lifetime, now = int(timeout * SECOND), self._space.clock.monotonic()
+        number = self._next_number()
+        call = self._calls[number] = Call(self._space.loop.create_future(), number, now + lifetime, server)
+        call.target, call.data = target, data
+        pause = _LOSSLESS if target.lossless else min(max(lifetime // _REPEATS, _FIRST_MIN), _FIRST_MAX)
+        call.repeat_at, call.pause = now + pause, pause * 3 // 2
+        due = call.deadline if lifetime < pause else call.repeat_at
+        if not self._alarm_at or due < self._alarm_at:
+            self._set_alarm(due)
+        space = self._space
+        packed = services.pack(space.instance, number, Kind.REQUEST, target.instance, data, self._size)
+        self._outlet.send(packed, lifetime)
         return call
 
-    async def _result(self, call: Call, timeout: float) -> R:
-        try:
-            await call.future
-        except TimeoutError:
-            raise TimeoutError(f"{self._name_of(call)} did not answer within {timeout:g} s{self._down()}") from None
-        except asyncio.CancelledError:
-            self._give_up(call, "cancelled by its caller")
-            raise
-        finally:
-            self._calls.pop(call.key, None)
-        if call.kind is Kind.RESPONSE:
-            response: R = call.response
-            return response
+    def _end(self, call: Call) -> None:
+        """Forget a call that has an answer, or none any more."""
+        if self._calls.pop(call.key, None) is not None and call.target is not None:
+            self._numbers.open.discard(call.key)
+
+    def _failure(self, call: Call) -> Error:
+        """Return the error that an answer other than a response stands for."""
         if call.kind is Kind.BUSY:
-            raise ServiceBusy(f"{self._name_of(call)} is busy: call again later, or raise its limit=")
-        raise ServiceError(f"{self._name_of(call)}: {call.text or 'it failed; its log says why'}")
+            return ServiceBusy(f"{self._name_of(call)} is busy: call again later, or raise its limit=")
+        return ServiceError(f"{self._name_of(call)}: {call.text or 'it failed; its log says why'}")
 
     def _answered_here(self, handling: Handling, kind: Kind, response: Message | None, data: bytes) -> None:
         """Handle the answer of a server in this module."""
@@ -303,40 +304,38 @@ class ServiceClient(Generic[Q, R]):
             and header.server in (ANY, call.target.instance or header.server)
         ):
             self._read_answer(call, header.kind, sample.data[HEADER_SIZE:])
-        elif self._cancelled.pop(header.number, None) is None:
+        elif header.number not in self._cancelled or not self._forget_cancelled(header.number):
             self.late += 1
 
     def _read_answer(self, call: Call, kind: Kind, body: bytes) -> None:
         response = None
         if kind is Kind.RESPONSE:
             try:
-                response = self._definition.response.decode(body)
+                response = self._decode(body)
             except DecodeError as error:
                 self.undecodable += 1
                 kind, body = Kind.ERROR, f"its answer can't be decoded: {error}".encode()
         self._answered(call, kind, response, body)
 
-    def _send(self, call: Call) -> None:
-        """Send the request, for the first time or again."""
-        now = self._space.clock.monotonic()
+    def _send_again(self, call: Call, now: int) -> None:
+        """Repeat a request; each time after a longer pause."""
+        if call.target is not None and call.target.module:  # it may have restarted, with another instance
+            call.target = self._target(call.server, call.target.module) or call.target
         self._transmit(call, Kind.REQUEST, call.data, call.deadline - now)
         call.repeat_at = now + call.pause
         call.pause = min(call.pause * 3 // 2, max(_PAUSE_MAX, call.pause))
-        if call.repeat_at < self._alarm_at:
-            self._set_alarm(call.repeat_at)
 
     def _transmit(self, call: Call, kind: Kind, body: bytes, lifetime: int) -> None:
         server = ANY if call.target is None else call.target.instance
-        header = ServiceHeader(self._space.instance, call.key, kind, server)
-        self._outlet.send(services.encode(header, body, self._definition.requests.exact_size), max(1, lifetime))
+        self._outlet.send(services.pack(self._space.instance, call.key, kind, server, body, self._size), lifetime)
 
     def _next_number(self) -> int:
         """Return a number that no open call of this module to this service has."""
-        numbers, last = self._space.call_numbers, self._space.call_numbers.get(self.name, 0)
+        numbers = self._numbers
         for _ in range(NUMBERS):
-            last = (last + 1) % NUMBERS
-            if last not in self._calls and last not in self._cancelled:
-                numbers[self.name] = last
+            numbers.last = last = (numbers.last + 1) % NUMBERS
+            if last not in numbers.open:
+                numbers.open.add(last)
                 return last
         raise Error(f"service {self.name}: {NUMBERS} calls wait for their answers")
 
@@ -356,13 +355,12 @@ class ServiceClient(Generic[Q, R]):
                 self._give_up(call, "its caller's time-out")
                 call.future.set_exception(TimeoutError())
             elif call.target is not None and call.repeat_at <= now:
-                if call.target.module:  # it may have restarted, with another instance
-                    call.target = self._target(call.server, call.target.module) or call.target
-                self._send(call)
+                self._send_again(call, now)
         for call in list(self._cancelled.values()):
             if call.repeat_at <= now:
                 self._send_cancel(call)
-        waiting = [min(call.deadline, call.repeat_at) for call in self._calls.values() if not call.future.done()]
+        open_calls = [call for call in self._calls.values() if not call.future.done()]
+        waiting = [min(call.deadline, call.repeat_at or call.deadline) for call in open_calls]
         waiting += [call.repeat_at for call in self._cancelled.values()]
         self._alarm_at = 0
         if waiting:
@@ -375,7 +373,7 @@ class ServiceClient(Generic[Q, R]):
             call.handling.cancel(reason)
         elif call.target is not None and not answered:
             self._calls.pop(call.key, None)
-            self._cancelled[call.key] = call
+            self._cancelled[call.key] = call  # its number stays open
             self._send_cancel(call)
 
     def _send_cancel(self, call: Call) -> None:
@@ -383,11 +381,16 @@ class ServiceClient(Generic[Q, R]):
         self._transmit(call, Kind.CANCEL, b"", _FIRST_MAX)
         call.tries -= 1
         if not call.tries or (call.target is not None and call.target.lossless):
-            self._cancelled.pop(call.key, None)
+            self._forget_cancelled(call.key)
             return
         call.repeat_at = self._space.clock.monotonic() + _FIRST_MAX
         if not self._alarm_at or call.repeat_at < self._alarm_at:
             self._set_alarm(call.repeat_at)
+
+    def _forget_cancelled(self, number: int) -> bool:
+        """Return whether this call was given up, and end that."""
+        self._numbers.open.discard(number)
+        return self._cancelled.pop(number, None) is not None
 
     # Servers
 
@@ -399,8 +402,12 @@ class ServiceClient(Generic[Q, R]):
 
     def _is_connected(self) -> bool:
         """Return whether requests go out by a link, and answers come in."""
-        reachable = any(each.reachable for each in self._requests.remote_subscribers)
-        return reachable and self._responses.remote_publishers > 0
+        if not self._responses.remote_publishers:
+            return False
+        for remote in self._requests.remote_subscribers:  # noqa: SIM110 - a generator takes longer, for each call
+            if remote.reachable:
+                return True
+        return False
 
     def _target(self, server: str | None, last: str = "") -> Target | None:
         """Return the server of this module, or the one to call by default; None if there is none that is known.
@@ -410,16 +417,21 @@ class ServiceClient(Generic[Q, R]):
         if not self._is_connected():
             self._connected_at = None
             return None
+        target = self._targets.get(server or last or None)
+        if target is not None and self._known.current:
+            return target
         if self._connected_at is None:
             self._connected_at = self._space.clock.monotonic()
         remote = self._known.find()
+        self._targets.clear()
         wanted = server or last
         fitting = [pair for pair in remote if pair[0].module == wanted] if wanted else remote
         if fitting:
             if server is None and len({each.module for each, _ in remote}) > 1:
                 self._report_several(fitting[0][0].module, remote)
             (endpoint, lossless) = fitting[0]
-            return Target(endpoint.instance, endpoint.module, lossless)
+            target = self._targets[wanted or None] = Target(endpoint.instance, endpoint.module, lossless)
+            return target
         if wanted or remote or self._space.clock.monotonic() - self._connected_at < _ANNOUNCED:
             return None
         return Target(ANY, "", lossless=False)

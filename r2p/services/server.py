@@ -16,6 +16,8 @@ from collections.abc import Callable, Coroutine
 from contextvars import ContextVar
 from typing import Any, Generic, TypeAlias
 
+import msgspec
+
 from r2p.codecs import services
 from r2p.codecs.services import HEADER_SIZE, Kind, ServiceHeader
 from r2p.errors import DecodeError, Error, MessageError, ServiceError
@@ -26,11 +28,13 @@ from r2p.runtime.sample import Sample
 from r2p.runtime.topic import TopicSpace
 from r2p.services.answers import RememberedAnswers
 from r2p.services.definition import Definition, Q, R
-from r2p.services.topics import Inlet, Outlet, lifetime_of
-from r2p.units import SECOND
+from r2p.services.topics import Inlet, Outlet
+from r2p.units import MILLISECOND, SECOND
 
 Handler: TypeAlias = Callable[[Q], Coroutine[Any, Any, R]]
 """A coroutine function that takes a request and returns the response."""
+
+Reply: TypeAlias = Callable[["Handling", Kind, Message | None, bytes], None]
 
 LIMIT = 8
 """Handlers of a service that run at the same time, by default."""
@@ -39,64 +43,40 @@ WAITING_MAX = 64
 """Requests that wait for a handler to end; one more is answered with ServiceBusy."""
 
 _UNKNOWN_LIFETIME = 10 * SECOND  # ns; the time-out of a caller whose link does not carry it, about
+_LIFETIME_MAX = 3600 * SECOND  # ns; a longer time-out counts as this one
 _ANSWER_LIFETIME = SECOND  # ns for which an answer to such a caller is worth something
 _TEXT_MAX = 1000  # bytes of an error's text
 _LOG_LINES = 1  # a second about requests that fail, or that are refused
 
-_current: ContextVar["Handling | None"] = ContextVar("r2p_handling", default=None)
+CURRENT: ContextVar["Handling | None"] = ContextVar("r2p_handling", default=None)
+"""The request that this task handles, if there is one."""
 
 
-def current_handling() -> "Handling | None":
-    """Return the request that this task handles, if there is one."""
-    return _current.get()
-
-
-class Handling:
+class Handling(msgspec.Struct, eq=False):
     """One request, from its arrival to its answer.
 
-    `reply(kind, response, data)` gets the answer: a response with its packed bytes, or the text of an error.
+    `key` is the caller's instance and the number of the call; the call itself within the module. Such a call has a
+    `reply(handling, kind, response, data)`, which gets the answer: a response with its packed bytes, or the text of an
+    error. A request that came by a `link`, at last by this one, is answered there; `given` is its caller's time-out in
+    ns.
+
+    `calls` are the calls that the handler waits for, `counted` says whether it counts as running, `begun` whether it
+    was called, and `cancelled` why it is to end.
     """
 
-    __slots__ = (
-        "begun",
-        "calls",
-        "cancelled",
-        "counted",
-        "ended",
-        "key",
-        "link",
-        "reply",
-        "request",
-        "server",
-        "task",
-        "timer",
-    )
-
-    def __init__(
-        self,
-        server: "ServiceServer[Any, Any]",
-        key: object,
-        request: Any,
-        reply: "Callable[[Handling, Kind, Message | None, bytes], None]",
-        link: str = "",
-    ) -> None:
-        self.server = server
-        self.key = key
-        self.request = request
-        self.reply = reply
-        self.link = link
-        """The name of the link by which the request came last; empty for a call within the module."""
-        self.task: asyncio.Task[None] | None = None
-        self.timer: asyncio.TimerHandle | None = None
-        self.calls = 0
-        """Calls that the handler waits for."""
-        self.counted = False
-        """True while the handler counts as running."""
-        self.cancelled = ""
-        """The reason why the handler was cancelled."""
-        self.begun = False
-        """True once the handler was called."""
-        self.ended = False
+    server: "ServiceServer[Any, Any]"
+    key: Any
+    request: Any
+    reply: Reply | None
+    link: str = ""
+    given: int = 0
+    task: asyncio.Task[None] | None = None
+    timer: asyncio.TimerHandle | None = None
+    calls: int = 0
+    counted: bool = False
+    cancelled: str = ""
+    begun: bool = False
+    ended: bool = False
 
     def cancel(self, reason: str) -> None:
         """End the handler, after its clean-up; without one that runs, at once."""
@@ -145,6 +125,8 @@ class ServiceServer(Generic[Q, R]):
         self._definition = definition
         self._handler = check_handler(definition.name, handler)
         self._encode = definition.response.encode
+        self._decode = definition.request.decode
+        self._size = definition.responses.exact_size
         self._shares = definition.response.packing.shares
         self._open: dict[object, Handling] = {}
         self._waiting: deque[Handling] = deque()
@@ -226,114 +208,117 @@ class ServiceServer(Generic[Q, R]):
             self.undecodable += 1
 
     def _requested(self, header: ServiceHeader, sample: Sample) -> None:
-        given, left = self._lifetime(sample)
-        if self._answer_again(header, sample.source.link, given, left):
+        given, left = self._lifetime(sample) if sample.sequence else (_UNKNOWN_LIFETIME, 0)
+        key, link = (header.instance, header.number), sample.source.link
+        if (key in self._open or key in self._answers) and self._answer_again(key, link, given, left):
             return
         try:
-            request = self._definition.request.decode(sample.data[HEADER_SIZE:])
+            request = self._decode(sample.data[HEADER_SIZE:])
         except DecodeError as error:
             self.undecodable += 1
-            self._answer(header, sample.source.link, given, Kind.ERROR, str(error).encode())
+            self._answer(key, link, given, Kind.ERROR, str(error).encode())
             return
-
-        def reply(handling: Handling, kind: Kind, _response: Message | None, data: bytes) -> None:
-            if handling.timer is not None:
-                handling.timer.cancel()
-            self._answer(header, handling.link, given, kind, data)
-
-        handling = self.submit((header.instance, header.number), request, reply, sample.source.link)
+        handling = Handling(self, key, request, None, link)
+        handling.given = given
+        self._accept(handling)
         if left and not handling.ended:
             handling.timer = self._space.loop.call_later(left / SECOND, handling.cancel, "its caller's time-out")
 
     def _cancel_requested(self, header: ServiceHeader, sample: Sample) -> None:
         """Cancel a handler; a request that has not come yet is answered before it does."""
-        handling = self._open.get((header.instance, header.number))
+        key, link = (header.instance, header.number), sample.source.link
+        handling = self._open.get(key)
         given, left = self._lifetime(sample)
         if handling is not None:
-            handling.link = sample.source.link
+            handling.link = link
             handling.cancel("cancelled by its caller")
-        elif not self._answer_again(header, sample.source.link, given, left):
-            self._answer(header, sample.source.link, given, Kind.ERROR, b"cancelled by its caller")
+        elif not self._answer_again(key, link, given, left):
+            self._answer(key, link, given, Kind.ERROR, b"cancelled by its caller")
 
-    def _answer_again(self, header: ServiceHeader, link: str, given: int, left: int) -> bool:
+    def _answer_again(self, key: tuple[int, int], link: str, given: int, left: int) -> bool:
         """Return whether this request was here before; one that was answered is answered again."""
-        handling = self._open.get((header.instance, header.number))
+        handling = self._open.get(key)
         if handling is not None:
             handling.link = link
             self.repeated += 1
             return True
-        answer = self._answers.get(header.instance, header.number, self._space.clock.monotonic(), 2 * given)
+        answer = self._answers.get(*key, self._space.clock.monotonic(), 2 * given)
         if answer is None:
             return False
         self.repeated += 1
         self._send(answer, link, left)
         return True
 
-    def _answer(self, header: ServiceHeader, link: str, given: int, kind: Kind, body: bytes) -> None:
+    def _answer(self, key: tuple[int, int], link: str, given: int, kind: Kind, body: bytes) -> None:
         """Answer a request from a link, and remember the answer for twice the caller's time-out."""
-        layout = self._definition.responses
         if kind is Kind.ERROR:
-            body = services.encode_text(body.decode(errors="replace"), min(layout.size - HEADER_SIZE, _TEXT_MAX))
-        answer = ServiceHeader(header.instance, header.number, kind, self._space.instance)
-        data = services.encode(answer, body, layout.exact_size)
-        self._answers.put(header.instance, header.number, data, self._space.clock.monotonic(), 2 * given)
+            room = min(self._definition.responses.size - HEADER_SIZE, _TEXT_MAX)
+            body = services.encode_text(body.decode(errors="replace"), room)
+        instance, number = key
+        data = services.pack(instance, number, kind, self._space.instance, body, self._size)
+        self._answers.put(instance, number, data, self._space.clock.monotonic(), 2 * given)
         self._send(data, link, given)
 
     def _send(self, data: bytes, link: str, lifetime: int) -> None:
         if self._outlet is not None:
-            self._outlet.send(data, min(lifetime, _UNKNOWN_LIFETIME) or _ANSWER_LIFETIME, link)
+            self._outlet.send(data, lifetime or _ANSWER_LIFETIME, link)
 
     def _lifetime(self, sample: Sample) -> tuple[int, int]:
-        """Return the caller's time-out and what is left of it (ns); what is usual and 0, where it is unknown."""
-        given, left = lifetime_of(sample, self._space.clock.now())
-        return (given, max(1, left)) if given else (_UNKNOWN_LIFETIME, 0)
+        """Return the caller's time-out and what is left of it (ns); what is usual and 0, where it is unknown.
+
+        The laxity of a CAN frame does not say it: what was left when the frame was sent, up to 61 ms, and with firmware
+        not what its caller waits.
+        """
+        if not (sample.deadline and sample.sequence):
+            return _UNKNOWN_LIFETIME, 0
+        left = sample.due - self._space.clock.now()
+        return max(MILLISECOND, min(sample.deadline - sample.stamp, _LIFETIME_MAX)), max(1, left)
 
     # Handlers
 
-    def submit(
-        self,
-        key: object,
-        request: Message,
-        reply: Callable[[Handling, Kind, Message | None, bytes], None],
-        link: str = "",
-    ) -> Handling:
-        """Handle a request, now or when it is its turn; it is refused if too many wait, or the server ends."""
-        handling = Handling(self, key, request, reply, link)
-        if self._ending or self._node.ending or len(self._open) >= self.limit + WAITING_MAX:
+    def submit(self, key: object, request: Message, reply: Reply) -> Handling:
+        """Handle a request of this module, now or when it is its turn."""
+        handling = Handling(self, key, request, reply)
+        self._accept(handling)
+        return handling
+
+    def _accept(self, handling: Handling) -> None:
+        """Start a handler, or let its request wait; it is refused if too many wait, or the server ends."""
+        if self._ending or len(self._open) >= self.limit + WAITING_MAX:
             self._refuse(handling)
-            return handling
-        self._open[key] = handling
+            return
+        self._open[handling.key] = handling
         if self._running < self.limit:
             self._start(handling)
         else:
             self._waiting.append(handling)
-        return handling
 
     def _refuse(self, handling: Handling) -> None:
         handling.ended = True
-        if self._ending or self._node.ending:
-            handling.reply(handling, Kind.ERROR, None, (self._ending or "its node ends").encode())
+        if self._ending:
+            self._reply(handling, Kind.ERROR, None, self._ending.encode())
             return
         self.refused += 1
         self._log(logging.WARNING, "busy", f"{self.limit} handlers run and {WAITING_MAX} requests wait: refused")
-        handling.reply(handling, Kind.BUSY, None, b"")
+        self._reply(handling, Kind.BUSY, None, b"")
 
     def _start(self, handling: Handling) -> None:
         self._running += 1
         handling.counted = True
-        if self._node.priority < self._space.wake_scheduler.top:
-            turn = self._space.loop.create_future()
+        space = self._space
+        if self._node.priority < space.wake_scheduler.top:
+            turn = space.loop.create_future()
             turn.add_done_callback(lambda _turn: self._start_task(handling))
-            self._space.wake_scheduler.wake_later(self._node.priority, turn)
+            space.wake_scheduler.wake_later(self._node.priority, turn)
         else:
-            self._start_task(handling)
+            handling.task = space.loop.create_task(self._run(handling), name=self._task_name)
 
     def _start_task(self, handling: Handling) -> None:
         if not handling.ended:
             handling.task = self._space.loop.create_task(self._run(handling), name=self._task_name)
 
     async def _run(self, handling: Handling) -> None:
-        _current.set(handling)
+        CURRENT.set(handling)
         handling.begun = True
         try:
             response = await self._handler(handling.request)
@@ -385,14 +370,23 @@ class ServiceServer(Generic[Q, R]):
         self.handled += 1
         del self._open[handling.key]
         self.pause(handling)
-        handling.reply(handling, kind, response, data)
+        self._reply(handling, kind, response, data)
+
+    def _reply(self, handling: Handling, kind: Kind, response: Message | None, data: bytes) -> None:
+        """Hand the answer to the caller in this module, or send it."""
+        if handling.timer is not None:
+            handling.timer.cancel()
+        if handling.reply is not None:
+            handling.reply(handling, kind, response, data)
+        else:
+            self._answer(handling.key, handling.link, handling.given, kind, data)
 
     def pause(self, handling: Handling) -> None:
         """Give the place of a handler, which has ended or waits for a call, to the next request."""
         if handling.counted:
             handling.counted = False
             self._running -= 1
-            while self._waiting and self._running < self.limit:
+            if self._waiting and self._running < self.limit:
                 self._start(self._waiting.popleft())
 
     def resume(self, handling: Handling) -> None:

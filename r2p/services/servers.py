@@ -32,21 +32,32 @@ class KnownServers:
         self._space = space
         self._definition = definition
         self._found: list[tuple[RemoteServer, bool]] = []
+        self._links: list[LinkView] | None = None
         self._generations: list[int] = []
         self._changed_at = space.clock.monotonic()
+
+    @property
+    def current(self) -> bool:
+        """Return whether nothing has changed since `find` has looked."""
+        if self._links != self._space.links:
+            return False
+        for link, generation in zip(self._space.links, self._generations, strict=True):
+            if link.discovery.generation != generation:
+                return False
+        return True
 
     def find(self) -> list[tuple[RemoteServer, bool]]:
         """Return the servers, the nearest first, each with whether nothing gets lost on the way to it.
 
         They are looked up anew when the discovery of a link has changed.
         """
-        generations = [link.discovery.generation for link in self._space.links]
-        if generations != self._generations:
+        if not self.current:
             found: dict[RemoteServer, bool] = {}
             for link in self._space.links:
                 for each in self._behind(link):
                     found[each] = link.lossless and not each.hops
-            self._generations = generations
+            self._links = list(self._space.links)
+            self._generations = [link.discovery.generation for link in self._links]
             self._changed_at = self._space.clock.monotonic()
             self._found = sorted(found.items())
         return self._found

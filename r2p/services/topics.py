@@ -16,7 +16,6 @@ from r2p.runtime.qos import Sporadic
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import Topic, TopicSpace
-from r2p.units import MILLISECOND
 
 PENDING_MAX = 64
 """Messages of one end that wait for room in a link; one more drops the oldest of them."""
@@ -98,14 +97,3 @@ class Outlet(SporadicPublisher[Any]):
 
     def link_degraded(self, link: str, reason: str) -> None:
         """Report nothing: the link says in the log that it is down, and calls say what they lack."""
-
-
-def lifetime_of(sample: Sample, now: int) -> tuple[int, int]:
-    """Return the ns that a sample's sender gave it in all, and that are left at `now` (UTC); 0, 0 if unknown.
-
-    The laxity of a CAN frame says less: what was left when the frame was sent, up to 61 ms, and with firmware not what
-    its caller waits.
-    """
-    if not (sample.deadline and sample.sequence):
-        return 0, 0
-    return max(MILLISECOND, sample.deadline - sample.stamp), max(0, sample.due - now)
