@@ -258,7 +258,9 @@ class RoutingTable:
         subscribes = self._is_allowed(name, [[port]], relayed.subscribed_on_kinds)
         if not publishes and not subscribes:
             return own
-        published, asked = (own.asked, own.asked) if topic.layout is not None else self._types(name, port)
+        published, asked = TopicType(own.size, own.fingerprint, own.varies), own.asked
+        if topic.layout is None:
+            published, asked = self._types(name, port)
         return msgspec.structs.replace(
             own,
             publishes=own.publishes or publishes,

@@ -5,7 +5,7 @@ closed when its function ends, for any reason.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar, overload
 
 from r2p.clock import SHORTEST, Alarm, Ticker, check_seconds, check_timeout
@@ -13,6 +13,7 @@ from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.log_lines import NodeLogger, node_logger
 from r2p.messages import Layout, Message, layout
 from r2p.names import RESERVED, topic_name
+from r2p.runtime.accepting import Accept, AcceptedTypes
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
@@ -169,6 +170,7 @@ class Node:
         timeout: float | None = ...,
         on_timeout: Callable[[], object] | None = ...,
         queue_bytes: int = ...,
+        accept: Mapping[Any, Callable[[Any], M]] | None = ...,
     ) -> Subscriber[M]: ...
 
     @overload
@@ -200,6 +202,7 @@ class Node:
         timeout: float | None = None,
         on_timeout: Callable[[], object] | None = None,
         queue_bytes: int = QUEUE_BYTES,
+        accept: Accept | None = None,
     ) -> Subscriber[Any]:
         """Subscribe to a topic. With the type None, messages are packed bytes.
 
@@ -210,6 +213,9 @@ class Node:
         Messages older than `max_age` seconds are skipped, and counted in `stale`. The age is measured from the
         publisher's stamp to this computer's clock, so the two clocks have to agree.
 
+        `accept` has functions that convert messages of other types, for a type that grows: `accept={OldScan: upgrade}`
+        receives the messages of publishers of an OldScan as what `upgrade` returns for them.
+
         When no message arrives for `timeout` seconds, `on_timeout` is called once; without it, reading raises
         TimeoutError. A `callback` is called from `spin()`, in this node's task.
 
@@ -219,10 +225,12 @@ class Node:
         options = SubscriberOptions(callback, queue, lossy, keep, max_age, timeout, on_timeout, queue_bytes)
         options.check(topic)
         shape = None if type is None else layout(type)
-        where = self._space.open(self._resolve(topic), shape)
+        name = self._resolve(topic)
+        accepted = AcceptedTypes(name, shape, accept) if accept else None
+        where = self._space.open(name, shape) if accepted is None else self._space.open_accepting(name, accepted)
         if shape is not None:
             self._warn_of_links(where.name, shape, "can't be received on")
-        subscriber: Subscriber[Any] = Subscriber(self._space, self, where, shape, options)
+        subscriber: Subscriber[Any] = Subscriber(self._space, self, where, shape, options, accepted)
         self.subscribers[subscriber] = None
         subscriber.open()
         if callback is not None and self._reminder is None:

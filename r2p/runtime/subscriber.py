@@ -14,6 +14,7 @@ import msgspec
 from r2p.clock import LONGEST, SHORTEST, Alarm, check_seconds, check_timeout
 from r2p.errors import Closed, DecodeError, MessageError, TooLong
 from r2p.messages import SIZE_MAX, Layout, Message
+from r2p.runtime.accepting import AcceptedTypes
 from r2p.runtime.qos import check_count
 from r2p.runtime.queues import QUEUE_BYTES, YIELD_EVERY, EndpointOwner, SampleQueue, SubscriberQueue, checkpoint
 from r2p.runtime.sample import Sample
@@ -82,6 +83,7 @@ class Subscriber(Generic[T]):
         topic: Topic,
         layout: Layout[Any] | None,
         options: SubscriberOptions,
+        accepted: AcceptedTypes | None = None,
     ) -> None:
         self.topic = topic.name
         """The topic's name, after remapping."""
@@ -102,6 +104,7 @@ class Subscriber(Generic[T]):
         self._space = space
         self._topic = topic
         self._layout = layout
+        self._accepted = accepted
         self._type = None if layout is None else layout.cls
         self._max_age = None if options.max_age is None else round(options.max_age * SECOND)
         self._on_timeout = options.on_timeout
@@ -229,6 +232,8 @@ class Subscriber(Generic[T]):
             self._closed = True
             self._alarm.close()
             self._topic.leave(self._sink)
+            if self._accepted is not None:
+                self._topic.accepted.remove(self._accepted)
             self._space.release(self._topic)
             self._node.forget(self)
             self.queue.clear()
@@ -249,6 +254,8 @@ class Subscriber(Generic[T]):
 
     def open(self) -> None:
         """Join the topic. A latched value is available at once."""
+        if self._accepted is not None:
+            self._topic.accepted.append(self._accepted)
         self._topic.join(self._sink)
         self._space.changed(self._topic)
 
@@ -299,7 +306,7 @@ class Subscriber(Generic[T]):
         if message.__class__ is self._type:
             return message
         try:
-            message = self._layout.decode(sample.data)
+            message = self._decode_any(sample) if self._topic.accepted else self._layout.decode(sample.data)
         except DecodeError as error:
             if isinstance(error, TooLong):
                 self._sink.too_long += 1
@@ -309,6 +316,17 @@ class Subscriber(Generic[T]):
         if sample.message is None:
             sample.message = message  # for the other subscribers
         return message
+
+    def _decode_any(self, sample: Sample) -> Any:
+        """Decode a message of a topic that may have several types, and convert it if it is of another one."""
+        accepted = self._accepted
+        if accepted is None:
+            assert self._layout is not None
+            accepted = AcceptedTypes(self.topic, self._layout, {})
+        if sample.message is None:
+            fingerprint = self._space.fingerprint_of(self._topic, sample.source)
+            sample.message = accepted.decode(sample.data, fingerprint)  # for the other subscribers, too
+        return accepted.convert(sample.message)
 
     async def _arrival(self) -> None:
         """Wait until something is in the queue, or the subscription is closed."""

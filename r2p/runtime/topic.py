@@ -11,12 +11,14 @@ from typing import Any, Protocol
 from weakref import WeakValueDictionary
 
 from r2p.clock import Clock
+from r2p.codecs.management import ANY_TYPE
 from r2p.errors import TypeMismatch
 from r2p.messages import Layout
 from r2p.protocols.discovery.session import DiscoveryProtocol
+from r2p.runtime.accepting import AcceptedTypes
 from r2p.runtime.backpressure import Sink, WaitQueue
 from r2p.runtime.queues import EndpointOwner, SubscriberQueue, WakeScheduler
-from r2p.runtime.sample import LastReceived, PublisherClass, Sample
+from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
 
 
 class RemoteSubscriber(Sink):
@@ -125,8 +127,15 @@ class Topic:
         self.latched_sources: list[LatchedSource] = []
         self.drop_filter: Callable[[str], bool] | None = None
         """Says for each message, by the name of its link, whether it is dropped (`r2p.bridge.multihoming`)."""
+        self.accepted: list[AcceptedTypes] = []
+        """The types of subscribers that accept several."""
         self._wake_scheduler = wake_scheduler
         self._last_received: WeakValueDictionary[Hashable, LastReceived] = WeakValueDictionary()
+
+    @property
+    def received_layout(self) -> Layout[Any] | None:
+        """The layout of all messages that are received; None if it is unknown, or there may be several."""
+        return None if self.accepted else self.layout
 
     def last_received(self, publisher: Hashable) -> LastReceived:
         """Return the record that all links with a remote publisher share, to recognise duplicates.
@@ -299,6 +308,9 @@ class LinkView(Protocol):
     def network_time(self) -> int | None:
         """Return the time (ns) that all nodes of the link's network share; None without one, or if it is unknown."""
 
+    def fingerprint_of(self, topic: str, source: Source) -> bytes:
+        """Return the fingerprint of the type in which this source publishes the topic; ANY_TYPE if it is unknown."""
+
     async def admission(self, topic: str) -> None:
         """Wait until the link has admitted the topic."""
 
@@ -341,6 +353,8 @@ class TopicSpace:
         if topic is None:
             topic = self.topics[name] = self.make_topic(name, self.wake_scheduler)
         if layout is not None:
+            for each in topic.accepted:
+                self._check_accepted(name, each, layout)
             if topic.layout is None:
                 topic.layout = layout
             elif topic.layout.fingerprint != layout.fingerprint:
@@ -349,6 +363,25 @@ class TopicSpace:
                     f"not {layout.cls.__name__} ({layout.schema}): a changed layout needs a topic of its own"
                 )
         return topic
+
+    def open_accepting(self, name: str, accepted: AcceptedTypes) -> Topic:
+        """Return the topic for a subscriber that accepts several types. Raises TypeMismatch if it has yet another."""
+        topic = self.open(name, None)
+        if topic.layout is not None:
+            self._check_accepted(name, accepted, topic.layout)
+        return topic
+
+    def _check_accepted(self, name: str, accepted: AcceptedTypes, layout: Layout[Any]) -> None:
+        if not accepted.accepts(layout):
+            raise TypeMismatch(
+                f"topic {name} is {layout.cls.__name__} ({layout.schema}) in module {self.module}, which a subscriber "
+                f"of {accepted.names} does not accept: add it to its accept="
+            )
+
+    def fingerprint_of(self, topic: Topic, source: Source) -> bytes:
+        """Return the fingerprint of the type in which another module publishes a topic; ANY_TYPE if it is unknown."""
+        link = next((each for each in self.links if each.name == source.link), None)
+        return ANY_TYPE if link is None else link.fingerprint_of(topic.name, source)
 
     def release(self, topic: Topic) -> None:
         """Inform the links of a change; forget the topic's type with its last user, and the topic if no link has it."""

@@ -41,6 +41,11 @@ def refused_publishers(topic: Topic, info: TopicInfo | None) -> str | None:
     return None if theirs is None or ours.fits(theirs) else describe_mismatch(ROLE_PUBLISHES, ours, theirs)
 
 
+def asked_type(topic: Topic) -> TopicType:
+    """The type in which this module subscribes to a topic: unknown, so that it fits any, if it accepts several."""
+    return TopicType() if topic.accepted else type_of(topic)
+
+
 def announcement_of(topic: Topic) -> Announcement:
     """Return what the other ends should know of a topic that only this module uses."""
     publishers: dict[tuple[str, int], int] = {}
@@ -56,6 +61,6 @@ def announcement_of(topic: Topic) -> Announcement:
         size=topic_type.size,
         fingerprint=topic_type.fingerprint,
         varies=topic_type.varies,
-        asked=topic_type,
+        asked=asked_type(topic),
         endpoints=publishers | subscribers,
     )

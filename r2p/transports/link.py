@@ -342,6 +342,10 @@ class Link(abc.ABC):
         """All losses since the link was opened, in both directions, by reason."""
         return self.stats.lost + self.discovery.counts
 
+    def fingerprint_of(self, topic: str, source: Source) -> bytes:
+        """Return the fingerprint of the type in which this source publishes the topic; ANY_TYPE if it is unknown."""
+        return self.discovery.publisher_type(topic, source.module).fingerprint
+
     def latched(self, topic: str) -> bool:
         """Return whether a publisher at the other end latches the topic; only r2p modules announce that."""
         return any(each.latches(topic) for each in self.discovery.endpoints.values())
@@ -534,7 +538,8 @@ class Link(abc.ABC):
     def _publisher_found(self, name: str, size: int, source: Hashable = None) -> None:
         topic = self._space.topics.get(name)
         if topic is not None and topic.wanted:
-            self.add_publisher(topic, size if topic.layout is None else topic.layout.exact_size, source)
+            layout = topic.received_layout
+            self.add_publisher(topic, size if layout is None else layout.exact_size, source)
 
     def _remove_subscriber(self, name: str) -> None:
         subscriber = self._subscribers.pop(name, None)

@@ -424,6 +424,50 @@ async def test_variable_length_does_not_match_a_fixed_one(cable: Cable) -> None:
     await _mismatch(cable, Go, Led)
 
 
+class Degrees(Message):
+    """An angle, as it was."""
+
+    degrees: r2p.f32 = 0.0
+
+
+class Radians(Message):
+    """The same in as many bytes, so that only the announced type says which one it is."""
+
+    radians: r2p.f32 = 0.0
+
+
+class Angle(Message):
+    """The same with more fields."""
+
+    radians: r2p.f32 = 0.0
+    frame: Annotated[str, r2p.Max(20)] = ""
+
+
+@conforms
+async def test_a_subscriber_accepts_older_types(cable: Cable) -> None:
+    convert = {Degrees: lambda old: Radians(old.degrees / 2), Angle: lambda old: Radians(old.radians)}
+    async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
+        await acquainted(a, b)
+        for sent in (Degrees(1.0), Radians(0.5), Angle(0.5, "map")):
+            topic = f"angle_{type(sent).__name__}"
+            angles = bob.subscribe(topic, Radians, accept=convert)
+            publisher = alice.advertise(topic, type(sent))
+            await publisher.wait_subscriber()
+            await angles.wait_publisher()
+            await publisher.publish(sent)
+            assert await angles.fetch(GUARD) == Radians(0.5)
+            assert angles.undecodable == 0
+        other = bob.subscribe("other", Radians, accept=convert)
+        numbers = alice.advertise("other", r2p.msg.Float32)
+        await numbers.wait_subscriber()
+        await other.wait_publisher()
+        await numbers.publish(r2p.msg.Float32(1.0))
+        await until(lambda: other.queue)
+        with pytest.raises(TimeoutError):
+            await other.fetch(0.001)
+        assert other.undecodable == 1
+
+
 @conforms
 async def test_two_modules_of_one_name_both_learn_of_it(cable: Cable) -> None:
     a, b = module("X", cable.a()), module("X", cable.b())

@@ -170,6 +170,11 @@ class SubscriptionNegotiation:
         else:
             self._counts["unsubscribe left to the lease"] += 1
 
+    def publisher_types(self, topic: str) -> dict[PeerAddress, TopicType]:
+        """Return the types of the publishers of a topic whose messages are accepted, by address."""
+        peers = (peer for peer in self._peers.values() if topic in peer.publishers)
+        return {peer.source: peer.types.get((topic, ROLE_PUBLISHES), TopicType()) for peer in peers}
+
     # Answers
 
     def answer(self, now: int, role: int, topic: str) -> None:

@@ -106,6 +106,10 @@ class DiscoveryProtocol(ABC):
     def demand(self) -> Demand:
         """Return what the other modules publish and subscribe to, for gateways."""
 
+    @abstractmethod
+    def publisher_type(self, topic: str, module: str) -> TopicType:
+        """Return the type in which a module (empty: any) publishes a topic, if only one is possible."""
+
     # Names
 
     def alias(self, topic: str) -> str:
@@ -340,6 +344,13 @@ class Discovery(DiscoveryProtocol):
         return self._demand
 
     # Names
+
+    def publisher_type(self, topic: str, module: str) -> TopicType:
+        types = self._negotiation.publisher_types(topic)
+        info = self.modules.get(module)
+        if info is not None and info.source in types:
+            return types[info.source]
+        return next(iter(types.values())) if len(set(types.values())) == 1 else TopicType()
 
     def alias(self, topic: str) -> str:
         return self._names.alias(KIND_TOPIC, topic)

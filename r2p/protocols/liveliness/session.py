@@ -22,6 +22,7 @@ from r2p.protocols.discovery.events import (
     NameConflict,
     PeerAddress,
     QueryTokens,
+    TopicType,
 )
 from r2p.protocols.discovery.session import DiscoveryProtocol
 from r2p.protocols.liveliness.modules import ModuleRegistry
@@ -180,6 +181,10 @@ class LivelinessDiscovery(DiscoveryProtocol):
         if message is not None:
             self._handle(now, message, source)
         return self._outbox.drain()
+
+    def publisher_type(self, topic: str, module: str) -> TopicType:
+        types = self._matching.publisher_types(topic)
+        return types.pop() if len(types) == 1 else TopicType()
 
     # Tokens of other modules
 

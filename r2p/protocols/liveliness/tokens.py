@@ -243,6 +243,12 @@ class Matching:
         if topic in self.topics:
             self.topics[topic].mismatch = topic in self._mismatches
 
+    def publisher_types(self, topic: str) -> set[TopicType]:
+        """Return the types of a topic's publishers whose messages are accepted."""
+        key = topic, ROLE_PUBLISHES
+        sessions = self._sessions_of.get(key, {}).values()
+        return {_type_of(session.tokens[key]) for session in sessions if key in session.matched}
+
     def _clear_mismatch(self, session: _PeerSession, key: TopicRole) -> None:
         """Forget that the session's type of the topic did not fit."""
         if session.mismatched.pop(key, None) is not None:

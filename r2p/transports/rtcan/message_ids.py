@@ -82,8 +82,8 @@ class MessageIdMap:
         if topic is None or not topic.wanted:
             return
         size, varies = found.bound if found.varies else found.size, found.varies
-        if topic.layout is not None:
-            size, varies = topic.layout.size, topic.layout.varies
+        if (layout := topic.received_layout) is not None:
+            size, varies = layout.size, layout.varies
         message_id = management.rtcan_message_id(found.params)
         possible = varies or 1 <= size <= rtcan.PAYLOAD_MAX
         if not (possible and self._plausible(message_id, found.source)):

@@ -30,7 +30,7 @@ from r2p.protocols.discovery.events import (
     Undeclare,
 )
 from r2p.protocols.liveliness.session import TOKENS_MAX, LivelinessDiscovery
-from r2p.runtime.sample import PublisherClass
+from r2p.runtime.sample import PublisherClass, Source
 from r2p.runtime.topic import Topic
 from r2p.transports.announcement import NOTHING, Announcement
 from r2p.transports.link import Hub, Link, unique_name
@@ -213,6 +213,9 @@ class ZenohLink(Link):
                 super()._act(event)
 
     # Types
+
+    def fingerprint_of(self, topic: str, source: Source) -> bytes:
+        return self.receiver.fingerprint_of(topic, source)
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         session = self._session

@@ -24,6 +24,7 @@ from r2p.codecs.attachment import (
     encode_credit,
     split,
 )
+from r2p.codecs.management import ANY_TYPE
 from r2p.errors import DecodeError
 from r2p.protocols.discovery.events import TopicType
 from r2p.protocols.flow_control import CREDIT_BYTES, UNCOUNTED_BYTES, ReceiveWindow
@@ -31,7 +32,7 @@ from r2p.protocols.time_left import TimeLeft
 from r2p.runtime.backpressure import Sink
 from r2p.runtime.sample import LastReceived, PublisherClass, Sample, Source
 from r2p.runtime.topic import Topic
-from r2p.transports.announcement import type_of
+from r2p.transports.announcement import asked_type
 from r2p.transports.link import MESSAGES_PER_TURN, Hub, Link
 from r2p.transports.receive_backpressure import Backlog
 from r2p.transports.zenoh.large import LARGE, keep_freed_memory
@@ -97,14 +98,14 @@ class RxStream:
         self._receiver = receiver
         self._loop = receiver.loop
         self._paused = False
-        self._type = type_of(topic)
+        self._type = asked_type(topic)
         self._bound, self._long = self._limits()
         self._headers = HeaderReader(self._new_publisher)
 
     def update(self) -> None:
         """Apply a change of the topic's type, or of the number of messages on the way."""
         self._bound, self._long = self._limits()
-        topic_type = type_of(self.topic)
+        topic_type = asked_type(self.topic)
         if topic_type != self._type:
             self._type = topic_type
             for publisher in self._headers.known.values():
@@ -116,7 +117,7 @@ class RxStream:
 
     def _limits(self) -> tuple[int, bool]:
         """Return the bytes of the longest message, and whether messages may be so long that their bytes are counted."""
-        layout, link = self.topic.layout, self._receiver.link
+        layout, link = self.topic.received_layout, self._receiver.link
         if layout is None:
             return link.max_payload, True
         if not layout.varies:
@@ -124,6 +125,11 @@ class RxStream:
         if link.gateway_hooks is not None:  # other modules may have other bounds: no part of the type
             return link.max_payload, True
         return max((queue.size_max for queue in self.topic.queues), default=layout.size), True
+
+    def fingerprint_of(self, source: Source) -> bytes:
+        """Return the fingerprint in the headers of a publisher's messages; ANY_TYPE if there is none."""
+        origins = (each.origin for each in self._headers.known.values() if each.source == source)
+        return next((origin.fingerprint for origin in origins), ANY_TYPE)
 
     def add_session(self, session: int) -> None:
         """Remember a publisher's module, which gets a final credit even if none of its messages has arrived yet."""
@@ -511,9 +517,16 @@ class ZenohReceiver:
         if topic.queues and all(queue.lossy for queue in topic.queues):
             return 0
         size = _UNKNOWN_SIZE if topic.layout is None else topic.layout.size
+        if topic.accepted:
+            size = max(each.size for each in topic.accepted)
         return min(WINDOW, max(_WINDOW_MIN, _WINDOW_BYTES // (size + _OVERHEAD)))
 
     # Publishers
+
+    def fingerprint_of(self, topic: str, source: Source) -> bytes:
+        """Return the fingerprint in the headers of a publisher's messages; ANY_TYPE if there is none."""
+        stream = self._streams.get(topic)
+        return ANY_TYPE if stream is None else stream.fingerprint_of(source)
 
     def add_publisher(self, topic: Topic, sender: Hashable) -> None:
         """Add a module that publishes the topic."""
