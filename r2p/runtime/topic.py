@@ -137,6 +137,11 @@ class Topic:
         """The layout of all messages that are received; None if it is unknown, or there may be several."""
         return None if self.accepted else self.layout
 
+    def received_size(self, announced: int) -> int:
+        """Return the bytes of each message of a publisher that has announced so many; 0: any."""
+        layout = self.received_layout
+        return announced if layout is None else layout.exact_size
+
     def last_received(self, publisher: Hashable) -> LastReceived:
         """Return the record that all links with a remote publisher share, to recognise duplicates.
 

@@ -536,14 +536,11 @@ class Link(abc.ABC):
         self._hub.discovered(self, event)
 
     def _publisher_found(self, name: str, size: int, source: Hashable = None) -> None:
-        topic = self._space.topics.get(name)
-        if topic is not None and topic.wanted:
-            layout = topic.received_layout
-            self.add_publisher(topic, size if layout is None else layout.exact_size, source)
+        if (topic := self._space.topics.get(name)) is not None and topic.wanted:
+            self.add_publisher(topic, topic.received_size(size), source)
 
     def _remove_subscriber(self, name: str) -> None:
-        subscriber = self._subscribers.pop(name, None)
-        if subscriber is not None:
+        if (subscriber := self._subscribers.pop(name, None)) is not None:
             subscriber.topic.leave(subscriber)
 
 
