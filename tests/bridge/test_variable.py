@@ -6,11 +6,13 @@ import asyncio
 from collections import Counter
 from contextlib import AsyncExitStack
 from typing import Annotated, Any
+from unittest.mock import Mock
 
 import pytest
 
 import r2p
 from r2p.bridge import BridgeOptions
+from r2p.bridge.forwarding import HeldMessages
 from r2p.testing.network import node_in
 from r2p.transports.rtcan.link import RtcanLink
 from tests.transports.cables import LineCable
@@ -114,3 +116,10 @@ async def test_a_bound_for_which_there_are_never_slots() -> None:
         with pytest.raises(r2p.TransportError, match="up to 100004 bytes, and it carries at most 1020"):
             bob.advertise("strict", Note, r2p.Periodic(0.1, Note), strict=True)
         assert {sample.publisher_class for sample in far.queue} == {r2p.PublisherClass.SPORADIC}
+
+
+def test_messages_that_wait_for_the_gateway_are_limited_in_bytes_too() -> None:
+    held, long = HeldMessages(), r2p.Sample(bytes(32 << 20), r2p.Source(), 0)
+    assert [held.hold(long, list) for _ in range(3)] == [True, True, False]
+    held.release(Mock())
+    assert held.hold(long, list)

@@ -10,7 +10,7 @@ from r2p.errors import TransportError
 from r2p.msg import Float32
 from r2p.sim import run
 from r2p.testing.network import node_in
-from r2p.transports.memory import IN_FLIGHT, MemoryNetwork, network
+from r2p.transports.memory import IN_FLIGHT, Datagram, MemoryNetwork, MemoryPort, network
 from r2p.transports.url import open_transport
 
 MESSAGES = 500
@@ -119,3 +119,18 @@ async def test_options_of_the_url_hold_for_the_whole_network() -> None:
 def test_a_network_without_a_name() -> None:
     with pytest.raises(TransportError, match="give the network a name"):
         open_transport("memory:")
+
+
+@pytest.mark.virtual_time
+async def test_what_is_on_its_way_is_limited_in_bytes_too() -> None:
+    """64 MiB; one message always has room."""
+    net = MemoryNetwork(delay=1.0)
+    received: list[Datagram] = []
+    net.plug_in(2, MemoryPort(net, received.append, lambda: None))
+    image = Datagram(1, b"image", bytes(32 << 20))
+    for full in (False, True):
+        assert not net.full
+        net.send(image)
+        assert net.full is full
+    await asyncio.sleep(1.5)
+    assert (received, net.full) == ([image] * 2, False)
