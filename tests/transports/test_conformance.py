@@ -379,6 +379,17 @@ async def test_messages_of_every_length_both_ways(cable: Cable) -> None:
 
 
 @conforms
+async def test_empty_messages(cable: Cable) -> None:
+    async with two_nodes(cable) as (alice, bob):
+        publisher, subscriber = alice.advertise("go", Go), bob.subscribe("go", Go, queue=99)
+        await publisher.wait_subscriber()
+        await subscriber.wait_publisher()
+        for _ in range(3):
+            await publisher.publish(Go())
+        assert [await subscriber.fetch() for _ in range(3)] == [Go()] * 3
+
+
+@conforms
 async def test_what_is_too_long_for_the_link_is_counted_and_reported_and_the_others_pass(cable: Cable) -> None:
     missed: list[r2p.Missed] = []
     async with two(cable) as (a, b), node_in(a) as alice, node_in(b) as bob:
