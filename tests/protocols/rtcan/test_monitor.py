@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r2p.codecs import can_bits, management, rtcan
+from r2p.codecs import call_parts, can_bits, management, rtcan
 from r2p.codecs.can_bits import INTERMISSION
 from r2p.codecs.rtcan import Frame, OtherFrame
 from r2p.protocols.rtcan.cycle import timing
@@ -218,6 +218,18 @@ def test_nothing_on_the_bus_upsets_it(frames: list[tuple[int, bytes, int]]) -> N
         monitor.frame(Frame(identifier, data), now)
     assert sum(tally.frames for tally in monitor.load(now).tallies.values()) == len(frames)
     assert len(monitor.slots) <= 64
+
+
+def test_parts_of_calls_are_described_and_damaged_ones_are_not() -> None:
+    monitor = Monitor(timing())
+    message = rtcan.message_id(rtcan.MANAGEMENT, 5)
+    part = call_parts.encode(0xA1B2C3D4, 7, bytes(40))[1]
+    for data, text in (
+        (part, "CallPart sender=a1b2c3d4 serial=7 part=1 length=40"),
+        (part[:6] + b"\xff" + part[7:], "unknown management 0x5b"),
+    ):
+        frames = [Frame(rtcan.encode_identifier(10, message, left), each) for left, each in rtcan.fragments(data)]
+        assert [monitor.frame(frame, number * MS).text for number, frame in enumerate(frames, 1)][-1] == text
 
 
 def test_management_of_firmware_that_has_no_time_left_is_not_shown_as_a_sync() -> None:
