@@ -16,7 +16,7 @@ from r2p.messages.shapes import show
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 _REQUIRED = re.compile(r"Required field '(\w+)' cannot follow optional fields")
-_OPTION = re.compile(r"'(\w+)' is an invalid keyword argument for StructMeta")
+_OPTION = re.compile(r"(?=.*keyword argument).*'(\w+)'")  # Python's text depends on its version
 _ARGUMENTS = re.compile(
     r"(Unexpected keyword|Missing required) argument '\w+'|Extra positional arguments|Argument '\w+' given by name and"
 )

@@ -84,12 +84,13 @@ class Output:
         try:
             yield
         except asyncio.CancelledError:
-            if not closed or task is None:
+            if not closed:
                 raise
-            task.uncancel()
             raise PipeClosed from None
         finally:
             loop.remove_reader(fd)
+            if closed and task is not None:
+                await _take_back(task)
 
     async def put(
         self, record: Record, text: str | None = None, *, colour: int | None = None, wrap: bool = False
@@ -175,6 +176,13 @@ class Output:
             raise PipeClosed from error
         except OSError as error:
             raise Unwritable(f"can't write the output: {error.strerror}") from error
+
+
+async def _take_back(task: asyncio.Task[Any]) -> None:
+    """Take back a cancellation of this task, also one that is still to come: task groups put it off (Python 3.13)."""
+    with contextlib.suppress(asyncio.CancelledError):
+        await asyncio.sleep(0)
+    task.uncancel()
 
 
 def waitable(stream: TextIO) -> int | None:

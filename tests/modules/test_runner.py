@@ -149,7 +149,7 @@ def test_a_crash_is_logged_once_and_is_one_line_at_the_end_also_after_a_signal()
     ended = execute(program, signal.SIGINT)
     assert (ended.code, ended.out) == (1, "ready\ncleaned up\nno motor\n")
     timeless = re.sub(r"^\d\d:\d\d:\d\d\.\d\d\d ", "", ended.err, flags=re.MULTILINE)
-    lines = timeless.splitlines()
+    lines = [each for each in timeless.splitlines() if "event loop" not in each]  # a computer may be slow now
     assert lines[:4] == [
         "INFO    PC1/broken: on",
         "WARNING r2p: link is down",

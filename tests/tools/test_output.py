@@ -254,6 +254,34 @@ async def test_a_closed_pipe_ends_who_waits_for_something_to_print(pipe: tuple[i
 
 
 @pytest.mark.anyio
+async def test_a_pipe_that_closes_while_an_error_ends_the_block(pipe: tuple[int, io.TextIOWrapper]) -> None:
+    """The error is all that is left: no cancellation hits what the program does next."""
+    reading, stream = pipe
+    task = asyncio.current_task()
+    assert task is not None
+
+    async def linger() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            os.close(reading)
+            while not task.cancelling():  # noqa: ASYNC110 - no event tells
+                await asyncio.sleep(0)
+
+    async def write() -> None:
+        async with Output("json", stream).while_read(), asyncio.TaskGroup() as group:
+            group.create_task(linger())
+            await asyncio.sleep(0)
+            raise PipeClosed
+
+    with pytest.raises(ExceptionGroup) as raised:
+        await write()
+    assert [type(each) for each in raised.value.exceptions] == [PipeClosed]
+    await asyncio.sleep(0)
+    assert not task.cancelling()
+
+
+@pytest.mark.anyio
 async def test_a_cancelled_writer_stays_cancelled(pipe: tuple[int, io.TextIOWrapper]) -> None:
     _, stream = pipe
 

@@ -11,11 +11,12 @@ is ever repeated), and integers have at most `BITS_MAX` bits.
 import ast
 import contextlib
 import difflib
+import functools
 import math
 import operator
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sized
 from typing import Any
 
 from r2p.errors import Error
@@ -333,6 +334,18 @@ def _round(value: float, digits: int = 0) -> Any:
     return round(value, digits)
 
 
+def _extreme(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return max or min; Python's own text for no values depends on its version."""
+
+    @functools.wraps(function)
+    def pick(*values: Any) -> Any:
+        if len(values) == 1 and isinstance(values[0], Sized) and not len(values[0]):
+            raise ValueError(f"{function.__name__}() of no values")
+        return function(*values)
+
+    return pick
+
+
 def _kind(value: Any) -> str:
     if isinstance(value, int | float):
         return "a number"
@@ -359,8 +372,8 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "hypot": math.hypot,
     "isnan": math.isnan,
     "len": len,
-    "max": max,
-    "min": min,
+    "max": _extreme(max),
+    "min": _extreme(min),
     "round": _round,
     "sqrt": math.sqrt,
     "sum": sum,

@@ -25,6 +25,9 @@ _DATAGRAMS = {"udp", "quic"}
 _WRONG_TIME = {9, 10}
 """OpenSSL's codes for a certificate that is not valid yet, and for one that has expired."""
 
+_ZENOH_TRUSTS = ssl.VERIFY_X509_TRUSTED_FIRST | ssl.VERIFY_X509_PARTIAL_CHAIN
+"""zenoh takes any authority in its file: an intermediate one, or one without key usage (which Python 3.13 refuses)."""
+
 _NO_TLS = "it does not speak TLS: connect to tcp/ instead of tls/, or correct the router's listen endpoint"
 
 
@@ -245,6 +248,7 @@ def _context(tls: Tls) -> ssl.SSLContext:
     except ssl.SSLError as error:
         raise FilesUnusable(f"{tls.root} contains no certificate in PEM format") from error
     context.check_hostname = tls.check_name
+    context.verify_flags = _ZENOH_TRUSTS
     if tls.certificate is not None:
         _load_certificate(context, tls.certificate, tls.key)
     return context

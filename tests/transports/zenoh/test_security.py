@@ -82,7 +82,8 @@ async def test_tls(tmp_path: Path) -> None:
 
 @guarded
 async def test_a_certificate_for_another_name(tmp_path: Path) -> None:
-    authority = Authority(tmp_path / "ca")
+    """Of an authority that zenoh trusts, though it is an intermediate one, and its certificate has no key usage."""
+    authority = Authority(tmp_path / "ca", by=Authority(tmp_path / "root"))
     certificate, key = authority.sign("router", host="robot.example")
     net = Secured(tmp_path, "tls")
     async with module("A", net.router(transport=tls(listen_certificate=certificate, listen_private_key=key))):
