@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import r2p
 from r2p.testing.network import node_in
@@ -23,6 +23,16 @@ class Add(r2p.Service):
     class Response(r2p.Message):
         total: r2p.u64 = 0
         spare: tuple[r2p.u64, r2p.u64, r2p.u64] = (0, 0, 0)
+
+
+class Names(r2p.Service):
+    """What a request without fields asks for: a list, as long as it is."""
+
+    class Request(r2p.Message):
+        pass
+
+    class Response(r2p.Message):
+        names: Annotated[tuple[Annotated[str, r2p.Max(30)], ...], r2p.Max(5)] = ()
 
 
 async def add(request: Add.Request) -> Add.Response:

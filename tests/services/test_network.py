@@ -18,7 +18,7 @@ from r2p.codecs import services
 from r2p.codecs.services import Kind, ServiceHeader
 from r2p.sim import run
 from r2p.testing.network import Network, node_in
-from tests.services.common import Add, Desk, add, outcome, until
+from tests.services.common import Add, Desk, Names, add, outcome, until
 
 if TYPE_CHECKING:
     from r2p.services.server import Handler
@@ -233,16 +233,6 @@ async def test_a_call_through_gateways() -> None:
             answer = await calls.call(Add.Request(a=number), timeout=5.0, server="S")
             assert answer == Add.Response(total=number)
         assert desk.begun == list(range(50))
-
-
-class Names(r2p.Service):
-    """What a request without fields asks for: a list, as long as it is."""
-
-    class Request(r2p.Message):
-        pass
-
-    class Response(r2p.Message):
-        names: Annotated[tuple[Annotated[str, r2p.Max(20)], ...], r2p.Max(5)] = ()
 
 
 async def test_requests_and_responses_may_vary_in_length() -> None:

@@ -19,7 +19,7 @@ from r2p.protocols.discovery.events import Mismatched, ModuleGone, NameConflict
 from r2p.runtime.events import ModuleEvent
 from r2p.testing.network import node_in
 from r2p.transports.line import LineLink
-from tests.services.common import Add, Desk, add
+from tests.services.common import Add, Desk, Names, add
 from tests.transports.cables import GUARD, Cable, conforms, conforms_lines
 from tests.transports.exchange import EVERY, filled
 
@@ -156,6 +156,27 @@ async def test_calls_both_ways_their_errors_and_their_end(cable: Cable) -> None:
         call.cancel()
         await until(lambda: desk.cancelled)
         assert desk.begun == [1]
+
+
+@conforms
+async def test_calls_whose_length_varies(cable: Cable) -> None:
+    """A request without fields, responses from nothing to 200 bytes, and an error whose text is as long."""
+
+    async def names(_request: Names.Request) -> Names.Response:
+        if len(known) > 4:
+            raise r2p.ServiceError("too many " + "names " * 50)
+        return Names.Response(names=tuple(known))
+
+    known: list[str] = []
+    async with two_nodes(cable) as (alice, bob):
+        alice.serve("names", Names, names)
+        calls = bob.client("names", Names)
+        await calls.ready()
+        while len(known) <= 4:
+            assert await calls.call(Names.Request(), timeout=GUARD) == Names.Response(names=tuple(known))
+            known.append("x" * 7 * len(known))
+        with pytest.raises(r2p.ServiceError, match=r"^service names of A: too many names .{150,}names\.\.\.$|too many"):
+            await calls.call(Names.Request(), timeout=GUARD)
 
 
 @conforms
