@@ -107,7 +107,7 @@ def check_class(topic: str, klass: NonRealTime | Sporadic | Periodic[Any]) -> No
             raise MessageError(f"topic {topic}: {name} is a function that takes an r2p.Missed, not {signal!r}")
 
 
-def check_count(topic: str, option: str, value: object) -> None:
-    """Raise MessageError unless the value is a number of messages."""
+def check_count(topic: str, option: str, value: object, of: str = "messages") -> None:
+    """Raise MessageError unless the value is a number of messages, or of something else."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise MessageError(f"topic {topic}: {option} is a number of messages, 1 or more, not {value!r}")
+        raise MessageError(f"topic {topic}: {option} is a number of {of}, 1 or more, not {value!r}")

@@ -43,7 +43,7 @@ class SubscriberOptions(msgspec.Struct, frozen=True):
     def check(self, topic: str) -> None:
         """Raise MessageError for invalid options."""
         check_count(topic, "queue", self.queue)
-        check_count(topic, "queue_bytes", self.queue_bytes)
+        check_count(topic, "queue_bytes", self.queue_bytes, "bytes")
         if self.keep not in ("newest", "oldest"):
             raise MessageError(f"topic {topic}: keep is 'newest' or 'oldest', not {self.keep!r}")
         if self.callback is not None and not callable(self.callback):

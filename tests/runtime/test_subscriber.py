@@ -58,6 +58,7 @@ async def test_a_full_queue_drops_for_its_own_subscriber_only(keep: str, left: l
     ("options", "text"),
     [
         *(({"queue": bad}, "queue is a number of messages, 1 or more") for bad in (0, -1, 1.5, math.nan, None, True)),
+        ({"queue_bytes": 0}, "queue_bytes is a number of bytes, 1 or more, not 0"),
         *(({"max_age": bad}, "max_age is in seconds, 1e-06 to") for bad in (0, math.nan, math.inf, "1")),
         *(({"timeout": bad}, "timeout is in seconds, 1e-06 to") for bad in (-1.0, 1e-9, math.nan, math.inf)),
         ({"keep": "latest"}, "keep is 'newest' or 'oldest', not 'latest'"),
