@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from statistics import median
-from typing import Annotated, Any
+from typing import Any
 
 import zenoh
 
@@ -15,23 +15,16 @@ from benchmarks.loops import run_on
 from benchmarks.processes import process
 from benchmarks.table import Row, p50_p99
 from benchmarks.zenoh import LISTEN, bare_client, bare_listener, connect, port_of
+from r2p.msg import Image
 
 IMAGE_BYTES = 1_000_000
 IMAGES = 1_000
-TICKS = 8_000  # of 1 ms
+TICKS = 5_000  # of 1 ms
 IMAGE_PERIOD = 0.1  # seconds
 WARM_UP = 1_000  # ticks that do not count
 RUNS = 3  # of each, in turns: neighbours on the computer disturb one run or the other
 
 DATA = bytes(range(250)) * (IMAGE_BYTES // 250)
-
-
-class Picture(r2p.Message):
-    """An image, as the drivers of cameras have it."""
-
-    width: r2p.u32
-    height: r2p.u32
-    data: Annotated[bytes, r2p.Max(64_000_000)]
 
 
 class Tick(r2p.Message):
@@ -40,7 +33,7 @@ class Tick(r2p.Message):
     sent_ns: r2p.u64
 
 
-PICTURE = Picture(width=1000, height=1000, data=DATA)
+IMAGE = Image(width=1000, height=1000, encoding="mono8", step=1000, data=r2p.Array(DATA))
 Times = list[float]
 
 
@@ -56,7 +49,7 @@ def _receive_r2p(pipe: Connection, shm: str, ticks: bool) -> None:
 
     async def count(node: r2p.Node) -> None:
         images, started = 0, 0.0
-        async for image in node.subscribe("images", Picture):
+        async for image in node.subscribe("images", Image):
             started = started or time.perf_counter()
             images += len(image.data) == IMAGE_BYTES
             if images == IMAGES:
@@ -85,13 +78,13 @@ def _send_r2p(port: int, pipe: Connection, shm: str, ticks: bool) -> object:
     module = r2p.Module("CLIENT", via=f"{connect(port)}&shm={shm}", watchdog=False)
 
     async def images(node: r2p.Node) -> None:
-        publisher = node.advertise("images", Picture)
+        publisher = node.advertise("images", Image)
         await publisher.wait_subscriber()
         if ticks:
             async for _ in node.every(IMAGE_PERIOD):
-                await publisher.publish(PICTURE)
+                await publisher.publish(IMAGE)
         for _ in range(IMAGES):
-            await publisher.publish(PICTURE)
+            await publisher.publish(IMAGE)
 
     async def tick(node: r2p.Node) -> None:
         publisher = node.advertise("ticks", Tick, r2p.Sporadic(deadline=0.1))
