@@ -35,7 +35,7 @@ TypeArguments = Annotated[
 @app.command("list")
 @standalone
 async def list_(*, format: Format = None) -> None:
-    """List the types in r2p.msg and those that r2p.toml names, with the sizes of their messages."""
+    """List the types in r2p.msg and those that r2p.toml names."""
     output = Output(format)
     await put_sizes(output, sorted(map(_row, _known()), key=lambda row: str(row["type"])), _COLUMNS)
 
@@ -43,7 +43,7 @@ async def list_(*, format: Format = None) -> None:
 @app.command("show")
 @standalone
 async def show(type: TypeArgument, *, format: Format = None) -> None:
-    """Show a message type: its size, its fingerprint, and its fields in the order of their bytes."""
+    """Show a type: its size, fingerprint and fields."""
     output = Output(format)
     cls = Types(settings()).load(type)
     shape = r2p.layout(cls)
@@ -64,10 +64,10 @@ async def export(
     *,
     c: Annotated[Path, typer.Option("--c", metavar="DIR", help="Where to write the C headers.", show_default=False)],
 ) -> None:
-    """Write packed C structs of message types, one header for each: DIR/package/Name.h.
+    """Write packed C structs of message types.
 
-    The compiler checks their sizes and offsets. Types whose length varies have no struct, as firmware's messages have
-    a fixed size.
+    Each gets a header, DIR/package/Name.h, in which the compiler checks its size and offsets. Types whose length varies
+    have no struct, as firmware's messages have a fixed size.
     """
     known = Types(settings())
     classes = [known.load(text) for text in types or ()] or [cls for cls in _known() if r2p.layout(cls).exact_size]

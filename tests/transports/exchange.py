@@ -8,7 +8,7 @@ import sys
 from collections.abc import AsyncIterator
 
 import r2p
-from r2p.messages import Message, layout
+from r2p.messages import Message, Nested, Shape, VariableArray, VariableText, layout
 from r2p.modules.runner import run_main
 from r2p.runtime.events import ModuleEvent
 from r2p.tools.types import standard_types
@@ -17,8 +17,20 @@ EVERY = standard_types()
 
 
 def filled(cls: type[Message]) -> Message:
-    """A message of bytes other than zero, as far as its type lets them; texts are text, too."""
-    return layout(cls).decode(bytes(0x31 + at % 0x40 for at in range(layout(cls).size)))
+    """A message of bytes other than zero, as far as its type lets them; texts are text, too. Short where it varies."""
+    return layout(cls).decode(b"".join(_filling(field.shape) for field in layout(cls).fields))
+
+
+def _filling(shape: Shape) -> bytes:
+    match shape:
+        case Nested(inner):
+            return b"".join(_filling(field.shape) for field in inner.fields)
+        case VariableText(_):
+            return b"\1\0\0\0x"
+        case VariableArray(item, _):
+            return b"\1\0\0\0" + _filling(item)
+        case _:
+            return bytes(0x31 + at % 0x40 for at in range(shape.size))
 
 
 async def exchange(node: r2p.Node, peer: str) -> None:
