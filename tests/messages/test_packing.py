@@ -21,7 +21,8 @@ from tests.messages.classes import Derived, Keywords, Numbers, Redefined, Robot,
 from tests.messages.strategies import messages
 
 STANDARD = standard_types()
-ALL = [*STANDARD, Numbers, Robot, Keywords, Derived, Redefined]
+ALL: list[type[Message]] = [*STANDARD, Numbers, Robot, Keywords, Derived, Redefined]
+FIXED = [each for each in ALL if not layout(each).varies]  # test_variable.py has bytes of others
 BASE = Robot()
 
 
@@ -36,14 +37,14 @@ def one(kind: str) -> type[Any]:
 def test_round_trip(cls: type[Message], data: st.DataObject) -> None:
     message = data.draw(messages(layout(cls)))
     packed = message.encode()
-    assert len(packed) == layout(cls).size
+    assert layout(cls).size_min <= len(packed) <= layout(cls).size
     assert cls.decode(packed) == message
     assert cls.decode(packed).encode() == packed
 
 
 @settings(max_examples=30)  # of each class
 @given(st.data())
-@pytest.mark.parametrize("cls", ALL)
+@pytest.mark.parametrize("cls", FIXED)
 def test_any_bytes_are_a_message_or_a_decode_error(cls: type[Message], data: st.DataObject) -> None:
     size = layout(cls).size
     raw = data.draw(st.binary(min_size=size, max_size=size))
