@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from r2p import keys
 from r2p.transports.url import open_transport
 from tests.docs.blocks import ROOT, pages
 
@@ -18,7 +19,9 @@ WRONG = {"serial:/dev/ttyUSB0,speed=9600"}  # the page shows its error
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
-def test_urls(page: Path) -> None:
+def test_urls(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    keys.create(Path("robot.key"))  # the one that the pages make
     found = {match[0].rstrip(";,") for match in URL.finditer(page.read_text())}
     for url in sorted(found - WRONG):
         if not PLACEHOLDER.search(url):

@@ -180,10 +180,8 @@ class BasePublisher(Generic[M, C]):
         stamp = self._now()
         if deadline:
             deadline += stamp
-        if self._shares is not None and not self._shares(message):  # subscribers decode the bytes
-            sample = Sample(data, self._source, stamp, deadline, sequence, self.publisher_class)
-        else:
-            sample = Sample(data, self._source, stamp, deadline, sequence, self.publisher_class, message)
+        shared = message if self._shares is None or self._shares(message) else None  # without it, the bytes are decoded
+        sample = Sample(data, self._source, stamp, deadline, sequence, self.publisher_class, shared)
         if self.latch:
             self._last = sample
         return sample

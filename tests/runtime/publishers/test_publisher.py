@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import array
 import asyncio
 import functools
 import math
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pytest
 
@@ -587,3 +588,24 @@ async def test_a_message_that_many_missed_does_not_make_others_count_again() -> 
             publisher.link_missed(link, "never sent", sequence=1 if link == "first" else 2)
         publisher.link_missed("last", "never sent", sequence=1)
         assert publisher.missed == 2
+
+
+class Samples(r2p.Message):
+    values: Annotated[r2p.Array[r2p.f32], r2p.Max(4)] = r2p.Array()
+
+
+@pytest.mark.virtual_time
+@pytest.mark.parametrize("klass", [r2p.NonRealTime(), r2p.Sporadic(deadline=1.0)])
+async def test_a_buffer_that_can_be_written_to_is_not_shared(klass: r2p.NonRealTime | r2p.Sporadic) -> None:
+    """Subscribers get what was published, also if the publisher uses its buffer again; what is immutable they share."""
+    async with local() as module:
+        node = module.start(hold, name="n")
+        subscriber = node.subscribe("samples", Samples)
+        publisher = node.advertise("samples", Samples, klass)
+        buffer = array.array("f", [1.0, 2.0])
+        await publisher.publish(Samples(buffer))  # type: ignore[arg-type]
+        buffer[0] = 9.0
+        received = await subscriber.fetch()
+        assert received == Samples(r2p.Array([1.0, 2.0]))
+        await publisher.publish(received)
+        assert await subscriber.fetch() is received
