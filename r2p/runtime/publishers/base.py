@@ -69,6 +69,7 @@ class BasePublisher(Generic[M, C]):
         self._space = space
         self._topic = topic
         self._encode = layout.encode
+        self._decode = layout.decode
         self._shares = layout.packing.shares
         self._clock = space.clock
         self._now = space.clock.now
@@ -180,7 +181,7 @@ class BasePublisher(Generic[M, C]):
         stamp = self._now()
         if deadline:
             deadline += stamp
-        shared = message if self._shares is None or self._shares(message) else None  # without it, the bytes are decoded
+        shared = message if self._shares is None or self._shares(message) else self._decode(data)
         sample = Sample(data, self._source, stamp, deadline, sequence, self.publisher_class, shared)
         if self.latch:
             self._last = sample

@@ -31,7 +31,7 @@ class Publisher(BasePublisher[M, NonRealTime]):
             raise self._wrong_type(message)
         data = self._encode(message)
         self.sent = sequence = self.sent + 1
-        shared = message if self._shares is None or self._shares(message) else None
+        shared = message if self._shares is None or self._shares(message) else self._decode(data)
         sample = Sample(data, self._source, self._now(), 0, sequence, _NRT, shared)
         if self.latch:
             self._last = sample
