@@ -14,7 +14,6 @@ from r2p.clock import Clock
 from r2p.codecs import management
 from r2p.log_lines import get_logger
 from r2p.names import module_alias
-from r2p.transports.link import is_booting
 from r2p.units import SECOND
 
 logger = get_logger("r2p.bridge")
@@ -154,7 +153,7 @@ class OrderRelay:
     def _denied(self, port: BridgePort, other: BridgePort, order: management.Order, link_name: str) -> int:
         """Return why an order may not go to another link, where its module has this name (DENIED_..., 0: it may)."""
         harmless = isinstance(order, management.Stop)
-        if harmless and is_booting(other.link, link_name):
+        if harmless and other.link.discovery.is_booting(link_name):
             return management.DENIED_BOOT
         if other.link.guard is not None and port.link.guard is None:
             return management.DENIED_OPEN_LINK  # this gateway does not lend its key

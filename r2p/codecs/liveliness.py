@@ -56,7 +56,7 @@ _ROLE_NAMES = {role: name for name, role in _ROLES.items()}
 
 
 class ModuleToken(msgspec.Struct, frozen=True):
-    """A running module. `flags` are the FLAG_... bits of ALIVE; `instance` is None for firmware behind a gateway."""
+    """A running module. `flags` are the FLAG_... bits of ALIVE. Firmware behind a gateway has no `instance`."""
 
     session: int
     name: str

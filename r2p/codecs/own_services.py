@@ -51,7 +51,7 @@ _TOPICS = (REPLIES.encode(), CALLS.encode())
 
 
 class Operation(enum.IntEnum):
-    """What a module can be asked for; it answers others with an error."""
+    """Operations of modules; a module answers any other one with an error."""
 
     SCHEMA = 1
     STATISTICS = 2

@@ -265,7 +265,7 @@ def sharing(shape: Shape) -> Callable[[Any], bool] | None:
 
 
 def _is_decoded(value: object, code: str) -> bool:
-    """Return whether a value is an Array as decoding makes it: over bytes, into which nobody can write."""
+    """Return whether a value is what decoding makes: an Array of this format whose buffer is immutable bytes."""
     return isinstance(value, Array) and value.view.format == code and value.view.obj.__class__ is bytes
 
 

@@ -311,8 +311,8 @@ class Packing(msgspec.Struct, frozen=True, eq=False):
     read: "Read"
     """Unpack the message that begins at an offset; return it and the offset of its end."""
     shares: Callable[[Any], bool] | None = None
-    """Says whether local subscribers may have this very message: decoding gives one that is equal, in the same types,
-    and nobody can write into it. None: they always may.
+    """Says whether local subscribers may share a message: whether decoding would give an equal one of the same types,
+    and all its buffers are immutable. None: always.
     """
 
 

@@ -51,7 +51,7 @@ from r2p.protocols.keys import Verdict
 from r2p.runtime.events import EventHub, LinkDown, LinkNotice, LinkUp, LinkWaits, Listening
 from r2p.runtime.topic import Topic, TopicSpace
 from r2p.transports.guard import OTHER_END_WANTS_KEY, OTHER_KEY
-from r2p.transports.link import Link, is_booting
+from r2p.transports.link import Link
 from r2p.transports.stats import LinkStats
 from r2p.units import SECOND
 from r2p.version import __version__
@@ -156,7 +156,7 @@ class LinkManager:
 
     def command(self, command: Command, module: str) -> None:
         """Send a command to another module, by all links. Raises Error for a harmful one."""
-        if command is Command.STOP and any(is_booting(link, module) for link in self.links):
+        if command is Command.STOP and any(link.discovery.is_booting(module) for link in self.links):
             raise Error(
                 f"module {module} is in its boot loader, where a STOP hangs its management until its power is cut: "
                 f"there is nothing to stop; reboot it (r2p module reboot {module})"

@@ -34,7 +34,7 @@ _Name = Annotated[str, Max(_NAME_MAX)]
 
 
 class ReasonCount(Message, name="r2p_msgs/ReasonCount"):
-    """How often something happened for one reason."""
+    """A counter: the number of times that something happened for this reason."""
 
     reason: _Name = ""
     count: u64 = 0

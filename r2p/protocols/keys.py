@@ -71,7 +71,7 @@ class LinkEnd(enum.IntEnum):
 
 
 class Verdict(enum.Enum):
-    """Whether a message that needs a seal counts."""
+    """The judgement on a message that needs a seal: admitted, or the reason why it is not."""
 
     ADMITTED = "admitted"
     NO_KEY = "without key"  # it has no seal
@@ -93,9 +93,7 @@ class _ProvenSession(msgspec.Struct):
     used: int = 0
 
     def renew(self, now: int, counter: int) -> None:
-        """Enter another proof. What was sent before the proof before it does not count any more; after a gap between
-        the two, nothing does that was sent before this one.
-        """
+        """Enter another proof: the counters up to that of the last one expire; after a gap, all up to this one."""
         self.floor = counter if now - self.proven_at >= PROOF_VALID else self.proven
         self.proven_at, self.proven = now, counter
 
@@ -200,7 +198,7 @@ class KeyProtocol:
     # Other modules prove themselves
 
     def challenge(self, now: int, session: int = ANY_SESSION) -> Challenge:
-        """Return a challenge to this session, or to whoever is at the other end of the line."""
+        """Return a challenge to this session; by default, to any module at the other end of the line."""
         nonce = self._draw(keys.NONCE)
         while len(self._challenged) >= CHALLENGES_MAX:
             del self._challenged[next(iter(self._challenged))]

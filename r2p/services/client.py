@@ -254,7 +254,7 @@ class ServiceClient(Generic[Q, R]):
         return call
 
     def _end(self, call: Call) -> None:
-        """Forget a call that has an answer, or none any more."""
+        """Forget a call that is over, answered or not."""
         if self._calls.pop(call.key, None) is not None and call.target is not None:
             self._numbers.open.discard(call.key)
 

@@ -99,7 +99,7 @@ def _nested(name: str, service: Any, part: str) -> type[Message]:
 
 
 def _topic_layout(body: Layout[Any], end: str, field: str) -> Layout[Any]:
-    """Return the layout of a topic of the pair: the header, then one field. Its type is called after the field's."""
+    """Return the layout of a topic of the pair: the header, then one field, after whose type it is named."""
     path = body.cls.__qualname__.rpartition("<locals>.")[2]  # with the classes that it is nested in
     name, package = path.replace(".", "_") + end, body.name.partition("/")[0]
     full_name = f"{re.sub(_NOT_IN_NAMES, '', package) or 'r2p'}/{re.sub(_NOT_IN_NAMES, '', name)}"

@@ -71,7 +71,7 @@ def header_path(shape: Layout[Any]) -> str:
 
 
 def with_nested(shape: Layout[Any]) -> Iterator[Layout[Any]]:
-    """Yield a type, and the types of its fields; one that is in several places more than once."""
+    """Yield a type and the types of its fields, in depth; a type in several places comes several times."""
     yield shape
     for field in shape.fields:
         inner, _ = _element(field.shape)

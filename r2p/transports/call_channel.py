@@ -46,7 +46,7 @@ class CallHub(Protocol):
 class CallChannel:
     """The calls and answers of one link.
 
-    `management_rate` is that of the link's management messages, one of which is as long as a part.
+    `management_rate` is the number of management messages a second that the link carries; a part is as long as one.
     """
 
     def __init__(self, link: CallLink, hub: CallHub, management_rate: float) -> None:

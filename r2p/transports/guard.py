@@ -78,7 +78,7 @@ class LinkGuard:
         self._link.write_management(data, urgent=urgent)
 
     def challenge(self) -> None:
-        """Have whoever is at the other end of the line prove the key."""
+        """Challenge the other end of the line to prove that it has the key."""
         self._write(self.protocol.challenge(self._clock.monotonic()))
 
     def admits(self, data: bytes, source: Hashable) -> bool:
@@ -144,10 +144,9 @@ class LinkGuard:
 
 
 class LineGate:
-    """Keeps a line from coming up until its other end has proven the key.
+    """Keeps a line from coming up until its other end has proven that it has the key.
 
-    `opened` is called then, and `refused(reason, text)` when the other end will not: `reason` is what to send it as
-    DENIED_..., 0 for nothing.
+    `opened()` reports the proof, `refused(reason, text)` its lack: `reason` is the DENIED_... to send, 0 for nothing.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ _SHOWN_MAX = 40  # characters of an unknown server's first line that are shown
 
 
 class ServerKind(enum.Enum):
-    """What a server speaks."""
+    """Protocols of servers."""
 
     UNKNOWN = enum.auto()
     """The server sent nothing, or nothing that is known."""
@@ -34,7 +34,7 @@ class ServerKind(enum.Enum):
 
 
 class Server(msgspec.Struct, frozen=True):
-    """What a server speaks, and what it sent."""
+    """The protocol of a server, and the first bytes that it sent."""
 
     kind: ServerKind
     sent: bytes

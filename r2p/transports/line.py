@@ -32,7 +32,7 @@ from r2p.runtime.topic import Topic
 from r2p.transports.announcement import NOTHING
 from r2p.transports.buffered_link import TOO_LONG, BufferedLink, SenderLookup
 from r2p.transports.guard import LineGate
-from r2p.transports.link import Hub, is_booting
+from r2p.transports.link import Hub
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
@@ -469,7 +469,7 @@ class LineLink(BufferedLink):
         name = topic.name
         module = name.removeprefix(LOADER_PREFIX)
         is_own = module == self._space.module
-        in_boot_mode = bool(self.discovery.flags & FLAG_BOOT) if is_own else is_booting(self, module)
+        in_boot_mode = bool(self.discovery.flags & FLAG_BOOT) if is_own else self.discovery.is_booting(module)
         if in_boot_mode:
             self._loader_topics.add(name)
             if not self._announced.get(name, NOTHING).publishes:

@@ -17,7 +17,7 @@ import msgspec
 
 from r2p.clock import Alarm
 from r2p.codecs import management
-from r2p.codecs.management import FLAG_BOOT, NO_PARAMS, QUEUE
+from r2p.codecs.management import NO_PARAMS, QUEUE
 from r2p.keys import SharedKey
 from r2p.messages import ClockOffset, Message
 from r2p.names import CARRIED_MAX, TOPIC_FIELD
@@ -575,12 +575,6 @@ class LinkSubscriber(RemoteSubscriber):
             return False
         self.count_lost(LINK_DOWN)
         return True
-
-
-def is_booting(link: Link, module: str) -> bool:
-    """Return whether a module on the link is in boot mode, where a STOP does lasting harm."""
-    info = link.discovery.modules.get(module)
-    return info is not None and bool(info.flags & FLAG_BOOT)
 
 
 def unique_name(name: str, hub: Hub) -> str:

@@ -80,7 +80,7 @@ _MODULE_FIELDS: dict[type, tuple[str, ...]] = {
 
 
 class Renamed(msgspec.Struct, frozen=True):
-    """What was heard as `old` is called `new`: the name behind an alias is known now, or not certain any more."""
+    """A change of the name under which an object is known: from its alias to the name behind it, or back."""
 
     kind: int
     old: str
@@ -88,9 +88,9 @@ class Renamed(msgspec.Struct, frozen=True):
 
 
 class LinkNames:
-    """The names of topics and nodes on one link. `chosen` are aliases chosen for topics.
+    """The names of topics and nodes on one link, and their aliases. `chosen` has the aliases of r2p.toml, by topic.
 
-    Timers have the keys ("alias", KIND_..., alias). `emit` is called with events for the link.
+    Timers have the keys ("alias", KIND_..., alias). `emit` reports events for the link.
     """
 
     def __init__(self, chosen: Mapping[str, str] | None = None, timers: KeyedTimers | None = None) -> None:
@@ -190,7 +190,7 @@ class LinkNames:
             self.emit(AliasFreed(heir))
 
     def rival(self, topic: str) -> str:
-        """Return the name because of which the link can't carry this topic of this module; empty: it can."""
+        """Return another name with the alias of this topic, which the link can't carry then; empty without one."""
         key = KIND_TOPIC, self.alias(KIND_TOPIC, topic)
         owner = self._own.get(key, topic)
         if owner != topic:
@@ -348,7 +348,7 @@ class ModuleAliases:
         return None if known == name else name
 
     def other_name(self, name: str) -> str:
-        """Return the other name with the alias of a name; an empty string if it is the only one."""
+        """Return another name that has the same alias; empty without one."""
         alias = module_alias(name)
         known = self.name_of(alias)
         return self._others.get(alias, "") if known in (name, alias) else known

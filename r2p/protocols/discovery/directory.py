@@ -265,7 +265,7 @@ class Directory:
             self.timers.clear(("endpoint", key))
 
     def rename(self, now: int, kind: int, old: str, new: str) -> None:
-        """Rename a topic or a node (KIND_...), as the name behind its alias is known now, or not any more."""
+        """Rename a topic or a node (KIND_...) from its alias to the name behind it, or back."""
         if kind == management.KIND_TOPIC and (info := self.topics.pop(old, None)) is not None:
             info.name = new
             self.topics.setdefault(new, info)
@@ -452,7 +452,7 @@ class LeasedDemand(Demand):
             self._permanent.setdefault(source, {})[topic, role] = None
 
     def rename(self, now: int, old: str, new: str) -> None:
-        """Move the sources of a topic whose alias was understood, or is not any more."""
+        """Move the sources of a topic from its alias to the name behind it, or back."""
         for role in (ROLE_PUBLISHES, ROLE_SUBSCRIBES):
             for source in self.sources_of(old, role):
                 self.expired(old, role, source)

@@ -208,7 +208,7 @@ def describe_mismatch(role: int, ours: TopicType, theirs: TopicType) -> str:
 
 
 class NameConflict(msgspec.Struct, frozen=True):
-    """Two modules have the same name; `instance_a` or `instance_b` is None for firmware."""
+    """Two modules have the same name. Firmware has no instance: None."""
 
     module: str
     instance_a: int | None

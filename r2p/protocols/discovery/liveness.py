@@ -154,7 +154,7 @@ class PeerLiveness:
         return self._aliases.name_of(alias)
 
     def other_module(self, name: str) -> str:
-        """Return the other module with the alias of this one; an empty string if there is none."""
+        """Return another module that has the same alias; empty without one."""
         return self._aliases.other_name(name)
 
     def _is_possible(self, name: str) -> bool:

@@ -92,6 +92,11 @@ class DiscoveryProtocol(ABC):
         self._instance = instance
         self._outbox = Outbox(names.to_wire)
 
+    def is_booting(self, module: str) -> bool:
+        """Return whether a module is in boot mode, where a STOP does lasting harm."""
+        info = self.modules.get(module)
+        return info is not None and bool(info.flags & management.FLAG_BOOT)
+
     @property
     def sole_peer(self) -> int | None:
         """The instance of the only r2p module on the link itself; None unless there is one, and just one."""
@@ -125,7 +130,7 @@ class DiscoveryProtocol(ABC):
         return alias
 
     def other_module(self, name: str) -> str:
-        """Return another module that the alias of this one stands for as well; an empty string if there is none."""
+        """Return another module that has the same alias; empty without one."""
         return ""
 
     def claim(self, topic: str) -> list[Event]:
@@ -276,9 +281,8 @@ class DiscoveryProtocol(ABC):
 class Discovery(DiscoveryProtocol):
     """The management protocol of one link.
 
-    `rate` is the most management messages a second that were not asked for, `burst` how many of them may go at once,
-    `quiet` the time (s) without management traffic before something is repeated. An `observer` sends no ALIVE.
-    `aliases` are those chosen for topics.
+    `rate` is the number of management messages a second, at most, that were not asked for, `burst` the number of them
+    that may go at once. An `observer` sends no ALIVE. `aliases` are those chosen for topics.
     """
 
     def __init__(
@@ -288,7 +292,6 @@ class Discovery(DiscoveryProtocol):
         *,
         rate: float = 250.0,
         burst: int = 32,
-        quiet: float = 0.0,
         observer: bool = False,
         counts: Counter[str] | None = None,
         aliases: Mapping[str, str] | None = None,
@@ -298,7 +301,7 @@ class Discovery(DiscoveryProtocol):
         self._names = LinkNames(aliases, self._timers)
         super().__init__(module, instance, counts, self._names)
         self._names.emit = self._outbox.emit
-        self._schedule = Schedule(rate, burst, round(quiet * SECOND))
+        self._schedule = Schedule(rate, burst, 0)
         self._directory = Directory(self._timers, self.counts)
         self.modules = self._directory.modules
         self.topics = self._directory.topics
@@ -376,7 +379,7 @@ class Discovery(DiscoveryProtocol):
         return self._names.rival(topic)
 
     def _long_name(self, now: int, message: management.LongName, source: PeerAddress) -> None:
-        """Handle LONG_NAME: what was heard under an alias gets its name."""
+        """Handle LONG_NAME: rename everything that is known under this alias."""
         short = self._names.receive(now, message, self.counts)
         if short and not self._observer:  # the user of a tool may ask for a topic by its alias
             self._announcer.announce_name(KIND_TOPIC, short)
@@ -436,7 +439,10 @@ class Discovery(DiscoveryProtocol):
     # The link
 
     def set_pace(self, rate: float, burst: int, quiet: float) -> None:
-        """Change the pace: for links that learn only in use how much the others can take."""
+        """Change the pace, for links that learn in use what the others can take.
+
+        Repetitions wait for `quiet` seconds without management traffic. `rate` and `burst`: as for the class.
+        """
         self._schedule.set_pace(rate, burst, round(quiet * SECOND))
 
     def link_up(self, now: int) -> list[Event]:

@@ -182,9 +182,9 @@ class Reassembly:
         return Received(buffer.identifier, payload, buffer.started)
 
     def _check_variable(self, buffer: SourceBuffer, data: bytes, frame: Frame, stamp: int) -> Received | None:
-        """Return the message, if its checksum is right; else the one that is in its last frame alone, if there is one.
+        """Return the message if its checksum is right, else a whole message in the last frame alone, if there is one.
 
-        That one would else be lost along with the message before it, whose last frame is missing.
+        Without that, a message whose last frame is lost would take the next one along, if that has one frame.
         """
         alone, buffer.first = buffer.first == 0, _UNKNOWN
         if alone:

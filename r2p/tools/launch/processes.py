@@ -35,7 +35,7 @@ class LinePrinter:
     """Shows the output of all commands, line by line, with the name of the command in front."""
 
     def __init__(self, names: Iterable[str], on_error: Callable[[], object]) -> None:
-        """`on_error` is called in another thread when the output can't be written any more."""
+        """Call `on_error`, in another thread, once the output can't be written."""
         self.error: OSError | None = None
         """The error of the output, if it can't be written; BrokenPipeError: its reader has ended."""
         self._names = list(names)

@@ -81,7 +81,7 @@ class _ParsedEndpoint(msgspec.Struct, frozen=True):
 
     @property
     def identifiable(self) -> bool:
-        """Whether the server's first bytes tell what it is."""
+        """True if the first bytes of the server show its protocol."""
         return self.protocol in {"tcp", "tls"} and bool(self.port)
 
 

@@ -161,7 +161,8 @@ RESPONSE = m.SubscribeResponse("cmd", 12)
 
 def started(*, observer: bool = False, quiet: float = 0.0) -> Discovery:
     """A module that publishes `leds` and subscribes `cmd`, 100 ms after its link went up."""
-    discovery = Discovery("PC1", ME, observer=observer, quiet=quiet)
+    discovery = Discovery("PC1", ME, observer=observer)
+    discovery.set_pace(250.0, 32, quiet)
     discovery.advertise(0, "leds", 5, ONE)
     discovery.subscribe(0, "cmd", 12, 5, TWO)
     discovery.link_up(0)
