@@ -16,6 +16,7 @@ text, as much as fits (if that is 16 bytes or more), and zeros. Where the length
 
 import enum
 import struct
+from collections.abc import Collection
 
 import msgspec
 
@@ -99,3 +100,10 @@ def encode_text(text: str, room: int) -> bytes:
 def decode_text(body: bytes) -> str:
     """Decode the text of an error, up to its first NUL; bytes that are not UTF-8 become U+FFFD."""
     return body.partition(b"\0")[0].decode(errors="replace")
+
+
+def is_of_service(name: str, topics: Collection[str]) -> bool:
+    """Return whether a topic is one of the pair of a service, by its name and that of the other one."""
+    base, end = name[: -len(REQUESTS)], name[-len(REQUESTS) :]
+    other = {REQUESTS: RESPONSES, RESPONSES: REQUESTS}.get(end)
+    return other is not None and base + other in topics

@@ -15,6 +15,7 @@ import typer
 import r2p
 from r2p.msg import Log
 from r2p.names import LOG
+from r2p.tools.completion import complete_node_or_module
 from r2p.tools.options import Count, Format, Once, Timeout
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, joined, patience
@@ -49,7 +50,10 @@ async def log(
     node: Annotated[
         str | None,
         typer.Argument(
-            metavar="NODE|MODULE", help="Only of this node (NODE or MODULE/NODE), or module.", show_default=False
+            metavar="NODE|MODULE",
+            autocompletion=complete_node_or_module,
+            help="Only of this node (NODE or MODULE/NODE), or module.",
+            show_default=False,
         ),
     ] = None,
     *,

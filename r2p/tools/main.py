@@ -5,6 +5,7 @@ function `command` for Typer. `r2p.tools.session` has how they join the network,
 """
 
 import errno
+import functools
 import importlib
 import os
 import re
@@ -39,6 +40,7 @@ COMMANDS = {
     "demo": ("r2p.tools.demo", "Show r2p at work, without hardware."),
 }
 
+_COMPLETION_VARIABLE = "_R2P_COMPLETE"  # what a shell asks for, and for which shell
 _COMPLETION_OPTIONS = ("--install-completion", "--show-completion")
 _SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
 
@@ -118,7 +120,7 @@ def main() -> None:
     try:
         raise_on_interrupt()
         _open_missing_streams()
-        app(prog_name="r2p")
+        _complete_or_run()
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
@@ -132,6 +134,15 @@ def main() -> None:
         raise
     finally:
         _flush()
+
+
+def _complete_or_run() -> None:
+    """Answer the shell that asks what may come next, or run the command."""
+    run = functools.partial(app, prog_name="r2p")
+    if os.environ.get(_COMPLETION_VARIABLE, "").startswith("complete_"):
+        importlib.import_module("r2p.tools.completion").answer(run)
+    else:
+        run()
 
 
 def _open_missing_streams() -> None:

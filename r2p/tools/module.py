@@ -15,6 +15,7 @@ import r2p
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, WIRE_VERSION
 from r2p.names import module_alias, module_path
 from r2p.tools import session
+from r2p.tools.completion import complete_module
 from r2p.tools.options import All, Format, Timeout, Wait
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError, alias_or_none, wait_until
@@ -30,7 +31,7 @@ _PROMPT = 0.2  # seconds: firmware sends ALIVE 10 ms after a command to restart
 
 app = session.group("List, stop and restart modules.")
 
-Name = Annotated[str, typer.Argument(metavar="MODULE", show_default=False)]
+Name = Annotated[str, typer.Argument(metavar="MODULE", autocompletion=complete_module, show_default=False)]
 
 
 @session.command(app, "list")

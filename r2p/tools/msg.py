@@ -8,10 +8,11 @@ import typer
 
 import r2p
 from r2p.tools.c_header import c_header, header_path, with_nested
+from r2p.tools.completion import complete_type
 from r2p.tools.options import Format
 from r2p.tools.output import Output, notify
 from r2p.tools.session import UsageError, group, settings, standalone
-from r2p.tools.types import Types, class_path, complete_type, put_sizes, size_text, standard_types, type_name
+from r2p.tools.types import Types, class_path, put_sizes, size_text, standard_types, type_name
 
 app = group("Show message types, and export them to C.")
 

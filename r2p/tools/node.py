@@ -11,6 +11,7 @@ import typer
 import r2p
 from r2p.names import node_alias
 from r2p.tools import session
+from r2p.tools.completion import complete_node
 from r2p.tools.options import CLASS_NAMES, All, Format, Wait
 from r2p.tools.output import Output
 from r2p.tools.session import Session, alias_or_none
@@ -48,7 +49,10 @@ async def list_(session: Session, *, all: All = False, wait: Wait = None, format
 @session.command(app, "info")
 async def info(
     session: Session,
-    node: Annotated[str, typer.Argument(metavar="MODULE/NODE", help="NODE alone if the name is unique.")],
+    node: Annotated[
+        str,
+        typer.Argument(metavar="MODULE/NODE", autocompletion=complete_node, help="NODE alone if the name is unique."),
+    ],
     *,
     wait: Wait = None,
     format: Format = None,

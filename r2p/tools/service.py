@@ -11,16 +11,17 @@ import msgspec
 import typer
 
 import r2p
-from r2p.codecs.services import REQUESTS, RESPONSES
+from r2p.codecs.services import REQUESTS, RESPONSES, is_of_service
 from r2p.messages import Nested
 from r2p.names import topic_name
 from r2p.services.definition import Definition, define
 from r2p.tools import session
+from r2p.tools.completion import complete_module, complete_service, complete_type
 from r2p.tools.options import Format, Wait, time_option
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, TimedOut, UsageError
-from r2p.tools.topic.list import endpoints_of, is_of_service
-from r2p.tools.types import Types, complete_type, is_service, load_service, load_type
+from r2p.tools.topic.list import endpoints_of
+from r2p.tools.types import Types, is_service, load_service, load_type
 from r2p.tools.values import parse, to_plain
 
 app = session.group("List, inspect and call services.")
@@ -30,7 +31,7 @@ _REQUEST, _RESPONSE = "request", "response"
 """The fields of the two topics' messages that hold request and response."""
 _TIMEOUT = 5.0  # seconds
 
-Name = Annotated[str, typer.Argument(metavar="SERVICE", show_default=False)]
+Name = Annotated[str, typer.Argument(metavar="SERVICE", autocompletion=complete_service, show_default=False)]
 ServiceTypeName = Annotated[
     str | None,
     typer.Option(
@@ -80,7 +81,12 @@ async def info(session: Session, service: Name, *, wait: Wait = None, format: Fo
 @session.command(app, "find")
 async def find(
     session: Session,
-    type: Annotated[str, typer.Argument(metavar="TYPE", help="A subclass of r2p.Service, or a type of message.")],
+    type: Annotated[
+        str,
+        typer.Argument(
+            metavar="TYPE", autocompletion=complete_type, help="A subclass of r2p.Service, or a type of message."
+        ),
+    ],
     *,
     wait: Wait = None,
     format: Format = None,
@@ -108,7 +114,10 @@ async def call(
     ] = None,
     *,
     type: ServiceTypeName = None,
-    server: Annotated[str | None, typer.Option("--server", metavar="MODULE", help="Which of several to call.")] = None,
+    server: Annotated[
+        str | None,
+        typer.Option("--server", metavar="MODULE", autocompletion=complete_module, help="Which of several to call."),
+    ] = None,
     timeout: Annotated[
         float | None, time_option("--timeout", "Give up (exit code 3) without an answer after this long; default: 5 s.")
     ] = None,

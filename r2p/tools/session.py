@@ -55,11 +55,13 @@ Check = Callable[[Settings, Mapping[str, Any]], object]
 REPORT_WAITING_AFTER = 1.0
 """Seconds that a command waits before it reports what it waits for."""
 
+IN_ONE_PROGRAM = ("memory:", "sim:", "rtcan:virtual:")
+"""How the URLs of networks begin that no other program can join."""
+
 _DESCRIPTORS = 12  # free file descriptors that are needed: an event loop, its wake-ups, and a link
 _TOO_MANY_FILES = (errno.EMFILE, errno.ENFILE)  # of this process, or of the computer
 _SETTLED = 0.3  # seconds without a new announcement, after which an r2p peer has announced everything
 _SETTLED_ON_BUS = 0.6  # ... on a bus, where modules announce in turn
-_IN_ONE_PROGRAM = ("memory:", "sim:", "rtcan:virtual:")  # networks that no other program can join
 _FIRMWARE = 1.5  # seconds in which firmware, which announces one item each half second, is heard at least once
 _SETTLE_MAX = 8.0  # seconds to listen while announcements arrive: a bus of 1 Mbit/s carries 100 of them a second
 _POLL = 0.02  # seconds between two checks of a condition
@@ -191,7 +193,7 @@ class Session:
             return f"{text} ({heard}: {', '.join(names)}); listen longer with --wait 5"
         received = sum(link.stats.bytes_received for link in self.module.links)
         heard += f", received {received} bytes" if received else ""
-        if not received and all(url.startswith(_IN_ONE_PROGRAM) for url in self.settings.via):
+        if not received and all(url.startswith(IN_ONE_PROGRAM) for url in self.settings.via):
             return f"{text} ({heard}): such a network is inside one program; tcp-listen: and tcp: join two"
         return f"{text} ({heard}); try r2p doctor --via {self.settings.via[0]}"
 

@@ -19,7 +19,6 @@ from r2p.services.definition import Definition, define
 from r2p.tools.output import Output
 from r2p.tools.run import load_module
 from r2p.tools.session import Session, Settings, UsageError, wait_until
-from r2p.tools.session import settings as read_settings
 
 STANDARD = "r2p.msg"
 LEARNT = "r2p.messages.schemas"
@@ -259,23 +258,6 @@ def describe_other(
         return f"{what} another type of {shown} than {name}: give the right --type, or none"
     has = "messages of variable length" if own.varies else f"{own.size}"
     return f"{what} messages of {shown}, but {name} has {has}: give the right --type{suggestion(exact)}"
-
-
-def complete_type(incomplete: str) -> list[str]:
-    """Completions for --type: bare and full names; no `r2p.msg:` before its colon, which begins a new word in bash."""
-    classes = standard_types()
-    if ":" in incomplete:
-        names = [f"{STANDARD}:{cls.__name__}" for cls in classes]
-    else:
-        names = [cls.__name__ for cls in classes] + [type_name(cls) for cls in [*classes, *_named_by_settings()]]
-    return [name for name in names if name.startswith(incomplete)]
-
-
-def _named_by_settings() -> list[type[r2p.Message]]:
-    try:
-        return Types(read_settings()).named
-    except UsageError:  # what is wrong with the file is said when the command runs
-        return []
 
 
 async def _announced(session: Session, topic: str) -> r2p.TopicView:

@@ -11,6 +11,7 @@ import typer
 
 import r2p
 from r2p.names import module_path, node_name, topic_name
+from r2p.tools.completion import complete_awaited
 from r2p.tools.options import time_option
 from r2p.tools.session import Session, TimedOut, UsageError, joined
 
@@ -84,7 +85,15 @@ def _is_tool(module: str) -> bool:
 async def wait(
     session: Session,
     kind: Annotated[Kind, typer.Argument(metavar="topic|node|module", show_default=False)],
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A node: NODE or MODULE/NODE.", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            autocompletion=complete_awaited,
+            help="A node: NODE or MODULE/NODE.",
+            show_default=False,
+        ),
+    ],
     *,
     timeout: Annotated[float | None, time_option("--timeout", "Give up (exit code 3) after this long.")] = None,
 ) -> None:

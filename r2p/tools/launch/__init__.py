@@ -14,6 +14,7 @@ from typing import Annotated
 
 import typer
 
+from r2p.tools.completion import complete_entry
 from r2p.tools.config import Settings, UsageError, did_you_mean, find, read, settings
 from r2p.tools.config_show import File
 from r2p.tools.launch import systemd as units
@@ -32,7 +33,10 @@ _GOODBYE = 0.5  # seconds that the server has to end such a connection
 def command(
     file: File = None,
     ready: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Start nothing, but wait until this entry is ready.")
+        str | None,
+        typer.Option(
+            metavar="NAME", autocompletion=complete_entry, help="Start nothing, but wait until this entry is ready."
+        ),
     ] = None,
     systemd: Annotated[bool, typer.Option("--systemd", help="Start nothing, but write units for systemd.")] = False,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where --systemd writes.")] = Path(),

@@ -1,14 +1,15 @@
 """`r2p topic list`, `info` and `find`: what is known about topics."""
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import typer
 
 import r2p
-from r2p.codecs.services import REQUESTS, RESPONSES
+from r2p.codecs.services import is_of_service
 from r2p.names import chosen_alias, topic_name
+from r2p.tools.completion import complete_type
 from r2p.tools.options import CLASS_NAMES, Format, Wait
 from r2p.tools.output import Output, notify
 from r2p.tools.session import Session, alias_or_none
@@ -40,13 +41,6 @@ async def list_(session: Session, *, all: AllTopics = False, wait: Wait = None, 
         session.report_none("topics")
 
 
-def is_of_service(name: str, topics: Collection[str]) -> bool:
-    """Return whether a topic is one of the pair of a service, by its name and that of the other one."""
-    base, end = name[: -len(REQUESTS)], name[-len(REQUESTS) :]
-    other = {REQUESTS: RESPONSES, RESPONSES: REQUESTS}.get(end)
-    return other is not None and base + other in topics
-
-
 async def info(session: Session, topic: Topic, *, wait: Wait = None, format: Format = None) -> None:
     """Show everything about a topic.
 
@@ -76,7 +70,12 @@ async def info(session: Session, topic: Topic, *, wait: Wait = None, format: For
 async def find(
     session: Session,
     what: Annotated[
-        str, typer.Argument(metavar="TYPE|FINGERPRINT|SIZE", help="sensor_msgs/LaserScan, 16 hex digits, or bytes.")
+        str,
+        typer.Argument(
+            metavar="TYPE|FINGERPRINT|SIZE",
+            autocompletion=complete_type,
+            help="sensor_msgs/LaserScan, 16 hex digits, or bytes.",
+        ),
     ],
     *,
     wait: Wait = None,

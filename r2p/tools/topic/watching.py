@@ -13,27 +13,18 @@ import typer
 
 import r2p
 from r2p.codecs.management import ROLE_PUBLISHES, ROLE_SUBSCRIBES
+from r2p.tools.completion import complete_topic, complete_type
 from r2p.tools.options import valid_topic
 from r2p.tools.output import notify
-from r2p.tools.session import Session, Settings, UsageError, call_after, settings, wait_until
-from r2p.tools.types import Types, complete_type, describe_other
-
-
-def _complete_topic(incomplete: str) -> list[str]:
-    """Completions for topics: those that r2p.toml names; to ask the network would take too long."""
-    try:
-        known = settings().types
-    except UsageError:  # what is wrong with the file is said when the command runs
-        return []
-    return [name for name in known if name.startswith(incomplete)]
-
+from r2p.tools.session import Session, Settings, call_after, wait_until
+from r2p.tools.types import Types, describe_other
 
 Topic = Annotated[
-    str, typer.Argument(metavar="TOPIC", autocompletion=_complete_topic, parser=valid_topic, show_default=False)
+    str, typer.Argument(metavar="TOPIC", autocompletion=complete_topic, parser=valid_topic, show_default=False)
 ]
 Topics = Annotated[
     list[str],
-    typer.Argument(metavar="TOPIC", autocompletion=_complete_topic, parser=valid_topic, show_default=False),
+    typer.Argument(metavar="TOPIC", autocompletion=complete_topic, parser=valid_topic, show_default=False),
 ]
 TypeName = Annotated[
     str | None,
