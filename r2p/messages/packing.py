@@ -10,6 +10,7 @@ from typing import Any
 
 from r2p.errors import DecodeError, MessageError, TooLong
 from r2p.messages.array import Array, from_view
+from r2p.messages.known_lengths import SHORT_TEXT, Elements, KnownLengths, StructsWithText
 from r2p.messages.parts import bad_count, bytes_of, pack_chars, part, sharing_of_fields, unpack_chars, view_of
 from r2p.messages.shapes import (
     Chars,
@@ -67,12 +68,13 @@ def read(data, at):
     return {value}, at
 
 def decode(data):
-    at, size = 0, len(data)
+    size = len(data)
     try:
+        {known}at = 0
         {inner_read}
         if at != size:
             raise ValueError(f"{{size - at}} bytes are left over")
-        return {value}
+{learn}        return {value}
     except (StructError, TypeError, ValueError) as error:
         raise unreadable(data, error) from None
 """
@@ -127,6 +129,9 @@ class _SourceCode:
         self._slot_count = 0
         self._pieces: list[str] = []
         self._reads: list[str] = []
+        self._known = KnownLengths()
+        self._last_run: tuple[str, list[str]] | None = None  # format and values, unless a text is packed with it
+        self._short_text = ""  # the local with its length, if one is the last piece
 
     def finish(self, value: str) -> str:
         """Return the source; `value` is the expression that rebuilds the message from the slots."""
@@ -142,12 +147,16 @@ class _SourceCode:
                 check=_lines(self.checks, 8), values=", ".join(self._values), read=read, size=packed.size
             )
         self._end_run()
+        fast, learn = self._known.source(value)
+        self.names |= self._known.names
         return _VARIABLE.format(
             check=_lines(self.checks, 4),
             inner_check=_lines(self.checks, 8),
             pieces=f"({', '.join(self._pieces)},)",
             read=_lines(self._reads, 4),
+            known="".join(f"{line}\n        " for line in fast),
             inner_read=_lines(self._reads, 8),
+            learn="".join(f"        {line}\n" for line in learn),
             value=value,
         )
 
@@ -166,9 +175,9 @@ class _SourceCode:
                     self.refuse(f"{value} is not True and {value} is not False")
                 return self._add_fixed(shape.format, value)
             case VariableText(limit):
-                return self._add_counted(f"{value}.encode()", limit, 1, "data[begin:at].decode()")
+                return self._add_counted(f"{value}.encode()", limit, 1, ".decode()")
             case VariableArray(Scalar(), limit, "bytes"):
-                return self._add_counted(f"bytes_of({value})", limit, 1, "data[begin:at]")
+                return self._add_counted(f"bytes_of({value})", limit, 1)
             case VariableArray(Scalar() as item, limit, "array"):
                 return self._add_view(item, limit, value)
             case _:
@@ -215,34 +224,37 @@ class _SourceCode:
         packed = f"{local}._view if {is_array} else view_of({local}, {code})"
         empty = f"empty_{item.format if item.format != '?' else 'bool'}"
         self.names[empty] = from_view(memoryview(b"").cast(item.format), item.format)  # type: ignore[call-overload]
-        slot = self._add_counted(packed, limit, item.size, empty)
-        if "view = memoryview(data)" not in self._reads:
-            self._reads.insert(0, "view = memoryview(data)")
-        cast = "" if item.format == "B" else f".cast({code})"
-        made = [f"{slot} = new(Array)", f"{slot}._code = {code}", f"{slot}._view = view[begin:at]{cast}"]
-        self._reads[-1:] = ["if begin < at:", *(f"    {line}" for line in made), "else:", f"    {self._reads[-1]}"]
-        return slot
+        return self._add_counted(packed, limit, item.size, read=_read_array(item.format, empty))
 
-    def _add_counted(self, packed: str, limit: int, item_size: int, read: str) -> str:
-        """Add elements that are one piece, `packed`: their count is the last number of the run before them."""
+    def _add_counted(self, packed: str, limit: int, item_size: int, convert: str = "", read: str = "") -> str:
+        """Add elements that are one piece, `packed`: their count is the last number of the run before them.
+
+        `convert` and `read` are those of `Elements`.
+        """
         self.varies = True
         local = self.local(packed)
-        self.checks.append(f"if len({local}) > {limit}: raise ValueError")
-        count = self._add_fixed("I", f"len({local})")
+        length = self.local(f"len({local})")
+        self.checks.append(f"if {length} > {limit}: raise ValueError")
+        count = self._add_fixed("I", length)
         size = self._end_run()
         self._pieces.append(local)
         slot = f"v{self._slot_count}"
         self._slot_count += 1
+        self._short_text = length if convert and limit <= SHORT_TEXT and self._last_run else ""
+        elements = Elements(count, slot, item_size, convert, read)
+        self._known.add_elements(elements)
         self._reads[-1] = f"begin = at + {size}"  # instead of the sum that it ends with, which is slower
         self._reads += [
             f"at = begin + {count}" + f" * {item_size}" * (item_size > 1),
             f"if {count} > {limit} or at > size: raise bad_count({count}, {limit}, size - begin, {item_size})",
-            f"{slot} = {read}",
+            *elements.lines("begin:at"),
         ]
         return slot
 
     def _add_part(self, shape: Shape, value: str) -> str:
         self._end_run()
+        self._short_text = ""
+        self._known.add_part()
         number = len(self.names)
         self.names[f"write{number}"], self.names[f"read{number}"] = part(shape)
         self.varies = self.varies or shape.varies
@@ -256,18 +268,47 @@ class _SourceCode:
         """Pack the fields since the last part as one struct; return its bytes."""
         if not self._formats:
             return 0
-        packed, number = struct.Struct("<" + "".join(self._formats)), len(self.names)
-        self.names |= {f"pack{number}": packed.pack, f"unpack{number}": packed.unpack_from}
-        self._pieces.append(f"pack{number}({', '.join(self._values)})")
-        self._reads += [f"{', '.join(self._slots)}, = unpack{number}(data, at)", f"at += {packed.size}"]
+        code = "".join(self._formats)
+        self._add_packed(code, self._values)
+        packed, unpack = struct.Struct("<" + code), f"unpack{len(self.names)}"
+        self.names[unpack] = packed.unpack_from
+        self._reads += [f"{', '.join(self._slots)}, = {unpack}(data, at)", f"at += {packed.size}"]
+        self._known.add_run(self._formats, self._slots)
         for run in (self._formats, self._values, self._slots):
             run.clear()
         return packed.size
+
+    def _add_packed(self, code: str, values: list[str]) -> None:
+        """Add the piece of a run; if there is a short text before it, both are one struct with the run before that."""
+        name = f"pack{len(self.names)}"
+        if self._short_text and self._last_run:
+            code_before, values_before = self._last_run
+            self.names[name] = StructsWithText(code_before, code)
+            arguments = [*values_before, self._pieces[-1], *values]
+            self._pieces[-2:] = [f"{name}[{self._short_text}]({', '.join(arguments)})"]
+            self._short_text, self._last_run = "", None
+        else:
+            self.names[name] = struct.Struct("<" + code).pack
+            self._pieces.append(f"{name}({', '.join(values)})")
+            self._last_run = code, values.copy()
 
     def _slot(self) -> str:
         self._slots.append(f"v{self._slot_count}")
         self._slot_count += 1
         return self._slots[-1]
+
+
+def _read_array(code: str, empty: str) -> str:
+    """Return the statements that make an Array without a call of Python, with fields as in `Elements.read`."""
+    cast = "" if code == "B" else f".cast({code!r})"
+    return f"""
+if {{count}}:
+    {{value}} = new(Array)
+    {{value}}._code = {code!r}
+    {{value}}._view = memoryview(data)[{{place}}]{cast}
+else:
+    {{value}} = {empty}
+""".strip()
 
 
 def _lines(lines: list[str], indent: int) -> str:
