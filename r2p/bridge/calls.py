@@ -28,6 +28,10 @@ class CallRelay:
         """Forget a link that the gateway no longer has."""
         self._instances.pop(link, None)
 
+    def is_read_only(self, link: Link) -> bool:
+        """Return whether nothing may go onto a link, so that nothing may be changed from there either."""
+        return self._policy.is_read_only(link.name)
+
     def forward(self, link: Link, call: OwnCall, data: bytes) -> None:
         """Pass on a message that came by a link and is for another module, or count why not."""
         port, now = self._ports[link.name], self._clock.monotonic()

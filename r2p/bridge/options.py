@@ -21,6 +21,7 @@ from r2p.names import LOADER_PREFIX
 from r2p.protocols.time_left import TimesLeft
 from r2p.runtime.sample import PublisherClass, Sample
 from r2p.runtime.topic import SlotPublisher
+from r2p.transports.url import is_ip
 from r2p.units import SECOND
 
 T = TypeVar("T")
@@ -33,9 +34,6 @@ _SURE = 8  # intervals after which a period counts as known
 _PREFIX = re.compile(r"[A-Za-z0-9_]{1,16}/|[A-Za-z0-9_]{1,14}_")
 
 _TOPICS = re.compile(r"[A-Za-z0-9_*?\[\]!-]+(/[A-Za-z0-9_*?\[\]!-]+)*")
-
-IP = frozenset({"tcp", "tcp-listen", "zenoh"})
-"""Schemes of links that any computer of an IP network may reach: REBOOT and the like need permission there."""
 
 
 class ClassOf(msgspec.Struct, frozen=True):
@@ -122,11 +120,11 @@ class Policy:
         """
         rules = [*self._allow, *self._deny]
         ends = [is_link(link, pattern) for each in rules for pattern in (each.source, each.target)]
-        return (*ends, self._is_read_only(link), self._may_control(link))
+        return (*ends, self.is_read_only(link), self._may_control(link))
 
     def allows(self, topic: str, source: str, target: str) -> bool:
         """Return whether a topic (by its canonical name) may go from one link to another (by name)."""
-        if self._is_read_only(target):
+        if self.is_read_only(target):
             return False
         if topic.startswith(LOADER_PREFIX) and not self._may_control(source):
             return False
@@ -145,7 +143,7 @@ class Policy:
 
         `target` None: why the gateway itself does not obey it.
         """
-        if target is not None and self._is_read_only(target):
+        if target is not None and self.is_read_only(target):
             return DENIED_READ_ONLY
         return 0 if harmless or self._may_control(source) else DENIED_CONTROL
 
@@ -154,7 +152,7 @@ class Policy:
 
         What only asks passes wherever its answer may come back; what changes something, where orders may.
         """
-        if self._is_read_only(source if is_request else target):
+        if self.is_read_only(source if is_request else target):
             return True
         return is_request and changes and bool(self.order_denied(source, target, harmless=False))
 
@@ -224,11 +222,12 @@ class Policy:
             prefix = self._prefixes[link] = self._options.prefix if has_prefix else ""
         return prefix
 
-    def _is_read_only(self, link: str) -> bool:
+    def is_read_only(self, link: str) -> bool:
+        """Return whether nothing is forwarded onto a link (by name)."""
         return any(is_link(link, each) for each in self._options.read_only)
 
     def _may_control(self, source: str) -> bool:
-        return self._options.allow_control or source.partition(":")[0] not in IP
+        return self._options.allow_control or not is_ip(source)
 
 
 class RelayedPeriodic(SlotPublisher):

@@ -30,7 +30,7 @@ WIRE_MIN = 2
 """Hello.wire of the modules that know these services, at least."""
 
 CHANGES = 128
-"""The first of the operations that change something: gateways ask for permission to pass them on."""
+"""The first of the operations that change something: they need permission, of gateways on the way as well."""
 
 PAGES_MAX = 1024
 """Pages of the longest content."""
@@ -55,6 +55,11 @@ class Operation(enum.IntEnum):
 
     SCHEMA = 1
     STATISTICS = 2
+
+    @property
+    def changes(self) -> bool:
+        """Return whether the operation may change something."""
+        return self >= CHANGES
 
 
 class OwnCall(msgspec.Struct, frozen=True, gc=False):

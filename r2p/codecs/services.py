@@ -6,7 +6,7 @@ A service NAME is a pair of topics, `NAME_q` for requests and `NAME_r` for respo
 | --- | --- |
 | 0..3 | `u32 instance` of the caller's module |
 | 4..5 | `u16 number` of the call, counted by the caller |
-| 6 | `u8 kind`: 0 request, 1 cancel, 2 response, 3 error, 4 busy |
+| 6 | `u8 kind`: 0 request, 1 cancel, 2 response, 3 error, 4 busy; 5 working, of r2p's own services only |
 | 7 | `u8 version`, 1 |
 | 8..11 | `u32 server`: the instance of the server's module; 0: any server, or one without an instance |
 
@@ -42,13 +42,17 @@ _HEADER = struct.Struct("<IHBBI")
 
 
 class Kind(enum.IntEnum):
-    """The kinds of messages on the two topics: REQUEST and CANCEL from the caller, the others from the server."""
+    """The kinds of messages on the two topics: REQUEST and CANCEL from the caller, the others from the server.
+
+    WORKING, that the request has arrived and is being worked on, is of r2p's own services only.
+    """
 
     REQUEST = 0
     CANCEL = 1
     RESPONSE = 2
     ERROR = 3
     BUSY = 4
+    WORKING = 5
 
 
 _KINDS = {int(kind): kind for kind in Kind}

@@ -117,20 +117,37 @@ class NetworkView:
 
         Raises Error if there is no such module, or it can't answer, and TimeoutError if it does not.
         """
+        firmware = "it counts nothing that others can ask for"
+        content = await self.ask(module, Operation.STATISTICS, what="statistics", firmware=firmware)
+        try:
+            return decode(content)
+        except DecodeError as error:
+            raise Error(f"the answer of {module} is not what this version of r2p can read: {error}") from error
+
+    async def ask(self, module: str, operation: Operation, argument: bytes = b"", *, what: str, firmware: str) -> bytes:
+        """Ask a module, this one or any r2p module on the network, and return the content of its answer.
+
+        `what` is asked for, and what `firmware` can't do, are for the texts of errors. Raises Error if there is no such
+        module, or it can't answer, ServiceError with the text of its own error, and TimeoutError if it does not answer:
+        whether it has changed what it was to change is then unknown.
+        """
         view = min((each for each in self.modules() if each.name == module), key=lambda each: each.age, default=None)
         if view is None:
             raise Error(f"there is no module {module} on the network")
         if view.instance is None:
-            raise Error(f"{module} is firmware: it counts nothing that others can ask for")
+            raise Error(f"{module} is firmware: {firmware}")
         if view.link and (view.wire or 0) < WIRE_MIN:
             known = f"has wire version {view.wire}" if view.wire else "does not say which version of r2p it has"
-            raise Error(f"{module} {known}, statistics need {WIRE_MIN}: update r2p there")
+            raise Error(f"{module} {known}, {what} need {WIRE_MIN}: update r2p there")
+        services = self._opened().own_services
+        call = services.change if operation.changes else services.fetch
         try:
-            return decode(await self._opened().own_services.fetch(view.instance, Operation.STATISTICS))
+            return await call(view.instance, operation, argument)
         except TimeoutError:
-            raise TimeoutError(f"module {module} does not answer, {view.age:.1f} s after its last message") from None
-        except DecodeError as error:
-            raise Error(f"the answer of {module} is not what this version of r2p can read: {error}") from error
+            text = f"module {module} does not answer, {view.age:.1f} s after its last message"
+            if operation.changes:
+                text += "; whether it has made the change is unknown"
+            raise TimeoutError(text) from None
 
     async def message_type(self, fingerprint: bytes) -> type[Message] | None:
         """Ask the modules on the network for a message class of this layout; None without an answer.

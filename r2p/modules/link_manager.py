@@ -104,6 +104,7 @@ class LinkManager:
         *,
         observer: bool,
         bridge: BridgeOptions | None,
+        allow_control: bool = False,
     ) -> None:
         self.space = space
         self.links: list[Link] = []
@@ -115,7 +116,8 @@ class LinkManager:
         space.instance = self.instance
         self.opened_at = space.clock.monotonic()
         """The start of this run (monotonic ns)."""
-        self.own_services = OwnServices(space, self.instance, self.links)
+        allow_control |= bridge is not None and bridge.allow_control
+        self.own_services = OwnServices(space, self.instance, self.links, allow_control=allow_control)
         self.own_services.serve(Operation.SCHEMA, functools.partial(schema, space))
         self.flags = 0
         """The module's state, as in ALIVE."""

@@ -75,6 +75,9 @@ class Module:
     topics and services with more than 16 characters, instead of an alias made from the name. An `observer` is a tool
     that only looks: it sends no ALIVE and has no `log` topic. The `watchdog` logs code that blocks the event loop.
 
+    `allow_control` lets other modules change this one, such as its parameters, also by IP links without a key: `tcp:`,
+    `tcp-listen:` and `zenoh:`.
+
     With `bridge` the module is a gateway: it joins its links, and forwards on each network what the gateways there have
     agreed on. BridgeOptions restrict that. Raises InvalidName or NameTooLong.
     """
@@ -89,6 +92,7 @@ class Module:
         observer: bool = False,
         watchdog: bool = True,
         bridge: bool | BridgeOptions = False,
+        allow_control: bool = False,
     ) -> None:
         self.name = module_name(name) if name is not None else module_name_from(socket.gethostname())
         self.observer = observer
@@ -106,6 +110,7 @@ class Module:
         self._aliases = check_aliases(aliases or {})
         self._with_watchdog = watchdog
         self._bridge_options = BridgeOptions() if bridge is True else bridge or None
+        self._allow_control = allow_control
         self._supervisors: dict[str, Supervisor] = {}
         self._crashes: dict[str, Exception] = {}
         self._events = EventHub()
@@ -131,6 +136,7 @@ class Module:
             self._commands.handle,
             observer=self.observer,
             bridge=self._bridge_options,
+            allow_control=self._allow_control,
         )
         self._opened.own_services.serve(Operation.STATISTICS, lambda _argument: encode(self.statistics()))
         self._changed = asyncio.Event()
@@ -140,7 +146,7 @@ class Module:
         self._tasks = asyncio.TaskGroup()
         await self._tasks.__aenter__()
         self._open = True
-        self._commands.tasks = self._tasks
+        self._commands.tasks = self._opened.own_services.tasks = self._tasks
         try:
             for via in self._via:
                 await self._open_transport(self._tasks, via)
@@ -251,6 +257,7 @@ class Module:
             return
         self._open = False
         self._commands.tasks = None
+        self._opened.own_services.close()
         try:
             await self._end_nodes()  # while the links are up: clean-up publishes what stops the motors
         finally:

@@ -1,43 +1,58 @@
 """r2p's own services: what each module can be asked for by others, without a topic or an announcement of its own.
 
-    fetch  ->  _ask, page by page  ->  CallChannel of the nearest link  ...  receive  ->  _answer  ->  a handler
-    the answer                                                         ...  receive  ->  the waiting `_ask`
+    fetch, change  ->  _ask, page by page  ->  CallChannel of the nearest link  ...  receive  ->  _answer  ->  a handler
+    the answer                                                                 ...  receive  ->  the waiting `_ask`
 
 Messages are those of `r2p.codecs.own_services`. A request is addressed to the instance of a module, and gateways pass
 it on (`r2p.bridge.calls`). It is repeated until it is answered; a repeated one gets the same answer again. A content
-that does not fit a message is kept until its caller has fetched all pages of it.
+that does not fit a message is kept until its caller has fetched all pages of it. While a handler that takes time runs,
+repetitions get WORKING, and its caller waits.
+
+Operations from `CHANGES` on change something. They need permission (`_refusal`) and run once for each call, however
+often requests and answers are lost or repeated.
 """
 
 import asyncio
-from collections.abc import Callable, Hashable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Coroutine, Hashable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from r2p.codecs import UnknownType, own_services, services
 from r2p.codecs.own_services import EDITIONS, PAGE_MAX, PAGES_MAX, WIRE_MIN, Operation, OwnCall
 from r2p.codecs.services import NUMBERS, Kind, ServiceHeader
-from r2p.errors import DecodeError, ServiceError
+from r2p.errors import DecodeError, Error, ServiceError
+from r2p.log_lines import LineLimit, get_logger
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.topic import TopicSpace
 from r2p.services.answers import RememberedAnswers
 from r2p.transports.link import Link
+from r2p.transports.url import is_ip, scheme_of
 from r2p.units import SECOND
 
 if TYPE_CHECKING:
     from r2p.bridge.calls import CallRelay
 
-Handler = Callable[[bytes], bytes]
-"""Returns the content for an argument; raises LookupError or ValueError with a text for the caller."""
+logger = get_logger("r2p.module")
+
+Handler = Callable[[bytes], bytes | Coroutine[Any, Any, bytes]]
+"""Returns the content for an argument, or a coroutine that does; raises Error, LookupError or ValueError with a text
+for the caller.
+"""
 
 _PATIENCE = 1.5  # seconds that a module on the link itself may be silent
 _PATIENCE_BEHIND = 3.0  # ... and one behind gateways, whose other links may be slow
+_WORKING_PATIENCE = 3.0  # ... and one that has said that it works on the request
 _SLOW = 4  # times that a message takes on a slow link, for which it may be silent besides
 _FIRST_PAUSE = 0.1  # seconds until a request is repeated
+_WORKING_PAUSE = 0.25  # ... and again after it was said that it is worked on
 _GROWTH = 1.5  # of the pause, each time
 _SHORTEST_PAUSE = 0.001  # seconds
 _TRIES = 3  # times that a content is fetched from its beginning, if its module forgets it meanwhile
 _REMEMBERED = 10 * SECOND  # ns for which an answer is remembered
+_CHANGE_REMEMBERED = 60 * SECOND  # ... and that of a change: nothing on the way holds a request back for so long
+_RUNNING_MAX = 64  # handlers that run at once
+_REFUSALS_APART = 60 * SECOND  # ns between two lines of the log about changes that one link lacks the permission for
 _CONTENTS_MAX = 64  # contents of several pages that are kept: the latest of each caller and argument
 
 
@@ -48,10 +63,19 @@ class _Question(msgspec.Struct, eq=False):
     operation: int
     page: int
     answer: "asyncio.Future[OwnCall]"
+    working_at: float = 0.0
+    """The time at which the module has said last that it works on the request (s of the loop)."""
 
     def is_answered_by(self, call: OwnCall) -> bool:
         same = (call.header.number, call.header.server) == (self.header.number, self.header.server)
         return same and (call.operation, call.page) == (self.operation, self.page)
+
+
+class _Running(msgspec.Struct, eq=False):
+    """A handler that runs, and the way back to its caller: by which the request came last."""
+
+    link: Link
+    source: Hashable
 
 
 class _Content(msgspec.Struct, frozen=True):
@@ -69,10 +93,16 @@ class _Content(msgspec.Struct, frozen=True):
 
 
 class OwnServices:
-    """The own services of one module, as caller and as server; `relay` passes on what is for others, in a gateway."""
+    """The own services of one module, as caller and as server; `relay` passes on what is for others, in a gateway.
 
-    def __init__(self, space: TopicSpace, instance: int, links: list[Link]) -> None:
+    `allow_control`: changes may come by IP links without a key.
+    """
+
+    def __init__(self, space: TopicSpace, instance: int, links: list[Link], *, allow_control: bool = False) -> None:
         self.relay: CallRelay | None = None
+        self.tasks: asyncio.TaskGroup | None = None
+        """The owner of handlers that take time, while the module is open."""
+        self._allow_control = allow_control
         self._space = space
         self._clock = space.clock
         self._instance = instance
@@ -80,13 +110,31 @@ class OwnServices:
         self._number = instance % NUMBERS  # another one after each start
         self._questions: dict[int, _Question] = {}
         self._handlers: dict[int, Handler] = {}
+        self._needs_key: set[int] = set()
+        self._running: dict[tuple[int, int, int], _Running] = {}
+        """By the caller's instance, the number of the call and the operation."""
+        self._working: set[asyncio.Task[None]] = set()
         self._answers = RememberedAnswers()
+        self._changes = RememberedAnswers()
+        """Answers of changes: those of others, which may be many, displace none of them."""
+        self._refusals = LineLimit(1, _REFUSALS_APART)
         self._contents: dict[tuple[int, int, bytes], _Content] = {}
         self._edition = 0
 
-    def serve(self, operation: Operation, handler: Handler) -> None:
-        """Answer requests for this operation with what `handler` returns."""
+    def serve(self, operation: Operation, handler: Handler, *, needs_key: bool = False) -> None:
+        """Answer requests for this operation with what `handler` returns; at once, or as soon as its coroutine ends.
+
+        An operation that changes something runs once for each call. `needs_key`: only from links with a key.
+        """
         self._handlers[operation] = handler
+        if needs_key:
+            self._needs_key.add(operation)
+
+    def close(self) -> None:
+        """Cancel the handlers that run, as the module ends; `tasks` waits for their end."""
+        self.tasks = None
+        for task in list(self._working):
+            task.cancel()
 
     # As caller
 
@@ -96,12 +144,29 @@ class OwnServices:
         Raises TimeoutError if the module is silent, and ServiceError with the text of its error.
         """
         if instance == self._instance:
-            return self._handlers[operation](argument)
+            return await self._call_own(operation, argument)
         for _ in range(_TRIES):
             content = await self._fetch_edition(instance, operation, argument)
             if content is not None:
                 return content
         raise ServiceError("the module forgets what it was asked for faster than that can be fetched: try again")
+
+    async def change(self, instance: int, operation: Operation, argument: bytes = b"") -> bytes:
+        """Have a module change something, once, and return the content of its answer. It may take its time.
+
+        Raises TimeoutError if the module is silent: whether it has made the change is then unknown. Raises ServiceError
+        with the text of its error, or of the module that refuses the change: this one, or a gateway before it.
+        """
+        if instance == self._instance:
+            return await self._call_own(operation, argument)
+        content = await self._fetch_edition(instance, operation, argument)
+        if content is None:
+            raise ServiceError("the change was made, but the module has forgotten its answer")
+        return content
+
+    async def _call_own(self, operation: Operation, argument: bytes) -> bytes:
+        made = self._handlers[operation](argument)
+        return made if isinstance(made, bytes) else await made
 
     async def _fetch_edition(self, instance: int, operation: Operation, argument: bytes) -> bytes | None:
         """Return the content; None if the module has forgotten it meanwhile."""
@@ -134,12 +199,13 @@ class OwnServices:
 
     async def _repeat(self, request: bytes, question: _Question) -> None:
         start, pause, patience = self._space.loop.time(), _FIRST_PAUSE, _PATIENCE
+        works = 0.0
         while not question.answer.done():
             nearest = self._nearest(question.header.server)
             if nearest is not None:
                 link, info = nearest
                 slow = link.calls.duration
-                patience = (_PATIENCE_BEHIND if info.hops else _PATIENCE) + _SLOW * slow
+                patience = (_PATIENCE_BEHIND if info.hops else _PATIENCE) + _SLOW * slow + works
                 pause = max(pause, 2 * slow)
             left = start + patience - self._space.loop.time()
             if left < _SHORTEST_PAUSE:
@@ -148,6 +214,8 @@ class OwnServices:
                 link.calls.send(request, info.source)
             await asyncio.wait([question.answer], timeout=min(pause, left))
             pause *= _GROWTH
+            if question.working_at > start:
+                start, pause, works = question.working_at, _WORKING_PAUSE, _WORKING_PATIENCE
 
     def _nearest(self, instance: int) -> tuple[Link, ModuleInfo] | None:
         """Return the link by which a module is reached now, and the module as it is known there."""
@@ -181,48 +249,128 @@ class OwnServices:
         elif call.header.kind is Kind.REQUEST:
             if link.calls.full:  # do not even make the answer
                 link.stats.lost["calls, send buffer full"] += 1
-            else:
-                link.calls.send(self._answer(link, call), source)
+            elif (answer := self._answer(link, call, source)) is not None:
+                link.calls.send(answer, source)
         elif not call.is_request:
             question = self._questions.get(call.header.number)
             if question is not None and question.is_answered_by(call) and not question.answer.done():
-                question.answer.set_result(call)
+                if call.header.kind is Kind.WORKING:
+                    question.working_at = self._space.loop.time()
+                else:
+                    question.answer.set_result(call)
 
-    def _answer(self, link: Link, call: OwnCall) -> bytes:
-        """Return the answer to a request, the same for each repetition of it."""
+    def _answer(self, link: Link, call: OwnCall, source: Hashable) -> bytes | None:
+        """Return the answer to a request, the same for each repetition of it; None: a handler begins to work on it."""
         caller, number, now = call.header.instance, call.header.number, self._clock.monotonic()
-        known = self._answers.get(caller, number, now, _REMEMBERED)
-        if known is None:
-            known = self._make_answer(link, call)
-            self._answers.put(caller, number, known, now, _REMEMBERED)
-        return known
+        running = self._running.get((caller, number, call.operation))
+        if running is not None:
+            running.link, running.source = link, source
+            return self._reply(call, Kind.WORKING, b"")
+        answers, lifetime = self._remembered(call)
+        known = answers.get(caller, number, now, lifetime)
+        if known is not None:
+            return known
+        refusal = self._refusal(link, call)
+        if refusal:  # not remembered: it costs nothing to make, and displaces no answer of those that may
+            return self._refuse(link, call, refusal)
+        answer = self._make_answer(link, call, source)
+        if answer is not None:
+            answers.put(caller, number, answer, now, lifetime)
+        return answer
 
-    def _make_answer(self, link: Link, call: OwnCall) -> bytes:
+    def _remembered(self, call: OwnCall) -> tuple[RememberedAnswers, int]:
+        """Return the memory for the answer to a request, and for how long it stays there (ns)."""
+        return (self._changes, _CHANGE_REMEMBERED) if call.changes else (self._answers, _REMEMBERED)
+
+    def _make_answer(self, link: Link, call: OwnCall, source: Hashable) -> bytes | None:
+        """Return the answer to a request; None if a task makes it."""
         try:
-            content = self._content(call)
-        except (LookupError, ValueError) as error:
+            if call.page:
+                return self._page(call, self._kept(call))
+            handler = self._handlers.get(call.operation)
+            if handler is None:
+                raise LookupError(f"operation {call.operation} is unknown to this version of r2p")
+            made = handler(call.body)
+            if isinstance(made, bytes):
+                return self._page(call, self._keep(call, made))
+            if self.tasks is None or len(self._running) >= _RUNNING_MAX:
+                made.close()
+                raise ServiceError(f"{self._space.module} {'is busy' if self.tasks else 'ends'}: try again later")
+        except Exception as error:  # noqa: BLE001 - the caller learns of it
+            return self._error(link, call, error)
+        running = self._running[call.header.instance, call.header.number, call.operation] = _Running(link, source)
+        task = self.tasks.create_task(self._work(call, running, made), name=f"{self._space.module} operation")
+        self._working.add(task)
+        task.add_done_callback(self._working.discard)
+        return None
+
+    async def _work(self, call: OwnCall, running: _Running, making: Coroutine[Any, Any, bytes]) -> None:
+        """Answer a request when its handler has ended, by the link by which it was repeated last."""
+        try:
+            answer = self._page(call, self._keep(call, await making))
+        except Exception as error:  # noqa: BLE001 - the caller learns of it
+            answer = self._error(running.link, call, error)
+        finally:
+            del self._running[call.header.instance, call.header.number, call.operation]
+        answers, lifetime = self._remembered(call)
+        answers.put(call.header.instance, call.header.number, answer, self._clock.monotonic(), lifetime)
+        if running.link.up:
+            running.link.calls.send(answer, running.source)
+
+    def _refusal(self, link: Link, call: OwnCall) -> str:
+        """Return why a request that came by this link lacks the permission for what it changes; empty if it does not.
+
+        Any computer of an IP network may send one. On a link with a key it has counted only behind its seal.
+        """
+        if not call.changes:
+            return ""
+        module, scheme = self._space.module, scheme_of(link.name)
+        if self.relay is not None and self.relay.is_read_only(link):
+            return f"{module} refuses changes from {scheme}: it is started with --read-only for that link"
+        if link.guard is not None:
+            return ""
+        if call.operation in self._needs_key:
+            return f"{module} takes this only from links with a key, and its {scheme} has none (?key=FILE)"
+        if self._allow_control or not is_ip(link.name):
+            return ""
+        return (
+            f"{module} refuses changes from {scheme}: start it with --allow-control, or give the link a key (?key=FILE)"
+        )
+
+    def _refuse(self, link: Link, call: OwnCall, refusal: str) -> bytes:
+        """Count a request that lacks permission, log it once in a while, and return its answer."""
+        link.stats.lost["change refused"] += 1
+        suffix = self._refusals.suffix(link.name, self._clock.monotonic())
+        if suffix is not None:
+            logger.warning("link %s: %s%s", link.title, refusal, suffix)
+        return self._reply(call, Kind.ERROR, services.encode_text(refusal, PAGE_MAX))
+
+    def _error(self, link: Link, call: OwnCall, error: Exception) -> bytes:
+        """Return the answer with the text of an error."""
+        if isinstance(error, Error | LookupError | ValueError):
             text = str(error.args[0] if error.args else type(error).__name__)
             return self._reply(call, Kind.ERROR, services.encode_text(text, PAGE_MAX))
-        except Exception as error:  # noqa: BLE001 - counted and logged; the caller learns of it
-            link.stats.lost.internal_error(error)
-            return self._reply(call, Kind.ERROR, b"internal error: the log of the module has it")
+        link.stats.lost.internal_error(error)
+        return self._reply(call, Kind.ERROR, b"internal error: the log of the module has it")
+
+    def _page(self, call: OwnCall, content: _Content) -> bytes:
+        """Return the answer with the page that a request wants."""
         if call.page >= content.pages:
             return self._reply(call, Kind.ERROR, b"no such page")
         return self._reply(call, Kind.RESPONSE, content.page(call.page), content)
 
-    def _content(self, call: OwnCall) -> _Content:
-        """Return what a caller asks for: what it began to fetch, or something new for a first page."""
+    def _kept(self, call: OwnCall) -> _Content:
+        """Return the content that a caller has begun to fetch."""
+        kept = self._contents.get((call.header.instance, call.operation, call.body))
+        if kept is None or kept.edition != call.edition:
+            raise LookupError("this edition is forgotten: begin with the first page")
+        return kept
+
+    def _keep(self, call: OwnCall, data: bytes) -> _Content:
+        """Make a content of a handler's answer, and keep it for the requests of its other pages."""
         key = (call.header.instance, call.operation, call.body)
-        if call.page:
-            kept = self._contents.get(key)
-            if kept is None or kept.edition != call.edition:
-                raise LookupError("this edition is forgotten: begin with the first page")
-            return kept
-        handler = self._handlers.get(call.operation)
-        if handler is None:
-            raise LookupError(f"operation {call.operation} is unknown to this version of r2p")
         self._edition = self._edition % (EDITIONS - 1) + 1
-        content = _Content(self._edition, handler(call.body))
+        content = _Content(self._edition, data)
         if content.pages > PAGES_MAX:
             raise ValueError(f"{len(content.data)} bytes, more than {PAGES_MAX * PAGE_MAX}")
         self._contents.pop(key, None)

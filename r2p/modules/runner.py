@@ -42,12 +42,13 @@ def run(
     remap: dict[str, str] | None = None,
     aliases: dict[str, str] | None = None,
     restart: bool = False,
+    allow_control: bool = False,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended or a signal ends them.
 
     A node has the name of its function, or another: `run(line_follower, name="follower")`, and of several
-    `run(blink, ("follower", line_follower))`. `module` is the module's name; `via`, `remap` and `aliases` are as for
-    `Module`, `restart` as for `Module.start`.
+    `run(blink, ("follower", line_follower))`. `module` is the module's name; `via`, `remap`, `aliases` and
+    `allow_control` are as for `Module`, `restart` as for `Module.start`.
 
     Meanwhile logging writes to stderr, unless the root logger or the logger `r2p` has handlers: `r2p` from INFO up, all
     other loggers from WARNING up.
@@ -58,7 +59,7 @@ def run(
 
     async def main() -> None:
         nodes = _named(functions, name)
-        async with Module(module, via=via, remap=remap, aliases=aliases) as host:
+        async with Module(module, via=via, remap=remap, aliases=aliases, allow_control=allow_control) as host:
             for node, function in nodes:
                 host.start(function, name=node, restart=restart)
             await host.wait()

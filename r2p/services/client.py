@@ -33,6 +33,7 @@ _SETTLED_MAX = 2 * SECOND  # ... and after which it does, whatever has not been 
 _ANNOUNCED = SECOND // 10  # ns in which a server's node is announced after its topics; firmware announces no nodes
 _LOOK_AGAIN = 0.05  # seconds after which a call without a server looks again
 
+_NO_ANSWER = (Kind.REQUEST, Kind.CANCEL, Kind.WORKING)
 _REPEATS = 16  # of the time-out: after that part of it the first repetition follows; each pause is 1.5 times the last
 _FIRST_MIN, _FIRST_MAX = 25 * MILLISECOND, 250 * MILLISECOND  # ns, of the first pause
 _LOSSLESS = SECOND  # ns of the first pause where only the end of a link loses anything
@@ -294,7 +295,7 @@ class ServiceClient(Generic[Q, R]):
             return
         if header.instance != self._space.instance:
             return
-        if header.kind in (Kind.REQUEST, Kind.CANCEL):
+        if header.kind in _NO_ANSWER:
             self.undecodable += 1
             return
         call = self._calls.get(header.number)

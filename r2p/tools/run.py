@@ -60,6 +60,9 @@ async def command(
         ),
     ] = None,
     restart: Annotated[bool, typer.Option("--restart", help="Restart a crashed node, after a pause.")] = False,
+    allow_control: Annotated[
+        bool, typer.Option("--allow-control", help="Let other modules change this one by IP links without a key, too.")
+    ] = False,
     via: Via = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended, or Ctrl-C.
@@ -71,7 +74,13 @@ async def command(
     names = chosen.remap | _parse_remap(remap or ())
     programs = load(functions)
     priorities = _parse_priorities(priority or (), programs)
-    async with r2p.Module(module or chosen.module, via=chosen.via, remap=names, aliases=chosen.aliases) as host:
+    async with r2p.Module(
+        module or chosen.module,
+        via=chosen.via,
+        remap=names,
+        aliases=chosen.aliases,
+        allow_control=allow_control,
+    ) as host:
         for program in programs:
             host.start(program.function, name=program.name, priority=priorities.get(program.name, 0), restart=restart)
         nodes = ", ".join(program.name for program in programs)

@@ -35,6 +35,8 @@ BUILT_IN = {
 
 GROUP = "r2p.transports"
 
+_IP = frozenset({"tcp", "tcp-listen", "zenoh"})
+
 _OPTIONS = re.compile(r"[?,&]")
 _CAN = re.compile(r"[a-z]*can[0-9]+")
 _CLOSE = 0.65  # how alike a name must be to be suggested (difflib): can and rtcan are 0.75
@@ -100,6 +102,16 @@ def open_transport(text: str) -> Transport:
 def schemes() -> list[str]:
     """Return all available schemes, those of other packages included."""
     return sorted({*BUILT_IN, *(entry.name for entry in _entry_points())})
+
+
+def scheme_of(link: str) -> str:
+    """Return the scheme of a link, by its name."""
+    return link.partition(":")[0]
+
+
+def is_ip(link: str) -> bool:
+    """Return whether any computer of an IP network may reach a link (by name): REBOOT and changes need permission."""
+    return scheme_of(link) in _IP
 
 
 def key_file(text: str) -> SharedKey:
