@@ -57,12 +57,19 @@ class Case(msgspec.Struct, frozen=True):
 def cases(group: str | None = None, build: str | None = None, name: str | None = None) -> list[Case]:
     """The recorded sessions, all of them or those of one group (pubsub, bootloader, gateway-rtcan), build, name."""
     wanted = {"group": group, "build": build, "name": name}
-    return [case for case in _debug() if all(value in (None, getattr(case, key)) for key, value in wanted.items())]
+    return [
+        case for case in _read("debug") if all(value in (None, getattr(case, key)) for key, value in wanted.items())
+    ]
+
+
+def loader_cases() -> list[Case]:
+    """The recorded sessions with the loader, whose other end were r2p's own codecs."""
+    return list(_read("loader"))
 
 
 @cache
-def _debug() -> tuple[Case, ...]:
-    recorded = msgspec.json.decode((GOLDEN / "debug.json").read_bytes())
+def _read(name: str) -> tuple[Case, ...]:
+    recorded = msgspec.json.decode((GOLDEN / f"{name}.json").read_bytes())
     return tuple(_case(case) for case in recorded["cases"])
 
 

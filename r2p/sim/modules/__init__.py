@@ -6,6 +6,7 @@
             ...
 
 `firmware` has `FirmwareModule`, a module with the firmware of 2014: bytes in and bytes out, with time as an argument.
+`loader` has its loader, for boot mode, and `flash` the memory for apps.
 `power` has `Powered`, which runs it in an event loop and connects it: by a `wire` inside the process, which works under
 virtual time, by TCP, or by a pseudo terminal in place of a serial port.
 
@@ -25,14 +26,21 @@ from r2p.sim.modules.boards import (
     ProximityModule,
 )
 from r2p.sim.modules.firmware import FirmwareModule, Publishes, Subscribes
+from r2p.sim.modules.flash import BOARD, FlashTimes, MemoryMap
+from r2p.sim.modules.loader import EmulatedLoader, LoaderFaults
 from r2p.sim.modules.power import Powered, Wire
 
 __all__ = [
+    "BOARD",
     "Board",
+    "EmulatedLoader",
     "FirmwareModule",
+    "FlashTimes",
     "GatewayModule",
     "ImuModule",
     "IoModule",
+    "LoaderFaults",
+    "MemoryMap",
     "MotorModule",
     "Plant",
     "PowerModule",

@@ -1,26 +1,33 @@
 """A module with the firmware of 2014, as seen on its debug line (PROTOCOL.md 3 and 4): bytes in, bytes out.
 
 It sends the same as the recorded firmware, in the same order: the boot marker, ALIVE, the announcements of its nodes
-half a second later, then one step of repetition each half second. It has no r2p extensions. Three things differ from
-firmware: a line with a wrong checksum is dropped and counted (firmware does not check it), invalid lines do no lasting
-harm, and there is no loader in boot mode.
+half a second later, then one step of repetition each half second. It has no r2p extensions. Two things differ from
+firmware: a line with a wrong checksum is dropped and counted (firmware does not check it), and invalid lines do no
+lasting harm.
+
+In boot mode its loader (`r2p.sim.modules.loader`) answers on the topic `BOOT_<module>`, which needs no handshake. Half
+a second after any other start, it starts the enabled apps that are in its flash memory.
 
 It fails where firmware fails, and `fault` says why: at a SUBSCRIBE_REQUEST with queue length 0, with a queue that does
-not fit its heap, or with size 0 (as gateways of firmware do; other firmware ignores the size), and at STOP in boot
-mode. It drops data that follow a SUBSCRIBE_RESPONSE within 50 ms.
+not fit its heap, or with size 0 (as gateways of firmware do; other firmware ignores the size), at STOP in boot mode, at
+the start of an app whose stack is too small, and where its loader fails. It drops data that follow a SUBSCRIBE_RESPONSE
+within 50 ms.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgspec
 
 from r2p.codecs import UnknownType, debug, management
+from r2p.codecs import loader as loader_codec
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED
 from r2p.errors import DecodeError, Error
 from r2p.messages import Layout, Message, layout
-from r2p.names import MANAGEMENT, MODULE_FIELD, TOPIC_FIELD, module_name, topic_name
+from r2p.names import LOADER_PREFIX, MANAGEMENT, MODULE_FIELD, TOPIC_FIELD, module_name, topic_name
+from r2p.sim.modules.installed import EndlessList, FlashApp
+from r2p.sim.modules.loader import QUEUE, EmulatedLoader
 from r2p.units import MILLISECOND, SECOND
 
 # All durations in ns, as measured in recordings of the firmware.
@@ -34,6 +41,8 @@ _RESPONSE_DELAY = 50 * MILLISECOND  # until a response takes effect: its managem
 
 HEAP = 20_000
 """Bytes of RAM for the queues of a module."""
+
+_LOG_MAX = 100
 
 Answer = Iterable[tuple[str, Message]]
 
@@ -60,6 +69,10 @@ class Subscribes(msgspec.Struct, frozen=True):
     answer: Callable[[Any], Answer | None] | None = None
 
 
+Program = Callable[[bytes], Iterable[Publishes | Subscribes]]
+"""What an app does: a function of its parameters, called when it starts, that returns what it publishes and takes."""
+
+
 class FirmwareModule:
     """An emulated module. All times are monotonic ns; methods return the bytes that it sends.
 
@@ -75,8 +88,12 @@ class FirmwareModule:
         repeats: bool = True,
         heap: int = HEAP,
         behind_gateway: bool = False,
+        loader: EmulatedLoader | None = None,
     ) -> None:
-        """`heap`: bytes for queues. `behind_gateway`: behind firmware's gateway, data needs a second response."""
+        """`heap`: bytes for queues. `behind_gateway`: behind firmware's gateway, data needs a second response.
+
+        `loader`: with the flash memory; by default an empty one.
+        """
         self.name = module_name(name, MODULE_FIELD)
         self.flags = 0
         """Flags of ALIVE: FLAG_STOPPED, FLAG_REBOOTED, FLAG_BOOT."""
@@ -91,8 +108,21 @@ class FirmwareModule:
         """The last message received on each topic."""
         self.drops: Counter[str] = Counter()
         """Dropped lines and messages, by reason."""
-        self._publishers = {topic_name(each.topic, TOPIC_FIELD): _FirmwarePublisher(each) for each in publishers}
-        self._subscribers = {topic_name(each.topic, TOPIC_FIELD): _FirmwareSubscriber(each) for each in subscribers}
+        self.loader = loader or EmulatedLoader()
+        """The loader, and the flash memory with the apps."""
+        self.programs: dict[str, Program] = {}
+        """What apps do, by name; others only start."""
+        self.log: deque[str] = deque(maxlen=_LOG_MAX)
+        """What it did with its apps, the newest last."""
+        self._own: list[Publishes | Subscribes] = [*publishers, *subscribers]
+        self._publishers: dict[str, _FirmwarePublisher] = {}
+        self._subscribers: dict[str, _FirmwareSubscriber] = {}
+        self._add_nodes(self._own)
+        self.heap_free = 0
+        self._boot_topic = LOADER_PREFIX + self.name
+        self._loader_line = debug.encoder(self._boot_topic.encode())
+        self._loader_advertisement = management.Advertise(self._boot_topic, loader_codec.SIZE, QUEUE)
+        self._loader_request = management.SubscribeRequest(self._boot_topic, loader_codec.SIZE, QUEUE)
         self._repeats = repeats
         self._heap = heap
         self._responses_needed = 2 if behind_gateway else 1
@@ -117,6 +147,7 @@ class FirmwareModule:
 
     def power_on(self, now: int, *, boot_mode: bool = False) -> bytes:
         """Start, or restart after a power cut."""
+        self.loader.cut_power(now)
         self.fault = ""
         self._management_hangs = False
         self._boot(now, FLAG_BOOT if boot_mode else 0, _FIRST_STEP)
@@ -130,10 +161,15 @@ class FirmwareModule:
         """Receive a decoded line; for a module with several lines, each with a `debug.Reader` of its own."""
         if self.halted or self._boot_at is not None:
             return b""
+        if self.loader.is_busy(now):
+            self.drops["writing flash"] += 1
+            return b""
         topic = line.topic.decode()
         if topic == MANAGEMENT:
             if not self._management_hangs:
                 self._receive_management(now, line.data)
+        elif topic == self._boot_topic and self.flags & FLAG_BOOT:
+            self._receive_loader(now, line.data)
         else:
             self._receive_data(now, topic, line.data)
         return self._drain()
@@ -144,8 +180,13 @@ class FirmwareModule:
             return b""
         if self._boot_at is not None and now >= self._boot_at:
             self._boot(self._boot_at, self.flags, _STEP)
+        self._poll_loader(now)
+        if self.halted:
+            return b""
         if self._nodes_at is not None and now >= self._nodes_at:
             self._start_nodes(now)
+        if self.halted:
+            return self._drain()
         if self._step_at is not None and now >= self._step_at:
             self._step(now)
         for topic, publisher in self._publishers.items():
@@ -160,7 +201,8 @@ class FirmwareModule:
             return None
         if self._boot_at is not None:
             return self._boot_at
-        times = [self._nodes_at, self._step_at, *(publisher.next_at for publisher in self._publishers.values())]
+        times = [self._nodes_at, self._step_at, self.loader.next_deadline()]
+        times += (publisher.next_at for publisher in self._publishers.values())
         return min((time for time in times if time is not None), default=None)
 
     def publish(self, now: int, topic: str, message: Message) -> bytes:
@@ -176,14 +218,12 @@ class FirmwareModule:
         self._boot_at = None
         self._nodes_running = False
         self._reader = debug.Reader(self.drops)
-        own = (_queue_bytes(each.layout.size, each.request.queue) for each in self._subscribers.values())
-        self.heap_free = self._heap - sum(own)
-        for publisher in self._publishers.values():
-            publisher.next_at = None
-            publisher.joined = False
-        for subscriber in self._subscribers.values():
-            subscriber.opened_at = None
-            subscriber.responses = 0
+        self.heap_free = self._heap
+        self._publishers.clear()
+        self._subscribers.clear()
+        self._add_nodes(self._own)
+        if flags & FLAG_BOOT:
+            self.loader.boot(now)
         self._out.append(debug.OPENING)
         self._send(now, management.Alive(self.name, flags))
         self._nodes_at = now + _NODES
@@ -191,14 +231,47 @@ class FirmwareModule:
         self._step_at = now + first_step if self._repeats else None
         self._steps = []
 
+    def _add_nodes(self, nodes: Iterable[Publishes | Subscribes]) -> None:
+        for each in nodes:
+            topic = topic_name(each.topic, TOPIC_FIELD)
+            if isinstance(each, Publishes):
+                self._publishers[topic] = _FirmwarePublisher(each)
+            else:
+                self._subscribers[topic] = subscriber = _FirmwareSubscriber(each)
+                self.heap_free -= _queue_bytes(subscriber.layout.size, subscriber.request.queue)
+
     def _start_nodes(self, now: int) -> None:
         self._nodes_at = None
+        if not self.flags & FLAG_BOOT:
+            self._start_apps()
+            if self.fault:
+                return
         self._nodes_running = True
         for publisher in self._publishers.values():
             publisher.start(now)
             self._send(now, publisher.advertisement)
         for subscriber in self._subscribers.values():
             self._send(now, subscriber.request)
+
+    def _start_apps(self) -> None:
+        """Start the enabled apps, in the order in which they are in flash."""
+        started: list[FlashApp] = []
+        try:
+            for app in self.loader.apps:
+                if app.enabled and not self.fault:
+                    self._start_app(app, started)
+                    started.append(app)
+        except EndlessList as error:
+            self.fault = f"{error}: it hangs"
+
+    def _start_app(self, app: FlashApp, started: list[FlashApp]) -> None:
+        self.log.append(f"LAUNCH {app.name}")
+        least = self.loader.memory.least_stack
+        if app.setup.stacklen < least:
+            self.fault = f"app {app.name}: a stack of {app.setup.stacklen} bytes is too small, it takes {least}"
+        self.log.extend(f"{app.name} shares RAM with {each.name}" for each in started if app.shares_ram_with(each))
+        if app.name in self.programs:
+            self._add_nodes(self.programs[app.name](self.loader.apps.config(app)))
 
     def _on_stop(self, now: int) -> None:
         """Stop the nodes; of the round of repetition, what belongs to the current node is still sent."""
@@ -221,6 +294,7 @@ class FirmwareModule:
 
     def _restart(self, now: int, flags: int) -> None:
         self._end_nodes()
+        self.loader.stop()
         self.flags = flags
         self._step_at = None
         self._boot_at = now + _BOOT
@@ -240,11 +314,14 @@ class FirmwareModule:
 
     def _round(self) -> list[bytes | None]:
         """Return the steps between two ALIVE, last first; each publisher and subscriber counts as a node."""
+        steps: list[bytes | None] = []
+        if self.flags & FLAG_BOOT:  # the loader is one node
+            steps += [None, *(management.encode(each) for each in (self._loader_request, self._loader_advertisement))]
         if not self._nodes_running:
-            return []
+            return steps
         messages: list[management.Management] = [each.advertisement for each in self._publishers.values()]
         messages += [each.request for each in self._subscribers.values()]
-        return [step for message in messages for step in (None, management.encode(message))]
+        return steps + [step for message in messages for step in (None, management.encode(message))]
 
     # Management
 
@@ -274,6 +351,9 @@ class FirmwareModule:
                 self._restart(now, FLAG_REBOOTED | FLAG_BOOT)
 
     def _on_advertise(self, now: int, topic: str) -> None:
+        if topic == self._boot_topic and self.flags & FLAG_BOOT:
+            self._send(now, self._loader_request)
+            return
         subscriber = self._subscribers.get(topic)
         if subscriber is not None and self._nodes_running:
             self._send(now, subscriber.request)
@@ -289,6 +369,9 @@ class FirmwareModule:
     def _on_subscribe_request(self, now: int, message: management.SubscribeRequest) -> None:
         if not message.size:
             self.fault = f"SUBSCRIBE_REQUEST of {message.topic} with size 0: its buffers are overrun"
+            return
+        if message.topic == self._boot_topic and self.flags & FLAG_BOOT:
+            self._send(now, management.SubscribeResponse(message.topic, loader_codec.SIZE))
             return
         publisher = self._publishers.get(message.topic)
         if publisher is None or not self._nodes_running:
@@ -310,6 +393,20 @@ class FirmwareModule:
             return False
         self.heap_free -= needed
         return True
+
+    # The loader
+
+    def _receive_loader(self, now: int, data: bytes) -> None:
+        if len(data) == loader_codec.SIZE:
+            self.loader.receive(now, data)
+        else:
+            self.drops["wrong size"] += 1
+
+    def _poll_loader(self, now: int) -> None:
+        self._out += [self._loader_line(answer, self._deadline(now)) for answer in self.loader.poll(now)]
+        if self.loader.fault:
+            self.fault = self.loader.fault
+            self._management_hangs = False
 
     # Data
 

@@ -44,12 +44,12 @@ def recorded_nodes(*, repeats: bool = True) -> FirmwareModule:
 class Line:
     """The other end of the line, which advances the time."""
 
-    def __init__(self, module: FirmwareModule, start: int = 0) -> None:
+    def __init__(self, module: FirmwareModule, start: int = 0, *, boot_mode: bool = False) -> None:
         self.module = module
         self.now = start
         self.heard: list[tuple[int, Any]] = []  # ms, (topic, data) or a management message
         self._reader = debug.Reader()
-        self._hear(start, module.power_on(start))
+        self._hear(start, module.power_on(start, boot_mode=boot_mode))
 
     def until(self, ms: float) -> None:
         """Let time pass."""
