@@ -105,7 +105,7 @@ class Bridge:
         self.routing = RoutingTable(self.ports, space, self.policy)
         self.directory = DirectoryRelay(instance, self.ports, space, self.policy, self.routing.check_types)
         self.names = ModuleNames(self.policy, self.directory)
-        self.calls = CallRelay(self.ports, self.policy, space.clock)
+        self.calls = CallRelay(space.module, self.ports, self.policy, space.clock)
         self._name = space.module
         self._alias = module_alias(space.module)
         self._instance = instance

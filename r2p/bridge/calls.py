@@ -2,22 +2,31 @@
 
 They follow the tree as everything else, so there is no loop. Nothing about a call is remembered: an answer finds its
 caller as a request finds its server, by the instance of the module. On a bus all gateways receive a message; only the
-one behind which the module is passes it on.
+one behind which the module is passes it on, or refuses it: then it answers in the place of the module.
 """
+
+from collections.abc import Hashable
 
 from r2p.bridge.forwarding import HOPS_MAX, BridgePort
 from r2p.bridge.options import Policy
 from r2p.clock import Clock
-from r2p.codecs import own_services
-from r2p.codecs.own_services import OwnCall
+from r2p.codecs import own_services, services
+from r2p.codecs.management import DENIED_CONTROL, DENIED_READ_ONLY
+from r2p.codecs.own_services import PAGE_MAX, OwnCall
+from r2p.codecs.services import Kind, ServiceHeader
+from r2p.log_lines import get_logger
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.transports.link import Link
+from r2p.transports.url import scheme_of
+
+logger = get_logger("r2p.bridge")
 
 
 class CallRelay:
-    """The relay of calls and answers between the ports of a gateway, by the name of the link."""
+    """The relay of calls and answers between the ports of the gateway `module`, by the name of the link."""
 
-    def __init__(self, ports: dict[str, BridgePort], policy: Policy, clock: Clock) -> None:
+    def __init__(self, module: str, ports: dict[str, BridgePort], policy: Policy, clock: Clock) -> None:
+        self._module = module
         self._ports = ports
         self._policy = policy
         self._clock = clock
@@ -32,8 +41,8 @@ class CallRelay:
         """Return whether nothing may go onto a link, so that nothing may be changed from there either."""
         return self._policy.is_read_only(link.name)
 
-    def forward(self, link: Link, call: OwnCall, data: bytes) -> None:
-        """Pass on a message that came by a link and is for another module, or count why not."""
+    def forward(self, link: Link, call: OwnCall, data: bytes, source: Hashable) -> None:
+        """Pass on a message that came by a link, from this address, for another module; or count why not."""
         port, now = self._ports[link.name], self._clock.monotonic()
         if now >= port.tree_port.forwards_until:
             if port.in_tree:  # else it comes here by another link, or another gateway passes it on
@@ -45,11 +54,42 @@ class CallRelay:
                 port.count_dropped("call without route")
         elif call.hops >= HOPS_MAX:
             port.count_dropped("too many hops")
-        elif self._policy.call_denied(port.name, target.name, changes=call.changes, is_request=call.is_request):
-            port.count_dropped("call refused")
+        elif refusal := self._refusal(port, target, call):
+            self._refuse(port, call, refusal, source)
         else:
             info = self._modules(target)[call.target]
             target.link.calls.send(own_services.with_hops(data, call.hops + 1), info.source)
+
+    def _refusal(self, source: BridgePort, target: BridgePort, call: OwnCall) -> str:
+        """Return why a message may not go from one port to another; empty if it may.
+
+        What only asks passes where its answer may come back. What changes something needs permission besides.
+        """
+        gateway, here, there = self._module, scheme_of(source.name), scheme_of(target.name)
+        if self._policy.is_read_only((source if call.is_request else target).name):
+            return f"gateway {gateway} passes nothing on to {here}: it is started with --read-only for that link"
+        if not (call.is_request and call.changes):
+            return ""
+        sealed = source.link.guard is not None
+        if target.link.guard is not None and not sealed:  # this gateway does not lend its key
+            return f"gateway {gateway} passes no changes from {here}, without a key, to {there}: give {here} a key, too"
+        reason = self._policy.change_denied(source.name, target.name, sealed=sealed)
+        if reason == DENIED_READ_ONLY:
+            return f"gateway {gateway} lets no changes onto {there}: it is started with --read-only for that link"
+        if reason == DENIED_CONTROL:
+            return permission_text(f"gateway {gateway}", here)
+        return ""
+
+    def _refuse(self, port: BridgePort, call: OwnCall, refusal: str, source: Hashable) -> None:
+        """Count a message that may not pass, log it once in a while, and answer it if it is a request."""
+        port.count_dropped("change refused" if call.changes else "call refused")
+        if call.header.kind is not Kind.REQUEST or port.link.calls.full:
+            return
+        if call.changes and (more := port.refusal_lines.suffix("changes", self._clock.monotonic())) is not None:
+            logger.warning("link %s: %s%s", port.link.title, refusal, more)
+        header = ServiceHeader(call.header.instance, call.header.number, Kind.ERROR, call.target)
+        answer = OwnCall(header, call.operation, call.page, body=services.encode_text(refusal, PAGE_MAX))
+        port.link.calls.send(own_services.encode(answer), source)
 
     def _way_to(self, port: BridgePort, instance: int, now: int) -> BridgePort | None:
         """Return the port behind which a module is, in the tree; None if it is on the side where the message came from,
@@ -80,3 +120,8 @@ class CallRelay:
             modules = {info.instance: info for info in discovery.modules.values() if info.instance is not None}
             self._instances[port.name] = discovery.generation, modules
         return modules
+
+
+def permission_text(module: str, scheme: str) -> str:
+    """Describe that a module needs permission for changes by a link of this scheme, and how to give it."""
+    return f"{module} refuses changes from {scheme}: start it with --allow-control, or give the link a key (?key=FILE)"

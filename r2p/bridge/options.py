@@ -60,9 +60,9 @@ class BridgeOptions(msgspec.Struct, frozen=True, kw_only=True):
     `allow`, `deny`: rules `TOPIC[@FROM[>TO]]`, with patterns for a topic, the link that it comes from and the one that
     it goes to (a link is named as in the log, or by its scheme: `zenoh`). Without `allow` everything is allowed; `deny`
     wins. `rate_limit`: messages a second, by topic pattern. `read_only`: links onto which nothing is forwarded.
-    `prefix`: put before the names of topics and modules on the links `prefix_on`. `allow_control`: REBOOT, BOOTLOAD and
-    loader topics may come in from IP links. `classes`: the publisher class of messages from debug lines, which do not
-    carry it. `reserve`: topics that are sent in slots of their own on RTCAN.
+    `prefix`: put before the names of topics and modules on the links `prefix_on`. `allow_control`: REBOOT, BOOTLOAD,
+    changes of modules and loader topics may come in from IP links. `classes`: the publisher class of messages from
+    debug lines, which do not carry it. `reserve`: topics that are sent in slots of their own on RTCAN.
     """
 
     allow: tuple[str, ...] = ()
@@ -147,14 +147,14 @@ class Policy:
             return DENIED_READ_ONLY
         return 0 if harmless or self._may_control(source) else DENIED_CONTROL
 
-    def call_denied(self, source: str, target: str, *, changes: bool, is_request: bool) -> bool:
-        """Return whether a message of r2p's own services may not go from one link to another.
+    def change_denied(self, source: str, target: str, *, sealed: bool) -> int:
+        """Return why a request that changes something may not go from one link to another (DENIED_..., 0: it may).
 
-        What only asks passes wherever its answer may come back; what changes something, where orders may.
+        `sealed`: it came behind a seal, which proves more than --allow-control does.
         """
-        if self.is_read_only(source if is_request else target):
-            return True
-        return is_request and changes and bool(self.order_denied(source, target, harmless=False))
+        if self.is_read_only(target):
+            return DENIED_READ_ONLY
+        return 0 if sealed or self._may_control(source) else DENIED_CONTROL
 
     def class_of(self, topic: str, source: str) -> ClassOf | None:
         """Return the class of messages from a debug line; None: the one that they carry."""

@@ -14,10 +14,11 @@ often requests and answers are lost or repeated.
 
 import asyncio
 from collections.abc import Callable, Coroutine, Hashable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
+from r2p.bridge.calls import CallRelay, permission_text
 from r2p.codecs import UnknownType, own_services, services
 from r2p.codecs.own_services import EDITIONS, PAGE_MAX, PAGES_MAX, WIRE_MIN, Operation, OwnCall
 from r2p.codecs.services import NUMBERS, Kind, ServiceHeader
@@ -29,9 +30,6 @@ from r2p.services.answers import RememberedAnswers
 from r2p.transports.link import Link
 from r2p.transports.url import is_ip, scheme_of
 from r2p.units import SECOND
-
-if TYPE_CHECKING:
-    from r2p.bridge.calls import CallRelay
 
 logger = get_logger("r2p.module")
 
@@ -245,7 +243,7 @@ class OwnServices:
     def _handle(self, link: Link, call: OwnCall, data: bytes, source: Hashable) -> None:
         if call.target != self._instance:
             if self.relay is not None:
-                self.relay.forward(link, call, data)
+                self.relay.forward(link, call, data, source)
         elif call.header.kind is Kind.REQUEST:
             if link.calls.full:  # do not even make the answer
                 link.stats.lost["calls, send buffer full"] += 1
@@ -333,9 +331,7 @@ class OwnServices:
             return f"{module} takes this only from links with a key, and its {scheme} has none (?key=FILE)"
         if self._allow_control or not is_ip(link.name):
             return ""
-        return (
-            f"{module} refuses changes from {scheme}: start it with --allow-control, or give the link a key (?key=FILE)"
-        )
+        return permission_text(module, scheme)
 
     def _refuse(self, link: Link, call: OwnCall, refusal: str) -> bytes:
         """Count a request that lacks permission, log it once in a while, and return its answer."""

@@ -66,7 +66,7 @@ _Class = Annotated[
 ]
 _Reserve = Annotated[_Rules, typer.Option(metavar="TOPIC", help="Give this topic its own slots on RTCAN (repeatable).")]
 _AllowControl = Annotated[
-    bool, typer.Option("--allow-control", help="Let REBOOT, BOOTLOAD and loader topics in from IP links.")
+    bool, typer.Option("--allow-control", help="Let REBOOT, BOOTLOAD, changes and loader topics in from IP links.")
 ]
 
 

@@ -78,7 +78,7 @@ def command(
     ] = False,
     bus: Annotated[bool, typer.Option("--bus", help="At the end, report how much each node sent on the bus.")] = False,
     allow_control: Annotated[
-        bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT and BOOTLOAD from IP links.")
+        bool, typer.Option("--allow-control", help="Let the gateway accept REBOOT, BOOTLOAD and changes from IP links.")
     ] = False,
     via: Via = None,
     verbose: Verbose = 0,
@@ -133,7 +133,7 @@ async def simulate(
     """Run the robot and show its figures, for `duration` seconds or until cancelled.
 
     `outside`: URLs that the gateway opens. `laps`: of a square that a PC drives. `fast`: under virtual time. `bus`:
-    print bus statistics at the end. `allow_control`: the gateway accepts REBOOT and BOOTLOAD.
+    print bus statistics at the end. `allow_control`: the gateway accepts REBOOT, BOOTLOAD and changes.
     """
     world = World(box(SIDE / 2, SIDE / 2, 3.8, 3.8))
     screen = SimulatorScreen(world, live=not fast, duration=duration)

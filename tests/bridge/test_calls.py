@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
+from collections import Counter
 from contextlib import AsyncExitStack
+from typing import TYPE_CHECKING, Any, Self
 
 import pytest
 
@@ -17,9 +20,13 @@ from r2p.testing.network import node_in
 from r2p.transports.memory import MemoryNetwork
 from tests.bridge.test_topologies import CALM, populate, trouble
 from tests.bridge.world import World
+from tests.modules.test_changes import TEST, Desk, knows
 from tests.modules.test_own_services import WIDE, Stranger, Wide, knows_wide, services
 from tests.transports.cables import LineCable
 from tests.transports.rtcan.networks import until
+
+if TYPE_CHECKING:
+    from tests.transports.cables import Cable
 
 pytestmark = pytest.mark.virtual_time
 
@@ -79,7 +86,7 @@ async def test_what_is_not_passed_on_is_counted() -> None:
         unknown = ServiceHeader(b.instance, 1, Kind.REQUEST, instance ^ 1)
         stranger.say("R2P_CALL", own_services.encode(OwnCall(unknown, Operation.SCHEMA)))
         await until(lambda: gate.links[1].stats.lost["too many hops"])
-        assert gate.links[1].stats.lost == {"call refused": 1, "too many hops": 1}
+        assert gate.links[1].stats.lost == {"change refused": 1, "too many hops": 1}
 
 
 async def test_a_link_onto_which_nothing_may_go_gets_no_answer() -> None:
@@ -90,9 +97,113 @@ async def test_a_link_onto_which_nothing_may_go_gets_no_answer() -> None:
         await until(lambda: any(view.wire for view in b.network.modules() if view.name == "A"))
         (instance,) = (view.instance for view in b.network.modules() if view.name == "A")
         assert instance is not None
-        with pytest.raises(TimeoutError):
+        why = "gateway GW passes nothing on to memory: it is started with --read-only for that link"
+        with pytest.raises(ServiceError, match=why):
             await services(b).fetch(instance, Operation.SCHEMA, WIDE.fingerprint)
-        assert gate.links[1].stats.lost["call refused"] > 3
+        assert gate.links[1].stats.lost["call refused"] == 1
+
+
+# Changes
+
+
+class IpLine(LineCable):
+    """A line in this process that counts as one of an IP network."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._a.name = self._b.name = "tcp:robot"
+
+
+class Chain:
+    """B - line - GW1 - bus - GW2 - network - A: a module that can be changed, two gateways, and one that asks."""
+
+    def __init__(self, line: Cable, one: r2p.BridgeOptions, two: r2p.BridgeOptions) -> None:
+        can, self.far = SimCan(seed=1), MemoryNetwork()
+        self.gateways = [
+            r2p.Module("GW1", via=[line.a(), can.transport()], bridge=one, watchdog=False),
+            r2p.Module("GW2", via=[can.transport(), self.far.transport()], bridge=two, watchdog=False),
+        ]
+        self.a = r2p.Module("A", via=self.far.transport(), watchdog=False)
+        self.b = r2p.Module("B", via=line.b(), watchdog=False)
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        for each in (*self.gateways, self.a, self.b):
+            await self._stack.enter_async_context(each)
+        self.desk = Desk(self.a)
+        await until(lambda: knows(self.b, self.a))
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        await self._stack.aclose()
+
+    async def change(self, argument: bytes) -> bytes:
+        return await services(self.b).change(self.a.instance, TEST, argument)
+
+
+CONTROL = r2p.BridgeOptions(allow_control=True)
+
+
+async def test_a_change_through_two_gateways_is_made_once_though_the_network_loses_and_repeats() -> None:
+    async with Chain(IpLine(), CONTROL, r2p.BridgeOptions()) as chain:
+        vars(chain.far).update(loss=0.2, duplicate=0.4, jitter=0.02)
+        lengths = [str(length).encode() for length in (0, 1, 100, 300, 3000)]
+        answers = await asyncio.gather(*[chain.change(each) for each in lengths])
+        assert answers == [b"changed " + each * 100 for each in lengths]
+        assert chain.desk.made == Counter(lengths)
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "text"),
+    [
+        ({}, {}, "gateway GW1 refuses changes from tcp: start it with --allow-control, or give the link a key"),
+        (
+            {"allow_control": True, "read_only": ("sim",)},
+            {},
+            "gateway GW1 lets no changes onto sim: it is started with --read-only for that link",
+        ),
+        (
+            {"allow_control": True},
+            {"read_only": ("memory",)},
+            "gateway GW2 lets no changes onto memory: it is started with --read-only for that link",
+        ),
+        (
+            {"allow_control": True},
+            {"read_only": ("sim",)},
+            "gateway GW2 passes nothing on to sim: it is started with --read-only for that link",
+        ),
+    ],
+)
+async def test_a_gateway_that_refuses_a_change_answers_in_the_place_of_the_module(
+    one: dict[str, Any], two: dict[str, Any], text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Chain(IpLine(), r2p.BridgeOptions(**one), r2p.BridgeOptions(**two)) as chain:
+        with pytest.raises(ServiceError, match=text):
+            await chain.change(b"0")
+        refused = [link.stats.lost["change refused"] for each in chain.gateways for link in each.links]
+        assert sorted(refused) == [0, 0, 0, 1]
+        assert text in caplog.text
+        assert not chain.desk.made
+
+
+async def test_the_module_of_a_gateway_may_be_changed_where_its_links_let_others_be() -> None:
+    line = IpLine()
+    bus = MemoryNetwork()
+    for options, text in (
+        (r2p.BridgeOptions(), "GW refuses changes from tcp: start it with --allow-control"),
+        (CONTROL, ""),
+        (r2p.BridgeOptions(allow_control=True, read_only=("tcp",)), "GW refuses changes from tcp: .* --read-only"),
+    ):
+        gateway = r2p.Module("GW", via=[line.a(), bus.transport()], bridge=options, watchdog=False)
+        async with gateway as gw, r2p.Module("B", via=line.b()) as b:
+            desk = Desk(gw)
+            await until(lambda b=b, gw=gw: knows(b, gw))  # type: ignore[misc]
+            if text:
+                with pytest.raises(ServiceError, match=text):
+                    await services(b).change(gw.instance, TEST, b"0")
+            else:
+                await services(b).change(gw.instance, TEST, b"0")
+            assert len(desk.made) == (not text)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -132,7 +132,9 @@ class SimCable(Cable):
 
 
 class LineEnd(Transport, Carrier):
-    """One end of a line in this process: `arrived` gets what its module sends."""
+    """One end of a line in this process: `arrived` gets what its module sends. `name` is that of the link."""
+
+    name = "line"
 
     def __init__(self, arrived: Callable[[bytes], None]) -> None:
         self.link: LineLink | None = None
@@ -145,7 +147,7 @@ class LineEnd(Transport, Carrier):
         self._stuck: list[bytes] = []
 
     async def run(self, hub: Hub, opened: Callable[[], object]) -> None:
-        self.link = link = LineLink("line", hub)
+        self.link = link = LineLink(self.name, hub)
         hub.attach(link)
         try:
             if self._wanted:
