@@ -25,6 +25,7 @@ from r2p.errors import (
     NameTooLong,
     NodeCrashed,
     NoServer,
+    ParameterError,
     ServiceBusy,
     ServiceError,
     TooLong,
@@ -66,13 +67,17 @@ from r2p.modules.statistics import (
     TopicOnLink,
 )
 from r2p.modules.supervisor import NodeFunction, name_of
+from r2p.parameters.definition import ParameterInfo
+from r2p.parameters.parameter import Parameter
+from r2p.parameters.registry import ModuleParameters
 from r2p.protocols.discovery.events import Command, Mismatched, ModuleChanged, ModuleGone, ModuleInfo, NameConflict
 from r2p.runtime.events import LinkDown, LinkNotice, LinkUp, LinkWaits, Listening, ModuleEvent
-from r2p.runtime.node import Node, Tick
+from r2p.runtime.node import Node
 from r2p.runtime.publishers import PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import Missed, NonRealTime, Periodic, Sporadic
 from r2p.runtime.sample import PublisherClass, Sample, Source
 from r2p.runtime.subscriber import Subscriber
+from r2p.runtime.ticks import Tick
 from r2p.services.client import ServiceClient
 from r2p.services.definition import Service
 from r2p.services.server import ServiceServer
@@ -111,6 +116,7 @@ __all__ = [
     "ModuleEvent",
     "ModuleGone",
     "ModuleInfo",
+    "ModuleParameters",
     "ModuleStatistics",
     "ModuleView",
     "NameConflict",
@@ -122,6 +128,9 @@ __all__ = [
     "NodeFunction",
     "NodeStatistics",
     "NonRealTime",
+    "Parameter",
+    "ParameterError",
+    "ParameterInfo",
     "Periodic",
     "PeriodicPublisher",
     "PortStatistics",

@@ -13,6 +13,7 @@
     ├── ServiceError                 the handler of a service raised, or the service ended
     ├── ServiceBusy                  a server with as many requests as it accepts
     ├── NoServer                     a service that no module on the network serves
+    ├── ParameterError(ValueError)   a value that a parameter can't have, or a parameter that does not exist
     ├── NodeCrashed(ExceptionGroup)  the exceptions of a module's nodes
     └── Deadlock                     virtual time with nothing left to wait for
 
@@ -83,6 +84,12 @@ class ServiceBusy(Error):
 
 class NoServer(Error):
     """A call of a service that no module serves, or not the module that was asked for."""
+
+
+class ParameterError(Error, ValueError):
+    """A value that a parameter refuses, a parameter that does not exist or is declared wrongly, or a file of parameters
+    that can't be read or written. Nothing has changed then.
+    """
 
 
 class NodeCrashed(Error, ExceptionGroup[Exception]):

@@ -18,6 +18,7 @@ TOPIC_MAX = 255
 """Of a topic or a service that a program names."""
 CARRIED_MAX = TOPIC_MAX + 2
 """Of a topic on a link: the two topics of a service have two characters more than its name."""
+PARAMETER_MAX = 64
 NAMESPACE_MAX = 16
 """Characters of the namespace of a robot at most: `robot1` in `robot1/MOTOR1`."""
 MODULE_PATH_MAX = NAMESPACE_MAX + 1 + MODULE_MAX
@@ -78,6 +79,19 @@ def module_path(name: str) -> str:
 def node_name(name: str) -> str:
     """Return a valid name of a node: 1 to 64 characters of `[A-Za-z0-9_]`. Raises InvalidName or NameTooLong."""
     return _checked("node", name, NODE_MAX)
+
+
+def parameter_name(name: str) -> str:
+    """Return a valid name of a parameter: parts of `[A-Za-z0-9_]` joined by dots, 1 to 64 characters.
+
+    Raises InvalidName or NameTooLong.
+    """
+    plain = name.replace(".", "")
+    if not all(name.split(".")) or _FOREIGN.search(plain):
+        reason = _foreign(plain) if _FOREIGN.search(plain) else "it is empty" if not name else "a part of it is empty"
+        raise InvalidName(f"parameter name {_shown(name)}: {reason}: use letters, digits and underscores, and dots")
+    _check_length("parameter", name, PARAMETER_MAX)
+    return name
 
 
 def topic_name(name: str, longest: int = TOPIC_MAX) -> str:

@@ -15,6 +15,7 @@ from r2p.errors import (
     MessageError,
     NameTooLong,
     NodeCrashed,
+    ParameterError,
     TransportError,
     TypeMismatch,
 )
@@ -34,6 +35,7 @@ EVERY = [value for value in vars(errors).values() if inspect.isclass(value) and 
         (Closed, (TransportError,)),
         (Broken, (TransportError,)),
         (NodeCrashed, (Error, ExceptionGroup)),
+        (ParameterError, (Error, ValueError)),
         (Deadlock, (Error,)),
     ],
 )

@@ -18,10 +18,10 @@ from types import TracebackType
 from typing import Self
 
 from r2p.bridge import BridgeOptions, GatewayStatistics
-from r2p.clock import clock_of
+from r2p.clock import Alarm, clock_of
 from r2p.codecs.management import FLAG_REBOOTED, FLAG_STOPPED
 from r2p.codecs.own_services import Operation
-from r2p.errors import Closed, Error, NodeCrashed
+from r2p.errors import Closed, Error, NodeCrashed, ParameterError
 from r2p.log_lines import LineLimit, get_logger
 from r2p.messages import Timestamp
 from r2p.modules.graph import NetworkView
@@ -41,6 +41,9 @@ from r2p.names import (
     node_name,
     topic_name,
 )
+from r2p.parameters.file import ParameterFile
+from r2p.parameters.registry import ModuleParameters
+from r2p.parameters.sources import GivenParameters, given
 from r2p.protocols.discovery.events import Command
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.node import Node, no_log
@@ -58,6 +61,7 @@ CLEANUP_WARNING_AFTER = 1.0
 LOG_RATE = 50
 """Records a second on the topic `log`, and records that may come at once: an eighth of a CAN bus of 1 Mbit/s."""
 
+_DECLARED_AFTER = 2 * SECOND  # ns after which nodes have declared their parameters
 _COMMAND_LINES = 1  # of the log in a second about one kind of command
 _LOG_TEXT_MAX = 128  # characters of `Log.text`
 
@@ -79,7 +83,12 @@ class Module:
     `tcp-listen:` and `zenoh:`.
 
     With `bridge` the module is a gateway: it joins its links, and forwards on each network what the gateways there have
-    agreed on. BridgeOptions restrict that. Raises InvalidName or NameTooLong.
+    agreed on. BridgeOptions restrict that.
+
+    `params` are values for parameters, by name ("kp" of any node, "node.kp", or ("node", "kp")): they win over the
+    defaults in the code, and over those in `params_file`, the only file that parameters are saved to.
+
+    Raises InvalidName or NameTooLong, and ParameterError for a key of `params` that names no parameter.
     """
 
     def __init__(
@@ -93,6 +102,8 @@ class Module:
         watchdog: bool = True,
         bridge: bool | BridgeOptions = False,
         allow_control: bool = False,
+        params_file: str | os.PathLike[str] | None = None,
+        params: GivenParameters = None,
     ) -> None:
         self.name = module_name(name) if name is not None else module_name_from(socket.gethostname())
         self.observer = observer
@@ -105,6 +116,9 @@ class Module:
         """Numbers of refused commands from the network, by name."""
         self.network = NetworkView(lambda: self._opened)
         """The network as this module knows it."""
+        file = None if params_file is None else ParameterFile(params_file)
+        self.parameters = ModuleParameters(self.name, given(params), file)
+        """The parameters that the nodes have declared, by (node, name)."""
         self._via = _urls(via)
         self._remap = _checked_remap(remap)
         self._aliases = check_aliases(aliases or {})
@@ -119,15 +133,17 @@ class Module:
         self._tasks: asyncio.TaskGroup | None = None
         self._commands = CommandHandler(self)
         self._open = False
+        self._unused_alarm: Alarm | None = None
 
     # Opening and closing
 
     async def __aenter__(self) -> Self:
-        """Open the module, and wait until its transports work. Raises TransportError for a URL that can't work, and
-        Error for a module that was open before.
+        """Open the module, and wait until its transports work. Raises TransportError for a URL that can't work,
+        ParameterError for a file of parameters that can't be read, and Error for a module that was open before.
         """
         if self._tasks is not None:
             raise Error(f"module {self.name} was opened before: make a new one")
+        await self.parameters.load()
         loop = asyncio.get_running_loop()
         clock = clock_of(loop)
         self._link_manager = LinkManager(
@@ -153,6 +169,9 @@ class Module:
         except BaseException:  # also a cancellation: Python calls __aexit__ only after __aenter__ returned
             await self._close(self._tasks)
             raise
+        if self.parameters.unused():
+            self._unused_alarm = Alarm(loop, self._report_unused, background=True)
+            self._unused_alarm.set(clock.monotonic() + _DECLARED_AFTER)
         if self._with_watchdog and not clock.virtual:  # not before: opening imports the transports' libraries
             self._watchdog = watch(loop)
         return self
@@ -256,6 +275,7 @@ class Module:
         if not self._open:
             return
         self._open = False
+        self._report_unused()
         self._commands.tasks = None
         self._opened.own_services.close()
         try:
@@ -318,7 +338,15 @@ class Module:
         log = self._log.publish if self._log is not None else no_log
 
         def make_node() -> Node:
-            return Node(name, self.space, priority=priority, remap=names, log=log, events=self._events)
+            return Node(
+                name,
+                self.space,
+                priority=priority,
+                remap=names,
+                log=log,
+                events=self._events,
+                parameters=self.parameters,
+            )
 
         supervisor = Supervisor(function, args, make_node, restart=restart)
         self._supervisors[name] = supervisor
@@ -355,6 +383,7 @@ class Module:
             # Stopped in between, so that others notice each reboot: FLAG_REBOOTED stays set after the first one.
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
             await self._end_nodes()
+            await self._reload_parameters()
             if not self._open:
                 return
             self.stopped = False
@@ -364,6 +393,22 @@ class Module:
                     supervisor.start(tasks, self._node_ended)
             self._opened.set_flags(FLAG_REBOOTED)
 
+    async def _reload_parameters(self) -> None:
+        """Forget what was set at run time, and read the saved file again, which may have been edited."""
+        self.parameters.forget_run_time()
+        try:
+            await self.parameters.load()
+        except ParameterError as error:
+            logger.error("module %s keeps the saved parameters of its start: %s", self.name, error)
+
+    def _report_unused(self) -> None:
+        """Warn, once, of values that were given for parameters that no node has declared."""
+        if self._unused_alarm is not None:
+            self._unused_alarm.close()
+            self._unused_alarm = None
+            if unused := self.parameters.unused():
+                logger.warning("no node of %s has declared the parameter %s", self.name, ", ".join(unused))
+
     @property
     def _held(self) -> bool:
         """Return whether ended nodes will start again, or may."""
@@ -372,6 +417,7 @@ class Module:
     def _node_ended(self, supervisor: Supervisor) -> None:
         if supervisor.error is not None:
             self._crashes[supervisor.node.name] = supervisor.error
+        self.parameters.node_gone(supervisor.node.name)
         self._changed.set()
 
     # Network

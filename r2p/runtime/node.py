@@ -5,27 +5,33 @@ closed when its function ends, for any reason.
 """
 
 import asyncio
+import enum
 from collections.abc import AsyncIterator, Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar, overload
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, overload
 
-from r2p.clock import SHORTEST, Alarm, Ticker, check_seconds, check_timeout
+from r2p.clock import SHORTEST, Ticker, check_seconds, check_timeout
 from r2p.errors import Closed, Error, InvalidName, TransportError
 from r2p.log_lines import NodeLogger, node_logger
 from r2p.messages import Layout, Message, layout
 from r2p.names import RESERVED, topic_name
+from r2p.parameters.definition import Check, define_parameter
+from r2p.parameters.parameter import Parameter
+from r2p.parameters.registry import ModuleParameters
 from r2p.runtime.accepting import Accept, AcceptedTypes
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
 from r2p.runtime.queues import QUEUE_BYTES, checkpoint
+from r2p.runtime.spin_reminder import SpinReminder
 from r2p.runtime.subscriber import Callback, Keep, Subscriber, SubscriberOptions
+from r2p.runtime.ticks import Tick, ticks
 from r2p.runtime.topic import TopicSpace
 from r2p.services.client import ServiceClient
 from r2p.services.definition import Definition, Q, R, ServiceType, define
 from r2p.services.server import LIMIT, Handler, ServiceServer
-from r2p.units import SECOND
 
 M = TypeVar("M", bound=Message)
+V = TypeVar("V", bound=bool | int | float | str | enum.Enum | tuple[float, ...])
 
 QUEUE = 16
 """Messages in a subscriber's queue, by default."""
@@ -36,6 +42,10 @@ _OF_ROS = {
     "create_subscription": "node.subscribe(topic, type)",
     "create_service": "node.serve(name, Request, Response, handler)",
     "create_client": "node.client(name, Request, Response)",
+    "declare_parameter": "kp = node.parameter(name, default), and kp.value",
+    "get_parameter": "kp = node.parameter(name, default), and kp.value",
+    "set_parameters": "kp = node.parameter(name, default), and kp.set(value)",
+    "add_on_set_parameters_callback": "node.parameter(name, default, check=..., on_change=...)",
     "create_timer": "async for tick in node.every(seconds):",
     "create_rate": "async for tick in node.every(seconds):",
     "get_logger": "node.log",
@@ -43,14 +53,6 @@ _OF_ROS = {
     "get_name": "node.name",
 }
 """What to write here for the methods that a node of ROS 2 has."""
-
-
-class Tick(NamedTuple):
-    """One period of `Node.every`: when it was due (monotonic ns), how late it is (s), periods skipped before it."""
-
-    due: int
-    late: float
-    skipped: int
 
 
 def no_log(level: int, node: str, text: str) -> None:
@@ -69,6 +71,7 @@ class Node:
         remap: dict[str, str] | None = None,
         log: Callable[[int, str, str], None] = no_log,
         events: EventHub | None = None,
+        parameters: ModuleParameters | None = None,
     ) -> None:
         self.name = name
         self.module = space.module
@@ -92,8 +95,9 @@ class Node:
         self._space = space
         self._remap = remap or {}
         self._events = events or EventHub()
+        self._parameters = ModuleParameters(space.module) if parameters is None else parameters
         self._tickers: set[Ticker] = set()
-        self._reminder: _SpinReminder | None = None
+        self._reminder: SpinReminder | None = None
         """A reminder from the first subscription with a callback until `spin` is called."""
         self._started = False
 
@@ -234,7 +238,7 @@ class Node:
         self.subscribers[subscriber] = None
         subscriber.open()
         if callback is not None and self._reminder is None:
-            self._reminder = _SpinReminder(self, self._space)
+            self._reminder = SpinReminder(self.name, self.log, self.subscribers, self._space)
         return subscriber
 
     @overload
@@ -311,6 +315,53 @@ class Node:
         self.services[client] = None
         return client
 
+    def parameter(
+        self,
+        name: str,
+        default: V,
+        *,
+        min: float | None = None,
+        max: float | None = None,
+        unit: str = "",
+        doc: str = "",
+        check: Check[V] | None = None,
+        on_change: Callable[[V], object] | None = None,
+        read_only: bool = False,
+    ) -> Parameter[V]:
+        """Declare a parameter: a value that can be set while the node runs, from its default on. Read it as `.value`.
+
+        It has the type of its default: bool, int, float, str (at most 128 bytes of UTF-8), a member of an enum, or a
+        tuple of up to 16 numbers, whose length stays. The name has at most 64 characters, dots between its parts.
+        `min` and `max` are for numbers, and for each number of a tuple. `unit` (16 bytes) and `doc` (120) are for
+        people.
+
+        `check(value)` returns None, or a text that says why the value is refused; with a second argument it gets the
+        values that all parameters of the node would have, by name: at the declaration, those declared so far.
+        `on_change(value)` is called after each change; what it raises is the crash of the node. Only the node itself
+        sets a parameter that is `read_only`.
+
+        The first value is that of the strongest source: options, r2p.toml, the saved file, the default. One set at run
+        time outlives a crash of the node, but not a REBOOT.
+
+        Raises ParameterError for a definition that makes no sense, for a default or the value of an option that does
+        not fit, and for a name that the node has declared already; InvalidName or NameTooLong for the name; and Closed
+        once the node has ended.
+        """
+        if self.closed:
+            raise Closed(f"node {self.name} has ended: it can't declare parameter {name} any more")
+        definition = define_parameter(
+            f"{self.module}/{self.name}",
+            name,
+            default,
+            min=min,
+            max=max,
+            unit=unit,
+            doc=doc,
+            check=check,
+            read_only=read_only,
+        )
+        return self._parameters.declare(self, definition, on_change)
+
     async def spin(self, timeout: float | None = None) -> bool:
         """Wait for messages of subscriptions with a callback, and call it for each; return False if there was none.
 
@@ -344,34 +395,7 @@ class Node:
         once, for a period that is not a number of seconds, 1e-6 or more.
         """
         check_seconds("the period of every()", period, least=SHORTEST)
-        return self._tick(period)
-
-    async def _tick(self, period: float) -> AsyncIterator[Tick]:
-        loop, clock = self._space.loop, self._space.clock
-        waiter: asyncio.Future[None] | None = None
-        due = skipped = 0
-
-        def on_tick(scheduled: int, _late: int, lost: int) -> None:
-            nonlocal due, skipped
-            skipped += lost + (due > 0)
-            due = scheduled
-            if waiter is not None and not waiter.done():
-                waiter.set_result(None)
-
-        ticker = Ticker(loop, round(period * SECOND), on_tick)
-        self._tickers.add(ticker)
-        ticker.start()
-        try:
-            while True:
-                if not due:
-                    waiter = loop.create_future()
-                    await waiter
-                tick = Tick(due, (clock.monotonic() - due) / SECOND, skipped)
-                due = skipped = 0
-                yield tick
-        finally:
-            ticker.close()
-            self._tickers.discard(ticker)
+        return ticks(period, self._space.loop, self._space.clock, self._tickers)
 
     def now(self) -> int:
         """Return UTC in ns since 1970, which never jumps back."""
@@ -444,6 +468,7 @@ class Node:
         """Close all publishers, subscribers and services. The module does so when the node's function has ended."""
         self.closed = self._ending = True
         self._forget_reminder()
+        self._parameters.node_closed(self)
         for each in (*self.services, *self.publishers, *self.subscribers, *self._tickers):
             each.close()
         if self._started:
@@ -545,43 +570,3 @@ class Node:
 
     def _with_callback(self) -> list[Subscriber[Any]]:
         return [subscriber for subscriber in self.subscribers if subscriber.callback is not None]
-
-
-class _SpinReminder:
-    """Warns once when messages wait for callbacks of a node that does not call `spin`, or returns without it.
-
-    It looks once a second at what waits, until `spin` is called: so messages on their way cost nothing more.
-    """
-
-    def __init__(self, node: Node, space: TopicSpace) -> None:
-        self._node = node
-        self._clock = space.clock
-        self._alarm = Alarm(space.loop, self._look, background=True)
-        self._waiting: set[str] = set()
-        """The topics of which messages waited at the last look."""
-        self._warned = False
-        self._alarm.set(self._clock.monotonic() + SECOND)
-
-    def close(self) -> None:
-        self._alarm.close()
-
-    def returned(self) -> None:
-        """Warn of all callbacks: the node's function has returned."""
-        topics = {each.topic for each in self._node.subscribers if each.callback is not None}
-        if topics:
-            self._warn("it has returned, so its callbacks for %s were never called", topics)
-
-    def _look(self) -> None:
-        waiting = {each.topic for each in self._node.subscribers if each.callback is not None and each.queue}
-        late = waiting & self._waiting
-        self._waiting = waiting
-        if late:
-            self._warn("messages on %s wait for its callbacks", late)
-        else:
-            self._alarm.set(self._clock.monotonic() + SECOND)
-
-    def _warn(self, text: str, topics: set[str]) -> None:
-        if not self._warned:
-            self._warned = True
-            advice = "node %s does not call spin(): " + text + "; write `while True: await node.spin()`"
-            self._node.log.warning(advice, self._node.name, ", ".join(sorted(topics)))
