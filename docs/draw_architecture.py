@@ -19,7 +19,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "Modules": ("modules", "bus"),
     "Gateways": ("bridge",),
     "Links": ("transports", "transports.can", "transports.rtcan", "transports.zenoh"),
-    "Nodes and topics": ("runtime", "runtime.publishers", "services"),
+    "Nodes and topics": ("runtime", "runtime.publishers", "services", "parameters"),
     "Protocols, pure": (
         "protocols",
         "protocols.discovery",

@@ -4,7 +4,7 @@ r2p modules announce all of it at once. Firmware announces its name and its topi
 not the nodes that they belong to. The `age` of a view says how old the knowledge is.
 """
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from typing import Any
 
 import msgspec
@@ -16,6 +16,7 @@ from r2p.messages import Layout, Message
 from r2p.modules.link_manager import LinkManager
 from r2p.modules.statistics import ModuleStatistics, decode
 from r2p.modules.type_lookup import find_type
+from r2p.parameters.definition import ParameterInfo
 from r2p.protocols.discovery.directory import EndpointInfo
 from r2p.protocols.discovery.events import ModuleInfo
 from r2p.runtime.sample import PublisherClass
@@ -157,6 +158,43 @@ class NetworkView:
         """
         module = self._opened()
         return await find_type(module.links, module.own_services, fingerprint)
+
+    async def parameters(self, module: str, node: str | None = None) -> list[ParameterInfo]:
+        """Fetch the parameters of a module, this one or any r2p module on the network; of one node or all.
+
+        Raises Error if there is no such module or node, or it can't answer, and TimeoutError if it does not.
+        """
+        raise NotImplementedError
+
+    async def set_parameters(self, module: str, values: Mapping[tuple[str, str], object]) -> None:
+        """Set parameters of a module, one or several, by (node, name): all or nothing.
+
+        An int converts to a float, and the name of a member to an enum. Raises ParameterError for a value that does not
+        fit: then nothing has changed. Raises Error if there is no such module, or it refuses changes, and TimeoutError
+        if it does not answer.
+        """
+        raise NotImplementedError
+
+    async def save_parameters(self, module: str) -> int:
+        """Have a module save what was set to its file; return how many values the file has for it.
+
+        Raises as `set_parameters`, and ParameterError if it has no file or can't write it.
+        """
+        raise NotImplementedError
+
+    async def reset_parameters(self, module: str, node: str | None = None, names: Iterable[str] | None = None) -> int:
+        """Undo what was set and saved, as `ModuleParameters.reset`: of a module, a node, or some of its parameters.
+
+        Return how many parameters were reset. Raises as `set_parameters`.
+        """
+        raise NotImplementedError
+
+    def watch_parameters(self, module: str, *, period: float = 0.5) -> AsyncIterator[ParameterInfo]:
+        """Iterate over the changes of a module's parameters, from this call on: each as it is now.
+
+        The module is asked each `period` seconds. Raises Error, when iterated, if there is no such module.
+        """
+        raise NotImplementedError
 
 
 def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:

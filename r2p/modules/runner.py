@@ -26,6 +26,7 @@ from r2p.log_lines import debugging, default_logging, printable, short_traceback
 from r2p.modules.module import Module
 from r2p.modules.supervisor import NodeFunction, check_function, name_of
 from r2p.names import node_name
+from r2p.parameters.sources import GivenParameters
 from r2p.transports.link import Transport
 
 T = TypeVar("T")
@@ -43,12 +44,14 @@ def run(
     aliases: dict[str, str] | None = None,
     restart: bool = False,
     allow_control: bool = False,
+    params_file: str | os.PathLike[str] | None = None,
+    params: GivenParameters = None,
 ) -> None:
     """Run functions as the nodes of one module, until all have ended or a signal ends them.
 
     A node has the name of its function, or another: `run(line_follower, name="follower")`, and of several
-    `run(blink, ("follower", line_follower))`. `module` is the module's name; `via`, `remap`, `aliases` and
-    `allow_control` are as for `Module`, `restart` as for `Module.start`.
+    `run(blink, ("follower", line_follower))`. `module` is the module's name; `via`, `remap`, `aliases`,
+    `allow_control`, `params_file` and `params` are as for `Module`, `restart` as for `Module.start`.
 
     Meanwhile logging writes to stderr, unless the root logger or the logger `r2p` has handlers: `r2p` from INFO up, all
     other loggers from WARNING up.
@@ -59,7 +62,16 @@ def run(
 
     async def main() -> None:
         nodes = _named(functions, name)
-        async with Module(module, via=via, remap=remap, aliases=aliases, allow_control=allow_control) as host:
+        host = Module(
+            module,
+            via=via,
+            remap=remap,
+            aliases=aliases,
+            allow_control=allow_control,
+            params_file=params_file,
+            params=params,
+        )
+        async with host:
             for node, function in nodes:
                 host.start(function, name=node, restart=restart)
             await host.wait()
