@@ -246,6 +246,26 @@ class Battery(Message):
     """Remaining time at the present current, minutes; 65535: unknown."""
 
 
+class PowerEvent(Message):
+    """The power supply crossed thresholds (topic `power_event`, thesis 7.2.2). 1 fragment.
+
+    Several thresholds are added up: 0 is none of them.
+    """
+
+    LOW_VOLTAGE: ClassVar = 1
+    HIGH_VOLTAGE: ClassVar = 2
+    HIGH_CURRENT: ClassVar = 4
+
+    crossed: u8 = 0
+    """The thresholds that this event is about, crossed in either direction."""
+    exceeded: u8 = 0
+    """The thresholds beyond which the supply is now."""
+    voltage: u16 = 0
+    """mV."""
+    current: i16 = 0
+    """Out of the battery, mA."""
+
+
 class Pressure(Message):
     """Air pressure, and the altitude that follows from it (topic `pressure`, thesis 7.4.2). 1 fragment."""
 

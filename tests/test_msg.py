@@ -43,6 +43,7 @@ SIZES = {
     "StampedIMU": 32,
     "Proximity": 8,
     "Battery": 7,
+    "PowerEvent": 6,
     "Pressure": 8,
     "GPS": 32,
     "StampedGPS": 40,

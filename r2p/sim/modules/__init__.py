@@ -10,25 +10,26 @@
 `power` has `Powered`, which runs it in an event loop and connects it: by a `wire` inside the process, which works under
 virtual time, by TCP, or by a pseudo terminal in place of a serial port.
 
-`boards` has the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s with
-nodes around a model of `r2p.sim.physics`, on any transport. `Plant` advances the models. `r2p.sim.robots` assembles
-modules to robots.
+`boards` and `sensors` have the hardware modules of the thesis (`MotorModule`, `ProximityModule`, ...): `r2p.Module`s
+with nodes around a model of `r2p.sim.physics`, on any transport. `Plant` advances the models. `r2p.sim.robots`
+assembles modules to robots.
 """
 
 from r2p.sim.modules.boards import (
     Board,
     GatewayModule,
-    ImuModule,
     IoModule,
+    MotorConfig,
     MotorModule,
+    Pins,
     Plant,
     PowerModule,
-    ProximityModule,
 )
 from r2p.sim.modules.firmware import FirmwareModule, Publishes, Subscribes
 from r2p.sim.modules.flash import BOARD, FlashTimes, MemoryMap
 from r2p.sim.modules.loader import EmulatedLoader, LoaderFaults
 from r2p.sim.modules.power import Powered, Wire
+from r2p.sim.modules.sensors import ImuModule, InertialUnit, Motion, ProximityModule, RangeArray
 
 __all__ = [
     "BOARD",
@@ -38,15 +39,20 @@ __all__ = [
     "FlashTimes",
     "GatewayModule",
     "ImuModule",
+    "InertialUnit",
     "IoModule",
     "LoaderFaults",
     "MemoryMap",
+    "Motion",
+    "MotorConfig",
     "MotorModule",
+    "Pins",
     "Plant",
     "PowerModule",
     "Powered",
     "ProximityModule",
     "Publishes",
+    "RangeArray",
     "Subscribes",
     "Wire",
 ]

@@ -1,15 +1,15 @@
-"""The hardware modules of the thesis (chapter 7), emulated: motor, proximity, IMU, input/output, power and gateway.
+"""The hardware modules of the thesis (chapter 7), emulated: motor, input/output, power and gateway; more in `sensors`.
 
 Each is a `Board`, an `r2p.Module` that starts its nodes by itself when it is opened. The nodes are ordinary ones around
 a model of `r2p.sim.physics`, so a board runs on any transport, and sends the same messages as a real one. A `Plant`
 advances the models.
+
+What firmware has in its configuration are parameters of the nodes: they set the models, at once and at any time.
 """
 
 import asyncio
 import functools
-import math
-import random
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from typing import Any, Protocol, Self
 
 import msgspec
@@ -18,35 +18,19 @@ import r2p
 from r2p.bridge import BridgeOptions
 from r2p.clock import Ticker
 from r2p.modules.supervisor import NodeFunction
-from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
-from r2p.sim.physics.inertial import (
-    ACCELEROMETER,
-    BAROMETER_NOISE,
-    GRAVITY,
-    GYROSCOPE,
-    MAGNETOMETER,
-    ComplementaryFilter,
-    MemsSensor,
-    Vector,
-    altitude_at,
-    pressure_at,
-)
-from r2p.sim.physics.motor import Drive, LeadBattery
-from r2p.sim.physics.world import ADC_MAX, ADC_REFERENCE, RangeFinder, RangeSpec, adc_counts
+from r2p.msg import Battery, Encoder, Float32, Led, PowerEvent, Setpoint
+from r2p.sim.physics.motor import Drive, Gains, LeadBattery, Threshold
+from r2p.sim.physics.world import ADC_MAX, ADC_REFERENCE, adc_counts
 from r2p.transports.link import Transport
 from r2p.units import SECOND
 
 Via = str | Transport | Iterable[str | Transport] | None
-DistanceTo = Callable[[int], float]
-"""A function that returns the distance in mm to the object before sensor 0 to 3, or infinity."""
 
 _CATCH_UP = 1.0  # s of physics to make up for after the loop was blocked; more would hang after a long sleep
 _VOLTAGE_COUNT = 36_000 / ADC_MAX  # mV per count: a divider turns 36 V into 3.3 V
 _CURRENT_COUNT = 50_000 / ADC_MAX  # mA per count
-_MDPS = math.degrees(1.0) * 1000  # mdps in one rad/s
-_MG = 1000 / GRAVITY  # mg in one m/s^2
-_BARO = 0.04  # seconds: the barometer makes 25 measurements a second
-_REACTION = 0.02  # s; a robot of 2 m/s drives 4 cm meanwhile
+_SAMPLE = 0.02  # s: the analog watchdog of the power supply compares each sample
+_ALERT = 0.05  # s: deadline of its events
 
 
 class Part(Protocol):
@@ -110,8 +94,38 @@ class Board(r2p.Module):
         return self
 
 
+class Closes(Protocol):
+    """A publisher or a subscriber."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+def reopens(open: Callable[[float], Closes]) -> Callable[[float], None]:
+    """Return a function that opens something with a value, and then closes what it opened with the value before."""
+    opened: Closes | None = None
+
+    def reopen(value: float) -> None:
+        nonlocal opened
+        before, opened = opened, open(value)
+        if before is not None:
+            before.close()
+
+    return reopen
+
+
+async def paced(node: r2p.Node, period: r2p.Parameter[float]) -> AsyncIterator[r2p.Tick]:
+    """Iterate over ticks as `Node.every` does; a new period counts from the next tick on."""
+    while True:
+        seconds = period.value
+        async for tick in node.every(seconds):
+            yield tick
+            if period.value != seconds:
+                break
+
+
 class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """The configuration of the motor module, which firmware has in its flash memory."""
+    """The configuration of the motor module; times are what its parameters are at first."""
 
     setpoint: str = "setpoint"
     """Topic of the setpoints."""
@@ -131,8 +145,43 @@ class MotorConfig(msgspec.Struct, frozen=True, kw_only=True):
     """s."""
 
 
+def tune(node: r2p.Node, drive: Drive) -> None:
+    """Let the parameters of a node set gains and limits of a drive. Its angles are in ticks, theirs of the wheel."""
+    ticks, gains = drive.motor.spec.ticks_per_radian, drive.gains
+    units = ("V/(rad/s)", "V/rad", "V/(rad/s^2)") if drive.mode == "speed" else ("V/rad", "V/(rad s)", "V/(rad/s)")
+
+    def gain(name: str, default: float, most: float, unit: str, doc: str) -> r2p.Parameter[float]:
+        shown = float(f"{default * ticks:.6g}")
+        return node.parameter(name, shown, min=0.0, max=most, unit=unit, doc=doc, on_change=control)
+
+    def control(_value: float) -> None:
+        drive.pid.gains = Gains(kp.value / ticks, ki.value / ticks, kd.value / ticks, limit.value)
+
+    def chop(amperes: float) -> None:
+        drive.motor.current_limit = amperes
+
+    kp = gain("kp", gains.kp, 100.0, units[0], "Proportional gain")
+    ki = gain("ki", gains.ki, 10_000.0, units[1], "Integral gain")
+    kd = gain("kd", gains.kd, 10.0, units[2], "Derivative gain, of what is measured")
+    limit = node.parameter(
+        "voltage_limit", gains.limit, min=0.0, max=36.0, unit="V", doc="Highest voltage at the motor", on_change=control
+    )
+    current = node.parameter(
+        "current_limit",
+        drive.motor.spec.current_limit,
+        min=0.0,
+        max=20.0,
+        unit="A",
+        doc="The bridge chops a higher current, which limits the torque",
+        on_change=chop,
+    )
+    control(kp.value)
+    chop(current.value)
+
+
 async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
     """Control the motor: the node of the DC motor controller module."""
+    tune(node, drive)
 
     def command(message: r2p.Message) -> None:
         drive.setpoint = config.ticks(message)
@@ -141,10 +190,32 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
         return Encoder(delta=float(drive.take_ticks()))
 
     # Only the newest setpoint counts: a late one must not delay it.
-    node.subscribe(
-        config.setpoint, config.message, command, queue=1, lossy=True, timeout=config.timeout, on_timeout=drive.stop
+    listen = reopens(
+        lambda timeout: node.subscribe(
+            config.setpoint, config.message, command, queue=1, lossy=True, timeout=timeout, on_timeout=drive.stop
+        )
     )
-    node.advertise(config.encoder, Encoder, r2p.Periodic(config.period, moved))
+    measure = reopens(lambda period: node.advertise(config.encoder, Encoder, r2p.Periodic(period, moved)))
+    timeout = node.parameter(
+        "timeout",
+        config.timeout,
+        min=0.02,
+        max=10.0,
+        unit="s",
+        doc=f"The motor stops when no {config.setpoint} has arrived for so long",
+        on_change=listen,
+    )
+    period = node.parameter(
+        "encoder_period",
+        config.period,
+        min=0.005,
+        max=0.1,
+        unit="s",
+        doc=f"Period of {config.encoder}",
+        on_change=measure,
+    )
+    listen(timeout.value)
+    measure(period.value)
     try:
         while True:
             await node.spin()
@@ -154,8 +225,11 @@ async def motor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
 
 async def monitor(node: r2p.Node, drive: Drive, config: MotorConfig) -> None:
     """Publish the motor's current."""
+    period = node.parameter(
+        "period", config.current_period, min=0.01, max=10.0, unit="s", doc=f"Period of {config.current}"
+    )
     current = node.advertise(config.current, Float32)
-    async for _ in node.every(config.current_period):
+    async for _ in paced(node, period):
         await current.publish(Float32(data=drive.motor.current))
 
 
@@ -179,142 +253,6 @@ class MotorModule(Board):
             "motor": functools.partial(motor, drive=drive, config=config),
             "monitor": functools.partial(monitor, drive=drive, config=config),
         }
-        super().__init__(name, via=via, remap=remap, nodes=nodes)
-
-
-class RangeArray:
-    """Four sensors of the same kind, and their inputs of the A/D converter."""
-
-    def __init__(self, distance_to: DistanceTo, noise: random.Random) -> None:
-        self._distance_to = distance_to
-        self._sensors = [RangeFinder(RangeSpec(), noise) for _ in range(4)]
-
-    def read(self) -> Proximity:
-        """Read all four, corrected, in mm."""
-        one, two, three, four = (
-            sensor.millimetres(sensor.read(self._distance_to(number))) for number, sensor in enumerate(self._sensors)
-        )
-        return Proximity(ranges=(one, two, three, four))
-
-
-async def proximity(node: r2p.Node, sensors: RangeArray, topic: str, period: float) -> None:
-    """Publish the distances: event-triggered, because an obstacle needs an immediate reaction."""
-    ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=_REACTION))
-    async for _ in node.every(period):
-        await ranges.publish(sensors.read())
-
-
-class ProximityModule(Board):
-    """The proximity module (thesis 7.5): four range finders, published in millimetres on `proximity`."""
-
-    def __init__(
-        self,
-        name: str = "PROX1",
-        *,
-        sensors: RangeArray,
-        topic: str = "proximity",
-        period: float = 0.05,
-        via: Via = None,
-        remap: dict[str, str] | None = None,
-    ) -> None:
-        """`period` in seconds: the sensors need 40 ms for a measurement."""
-        node = functools.partial(proximity, sensors=sensors, topic=topic, period=period)
-        super().__init__(name, via=via, remap=remap, nodes={"prox": node})
-
-
-class Motion(msgspec.Struct, frozen=True):
-    """The true values that the sensors measure, in the frame of the module (x forward, y to the left, z up)."""
-
-    force: Vector = (0.0, 0.0, GRAVITY)
-    """Specific force (acceleration minus gravity), upwards at rest, m/s^2."""
-    rates: Vector = (0.0, 0.0, 0.0)
-    """rad/s."""
-    field: Vector = (220.0, 0.0, -400.0)
-    """Magnetic field, mgauss; by default x points north."""
-    altitude: float = 120.0
-    """m."""
-
-
-class InertialUnit:
-    """The inertial sensors, which return counts at their own rates, and the filter; it is a part of a `Plant`."""
-
-    def __init__(self, motion: Callable[[], Motion], noise: random.Random) -> None:
-        self.attitude = ComplementaryFilter()
-        self._motion = motion
-        self._acc = MemsSensor(ACCELEROMETER, noise)
-        self._gyro = MemsSensor(GYROSCOPE, noise)
-        self._mag = MemsSensor(MAGNETOMETER, noise)
-        self._noise = noise
-
-    def step(self, dt: float) -> None:
-        """Advance by `dt` seconds; the filter advances at each sample of the gyroscope."""
-        motion = self._motion()
-        fx, fy, fz = motion.force
-        gx, gy, gz = motion.rates
-        self._acc.step((fx * _MG, fy * _MG, fz * _MG), dt)
-        self._mag.step(motion.field, dt)
-        if self._gyro.step((gx * _MDPS, gy * _MDPS, gz * _MDPS), dt) and self._mag.samples:
-            self.attitude.step(self._rates(), self._acc.values, self._mag.values, 1 / GYROSCOPE.rate)
-
-    def imu(self) -> IMU:
-        """Return attitude and rates, filtered."""
-        roll, pitch, yaw = self.attitude.angles
-        x, y, z = (rate - bias for rate, bias in zip(self._rates(), self.attitude.bias, strict=True))
-        return IMU(roll=roll, pitch=pitch, yaw=yaw, roll_rate=x, pitch_rate=y, yaw_rate=z)
-
-    def raw(self) -> IMURaw9:
-        """Return the counts of the sensors."""
-        return IMURaw9(*self._acc.counts, *self._gyro.counts, *self._mag.counts)
-
-    def tilt(self) -> Tilt:
-        """Return the pitch, for a robot that balances on two wheels."""
-        return Tilt(angle=self.attitude.angles[1])
-
-    def pressure(self) -> Pressure:
-        """Return the air pressure, and its altitude."""
-        pressure = pressure_at(self._motion().altitude) + self._noise.gauss(0, BAROMETER_NOISE)
-        return Pressure(pressure=pressure, altitude=altitude_at(pressure))
-
-    def _rates(self) -> Vector:
-        x, y, z = self._gyro.values
-        return x / _MDPS, y / _MDPS, z / _MDPS
-
-
-async def readings(
-    node: r2p.Node, topic: str, type: type[r2p.Message], fill: Callable[[], r2p.Message], period: float
-) -> None:
-    """Publish readings, time-triggered."""
-    node.advertise(topic, type, r2p.Periodic(period, fill))
-    await asyncio.Event().wait()
-
-
-class ImuModule(Board):
-    """The inertial measurement unit (thesis 7.4): publishes `imu`, `imu_raw`, `tilt` and `pressure`.
-
-    `unit` is its hardware, which the caller steps in a `Plant`.
-    """
-
-    def __init__(
-        self,
-        name: str = "IMU1",
-        *,
-        unit: InertialUnit,
-        period: float = 0.01,
-        topics: Iterable[str] = ("imu", "imu_raw", "tilt", "pressure"),
-        via: Via = None,
-        remap: dict[str, str] | None = None,
-    ) -> None:
-        """`period` in seconds, of all topics but `pressure`, which has 25 Hz; `topics`: those to publish."""
-        streams: dict[str, tuple[type[r2p.Message], Callable[[], r2p.Message], float]] = {
-            "imu": (IMU, unit.imu, period),
-            "imu_raw": (IMURaw9, unit.raw, period),
-            "tilt": (Tilt, unit.tilt, period),
-            "pressure": (Pressure, unit.pressure, _BARO),
-        }
-        nodes: dict[str, NodeFunction] = {}
-        for topic in topics:
-            message, fill, each = streams[topic]
-            nodes[topic] = functools.partial(readings, topic=topic, type=message, fill=fill, period=each)
         super().__init__(name, via=via, remap=remap, nodes=nodes)
 
 
@@ -393,15 +331,65 @@ def measured(battery: LeadBattery) -> Battery:
 
 async def power(node: r2p.Node, battery: LeadBattery, topic: str, period: float) -> None:
     """Publish the measurements."""
+    each = node.parameter("period", period, min=0.01, max=10.0, unit="s", doc=f"Period of {topic}")
     measurements = node.advertise(topic, Battery)
-    async for _ in node.every(period):
+    async for _ in paced(node, each):
         await measurements.publish(measured(battery))
+
+
+async def limits(node: r2p.Node, battery: LeadBattery, topic: str) -> None:
+    """Publish an event when voltage or current crosses a threshold: the analog watchdog of the power supply."""
+    voltage, current = _thresholds(node)
+    events = node.advertise(topic, PowerEvent, r2p.Sporadic(deadline=_ALERT), latch=True)
+    async for _ in node.every(_SAMPLE):
+        now = measured(battery)
+        crossed = sum(bit for bit, each in voltage.items() if each.update(now.voltage / 1000))
+        crossed += sum(bit for bit, each in current.items() if each.update(now.current / 1000))
+        if crossed:
+            exceeded = sum(bit for bit, each in (voltage | current).items() if each.exceeded)
+            await events.publish(PowerEvent(crossed, exceeded, now.voltage, now.current))
+
+
+def _thresholds(node: r2p.Node) -> tuple[dict[int, Threshold], dict[int, Threshold]]:
+    """Declare the thresholds of voltage and current, and return them by their bits in a PowerEvent."""
+    low, high, most = Threshold("below"), Threshold("above"), Threshold("above")
+
+    def change(_value: float) -> None:
+        low.level, high.level, most.level = low_voltage.value, high_voltage.value, high_current.value
+        low.hysteresis = high.hysteresis = voltage_hysteresis.value
+        most.hysteresis = current_hysteresis.value
+
+    def threshold(name: str, default: float, most: float, unit: str, doc: str) -> r2p.Parameter[float]:
+        return node.parameter(name, default, min=0.0, max=most, unit=unit, doc=doc, on_change=change)
+
+    def ordered(hysteresis: float, values: Mapping[str, Any]) -> str | None:
+        below = values["low_voltage"] + hysteresis < values["high_voltage"]
+        return None if below else "low_voltage and voltage_hysteresis together have to be below high_voltage"
+
+    low_voltage = threshold("low_voltage", 23.0, 36.0, "V", "An event when the voltage falls below it")
+    high_voltage = threshold("high_voltage", 29.0, 36.0, "V", "An event when the voltage rises above it")
+    voltage_hysteresis = node.parameter(
+        "voltage_hysteresis",
+        0.5,
+        min=0.0,
+        max=5.0,
+        unit="V",
+        doc="How far the voltage has to return for the event to end",
+        check=ordered,
+        on_change=change,
+    )
+    high_current = threshold("high_current", 30.0, 50.0, "A", "An event when the current rises above it")
+    current_hysteresis = threshold(
+        "current_hysteresis", 2.0, 20.0, "A", "How far the current has to return for the event to end"
+    )
+    change(0.0)
+    return {PowerEvent.LOW_VOLTAGE: low, PowerEvent.HIGH_VOLTAGE: high}, {PowerEvent.HIGH_CURRENT: most}
 
 
 class PowerModule(Board):
     """The power supply module (thesis 7.2): measures voltage and current of the battery, and publishes `battery`.
 
-    The caller steps `battery` in a `Plant`.
+    An event on `power_event` says that one of them crossed a threshold. The caller steps `battery` in a `Plant`.
     """
 
     def __init__(
@@ -415,8 +403,11 @@ class PowerModule(Board):
         remap: dict[str, str] | None = None,
     ) -> None:
         """`period` in seconds."""
-        node = functools.partial(power, battery=battery, topic=topic, period=period)
-        super().__init__(name, via=via, remap=remap, nodes={"power": node})
+        nodes = {
+            "power": functools.partial(power, battery=battery, topic=topic, period=period),
+            "limits": functools.partial(limits, battery=battery, topic="power_event"),
+        }
+        super().__init__(name, via=via, remap=remap, nodes=nodes)
 
 
 class GatewayModule(Board):

@@ -5,6 +5,7 @@ the data sheet over the bandwidth of its rate, a resolution and a full scale. Th
 filter (Mahony, Hamel and Pflimlin 2008).
 """
 
+import enum
 import math
 import random
 
@@ -43,6 +44,21 @@ GYROSCOPE = MemsSpec(resolution=8.75, full_scale=250_000.0, rate=400.0, density=
 """L3G4200D, 250 dps, in mdps."""
 MAGNETOMETER = MemsSpec(resolution=0.9, full_scale=1300.0, rate=220.0, density=0.2, bias=5.0)
 """LSM303DLHC, +-1.3 gauss, in mgauss."""
+AccelerometerRange = enum.Enum(
+    "AccelerometerRange", {"2g": (2000.0, 1.0), "4g": (4000.0, 2.0), "8g": (8000.0, 4.0), "16g": (16_000.0, 12.0)}
+)
+"""The ranges of the LSM303DLHC: full scale and resolution, mg."""
+GyroscopeRange = enum.Enum(
+    "GyroscopeRange", {"250dps": (250_000.0, 8.75), "500dps": (500_000.0, 17.5), "2000dps": (2_000_000.0, 70.0)}
+)
+"""Those of the L3G4200D, mdps."""
+MagnetometerRange = enum.Enum(
+    "MagnetometerRange",
+    {"1.3gauss": (1300.0, 0.9), "2.5gauss": (2500.0, 1.49), "4gauss": (4000.0, 2.22), "8.1gauss": (8100.0, 4.35)},
+)
+"""Some of those of the LSM303DLHC, mgauss."""
+FILTER_GAIN, FILTER_BIAS_GAIN = 1.0, 0.2
+"""Of the attitude filter, 1/s and 1/s^2."""
 BAROMETER_NOISE = 2.0
 """LPS331AP, one sigma, Pa."""
 
@@ -56,9 +72,14 @@ class MemsSensor:
         """The last sample, in counts."""
         self.samples = 0
         """The number of samples so far."""
+        self._resolution = spec.resolution  # of the last sample
         self._noise = noise
         self._bias = [noise.gauss(0, spec.bias) for _ in range(3)]
         self._elapsed = 0.0
+
+    def set_range(self, full_scale: float, resolution: float) -> None:
+        """Choose another full scale and its resolution, in the unit of the data sheet, from the next sample on."""
+        self.spec = msgspec.structs.replace(self.spec, full_scale=full_scale, resolution=resolution)
 
     def step(self, truth: Vector, dt: float) -> bool:
         """Advance by `dt` seconds; return whether there is a new sample. `truth` is in the unit of the data sheet."""
@@ -66,6 +87,7 @@ class MemsSensor:
         if self._elapsed < 1.0 - 1e-9:
             return False
         self._elapsed -= 1.0
+        self._resolution = self.spec.resolution
         x, y, z = (self._sample(value, bias) for value, bias in zip(truth, self._bias, strict=True))
         self.counts = (x, y, z)
         self.samples += 1
@@ -75,7 +97,7 @@ class MemsSensor:
     def values(self) -> Vector:
         """The last sample, in the unit of the data sheet."""
         x, y, z = self.counts
-        return x * self.spec.resolution, y * self.spec.resolution, z * self.spec.resolution
+        return x * self._resolution, y * self._resolution, z * self._resolution
 
     def _sample(self, value: float, bias: float) -> int:
         spec = self.spec
@@ -96,20 +118,21 @@ def altitude_at(pressure: float) -> float:
 class ComplementaryFilter:
     """The attitude filter; `quaternion` rotates vectors of the body into the world (x north, y west, z up)."""
 
-    def __init__(self, *, gain: float = 1.0, bias_gain: float = 0.2) -> None:
-        """`gain` (1/s): how fast gravity and field win; `bias_gain` (1/s^2): how fast the bias is learnt."""
+    def __init__(self, *, gain: float = FILTER_GAIN, bias_gain: float = FILTER_BIAS_GAIN) -> None:
         self.quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self.bias: Vector = (0.0, 0.0, 0.0)
         """Bias of the gyroscope, rad/s."""
-        self._gain = gain
-        self._bias_gain = bias_gain
+        self.gain = gain
+        """How fast gravity and field win, 1/s."""
+        self.bias_gain = bias_gain
+        """How fast the bias is learnt, 1/s^2."""
 
     def step(self, gyro: Vector, acc: Vector, mag: Vector, dt: float) -> None:
         """Advance by `dt` seconds. `gyro` in rad/s; `acc` (up, at rest) and `mag` in any unit."""
         errors = self._correction(_unit(acc), _unit(mag))
-        x, y, z = (bias - self._bias_gain * error * dt for bias, error in zip(self.bias, errors, strict=True))
+        x, y, z = (bias - self.bias_gain * error * dt for bias, error in zip(self.bias, errors, strict=True))
         self.bias = (x, y, z)
-        rates = [rate - bias + self._gain * error for rate, bias, error in zip(gyro, self.bias, errors, strict=True)]
+        rates = [rate - bias + self.gain * error for rate, bias, error in zip(gyro, self.bias, errors, strict=True)]
         self.quaternion = _turned(self.quaternion, (rates[0], rates[1], rates[2]), dt)
 
     @property

@@ -1,4 +1,4 @@
-"""A brushed DC motor with gear and encoder, its load, its closed-loop control, and the battery.
+"""A brushed DC motor with gear and encoder, its load, its closed-loop control, the battery, and thresholds.
 
 The inductance of the winding is left out: its time constant, 0.2 ms, is shorter than every useful step. What is left is
 a first-order system, which `MotorSpec.gain` and `MotorSpec.time_constant` describe completely. The control is that of
@@ -35,7 +35,7 @@ class MotorSpec(msgspec.Struct, frozen=True, kw_only=True):
     damping: float = 0.5
     """Viscous friction at the wheel, mNm s/rad."""
     current_limit: float = 10.0
-    """A; above it the bridge chops the current (thesis 7.3.2)."""
+    """A; what `Motor.current_limit` is at first (thesis 7.3.2)."""
 
     @property
     def ticks_per_radian(self) -> float:
@@ -75,6 +75,8 @@ class Motor:
         """Angle of the wheel, rad."""
         self.speed = 0.0
         """Speed of the wheel, rad/s."""
+        self.current_limit = spec.current_limit
+        """A; above it the bridge chops the current."""
         self._constant = spec.constant
         self._ticks_per_radian = spec.ticks_per_radian
         self._dry, self._damping = spec.friction * 1e-3, spec.damping * 1e-3
@@ -86,7 +88,7 @@ class Motor:
 
     def torque(self) -> float:
         """Return the torque on the wheel at its present speed, including friction, Nm."""
-        limit = self.spec.current_limit
+        limit = self.current_limit
         current = (self.voltage - self._constant * self.speed) / self.spec.resistance
         self.current = current = max(-limit, min(limit, current))
         return current * self._constant - self._friction()
@@ -130,27 +132,48 @@ class Pid:
     """A PID controller with saturation; its integrator stops while the output is saturated."""
 
     def __init__(self, gains: Gains) -> None:
-        self.gains = gains
+        self._gains = gains
         self._integral = 0.0
+        self._error = self._slope = self._output = 0.0  # of the last step
         self._measured: float | None = None
+
+    @property
+    def gains(self) -> Gains:
+        """The gains. New ones do not make the output jump: the integral part makes up for what the others change.
+
+        Without an integral part (ki is 0) nothing can, and what was integrated before is forgotten.
+        """
+        return self._gains
+
+    @gains.setter
+    def gains(self, gains: Gains) -> None:
+        self._gains = gains
+        wanted = gains.kp * self._error + self._integral - gains.kd * self._slope
+        if _clamp(wanted, gains.limit) != _clamp(self._output, gains.limit):
+            self._integral += self._output - wanted
+        self._integral = _clamp(self._integral, gains.limit) if gains.ki else 0.0
 
     def reset(self) -> None:
         """Reset the integrator and the derivative."""
-        self._integral = 0.0
+        self._integral = self._error = self._slope = self._output = 0.0
         self._measured = None
 
     def step(self, setpoint: float, measured: float, dt: float) -> float:
         """Return the output for the next `dt` seconds."""
-        gains = self.gains
-        error = setpoint - measured
-        slope = 0.0 if self._measured is None else (measured - self._measured) / dt
+        gains = self._gains
+        self._error = error = setpoint - measured
+        self._slope = slope = 0.0 if self._measured is None else (measured - self._measured) / dt
         self._measured = measured
         integral = self._integral + gains.ki * error * dt
         wanted = gains.kp * error + integral - gains.kd * slope
-        output = max(-gains.limit, min(gains.limit, wanted))
+        self._output = output = _clamp(wanted, gains.limit)
         if wanted == output or wanted * error < 0:  # while saturated, integrate only what leads out of it
             self._integral = integral
         return output
+
+
+def _clamp(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))
 
 
 def speed_gains(spec: MotorSpec, load: float, *, frequency: float, damping: float) -> Gains:
@@ -168,10 +191,13 @@ class Drive:
 
     def __init__(self, motor: Motor, gains: Gains, *, mode: Mode = "speed") -> None:
         self.motor = motor
+        self.gains = gains
+        """The gains that it was made with."""
         self.mode: Mode = mode
         self.setpoint: float | None = None
         """Ticks (position) or ticks/s (speed); None: stopped."""
-        self._pid = Pid(gains)
+        self.pid = Pid(gains)
+        """The controller, whose gains may change at any time."""
         self._last_ticks = motor.ticks
         self._returned = motor.ticks
 
@@ -179,7 +205,7 @@ class Drive:
         """Short the winding, which brakes, until the next setpoint."""
         self.setpoint = None
         self.motor.voltage = 0.0
-        self._pid.reset()
+        self.pid.reset()
 
     def take_ticks(self) -> int:
         """Return the ticks since the last call."""
@@ -193,7 +219,7 @@ class Drive:
         moved, self._last_ticks = ticks - self._last_ticks, ticks
         if self.setpoint is not None:
             measured = ticks if self.mode == "position" else moved / dt
-            self.motor.voltage = self._pid.step(self.setpoint, measured, dt)
+            self.motor.voltage = self.pid.step(self.setpoint, measured, dt)
 
 
 class BatterySpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -207,6 +233,25 @@ class BatterySpec(msgspec.Struct, frozen=True, kw_only=True):
     """Voltage at rest when it is empty, V."""
     resistance: float = 60.0
     """Internal, milliohm."""
+
+
+class Threshold:
+    """One side of an analog watchdog (thesis 7.2.2): is a value beyond a level, with a hysteresis on the way back?"""
+
+    def __init__(self, side: Literal["below", "above"], level: float = 0.0, hysteresis: float = 0.0) -> None:
+        self.level = level
+        self.hysteresis = hysteresis
+        """How far behind the level the value has to return, 0 or more."""
+        self.exceeded = False
+        """Whether the last value was beyond the level, or has not returned far enough since then."""
+        self._sign = -1 if side == "below" else 1
+
+    def update(self, value: float) -> bool:
+        """Compare a new value; return whether it crossed the threshold, in either direction."""
+        before = self.exceeded
+        beyond = (value - self.level) * self._sign
+        self.exceeded = beyond > -self.hysteresis if before else beyond > 0
+        return self.exceeded != before
 
 
 class LeadBattery:

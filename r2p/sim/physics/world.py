@@ -90,11 +90,25 @@ class RangeSpec(msgspec.Struct, frozen=True, kw_only=True):
         return self.scale / (distance + self.offset)
 
 
+class RangeCalibration(msgspec.Struct, frozen=True, kw_only=True):
+    """The curve `scale / (distance + offset)` that firmware assumes for a sensor. Default: the data sheet's."""
+
+    scale: float = RangeSpec().scale
+    """V mm."""
+    offset: float = RangeSpec().offset
+    """mm."""
+    longest: float = RangeSpec().longest
+    """Readings beyond it are NOTHING, mm."""
+
+
 class RangeFinder:
-    """One sensor, and its input of the A/D converter."""
+    """One sensor, its input of the A/D converter, and its calibration."""
 
     def __init__(self, spec: RangeSpec, noise: random.Random) -> None:
         self.spec = spec
+        """The curve that this sensor really has; two of a kind differ by some percent."""
+        self.calibration = RangeCalibration()
+        """The curve that firmware converts its readings with."""
         self._noise = noise
 
     def read(self, distance: float) -> int:
@@ -105,10 +119,10 @@ class RangeFinder:
     def millimetres(self, counts: int) -> int:
         """Return the distance (mm) that firmware computes from counts; NOTHING beyond the longest range."""
         voltage = counts * ADC_REFERENCE / ADC_MAX
-        spec = self.spec
-        if voltage <= spec.scale / (spec.longest + spec.offset):
+        curve = self.calibration
+        if voltage <= curve.scale / (curve.longest + curve.offset):
             return NOTHING
-        return max(0, round(spec.scale / voltage - spec.offset))
+        return max(0, round(curve.scale / voltage - curve.offset))
 
 
 class OmniSpec(msgspec.Struct, frozen=True, kw_only=True):

@@ -53,12 +53,9 @@ DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 """Directions of the square's sides, in the robot's frame."""
 
 _DEADLINE = 0.05  # s, of soft real-time messages
-_STOP = 0.15  # m: closer than this a sensor's reading always stops the robot
-_BRAKING = 0.4  # s: plus this distance for each m/s
 _AHEAD = math.cos(math.radians(60))
 _BACKLOG = 250  # encoder readings, five seconds: a lost one would distort the odometry
 _ROUNDS = 5  # encoder readings per message of odometry: 10 Hz, thesis table 4.1
-_LOW = 20  # percent
 
 
 class Latest(Generic[M]):
@@ -118,6 +115,12 @@ async def obstacle_avoidance(node: r2p.Node, traffic: Traffic = "srt") -> None:
 
     If a proximity module is silent, the robot does not move in its direction.
     """
+    stop = node.parameter(
+        "stop_distance", 0.15, min=0.0, max=0.8, unit="m", doc="The robot stops before an obstacle at this distance ..."
+    )
+    braking = node.parameter(
+        "braking_time", 0.4, min=0.0, max=2.0, unit="s", doc="... and what it drives in this time at its present speed"
+    )
     sides = {angle: Latest(node, topic, Proximity, fresh=2 * FRESH) for topic, angle in SIDES.items()}
 
     def blocked(command: Velocity3) -> bool:
@@ -127,7 +130,7 @@ async def obstacle_avoidance(node: r2p.Node, traffic: Traffic = "srt") -> None:
             for bearing, reading in zip(BEARINGS, ranges, strict=True):
                 at = math.radians(angle + bearing)
                 towards = command.x * math.cos(at) + command.y * math.sin(at)
-                if towards > _AHEAD * speed and reading / 1000 < _STOP + _BRAKING * towards:
+                if towards > _AHEAD * speed and reading / 1000 < stop.value + braking.value * towards:
                     return True
         return False
 
@@ -166,6 +169,14 @@ async def forward_kinematics(node: r2p.Node) -> None:
 
     It pauses while a wheel is silent; the readings of the others count as soon as that is back.
     """
+    period = node.parameter(
+        "encoder_period",
+        PERIOD,
+        min=0.005,
+        max=0.1,
+        unit="s",
+        doc="Period of the encoders' messages, as the motor modules have it",
+    )
     odometry = node.advertise("odometry", Odometry, r2p.Sporadic(deadline=_ROUNDS * PERIOD))
     turned, readings = [0.0] * WHEELS, [0] * WHEELS
 
@@ -190,7 +201,7 @@ async def forward_kinematics(node: r2p.Node) -> None:
         x, y, w, rounds = x + dx, y + dy, w + dw, rounds + max(readings)
         turned[:], readings[:] = [0.0] * WHEELS, [0] * WHEELS
         if rounds >= _ROUNDS:
-            span = rounds * PERIOD
+            span = rounds * period.value
             odometry.publish_nowait(Odometry(pose, Velocity3(x / span, y / span, w / span)))
             x = y = w = 0.0
             rounds = 0
@@ -198,6 +209,7 @@ async def forward_kinematics(node: r2p.Node) -> None:
 
 async def battery_monitor(node: r2p.Node) -> None:
     """Estimate the charge (`battery`) from voltage and current (`power`); warn once when it is low."""
+    low = node.parameter("low_charge", 20, min=0, max=100, unit="%", doc="A lower charge of the battery is a warning")
     battery = node.advertise("battery", Battery, latch=True)
     current: float | None = None  # A, the mean of the last ten seconds or so
     warned = False
@@ -209,9 +221,9 @@ async def battery_monitor(node: r2p.Node) -> None:
         current = now if current is None else current + (now - current) / 20
         hours = BATTERY.capacity * charge / 100 / current if current > 0 else math.inf
         await battery.publish(Battery(reading.voltage, reading.current, charge, round(min(65535, hours * 60))))
-        if charge < _LOW and not warned:
+        if charge < low.value and not warned:
             node.log.warning("battery is down to %d %%: %.1f V", charge, reading.voltage / 1000)
-        warned = charge < _LOW
+        warned = charge < low.value
 
 
 async def square(

@@ -14,20 +14,16 @@ import pytest
 from r2p.msg import IMU, Battery, Encoder, Float32, IMURaw9, Led, Pressure, Proximity, Setpoint, Tilt
 from r2p.sim.modules.boards import (
     GatewayModule,
-    ImuModule,
-    InertialUnit,
     IoModule,
-    Motion,
     MotorConfig,
     MotorModule,
     Pins,
     Plant,
     PowerModule,
-    ProximityModule,
-    RangeArray,
     leds,
     sample,
 )
+from r2p.sim.modules.sensors import ImuModule, InertialUnit, Motion, ProximityModule, RangeArray
 from r2p.sim.physics.motor import Axle, Drive, Gains, LeadBattery, Motor, MotorSpec, speed_gains
 from r2p.sim.physics.world import NOTHING
 from tests.sim.physics.theory import step_response
@@ -84,7 +80,7 @@ async def test_names_topics_and_rates_by_default(r2p_network: Network) -> None:
         rates = {f"{name} {each.topic}": each.sent / 10 for name, node in nodes for each in node.publishers}
         needs = [f"{name} {each.topic}" for name, node in nodes for each in node.subscribers]
     imu = {"IMU1 imu": 100, "IMU1 imu_raw": 100, "IMU1 tilt": 100, "IMU1 pressure": 25}
-    others = {"MOTOR1 encoder": 50, "MOTOR1 current": 2, "PROX1 proximity": 20, "PS battery": 2}
+    others = {"MOTOR1 encoder": 50, "MOTOR1 current": 2, "PROX1 proximity": 20, "PS battery": 2, "PS power_event": 0}
     assert rates == pytest.approx(imu | others, rel=0.06)
     assert needs == ["MOTOR1 setpoint"]
     assert MotorConfig().timeout == 0.2
@@ -243,7 +239,7 @@ def test_the_rates_of_the_imu_are_without_the_gyroscopes_bias() -> None:
 async def test_the_imu_publishes_only_what_it_is_configured_for(r2p_network: Network) -> None:
     unit = InertialUnit(Motion, random.Random(2))
     async with ImuModule(unit=unit, topics=["tilt"], via=r2p_network.transport()) as module:
-        assert set(module.nodes) == {"tilt"}
+        assert set(module.nodes) == {"sensors", "tilt"}
 
 
 async def test_the_io_module_runs_what_it_is_given(r2p_network: Network) -> None:

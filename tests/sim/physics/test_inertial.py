@@ -11,6 +11,7 @@ from r2p.sim.physics.inertial import (
     BAROMETER_NOISE,
     GYROSCOPE,
     MAGNETOMETER,
+    AccelerometerRange,
     ComplementaryFilter,
     MemsSensor,
     MemsSpec,
@@ -61,6 +62,19 @@ def test_values_are_counts_of_the_resolution_within_the_full_scale() -> None:
     sensor = MemsSensor(spec, random.Random(5))
     sensor.step((999.6, -5000.0, 5000.0), DT)
     assert sensor.counts == (1000, -2000, 2000)
+
+
+def test_another_range_applies_from_the_next_sample_on() -> None:
+    sensor = MemsSensor(
+        MemsSpec(resolution=1.0, full_scale=2000.0, rate=500.0, density=0.0, bias=0.0), random.Random(5)
+    )
+    steps = [sensor.step((5000.0, 0.0, -30.0), DT) for _ in range(2)]
+    sensor.set_range(*AccelerometerRange["16g"].value)
+    assert steps == [False, True]
+    assert sensor.values == (2000.0, 0.0, -30.0)
+    sensor.step((5000.0, 0.0, -30.0), 2 * DT)
+    assert sensor.counts == (417, 0, -2)
+    assert sensor.values == (5004.0, 0.0, -24.0)
 
 
 def test_air_pressure_and_altitude_are_one_another() -> None:

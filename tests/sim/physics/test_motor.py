@@ -4,7 +4,17 @@ import math
 
 import pytest
 
-from r2p.sim.physics.motor import Axle, BatterySpec, Gains, LeadBattery, Motor, MotorSpec, Pid, speed_gains
+from r2p.sim.physics.motor import (
+    Axle,
+    BatterySpec,
+    Gains,
+    LeadBattery,
+    Motor,
+    MotorSpec,
+    Pid,
+    Threshold,
+    speed_gains,
+)
 from tests.sim.physics.theory import step_response
 
 DT = 1e-4
@@ -137,6 +147,54 @@ def test_reset_forgets() -> None:
     pid.step(1.0, 0.0, 1.0)
     pid.reset()
     assert pid.step(0.0, 5.0, 1.0) == -5.0  # the new error's own integral, no slope
+
+
+CHANGES = [Gains(3.0, 0.5), Gains(0.1, 20.0, 0.3), Gains(0.0, 0.5), Gains(1.0, 0.5, 0.1, limit=6.0)]
+
+
+@pytest.mark.parametrize("gains", CHANGES)
+def test_new_gains_do_not_make_the_output_jump(gains: Gains) -> None:
+    """In the middle of a transient: neither error nor slope nor integral is 0."""
+    pid = Pid(Gains(1.0, 2.0, 0.1))
+    pid.step(2.0, 0.0, 0.01)
+    before = pid.step(2.0, 0.5, 0.01)
+    pid.gains = gains
+    after = pid.step(2.0, 0.5 + 50e-6, 1e-6)  # at the same slope
+    assert after == pytest.approx(before, abs=1e-3)
+    assert -6.0 < before < -3.0
+
+
+def test_new_gains_of_a_saturated_controller_wind_nothing_up() -> None:
+    pid = Pid(Gains(1.0, 1.0, limit=5.0))
+    pid.step(100.0, 0.0, 0.01)
+    pid.gains = Gains(2.0, 1.0, limit=5.0)  # still saturated
+    assert pid.step(1.0, 0.0, 0.01) == pytest.approx(2.01)
+    pid.gains = Gains(0.0, 1.0, limit=1.5)
+    assert pid.step(0.0, 0.1, 0.01) < 1.5
+
+
+def test_without_an_integral_part_nothing_is_left_of_what_was_integrated() -> None:
+    pid = Pid(Gains(1.0, 10.0))
+    assert pid.step(2.0, 0.0, 0.1) == 4.0
+    pid.gains = Gains(3.0)
+    assert pid.step(2.0, 0.0, 0.1) == 6.0
+    assert pid.step(0.0, 0.0, 0.1) == 0.0
+
+
+def test_a_lower_limit_of_the_current_makes_less_torque() -> None:
+    load = axle()
+    load.motor.voltage, load.motor.current_limit = 24.0, 4.0
+    load.step(DT)
+    assert load.motor.current == 4.0
+    assert load.motor.speed == pytest.approx(4.0 * SMOOTH.constant / load.inertia * DT)
+
+
+def test_a_threshold_has_a_hysteresis_on_both_sides() -> None:
+    low, high = Threshold("below", 23.0, 0.5), Threshold("above", 23.0, 0.5)
+    values = [23.0, 22.9, 23.4, 23.5, 23.1, 22.5, 22.4]
+    assert [low.update(each) for each in values] == [False, True, False, True, False, True, False]
+    assert [high.update(each) for each in values] == [False, False, True, False, False, True, False]
+    assert (low.exceeded, high.exceeded) == (True, False)
 
 
 def test_a_battery_empties_with_the_charge_that_it_gives() -> None:

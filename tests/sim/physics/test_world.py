@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r2p.sim.physics.motor import Motor, MotorSpec
-from r2p.sim.physics.world import NOTHING, OmniBody, OmniSpec, RangeFinder, RangeSpec, World
+from r2p.sim.physics.world import NOTHING, OmniBody, OmniSpec, RangeCalibration, RangeFinder, RangeSpec, World
 
 SPEC = OmniSpec(wear=0.0)
 SMOOTH = MotorSpec(friction=0.0, damping=0.0)
@@ -106,6 +106,14 @@ def test_without_noise_the_correction_gives_the_distance_back(distance: int) -> 
     """As far as the A/D converter can tell: one count is less than a millimetre near by, more far away."""
     sensor = finder(noise=0.0)
     assert sensor.millimetres(sensor.read(distance)) == pytest.approx(distance, abs=2)
+
+
+def test_a_sensor_of_another_curve_is_right_once_it_is_calibrated() -> None:
+    sensor = finder(noise=0.0, scale=390.0, offset=40.0)
+    assert [sensor.millimetres(sensor.read(mm)) for mm in (150.0, 400.0)] == pytest.approx([118, 335], abs=2)
+    sensor.calibration = RangeCalibration(scale=390.0, offset=40.0, longest=300.0)
+    assert [sensor.millimetres(sensor.read(mm)) for mm in (150.0, 250.0)] == pytest.approx([150, 250], abs=2)
+    assert sensor.millimetres(sensor.read(400.0)) == NOTHING
 
 
 def test_the_curve_is_not_linear() -> None:

@@ -1,0 +1,254 @@
+"""The sensor modules of the thesis (7.4, 7.5), emulated: range finders and inertial measurement unit.
+
+They are boards as those of `r2p.sim.modules.boards`.
+"""
+
+import asyncio
+import functools
+import math
+import random
+from collections.abc import Callable, Iterable, Sequence
+
+import msgspec
+
+import r2p
+from r2p.msg import IMU, IMURaw9, Pressure, Proximity, Tilt
+from r2p.sim.modules.boards import Board, Via, paced, reopens
+from r2p.sim.physics.inertial import (
+    ACCELEROMETER,
+    BAROMETER_NOISE,
+    FILTER_BIAS_GAIN,
+    FILTER_GAIN,
+    GRAVITY,
+    GYROSCOPE,
+    MAGNETOMETER,
+    AccelerometerRange,
+    ComplementaryFilter,
+    GyroscopeRange,
+    MagnetometerRange,
+    MemsSensor,
+    Vector,
+    altitude_at,
+    pressure_at,
+)
+from r2p.sim.physics.world import RangeCalibration, RangeFinder, RangeSpec
+
+DistanceTo = Callable[[int], float]
+"""A function that returns the distance in mm to the object before sensor 0 to 3, or infinity."""
+
+_MDPS = math.degrees(1.0) * 1000  # mdps in one rad/s
+_MG = 1000 / GRAVITY  # mg in one m/s^2
+_BARO = 0.04  # seconds: the barometer makes 25 measurements a second
+_REACTION = 0.02  # s; a robot of 2 m/s drives 4 cm meanwhile
+
+
+class RangeArray:
+    """Four sensors of the same kind, and their inputs of the A/D converter."""
+
+    def __init__(
+        self, distance_to: DistanceTo, noise: random.Random, specs: Sequence[RangeSpec] = (RangeSpec(),) * 4
+    ) -> None:
+        """`specs`: the curve that each of the sensors really has."""
+        self.sensors = [RangeFinder(spec, noise) for spec in specs]
+        self._distance_to = distance_to
+
+    def read(self) -> Proximity:
+        """Read all four, corrected, in mm."""
+        one, two, three, four = (
+            sensor.millimetres(sensor.read(self._distance_to(number))) for number, sensor in enumerate(self.sensors)
+        )
+        return Proximity(ranges=(one, two, three, four))
+
+
+async def proximity(node: r2p.Node, sensors: RangeArray, topic: str, period: float) -> None:
+    """Publish the distances: event-triggered, because an obstacle needs an immediate reaction."""
+    calibrate(node, sensors)
+    each = node.parameter("period", period, min=0.04, max=0.25, unit="s", doc=f"Period of {topic}")
+    ranges = node.advertise(topic, Proximity, r2p.Sporadic(deadline=_REACTION))
+    async for _ in paced(node, each):
+        await ranges.publish(sensors.read())
+
+
+def calibrate(node: r2p.Node, sensors: RangeArray) -> None:
+    """Let the parameters of a node calibrate the four sensors."""
+    curve = RangeCalibration()
+
+    def change(_value: object) -> None:
+        for sensor, one, other in zip(sensors.sensors, scale.value, offset.value, strict=True):
+            sensor.calibration = RangeCalibration(scale=one, offset=other, longest=longest.value)
+
+    scale = node.parameter(
+        "scale",
+        (curve.scale,) * 4,
+        min=1.0,
+        max=10_000.0,
+        unit="V mm",
+        doc="For each sensor: its voltage is scale / (distance + offset)",
+        on_change=change,
+    )
+    offset = node.parameter(
+        "offset", (curve.offset,) * 4, min=0.0, max=1000.0, unit="mm", doc="See scale", on_change=change
+    )
+    longest = node.parameter(
+        "longest",
+        curve.longest,
+        min=1.0,
+        max=10_000.0,
+        unit="mm",
+        doc="Longest distance that the sensors measure: beyond it there is nothing",
+        on_change=change,
+    )
+    change(None)
+
+
+class ProximityModule(Board):
+    """The proximity module (thesis 7.5): four range finders, published in millimetres on `proximity`."""
+
+    def __init__(
+        self,
+        name: str = "PROX1",
+        *,
+        sensors: RangeArray,
+        topic: str = "proximity",
+        period: float = 0.05,
+        via: Via = None,
+        remap: dict[str, str] | None = None,
+    ) -> None:
+        """`period` in seconds: the sensors need 40 ms for a measurement."""
+        node = functools.partial(proximity, sensors=sensors, topic=topic, period=period)
+        super().__init__(name, via=via, remap=remap, nodes={"prox": node})
+
+
+class Motion(msgspec.Struct, frozen=True):
+    """The true values that the sensors measure, in the frame of the module (x forward, y to the left, z up)."""
+
+    force: Vector = (0.0, 0.0, GRAVITY)
+    """Specific force (acceleration minus gravity), upwards at rest, m/s^2."""
+    rates: Vector = (0.0, 0.0, 0.0)
+    """rad/s."""
+    field: Vector = (220.0, 0.0, -400.0)
+    """Magnetic field, mgauss; by default x points north."""
+    altitude: float = 120.0
+    """m."""
+
+
+class InertialUnit:
+    """The inertial sensors, which return counts at their own rates, and the filter; it is a part of a `Plant`."""
+
+    def __init__(self, motion: Callable[[], Motion], noise: random.Random) -> None:
+        self.attitude = ComplementaryFilter()
+        self._motion = motion
+        self.accelerometer = MemsSensor(ACCELEROMETER, noise)
+        self.gyroscope = MemsSensor(GYROSCOPE, noise)
+        self.magnetometer = MemsSensor(MAGNETOMETER, noise)
+        self._noise = noise
+
+    def step(self, dt: float) -> None:
+        """Advance by `dt` seconds; the filter advances at each sample of the gyroscope."""
+        motion = self._motion()
+        fx, fy, fz = motion.force
+        gx, gy, gz = motion.rates
+        self.accelerometer.step((fx * _MG, fy * _MG, fz * _MG), dt)
+        self.magnetometer.step(motion.field, dt)
+        if self.gyroscope.step((gx * _MDPS, gy * _MDPS, gz * _MDPS), dt) and self.magnetometer.samples:
+            self.attitude.step(self._rates(), self.accelerometer.values, self.magnetometer.values, 1 / GYROSCOPE.rate)
+
+    def imu(self) -> IMU:
+        """Return attitude and rates, filtered."""
+        roll, pitch, yaw = self.attitude.angles
+        x, y, z = (rate - bias for rate, bias in zip(self._rates(), self.attitude.bias, strict=True))
+        return IMU(roll=roll, pitch=pitch, yaw=yaw, roll_rate=x, pitch_rate=y, yaw_rate=z)
+
+    def raw(self) -> IMURaw9:
+        """Return the counts of the sensors."""
+        return IMURaw9(*self.accelerometer.counts, *self.gyroscope.counts, *self.magnetometer.counts)
+
+    def tilt(self) -> Tilt:
+        """Return the pitch, for a robot that balances on two wheels."""
+        return Tilt(angle=self.attitude.angles[1])
+
+    def pressure(self) -> Pressure:
+        """Return the air pressure, and its altitude."""
+        pressure = pressure_at(self._motion().altitude) + self._noise.gauss(0, BAROMETER_NOISE)
+        return Pressure(pressure=pressure, altitude=altitude_at(pressure))
+
+    def _rates(self) -> Vector:
+        x, y, z = self.gyroscope.values
+        return x / _MDPS, y / _MDPS, z / _MDPS
+
+
+async def readings(
+    node: r2p.Node, topic: str, type: type[r2p.Message], fill: Callable[[], r2p.Message], period: float
+) -> None:
+    """Publish readings, time-triggered."""
+    measure = reopens(lambda seconds: node.advertise(topic, type, r2p.Periodic(seconds, fill)))
+    each = node.parameter("period", period, min=0.0025, max=10.0, unit="s", doc=f"Period of {topic}", on_change=measure)
+    measure(each.value)
+    await asyncio.Event().wait()
+
+
+async def sensors(node: r2p.Node, unit: InertialUnit) -> None:
+    """Configure the sensors and the filter."""
+
+    def rescale(_value: object) -> None:
+        unit.accelerometer.set_range(*acc.value.value)
+        unit.gyroscope.set_range(*gyro.value.value)
+        unit.magnetometer.set_range(*mag.value.value)
+
+    def refilter(_value: float) -> None:
+        unit.attitude.gain, unit.attitude.bias_gain = gain.value, bias_gain.value
+
+    acc = node.parameter("acc_range", AccelerometerRange["2g"], doc="Range of the accelerometer", on_change=rescale)
+    gyro = node.parameter("gyro_range", GyroscopeRange["250dps"], doc="Range of the gyroscope", on_change=rescale)
+    mag = node.parameter("mag_range", MagnetometerRange["1.3gauss"], doc="Range of the magnetometer", on_change=rescale)
+    gain = node.parameter(
+        "filter_gain",
+        FILTER_GAIN,
+        min=0.0,
+        max=100.0,
+        unit="1/s",
+        doc="How fast gravity and magnetic field correct the attitude",
+        on_change=refilter,
+    )
+    bias_gain = node.parameter(
+        "filter_bias_gain",
+        FILTER_BIAS_GAIN,
+        min=0.0,
+        max=100.0,
+        unit="1/s^2",
+        doc="How fast they correct the bias of the gyroscope",
+        on_change=refilter,
+    )
+    rescale(None)
+    refilter(gain.value)
+    await asyncio.Event().wait()
+
+
+class ImuModule(Board):
+    """The inertial measurement unit (thesis 7.4): publishes `imu`, `imu_raw`, `tilt` and `pressure`.
+
+    `unit` is its hardware, which the caller steps in a `Plant`.
+    """
+
+    def __init__(
+        self,
+        name: str = "IMU1",
+        *,
+        unit: InertialUnit,
+        period: float = 0.01,
+        topics: Iterable[str] = ("imu", "imu_raw", "tilt", "pressure"),
+        via: Via = None,
+        remap: dict[str, str] | None = None,
+    ) -> None:
+        """`period` in seconds, of all topics but `pressure`, which has 25 Hz; `topics`: those to publish."""
+        streams: dict[str, tuple[type[r2p.Message], Callable[[], r2p.Message], float]] = {
+            "imu": (IMU, unit.imu, period),
+            "imu_raw": (IMURaw9, unit.raw, period),
+            "tilt": (Tilt, unit.tilt, period),
+            "pressure": (Pressure, unit.pressure, _BARO),
+        }
+        nodes: dict[str, r2p.NodeFunction] = {"sensors": functools.partial(sensors, unit=unit)}
+        for topic in topics:
+            message, fill, each = streams[topic]
+            nodes[topic] = functools.partial(readings, topic=topic, type=message, fill=fill, period=each)
+        super().__init__(name, via=via, remap=remap, nodes=nodes)
