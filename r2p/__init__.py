@@ -67,6 +67,7 @@ from r2p.modules.statistics import (
     TopicOnLink,
 )
 from r2p.modules.supervisor import NodeFunction, name_of
+from r2p.modules.swap import SwapLimits, SwapResult, TopicPause
 from r2p.parameters.definition import ParameterInfo
 from r2p.parameters.parameter import Parameter
 from r2p.parameters.registry import ModuleParameters
@@ -151,10 +152,13 @@ __all__ = [
     "SporadicPublisher",
     "Subscriber",
     "SubscriberStatistics",
+    "SwapLimits",
+    "SwapResult",
     "Tick",
     "Timestamp",
     "TooLong",
     "TopicOnLink",
+    "TopicPause",
     "TopicView",
     "TransportError",
     "TypeMismatch",

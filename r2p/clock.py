@@ -289,12 +289,20 @@ class Ticker:
         self._start = 0
         self._next = 1
 
-    def start(self) -> None:
-        """Start, or restart: the first tick is due one period from now."""
+    def start(self, phase: int | None = None) -> None:
+        """Start, or restart: the first tick is due one period from now, or as the next one of those whose `phase`
+        (monotonic ns) is given.
+        """
         self.close()
-        self._start = self._clock.monotonic()
-        self._next = 1
-        self._alarm.set(self._start + self._period)
+        now = self._clock.monotonic()
+        self._start = now if phase is None else phase
+        self._next = (now - self._start) // self._period + 1
+        self._alarm.set(self._start + self._next * self._period)
+
+    @property
+    def phase(self) -> int:
+        """The instant at which a tick was due last, or the start (monotonic ns)."""
+        return self._start + (self._next - 1) * self._period
 
     def close(self) -> None:
         """Stop the ticks; there are no more calls of the callback."""

@@ -26,8 +26,10 @@ from r2p.log_lines import LineLimit, get_logger
 from r2p.messages import Timestamp
 from r2p.modules.graph import NetworkView
 from r2p.modules.link_manager import LinkManager
+from r2p.modules.nodes import NodeTable
 from r2p.modules.statistics import ModuleStatistics, collect, encode
-from r2p.modules.supervisor import NodeFunction, Supervisor, check_function, name_of
+from r2p.modules.supervisor import NodeFunction, NodeOptions, Supervisor
+from r2p.modules.swap import SwapLimits, SwapResult
 from r2p.modules.watchdog import Watchdog, watch
 from r2p.msg import Log
 from r2p.names import (
@@ -38,7 +40,6 @@ from r2p.names import (
     module_name_from,
     module_path,
     node_alias,
-    node_name,
     topic_name,
 )
 from r2p.parameters.file import ParameterFile
@@ -54,9 +55,6 @@ from r2p.transports.url import open_transport
 from r2p.units import SECOND
 
 logger = get_logger("r2p.module")
-
-CLEANUP_WARNING_AFTER = 1.0
-"""Seconds after which the log names nodes that are still cleaning up."""
 
 LOG_RATE = 50
 """Records a second on the topic `log`, and records that may come at once: an eighth of a CAN bus of 1 Mbit/s."""
@@ -125,8 +123,7 @@ class Module:
         self._with_watchdog = watchdog
         self._bridge_options = BridgeOptions() if bridge is True else bridge or None
         self._allow_control = allow_control
-        self._supervisors: dict[str, Supervisor] = {}
-        self._crashes: dict[str, Exception] = {}
+        self._nodes = NodeTable(self.name, self._make_node, self.parameters.node_gone)
         self._events = EventHub()
         self._link_manager: LinkManager | None = None
         self._transports: list[asyncio.Task[None]] = []
@@ -155,14 +152,14 @@ class Module:
             allow_control=self._allow_control,
         )
         self._opened.own_services.serve(Operation.STATISTICS, lambda _argument: encode(self.statistics()))
-        self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
         self._watchdog: Watchdog | None = None
         self._tasks = asyncio.TaskGroup()
         await self._tasks.__aenter__()
         self._open = True
-        self._commands.tasks = self._opened.own_services.tasks = self._tasks
+        self._commands.tasks = self._nodes.tasks = self._opened.own_services.tasks = self._tasks
+        self._nodes.links = self._opened.links
         try:
             for via in self._via:
                 await self._open_transport(self._tasks, via)
@@ -182,7 +179,7 @@ class Module:
         """End the nodes, then the links. Raises NodeCrashed if nodes crashed; another error on its way gets a note of
         each crash.
         """
-        never_ran = [name for name, each in self._supervisors.items() if each.never_ran]
+        never_ran = [name for name, each in self.nodes.items() if each.never_ran]
         if self._tasks is not None:
             await self._close(self._tasks)
         if never_ran and error is None:
@@ -190,9 +187,9 @@ class Module:
             logger.warning(
                 "%s closed before %s ran: end its `async with` block with `await module.wait()`", them, names
             )
-        crashed = list(self._crashes.values())
+        crashed = list(self._nodes.crashes.values())
         if crashed and (error is None or isinstance(error, asyncio.CancelledError)):
-            nodes = f"node{'s'[: len(crashed) - 1]} {', '.join(self._crashes)}"
+            nodes = f"node{'s'[: len(crashed) - 1]} {', '.join(self._nodes.crashes)}"
             raise NodeCrashed(f"{nodes} of module {self.name} crashed", crashed)
         for crash in crashed:
             assert error is not None
@@ -214,7 +211,7 @@ class Module:
 
         `NetworkView.statistics` fetches those of other modules. Raises Closed before the module is opened.
         """
-        return collect(self._opened, self._supervisors)
+        return collect(self._opened, self._nodes.supervisors)
 
     @property
     def space(self) -> TopicSpace:
@@ -276,10 +273,11 @@ class Module:
             return
         self._open = False
         self._report_unused()
-        self._commands.tasks = None
+        self._commands.tasks = self._nodes.tasks = None
         self._opened.own_services.close()
         try:
-            await self._end_nodes()  # while the links are up: clean-up publishes what stops the motors
+            # While the links are up: clean-up publishes what stops the motors.
+            await self._nodes.end_all("the module was closed")
         finally:
             if self._log is not None:
                 self._log.close()
@@ -293,19 +291,8 @@ class Module:
                 self._opened.close()
                 if self._watchdog is not None:
                     self._watchdog.close()
-                self._changed.set()
+                self._nodes.changed.set()
                 self._events.close()
-
-    async def _end_nodes(self) -> None:
-        """Cancel all nodes, and wait until each has cleaned up."""
-        tasks = [task for each in self._supervisors.values() if (task := each.cancel()) is not None]
-        if not tasks:
-            return
-        _, pending = await asyncio.wait(tasks, timeout=CLEANUP_WARNING_AFTER)
-        if pending:
-            names = ", ".join(sorted(task.get_name() for task in pending))
-            logger.warning("module %s waits for the clean-up of %s", self.name, names)
-            await asyncio.wait(pending)
 
     # Nodes
 
@@ -327,42 +314,75 @@ class Module:
         coroutine function or does not take these arguments, or if the module is stopped; and Closed if the module is
         not open.
         """
-        tasks = self._running()
+        self._check_startable()
+        return self._nodes.start(function, args, name, NodeOptions(priority, _checked_remap(remap), restart))
+
+    def _check_startable(self) -> None:
+        self._running()
         if self.stopped:
             raise Error(f"module {self.name} is stopped: call its reboot() first")
-        check_function(function, *args)
-        name = node_name(name) if name is not None else name_of(function, *args)
-        if name in self._supervisors and self._supervisors[name].running:
-            raise Error(f"module {self.name} already has a node {name}: give this one another name=")
-        names = self._remap | _checked_remap(remap)
+
+    def _make_node(self, name: str, options: NodeOptions) -> Node:
         log = self._log.publish if self._log is not None else no_log
+        names = self._remap | options.remap
+        return Node(
+            name,
+            self.space,
+            priority=options.priority,
+            remap=names,
+            log=log,
+            events=self._events,
+            parameters=self.parameters,
+        )
 
-        def make_node() -> Node:
-            return Node(
-                name,
-                self.space,
-                priority=priority,
-                remap=names,
-                log=log,
-                events=self._events,
-                parameters=self.parameters,
-            )
+    async def swap(
+        self,
+        old: str,
+        function: NodeFunction,
+        *args: object,
+        name: str | None = None,
+        priority: int | None = None,
+        remap: dict[str, str] | None = None,
+        restart: bool | None = None,
+        limits: SwapLimits | None = None,
+    ) -> SwapResult:
+        """Let `function(node, *args)` take the place of a node that runs, and return the pause in what they publish.
 
-        supervisor = Supervisor(function, args, make_node, restart=restart)
-        self._supervisors[name] = supervisor
-        supervisor.start(tasks, self._node_ended)
-        return supervisor.node
+        The new node starts and subscribes while the old one goes on; what it publishes on topics of the old one is held
+        back. Then the old node ends, with `node.handing_over` set, and each publisher goes on where the old one's
+        ended: with the next sequence number, its latched value and, for a periodic one, its phase and its slots.
+        Services are handed over with the requests that wait. Name, priority, remappings and `restart` are the old
+        node's unless given.
+
+        Raises Error, and the old node goes on, if the new one crashes or returns, or does not publish and serve what
+        the old one does in time; other errors are those of `start`. STOP, REBOOT and the end of the module end both.
+        """
+        self._check_startable()
+        names = None if remap is None else _checked_remap(remap)
+        given = {"priority": priority, "remap": names, "restart": restart}
+        options = {key: value for key, value in given.items() if value is not None}
+        return await self._nodes.swap(old, function, args, name, limits or SwapLimits(), options)
+
+    async def stop_node(self, name: str) -> None:
+        """End one node, and wait for its end. Raises Error if there is none, and Closed if the module is not open."""
+        self._running()
+        await self._nodes.stop(name)
+
+    async def restart_node(self, name: str) -> Node:
+        """Start one node anew, after its end if it runs. Raises as `stop_node`, and Error for a stopped module."""
+        self._check_startable()
+        return await self._nodes.restart(name)
 
     @property
     def nodes(self) -> dict[str, Supervisor]:
         """Nodes by name, also those that have ended."""
-        return dict(self._supervisors)
+        return dict(self._nodes.supervisors)
 
     async def wait(self) -> None:
         """Wait until all nodes have ended by themselves (not by STOP: a stopped module waits for REBOOT)."""
-        while self._open and (self._held or any(each.running for each in self._supervisors.values())):
-            self._changed.clear()
-            await self._changed.wait()
+        while self._open and (self._held or self._nodes.running):
+            self._nodes.changed.clear()
+            await self._nodes.changed.wait()
 
     async def stop(self) -> None:
         """End all nodes, and wait for their end. Links stay up, and a flag of ALIVE informs other modules."""
@@ -370,27 +390,25 @@ class Module:
             self.stopped = True
             # Before the clean-up, which may take long: the module that sent STOP waits for this flag.
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
-            await self._end_nodes()
+            await self._nodes.end_all("the module was stopped")
 
     async def reboot(self) -> None:
         """End all nodes, wait for their end, and start them anew. Raises Closed if the module is not open."""
         tasks = self._running()
         # In a task of its own: if a node calls this, the reboot cancels its caller.
-        await asyncio.shield(tasks.create_task(self._reboot(tasks), name=f"{self.name} reboot"))
+        await asyncio.shield(tasks.create_task(self._reboot(), name=f"{self.name} reboot"))
 
-    async def _reboot(self, tasks: asyncio.TaskGroup) -> None:
+    async def _reboot(self) -> None:
         async with self._switching:
             # Stopped in between, so that others notice each reboot: FLAG_REBOOTED stays set after the first one.
             self._opened.set_flags(self._opened.flags | FLAG_STOPPED)
-            await self._end_nodes()
+            await self._nodes.end_all("the module was rebooted")
             await self._reload_parameters()
             if not self._open:
                 return
             self.stopped = False
             self.rebooted = True
-            for supervisor in self._supervisors.values():
-                if not supervisor.running:  # `start` may have been called meanwhile
-                    supervisor.start(tasks, self._node_ended)
+            self._nodes.start_all()
             self._opened.set_flags(FLAG_REBOOTED)
 
     async def _reload_parameters(self) -> None:
@@ -413,12 +431,6 @@ class Module:
     def _held(self) -> bool:
         """Return whether ended nodes will start again, or may."""
         return self.stopped or self._switching.locked()
-
-    def _node_ended(self, supervisor: Supervisor) -> None:
-        if supervisor.error is not None:
-            self._crashes[supervisor.node.name] = supervisor.error
-        self.parameters.node_gone(supervisor.node.name)
-        self._changed.set()
 
     # Network
 

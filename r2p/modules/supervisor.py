@@ -12,7 +12,10 @@ import functools
 import inspect
 import weakref
 from collections.abc import Awaitable, Callable, Coroutine
+from pathlib import Path
 from typing import Any, cast
+
+import msgspec
 
 from r2p.clock import Backoff, in_background, random_of
 from r2p.errors import Error, NameTooLong
@@ -78,6 +81,14 @@ def _not_a_coroutine_function(function: object) -> str:
     return f"{name or repr(function)} is not a coroutine function: write `async def {name or 'blink'}(node: r2p.Node)`"
 
 
+def describe_function(function: NodeFunction) -> str:
+    """Return a function's name, and the file or package it is from, as far as it says: `blink.py:blink`."""
+    bare: Any = function.func if isinstance(function, functools.partial) else function
+    code = getattr(bare, "__code__", None)
+    file = Path(code.co_filename).name if code is not None else getattr(bare, "__module__", "?")
+    return f"{file}:{getattr(bare, '__qualname__', type(bare).__name__)}"
+
+
 def name_of(function: NodeFunction, *args: object) -> str:
     """Return the default name of a function's node: the function's own name.
 
@@ -95,13 +106,28 @@ def name_of(function: NodeFunction, *args: object) -> str:
     return node_name(name)
 
 
+class NodeOptions(msgspec.Struct, frozen=True):
+    """The options of `Module.start`: `remap` renames topics, `restart` starts the node again after a crash."""
+
+    priority: int = 0
+    remap: dict[str, str] = {}
+    restart: bool = False
+
+
 class Supervisor:
-    """Runs one function as a node; with `restart` again after each crash."""
+    """Runs one function as a node; with the option `restart` again after each crash."""
 
     def __init__(
-        self, function: NodeFunction, args: tuple[object, ...], make_node: Callable[[], Node], *, restart: bool
+        self, function: NodeFunction, args: tuple[object, ...], make_node: Callable[[], Node], options: NodeOptions
     ) -> None:
         self.node = make_node()
+        self.options = options
+        self.source = describe_function(function)
+        """The function and where it is from, for users."""
+        self.started_at: float | None = None
+        """The start of this run (loop time)."""
+        self.on_trial = False
+        """True for a node that is to replace another one: a crash ends it until it has."""
         self.error: Exception | None = None
         """The exception that ended the node, if one did."""
         self.restarts = 0
@@ -109,7 +135,6 @@ class Supervisor:
         self._function = function
         self._args = args
         self._make_node = make_node
-        self._restart = restart
         self._task: asyncio.Task[None] | None = None
         self._attempt: _Attempt | None = None
         self._stopping = False
@@ -176,13 +201,13 @@ class Supervisor:
         loop = asyncio.get_running_loop()
         backoff = Backoff(random_of(loop), first=_FIRST_RESTART, longest=_LONGEST_RESTART)
         while True:
-            started = loop.time()
+            started = self.started_at = loop.time()
             error = await self._try()
             if error is None:
                 return
             explain_arguments(error)
             self.node.log.error("node %s crashed: %s: %s", self.node.name, type(error).__name__, error, exc_info=error)
-            if self._stopping or not self._restart:
+            if self._stopping or self.on_trial or not self.options.restart:
                 error.add_note(f"in node {self.node.name} of module {self.node.module}")
                 self.error = error
                 return

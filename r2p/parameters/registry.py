@@ -42,6 +42,8 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
         self._file = file
         self._parameters: dict[Name, Parameter[Any]] = {}
         self._changed_at: dict[Name, int] = {}
+        self._replaced: dict[Name, Parameter[Any]] = {}
+        """Those of a node that goes on if the one that is to replace it fails, whose parameters count meanwhile."""
         self._run_time: dict[Name, tuple[Plain, Origin]] = {}
         self._saved: dict[Name, object] = {}
         self._problems: dict[Name, str] = {}
@@ -90,6 +92,8 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
         parameter: Parameter[T] = Parameter(self, owner, definition, on_change)
         parameter.assign(value, origin)
         self._parameters[name] = parameter
+        if known is not None and not known.owner.closed:
+            self._replaced[name] = known
         self._touch([name])
         self.declared = self.revision
         return parameter
@@ -106,6 +110,11 @@ class ModuleParameters(Mapping[Name, Parameter[Any]]):
         for name in gone:
             del self._parameters[name]
             self._changed_at.pop(name, None)
+        for name in [name for name in self._replaced if name[0] == node]:
+            before = self._replaced.pop(name)
+            if not before.owner.closed:  # the node goes on
+                self._parameters[name] = before
+                self._touch([name])
         if gone:
             self._touch(())
             self.declared = self.revision

@@ -20,6 +20,7 @@ from r2p.parameters.registry import ModuleParameters
 from r2p.runtime.accepting import Accept, AcceptedTypes
 from r2p.runtime.events import EventHub, ModuleEvent
 from r2p.runtime.publishers import AnyPublisher, PeriodicPublisher, Publisher, SporadicPublisher
+from r2p.runtime.publishers.held import ReplacedNode, hold
 from r2p.runtime.qos import NonRealTime, Periodic, Sporadic, check_class
 from r2p.runtime.queues import QUEUE_BYTES, checkpoint
 from r2p.runtime.spin_reminder import SpinReminder
@@ -87,6 +88,10 @@ class Node:
         self.services: dict[ServiceServer[Any, Any] | ServiceClient[Any, Any], None] = {}
         """Open servers and clients of services, in order."""
         self.closed = False
+        self.replaced = ReplacedNode()
+        """The publishers and services of the node that this one replaces, in a swap."""
+        self.handing_over = False
+        """True while a swap ends the node: the one that replaces it goes on, so the motor need not be stopped."""
         self.crash_handler: Callable[[Exception], None] = self._log_crash
         """Handles an error outside the node's own task; set by its supervisor."""
         self.is_unwinding: Callable[[], bool] = lambda: False
@@ -154,6 +159,7 @@ class Node:
             self._space.release(where)
             raise
         where.publishers.append(publisher)
+        hold(publisher, self.replaced)
         for queue in where.queues:
             queue.publisher_joined()
         self.publishers[publisher] = None
@@ -498,7 +504,7 @@ class Node:
     ) -> ServiceServer[Any, Any]:
         self._check_service_links(definition)
         server = ServiceServer(self._space, self, definition, handler, limit)
-        server.open()
+        server.open(self.replaced.services)
         self.services[server] = None
         return server
 

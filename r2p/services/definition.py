@@ -72,6 +72,11 @@ class Definition(msgspec.Struct, Generic[Q, R], frozen=True):
     def response_topic(self) -> str:
         return self.name + RESPONSES
 
+    @property
+    def topics(self) -> tuple[tuple[str, Layout[Any]], ...]:
+        """The names of both topics, with their layouts."""
+        return (self.request_topic, self.requests), (self.response_topic, self.responses)
+
 
 def define(name: str, request: Any, response: Any = None) -> Definition[Any, Any]:
     """Return the definition of a service by two message classes, or one class with Request and Response.

@@ -12,7 +12,7 @@ import asyncio
 import inspect
 import logging
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from contextvars import ContextVar
 from typing import Any, Generic, TypeAlias
 
@@ -120,6 +120,9 @@ class ServiceServer(Generic[Q, R]):
         """Requests that came again, and were not handled again."""
         self.undecodable = 0
         """Messages that are not a request of this service."""
+        self.successor: ServiceServer[Any, Any] | None = None
+        """In a swap of nodes, the server that takes over when this one is closed."""
+        self._replaced: ServiceServer[Any, Any] | None = None  # the one that this one takes over from
         self._space = space
         self._node = node
         self._definition = definition
@@ -153,16 +156,29 @@ class ServiceServer(Generic[Q, R]):
         """The number of requests that wait for a handler to end."""
         return len(self._waiting)
 
-    def open(self) -> None:
-        """Announce the service. Raises TypeMismatch if it has other types, Error if the module serves it already."""
+    def open(self, replaced: Collection[str] = ()) -> None:
+        """Announce the service. Raises TypeMismatch if it has other types, Error if the module serves it already.
+
+        A server of a service in `replaced`, which are those of a node that this one's node replaces, goes on until it
+        is closed; then, or at `take_over`, this one serves.
+        """
         definition = self._definition
         topic = self._space.topics.get(definition.request_topic)
         other = None if topic is None else server_of(topic.queues)
+        if other is not None and self.name in replaced:
+            for name, layout in definition.topics:
+                self._space.open(name, layout)  # raises TypeMismatch, and adds nothing: the other server has them open
+            other.successor, self._replaced = self, other
+            return
         if other is not None:
             raise Error(
                 f"service {self.name} is already served by node {other.node_name} of module {self._space.module}: "
                 "close that one first, or choose another name"
             )
+        self._open_topics()
+
+    def _open_topics(self) -> None:
+        definition = self._definition
         # The answers first: who sees the requests' subscriber may call at once.
         self._outlet = Outlet(self._space, self._node, definition.response_topic, definition.responses)
         try:
@@ -171,18 +187,62 @@ class ServiceServer(Generic[Q, R]):
             self._outlet.close()
             raise
 
+    def take_over(self) -> None:
+        """Serve in place of the server that this one replaces: it ends the handlers that run, this one does the rest.
+
+        Requests that wait are handled here, and those that come again get the answer that they had, or wait for it.
+        """
+        other, self._replaced = self._replaced, None
+        if other is None:
+            return
+        other.successor = None
+        self._open, self._answers = other.memory
+        self._open_topics()
+        for handling in other.retire(self._outlet):
+            handling.server = self
+            self._start_or_wait(handling)
+
+    @property
+    def memory(self) -> tuple[dict[object, Handling], RememberedAnswers]:
+        """The requests that are open, and the answers that are remembered."""
+        return self._open, self._answers
+
+    def retire(self, outlet: Outlet | None) -> deque[Handling]:
+        """Answer by the outlet of the server that takes over from now on, and return the requests that wait."""
+        if outlet is not None and self._outlet is not None:
+            outlet.follow(self._outlet)
+            self._outlet.close()
+        self._inlet.close()
+        self._outlet = outlet
+        waiting, self._waiting = self._waiting, deque()
+        return waiting
+
+    @property
+    def busy(self) -> bool:
+        """True while handlers run, or requests wait for one."""
+        return bool(self._own())
+
     def stop(self, reason: str) -> list[asyncio.Task[None]]:
         """Accept nothing more and cancel all handlers; return the tasks of those that still clean up."""
         self._ending = self._ending or reason
-        for handling in [*reversed(self._waiting), *self._open.values()]:  # those that wait first: none may start
+        for handling in [*reversed(self._waiting), *self._own()]:  # those that wait first: none may start
             self.cancel(handling, reason)
-        return [handling.task for handling in self._open.values() if handling.task is not None]
+        return [handling.task for handling in self._own() if handling.task is not None]
+
+    def _own(self) -> list[Handling]:
+        """Return the open requests of this server: in a swap, two of them share the table."""
+        return [each for each in self._open.values() if each.server is self]
 
     def close(self) -> None:
         """End the service: requests that are being handled are answered with a ServiceError."""
+        if self.successor is not None:
+            self.successor.take_over()
+        if self._replaced is not None:
+            self._replaced.successor = None
+            self._replaced = None
         self.stop("its server was closed")
         self._inlet.close()
-        if self._outlet is not None:
+        if self._outlet is not None and self._outlet.node is self._node:
             self._outlet.close()
         self._node.forget(self)
 
@@ -288,6 +348,9 @@ class ServiceServer(Generic[Q, R]):
             self._refuse(handling)
             return
         self._open[handling.key] = handling
+        self._start_or_wait(handling)
+
+    def _start_or_wait(self, handling: Handling) -> None:
         if self._running < self.limit:
             self._start(handling)
         else:

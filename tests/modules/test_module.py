@@ -14,7 +14,7 @@ import pytest
 
 import r2p
 from r2p.codecs.management import ROLE_PUBLISHES
-from r2p.modules.module import CLEANUP_WARNING_AFTER
+from r2p.modules.nodes import CLEANUP_WARNING_AFTER
 from r2p.msg import Encoder, Led, Log, Odometry
 from r2p.protocols.discovery.events import Mismatched, NameConflict, TopicType
 from r2p.runtime.events import EVENTS

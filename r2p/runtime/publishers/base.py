@@ -9,7 +9,7 @@ All go through `_report`: at most one line of the log a second, and the callback
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Generic, NoReturn, TypeVar
 
 from msgspec import structs
@@ -62,6 +62,16 @@ class BasePublisher(Generic[M, C]):
         """Messages that did not reach every subscriber in time."""
         self.late = 0
         """Messages that were published or sent after their time."""
+        self.hand_over: Callable[[], Callable[[], None] | None] | None = None
+        """Lets the publisher that replaces this one go on here, and returns what then sends the messages that it held
+        back. Set in a swap of the node (`held`), as the next two.
+        """
+        self.abandon: Callable[[], None] | None = None
+        """Called if a publisher is closed that is held back."""
+        self.held_back = 0
+        """Calls of `publish()` that are held back."""
+        self.first_at = 0
+        """The instant of the first message in place of another publisher (monotonic ns); 0: none yet."""
         self._class = klass
         self._on_missed = klass.on_missed
         self._on_late: Signal | None = klass.on_late
@@ -135,11 +145,56 @@ class BasePublisher(Generic[M, C]):
     def close(self) -> None:
         """Stop publishing; the links inform their peers."""
         if self in self._topic.publishers:
+            # Before this one is gone: else the links would announce that the topic is not published any more.
+            release = self.hand_over() if self.hand_over is not None else self.abandon
             self._topic.publishers.remove(self)
             self._encode = self._closed  # so that publish() does not have to look each time
             self._space.release(self._topic)
             self.node.forget(self)
             self._subscriber_came.emit()
+            if release is not None:
+                release()
+
+    @property
+    def source(self) -> Source:
+        """The source of its messages."""
+        return self._source
+
+    @property
+    def latched(self) -> Sample | None:
+        """The message for subscribers that join later."""
+        return self._last
+
+    @property
+    def is_open(self) -> bool:
+        """True until the publisher is closed."""
+        return self in self._topic.publishers
+
+    def check(self, message: M) -> None:
+        """Raise MessageError for a message that does not fit the type."""
+        if message.__class__ is not self.type:
+            raise self._wrong_type(message)
+        self._encode(message)
+
+    def follow(self, other: "BasePublisher[Any, Any]") -> None:
+        """Go on where another publisher of the topic ends: with its next number, and the value that it latches."""
+        self.sent = other.sent
+        if other.source == self._source:
+            self._source = other.source  # the same object: what waits in a full queue keeps its order by it
+        if self.latch and self._last is None:
+            self._last = other.latched
+        self._note_first()
+
+    def _note_first(self) -> None:
+        encode = self._encode
+
+        def encode_first(message: M) -> bytes:
+            data = encode(message)
+            self._encode = encode
+            self.first_at = self._clock.monotonic()
+            return data
+
+        self._encode = encode_first
 
     def _closed(self, message: M) -> NoReturn:
         raise self._is_closed()

@@ -80,7 +80,8 @@ class Publisher(BasePublisher[M, NonRealTime]):
             await delivery.over
         finally:
             timer.cancel()
-            if without := delivery.drop_remaining(CANCELLED):  # only if this task was cancelled
+            # Only if this task was cancelled: then the message is lost, unless another node takes over meanwhile.
+            if self.hand_over is None and (without := delivery.drop_remaining(CANCELLED)):
                 self._miss(sample.sequence, CANCELLED, without)
             if delivery.failed:
                 self._miss(sample.sequence, delivery.reason, delivery.failed)

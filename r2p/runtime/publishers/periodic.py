@@ -11,7 +11,7 @@ Reports of a miss, all by `_miss` or `_report` of the base:
     link_degraded        a link, or its slots, are lost (`on_degraded`)
 """
 
-from typing import Generic
+from typing import Any, Generic
 
 from r2p.clock import Ticker
 from r2p.errors import MessageError
@@ -52,6 +52,10 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
         """Periods that passed without a message because the event loop was blocked."""
         self.lead = klass.lead
         """Seconds before a slot at which `fill` is called."""
+        self.due = 0
+        """The instant for which the last message was made (monotonic ns); 0: none yet."""
+        self.first_due = 0
+        """... and the first one."""
         self._slot_link: object = None
         self._pending: _PeriodDelivery[M] | None = None
         self._ticker = Ticker(space.loop, round(klass.period * SECOND), self.tick, background=True)
@@ -63,6 +67,27 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
     def silence(self) -> None:
         """Stop the clock for good: the node ends."""
         self._ticker.close()
+
+    def follow(self, other: BasePublisher[Any, Any]) -> None:
+        """Go on where another publisher ends, on its phase."""
+        super().follow(other)
+        if not isinstance(other, PeriodicPublisher):
+            self._ticker.start()
+            return
+        self._ticker.start(other.phase)
+        self._pending = other.release_pending()
+        if self._pending is not None:
+            self._pending.publisher = self
+
+    @property
+    def phase(self) -> int:
+        """An instant at which a message was due, or would have been (monotonic ns)."""
+        return self.due or self._ticker.phase
+
+    def release_pending(self) -> "_PeriodDelivery[Any] | None":
+        """Return the message that waits for links, for another publisher to wait on."""
+        pending, self._pending = self._pending, None
+        return pending
 
     def close(self) -> None:
         self._ticker.close()
@@ -108,6 +133,8 @@ class PeriodicPublisher(BasePublisher[M, Periodic[M]], SlotPublisher):
             self.close()
             self.node.crash(error)
             return None
+        self.due = scheduled
+        self.first_due = self.first_due or scheduled
         blocked = self._topic.deliver(sample, None, self._slot_link)
         if blocked is not None:
             self._deliver_later(sample, blocked)

@@ -1,6 +1,6 @@
 """Sporadic: never waits; a message that is not in every queue and on every link by its deadline is missed."""
 
-from typing import Generic
+from typing import Any, Generic
 
 from r2p.clock import Alarm
 from r2p.messages import Layout
@@ -60,6 +60,20 @@ class SporadicPublisher(BasePublisher[M, Sporadic]):
         while self._pending:
             self._give_up(self._pending[0], "publisher closed")
         self._alarm.close()
+
+    def follow(self, other: BasePublisher[Any, Any]) -> None:
+        """Go on where another publisher ends, also with the events that wait for room."""
+        super().follow(other)
+        if isinstance(other, SporadicPublisher):
+            self._pending = [*other.release_pending(), *self._pending]
+            for event in self._pending:
+                event.publisher = self
+            self._arm()
+
+    def release_pending(self) -> "list[_EventDelivery[Any]]":
+        """Return the events that wait for room, for another publisher to wait on."""
+        pending, self._pending = self._pending, []
+        return pending
 
     def _deliver_later(self, sample: Sample, blocked: list[Sink], lifetime: int) -> None:
         """Let the sample wait for room for `lifetime` (ns); what is behind links that are down misses it."""

@@ -42,7 +42,7 @@ _SENT = (Fate.SENT, Fate.UNKNOWN)
 
 class SlottedTopic(msgspec.Struct, eq=False):
     """A periodic topic and its slots. `period` and `phase` are in slots (0: none granted), `interval` in ns. `size`:
-    bytes of its messages on the bus, at most.
+    bytes of its messages on the bus, at most. `requested`: the period and the lead of the request, in ns.
 
     `is_clock`: these slots are the publisher's clock; `clock_elsewhere`: those of another link are. `sent` and `missed`
     count messages since the grant; `earliest` and `latest` are when they ended, in ns from the start of their first
@@ -53,6 +53,7 @@ class SlottedTopic(msgspec.Struct, eq=False):
     publisher: SlotPublisher
     high: int
     size: int
+    requested: tuple[int, int]
     period: int = 0
     phase: int = 0
     interval: int = 0
@@ -118,12 +119,23 @@ class SlottedTopics:
         """
         publisher = next(iter(topic.slot_publishers), None)
         known = self.by_topic.get(topic.name)
+        wanted = None if publisher is None or high is None else _request(topic, publisher, high)
         if known is not None and (known.publisher, known.high) != (publisher, high):
-            self._release(known)  # slots belong to a message id, and are as long as the publisher's messages
-            known = None
-        if known is None and publisher is not None and high is not None:
-            size = rtcan.size_on_bus(publisher.size, varies=publisher.varies)
-            self._reserve(SlottedTopic(topic, publisher, high, size))
+            if wanted is not None and _alike(known, wanted):
+                self._pass_on(known, wanted.publisher)
+            else:
+                self._release(known)  # slots belong to a message id, and are as long as the publisher's messages
+                known = None
+        if known is None and wanted is not None:
+            self._reserve(wanted)
+
+    def _pass_on(self, known: SlottedTopic, publisher: SlotPublisher) -> None:
+        """Let another publisher go on in the same slots."""
+        known.publisher.use_own_clock(self._link)
+        known.publisher = publisher
+        if known.is_clock:
+            known.is_clock = publisher.use_slot_clock(self._link, known.interval / SECOND)
+            known.clock_elsewhere = not known.is_clock
 
     async def wait_for_change(self) -> None:
         self._changed.clear()  # tasks that wait already were woken by `set`
@@ -204,9 +216,8 @@ class SlottedTopics:
 
     def _reserve(self, each: SlottedTopic) -> None:
         self.by_topic[each.topic.name] = self._by_high[each.high] = each
-        publisher, engine, now = each.publisher, self._driver.engine, self._driver.now()
-        interval, lead = round(publisher.period * SECOND), round(publisher.lead * SECOND)
-        varies = publisher.varies
+        engine, now, varies = self._driver.engine, self._driver.now(), each.publisher.varies
+        interval, lead = each.requested
         self._driver.carry_out(
             engine.reserve(now, each.high, each.size, interval, lead=lead, varies=varies, handle=each)
         )
@@ -222,6 +233,18 @@ class SlottedTopics:
         if each.is_clock:
             each.is_clock = False
             each.publisher.use_own_clock(self._link)
+
+
+def _request(topic: Topic, publisher: SlotPublisher, high: int) -> SlottedTopic:
+    size = rtcan.size_on_bus(publisher.size, varies=publisher.varies)
+    requested = round(publisher.period * SECOND), round(publisher.lead * SECOND)
+    return SlottedTopic(topic, publisher, high, size, requested)
+
+
+def _alike(one: SlottedTopic, other: SlottedTopic) -> bool:
+    """Return whether two publishers request the same slots for messages of the same kind."""
+    same = (one.high, one.size, one.requested) == (other.high, other.size, other.requested)
+    return same and one.publisher.varies == other.publisher.varies
 
 
 # All other messages
