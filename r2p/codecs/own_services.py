@@ -55,6 +55,12 @@ class Operation(enum.IntEnum):
 
     SCHEMA = 1
     STATISTICS = 2
+    PARAMETERS = 3
+    PARAMETER_CHANGES = 4
+    PARAMETER_STAGE = 128
+    PARAMETER_COMMIT = 129
+    PARAMETER_SAVE = 130
+    PARAMETER_RESET = 131
 
     @property
     def changes(self) -> bool:

@@ -4,15 +4,19 @@ r2p modules announce all of it at once. Firmware announces its name and its topi
 not the nodes that they belong to. The `age` of a view says how old the knowledge is.
 """
 
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+import contextlib
+import functools
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import msgspec
 
+from r2p.clock import check_seconds
 from r2p.codecs.management import FLAG_BOOT, FLAG_REBOOTED, FLAG_STOPPED, ROLE_PUBLISHES, WIRE_VERSION
 from r2p.codecs.own_services import WIRE_MIN, Operation
-from r2p.errors import DecodeError, Error
+from r2p.errors import DecodeError, Error, ParameterError
 from r2p.messages import Layout, Message
+from r2p.modules import parameter_services
 from r2p.modules.link_manager import LinkManager
 from r2p.modules.statistics import ModuleStatistics, decode
 from r2p.modules.type_lookup import find_type
@@ -132,7 +136,7 @@ class NetworkView:
         module, or it can't answer, ServiceError with the text of its own error, and TimeoutError if it does not answer:
         whether it has changed what it was to change is then unknown.
         """
-        view = min((each for each in self.modules() if each.name == module), key=lambda each: each.age, default=None)
+        view = self._view(module)
         if view is None:
             raise Error(f"there is no module {module} on the network")
         if view.instance is None:
@@ -162,39 +166,71 @@ class NetworkView:
     async def parameters(self, module: str, node: str | None = None) -> list[ParameterInfo]:
         """Fetch the parameters of a module, this one or any r2p module on the network; of one node or all.
 
-        Raises Error if there is no such module or node, or it can't answer, and TimeoutError if it does not.
+        Raises ParameterError for an unknown node, Error if there is no such module or it can't answer, and TimeoutError
+        if it does not.
         """
-        raise NotImplementedError
+        return await parameter_services.fetch(self._asker(module), module, node)
 
     async def set_parameters(self, module: str, values: Mapping[tuple[str, str], object]) -> None:
         """Set parameters of a module, one or several, by (node, name): all or nothing.
 
-        An int converts to a float, and the name of a member to an enum. Raises ParameterError for a value that does not
-        fit: then nothing has changed. Raises Error if there is no such module, or it refuses changes, and TimeoutError
-        if it does not answer.
+        An int converts to a float, and the name of a member to an enum. Raises ParameterError with the reason of the
+        module that refuses the values or any change: then nothing has changed. Raises Error if there is no such module,
+        it can't answer, or it has restarted meanwhile; and TimeoutError if it does not answer, and whether it has set
+        them is unknown.
         """
-        raise NotImplementedError
+        with self._explains_restarts(module):
+            await parameter_services.change(self._asker(module), module, values)
 
     async def save_parameters(self, module: str) -> int:
         """Have a module save what was set to its file; return how many values the file has for it.
 
-        Raises as `set_parameters`, and ParameterError if it has no file or can't write it.
+        Raises as `set_parameters`; also ParameterError if the module has no file, or can't write it.
         """
-        raise NotImplementedError
+        with self._explains_restarts(module):
+            return await parameter_services.save(self._asker(module))
 
     async def reset_parameters(self, module: str, node: str | None = None, names: Iterable[str] | None = None) -> int:
         """Undo what was set and saved, as `ModuleParameters.reset`: of a module, a node, or some of its parameters.
 
         Return how many parameters were reset. Raises as `set_parameters`.
         """
-        raise NotImplementedError
+        with self._explains_restarts(module):
+            return await parameter_services.reset(self._asker(module), module, node, names)
 
     def watch_parameters(self, module: str, *, period: float = 0.5) -> AsyncIterator[ParameterInfo]:
-        """Iterate over the changes of a module's parameters, from this call on: each as it is now.
+        """Iterate over the changes of a module's parameters, from the first step on: each parameter as it is then.
 
-        The module is asked each `period` seconds. Raises Error, when iterated, if there is no such module.
+        The module is asked each `period` seconds, also after it was silent or has restarted. Raises MessageError for a
+        period that is not a number of seconds, 0.001 or more; and when iterated, Error if there is no such module, and
+        TimeoutError if it does not answer at the beginning.
         """
-        raise NotImplementedError
+        check_seconds("the period of watch_parameters()", period, least=0.001)
+        return parameter_services.watch(self._asker(module), lambda: self._instance_of(module), module, period)
+
+    def _asker(self, module: str) -> parameter_services.Ask:
+        firmware = "its parameters are bytes in its flash, see `r2p param --help`"
+        return functools.partial(self.ask, module, what="parameters", firmware=firmware)
+
+    @contextlib.contextmanager
+    def _explains_restarts(self, module: str) -> Iterator[None]:
+        """Raise Error if the module has restarted meanwhile, instead of an error that this has caused."""
+        before = self._instance_of(module)
+        try:
+            yield
+        except (ParameterError, TimeoutError) as error:
+            now = self._instance_of(module)
+            if now is None or before is None or now == before:
+                raise
+            text = f"module {module} has restarted meanwhile, and has the values of its start: do it again"
+            raise Error(text) from error
+
+    def _instance_of(self, module: str) -> int | None:
+        view = self._view(module)
+        return None if view is None else view.instance
+
+    def _view(self, module: str) -> ModuleView | None:
+        return min((each for each in self.modules() if each.name == module), key=lambda each: each.age, default=None)
 
 
 def _module_view(link: Link, info: ModuleInfo, now: int) -> ModuleView:

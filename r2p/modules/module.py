@@ -27,6 +27,7 @@ from r2p.messages import Timestamp
 from r2p.modules.graph import NetworkView
 from r2p.modules.link_manager import LinkManager
 from r2p.modules.nodes import NodeTable
+from r2p.modules.parameter_services import ParameterServices
 from r2p.modules.statistics import ModuleStatistics, collect, encode
 from r2p.modules.supervisor import NodeFunction, NodeOptions, Supervisor
 from r2p.modules.swap import SwapLimits, SwapResult
@@ -152,6 +153,8 @@ class Module:
             allow_control=self._allow_control,
         )
         self._opened.own_services.serve(Operation.STATISTICS, lambda _argument: encode(self.statistics()))
+        ParameterServices(self.parameters, self._opened.own_services, clock, self._opened.random)
+        self._changed = asyncio.Event()
         self._switching = asyncio.Lock()
         self._log = None if self.observer else LogTopic(self.space, self._remap)
         self._watchdog: Watchdog | None = None

@@ -9,14 +9,13 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from r2p.codecs.parameters import ParameterKind, ParameterRecord, Plain
 from r2p.errors import ParameterError
 from r2p.names import parameter_name
 from r2p.parameters.values import (
     CHOICE_MAX,
     CHOICES_MAX,
     NUMBERS_MAX,
-    ParameterKind,
-    Plain,
     check_text,
     convert,
     kind_of,
@@ -41,32 +40,18 @@ One that takes a second argument also gets the values that all parameters of the
 _NUMBERS = (ParameterKind.INT, ParameterKind.FLOAT, ParameterKind.INTS, ParameterKind.FLOATS)
 
 
-class ParameterInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """A parameter of a module, as another module or a tool sees it: `NetworkView.parameters`.
+class ParameterInfo(ParameterRecord, frozen=True, kw_only=True):
+    """A parameter of a module, as other modules and tools see it: `NetworkView.parameters`.
 
     `kind` is "bool", "int", "float", "str", "enum", "ints" or "floats"; a value of an enum is its name, and `choices`
     are all of them. `origin` says where the value comes from: "code", "saved file", "r2p.toml", "--params", "--param",
-    "params=", "run time" (set over the network or by another node), or "program" (set by its own node).
+    "params=", "run time" (set over the network, or by another node) or "program" (set by its own node).
 
     `saved` is what the module's file has for it; None: nothing. `problem` says why that is not used, if it does not
     fit.
     """
 
     module: str
-    node: str
-    name: str
-    kind: str
-    value: Plain
-    default: Plain
-    minimum: float | None = None
-    maximum: float | None = None
-    unit: str = ""
-    doc: str = ""
-    read_only: bool = False
-    choices: tuple[str, ...] = ()
-    origin: str = "code"
-    saved: Plain | None = None
-    problem: str = ""
 
     @property
     def full_name(self) -> str:

@@ -21,9 +21,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from r2p.codecs.parameters import Name, Plain
 from r2p.errors import ParameterError
-from r2p.parameters.sources import TABLE, Name, flatten, read_tables, read_toml
-from r2p.parameters.values import Plain
+from r2p.parameters.sources import TABLE, flatten, read_tables, read_toml
 
 T = TypeVar("T")
 

@@ -8,9 +8,9 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from typing import TYPE_CHECKING, Any, Generic, Protocol, Self, TypeVar
 
+from r2p.codecs.parameters import Origin, Plain
 from r2p.parameters.definition import ParameterDefinition, ParameterInfo
-from r2p.parameters.sources import Origin
-from r2p.parameters.values import Plain, plain
+from r2p.parameters.values import plain
 from r2p.runtime.queues import EndpointOwner
 
 T = TypeVar("T")

@@ -10,12 +10,13 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Final, TypeVar, cast
 
+from r2p.codecs.parameters import Name, Origin, Plain
 from r2p.errors import Closed, ParameterError
 from r2p.parameters.definition import ParameterDefinition, ParameterInfo
 from r2p.parameters.file import ParameterFile
 from r2p.parameters.parameter import Parameter, ParameterOwner
-from r2p.parameters.sources import Name, Origin, ParameterSource
-from r2p.parameters.values import Plain, plain
+from r2p.parameters.sources import ParameterSource
+from r2p.parameters.values import plain
 
 T = TypeVar("T")
 

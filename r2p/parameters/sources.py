@@ -4,51 +4,18 @@ From the weakest to the strongest: the code, the saved file, `[params.MODULE.nod
 `--param kp=0.7`, and what was set at run time.
 """
 
-import enum
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from r2p.codecs.parameters import Name, Origin
 from r2p.errors import InvalidName, ParameterError
 from r2p.names import module_name, node_name, parameter_name
 
 TABLE = "params"
 """The table of files: `[params.MODULE.node]`."""
-
-Name = tuple[str, str]
-"""The names of a node and of its parameter."""
-
-
-class Origin(enum.IntEnum):
-    """Where a value comes from, with the numbers of the wire (PROTOCOL.md 9); a greater one wins."""
-
-    CODE = 0
-    SAVED = 1
-    CONFIG = 2
-    FILE = 3
-    OPTION = 4
-    ARGUMENT = 5
-    RUN_TIME = 6
-    PROGRAM = 7
-
-    @property
-    def text(self) -> str:
-        """The origin as users read it."""
-        return _TEXTS[self]
-
-
-_TEXTS = {
-    Origin.CODE: "code",
-    Origin.SAVED: "saved file",
-    Origin.CONFIG: "r2p.toml",
-    Origin.FILE: "--params",
-    Origin.OPTION: "--param",
-    Origin.ARGUMENT: "params=",
-    Origin.RUN_TIME: "run time",
-    Origin.PROGRAM: "program",
-}
 
 
 class ParameterSource(msgspec.Struct, eq=False):

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from r2p.codecs.parameters import ParameterKind, Plain
 from r2p.errors import ParameterError
 
 TEXT_MAX = 128
@@ -21,26 +22,6 @@ CHOICE_MAX = 64
 
 _INT_MIN, _INT_MAX = -(1 << 63), (1 << 63) - 1
 _SHOWN_MAX = 40  # characters of a value that an error shows
-
-Plain = bool | int | float | str | tuple[int, ...] | tuple[float, ...]
-"""A value outside of its node."""
-
-
-class ParameterKind(enum.IntEnum):
-    """The kinds of parameters, with their numbers on the wire (PROTOCOL.md 9)."""
-
-    BOOL = 1
-    INT = 2
-    FLOAT = 3
-    STR = 4
-    ENUM = 5
-    INTS = 6
-    FLOATS = 7
-
-    @property
-    def text(self) -> str:
-        """The kind as users read it: "bool", "int", "float", "str", "enum", "ints", "floats"."""
-        return self.name.lower()
 
 
 def kind_of(default: object) -> ParameterKind:
@@ -90,6 +71,11 @@ def convert(kind: ParameterKind, value: object, *, like: Any) -> Any:
 def plain(value: Any) -> Plain:
     """Return a value as it is outside of its node."""
     return value.name if isinstance(value, enum.Enum) else value
+
+
+def outside(value: object) -> Any:
+    """Return a value as another module can send it: a member of an enum as its name, a list as a tuple."""
+    return tuple(value) if isinstance(value, list) else plain(value)
 
 
 def parse(kind: ParameterKind, text: str) -> object:

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import r2p
+from r2p.codecs.parameters import ParameterKind
 from r2p.parameters.definition import ParameterDefinition, define_parameter
-from r2p.parameters.values import ParameterKind
 
 
 class Mode(enum.Enum):

@@ -1,0 +1,218 @@
+"""The parameters of a module for other modules, over r2p's own services (PROTOCOL.md 9).
+
+`ParameterServices` answers. The functions ask; `r2p.modules.graph` offers them as methods of `NetworkView`. What is set
+together is sent as one stage, in as many requests as it takes, and then committed: the module checks all of it before
+any value counts.
+"""
+
+import asyncio
+import random
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+
+import msgspec
+
+from r2p.clock import Clock
+from r2p.codecs import parameters as codec
+from r2p.codecs.own_services import PAGE_MAX, Operation
+from r2p.codecs.parameters import Name, ParameterList
+from r2p.errors import DecodeError, Error, MessageError, ParameterError, ServiceError
+from r2p.log_lines import get_logger
+from r2p.modules.own_services import OwnServices
+from r2p.parameters.definition import ParameterInfo, refused
+from r2p.parameters.registry import RESET, ModuleParameters
+from r2p.parameters.values import outside
+from r2p.units import SECOND
+
+logger = get_logger("r2p.module")
+
+STAGES_MAX = 16
+"""Stages that a module keeps at once."""
+STAGE_MAX = 1 << 16
+"""Bytes of a stage."""
+STAGE_AGE = 30 * SECOND
+"""Ns after which a stage that nothing was added to is forgotten."""
+
+_NUMBERS = 1 << 32  # of stages; 0 asks for a new one
+_PART_MAX = PAGE_MAX - len(codec.encode_part(0, 0))
+
+
+class _Stage(msgspec.Struct, eq=False):
+    """What was sent of a set so far, and when it came (monotonic ns)."""
+
+    data: bytearray
+    touched: int
+
+
+class ParameterServices:
+    """Answers what other modules ask of a module's parameters."""
+
+    def __init__(
+        self, parameters: ModuleParameters, services: OwnServices, clock: Clock, numbers: random.Random
+    ) -> None:
+        self._parameters = parameters
+        self._clock = clock
+        self._random = numbers
+        self._stages: dict[int, _Stage] = {}
+        services.serve(Operation.PARAMETERS, self._list)
+        services.serve(Operation.PARAMETER_CHANGES, self._list_changes)
+        services.serve(Operation.PARAMETER_STAGE, self._stage)
+        services.serve(Operation.PARAMETER_COMMIT, self._commit)
+        services.serve(Operation.PARAMETER_SAVE, self._save)
+        services.serve(Operation.PARAMETER_RESET, self._reset)
+
+    def _list(self, argument: bytes) -> bytes:
+        node = argument.decode(errors="replace") or None
+        return codec.encode_list(ParameterList(self._parameters.revision, True, [*self._parameters.infos(node)]))
+
+    def _list_changes(self, argument: bytes) -> bytes:
+        revision, parameters = codec.decode_count(argument), self._parameters
+        whole = revision < parameters.declared or revision > parameters.revision
+        infos = parameters.infos() if whole else parameters.changed_since(revision)
+        return codec.encode_list(ParameterList(parameters.revision, whole, [*infos]))
+
+    def _stage(self, argument: bytes) -> bytes:
+        number, offset, data = codec.decode_part(argument)
+        self._forget_old()
+        if not number:
+            if len(self._stages) >= STAGES_MAX:
+                raise ParameterError(f"{len(self._stages)} sets are on their way already: try again later")
+            number = self._new_number()
+            self._stages[number] = _Stage(bytearray(), 0)
+        stage = self._find(number)
+        if offset != len(stage.data):
+            raise ParameterError(f"a part of the set is missing: it has {len(stage.data)} bytes, not {offset}")
+        if offset + len(data) > STAGE_MAX:
+            del self._stages[number]
+            raise ParameterError(f"a set of more than {STAGE_MAX} bytes: set fewer parameters at once")
+        stage.data += data
+        stage.touched = self._clock.monotonic()
+        return codec.encode_count(number)
+
+    def _commit(self, argument: bytes) -> bytes:
+        number, size, _ = codec.decode_part(argument)
+        self._forget_old()
+        stage = self._find(number)
+        del self._stages[number]
+        if size != len(stage.data):
+            raise ParameterError(f"a part of the set is missing: it has {len(stage.data)} bytes, not {size}")
+        changes = codec.decode_changes(bytes(stage.data))
+        self._parameters.apply({name: RESET if value is None else value for name, value in changes.items()})
+        return codec.encode_count(self._parameters.revision)
+
+    async def _save(self, _argument: bytes) -> bytes:
+        return codec.encode_count(await self._parameters.save())
+
+    def _reset(self, argument: bytes) -> bytes:
+        node = codec.decode_text(argument) if argument else ""
+        return codec.encode_count(self._parameters.reset(node or None))
+
+    def _find(self, number: int) -> _Stage:
+        stage = self._stages.get(number)
+        if stage is None:
+            raise ParameterError("the module knows nothing of this set any more: set it again")
+        return stage
+
+    def _forget_old(self) -> None:
+        oldest = self._clock.monotonic() - STAGE_AGE
+        self._stages = {number: stage for number, stage in self._stages.items() if stage.touched >= oldest}
+
+    def _new_number(self) -> int:
+        while True:
+            number = self._random.randrange(1, _NUMBERS)
+            if number not in self._stages:
+                return number
+
+
+# The asking side
+
+Ask = Callable[[Operation, bytes], Awaitable[bytes]]
+"""Asks one module for an operation, with an argument. `NetworkView.ask` says what it raises."""
+
+
+async def fetch(ask: Ask, module: str, node: str | None) -> list[ParameterInfo]:
+    """Return the parameters of a module. Raises ParameterError with the module's text, and Error for other answers."""
+    return _infos(module, _decoded(module, await _asked(ask, Operation.PARAMETERS, (node or "").encode())))
+
+
+async def change(ask: Ask, module: str, values: Mapping[Name, object]) -> None:
+    """Set (None: reset) parameters of a module, all or nothing. Raises ParameterError for what it refuses."""
+    data = codec.encode_changes({})
+    for name, value in values.items():
+        try:
+            data += codec.encode_changes({name: outside(value)})
+        except MessageError as error:
+            raise refused(f"{module}/{'.'.join(name)}", value, str(error)) from None
+    stage = 0
+    for offset in range(0, len(data), _PART_MAX):
+        part = codec.encode_part(stage, offset, data[offset : offset + _PART_MAX])
+        stage = codec.decode_count(await _asked(ask, Operation.PARAMETER_STAGE, part))
+    if stage:
+        await _asked(ask, Operation.PARAMETER_COMMIT, codec.encode_part(stage, len(data)))
+
+
+async def save(ask: Ask) -> int:
+    """Have a module save its parameters. Raises ParameterError with its text."""
+    return codec.decode_count(await _asked(ask, Operation.PARAMETER_SAVE, b""))
+
+
+async def reset(ask: Ask, module: str, node: str | None, names: Iterable[str] | None) -> int:
+    """Reset parameters of a module; return how many. Raises ParameterError with its text."""
+    if names is None:
+        argument = b"" if node is None else codec.encode_text(node)
+        return codec.decode_count(await _asked(ask, Operation.PARAMETER_RESET, argument))
+    if node is None:
+        raise ParameterError("reset with names= needs their node=, too")
+    chosen = dict.fromkeys((node, name) for name in names)
+    await change(ask, module, chosen)
+    return len(chosen)
+
+
+async def watch(
+    ask: Ask, instance: Callable[[], int | None], module: str, period: float
+) -> AsyncIterator[ParameterInfo]:
+    """Yield the parameters of a module that change, each as it is then; `instance` is that of the module now.
+
+    Where the module does not answer, it is asked again; one that has restarted is asked for all of its parameters.
+    """
+    asked = instance()
+    listed = _decoded(module, await _asked(ask, Operation.PARAMETERS, b""))
+    known = {(each.node, each.name): each for each in _infos(module, listed)}
+    silent = False
+    while True:
+        await asyncio.sleep(period)
+        now = instance()
+        restarted = now != asked
+        operation = Operation.PARAMETERS if restarted else Operation.PARAMETER_CHANGES
+        try:
+            listed = _decoded(module, await ask(operation, b"" if restarted else codec.encode_count(listed.revision)))
+        except (Error, TimeoutError) as error:
+            if not silent:
+                logger.warning("the parameters of %s can't be watched now: %s; trying again", module, error)
+            silent = True
+            continue
+        silent, asked = False, now
+        infos = _infos(module, listed)
+        fresh = {(each.node, each.name): each for each in infos}
+        changed = [each for name, each in fresh.items() if known.get(name) != each]
+        known = fresh if listed.whole else known | fresh
+        for each in changed:
+            yield each
+
+
+async def _asked(ask: Ask, operation: Operation, argument: bytes) -> bytes:
+    """Ask, and turn the module's own error into that of a parameter."""
+    try:
+        return await ask(operation, argument)
+    except ServiceError as error:
+        raise ParameterError(str(error)) from None
+
+
+def _decoded(module: str, content: bytes) -> ParameterList:
+    try:
+        return codec.decode_list(content)
+    except DecodeError as error:
+        raise Error(f"the answer of {module} is not what this version of r2p can read: {error}") from error
+
+
+def _infos(module: str, listed: ParameterList) -> list[ParameterInfo]:
+    return [ParameterInfo(module=module, **msgspec.structs.asdict(each)) for each in listed.records]
