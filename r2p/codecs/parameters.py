@@ -102,7 +102,7 @@ class ParameterList(msgspec.Struct, frozen=True):
     records: list[ParameterRecord]
 
 
-class _Reader:
+class _ValueReader:
     """Reads values from bytes. Its methods raise DecodeError where there are too few."""
 
     def __init__(self, data: bytes) -> None:
@@ -187,14 +187,14 @@ def decode_list(data: bytes) -> ParameterList:
 
     Raises DecodeError.
     """
-    reader = _Reader(data)
+    reader = _ValueReader(data)
     version, revision, whole = reader.unpack(_LIST)
     if version != VERSION:
         raise DecodeError(f"a list of parameters of version {version}")
     records = []
     while reader.left:
         size, flags, origin = reader.unpack(_RECORD)
-        records.append(_decode_record(_Reader(reader.bytes(size)), flags, origin))
+        records.append(_decode_record(_ValueReader(reader.bytes(size)), flags, origin))
     return ParameterList(revision, whole == 1, records)
 
 
@@ -221,7 +221,7 @@ def _encode_record(record: ParameterRecord) -> bytes:
     return _RECORD.pack(len(body), record.read_only * _READ_ONLY, _ORIGINS.index(record.origin)) + body
 
 
-def _decode_record(reader: _Reader, flags: int, origin: int) -> ParameterRecord:
+def _decode_record(reader: _ValueReader, flags: int, origin: int) -> ParameterRecord:
     node, name, kind = reader.text(), reader.text(), reader.kind()
     default, value = reader.value(), reader.value()
     if default is None or value is None:
@@ -253,7 +253,7 @@ def encode_changes(changes: Mapping[Name, Plain | None]) -> bytes:
 
 def decode_changes(data: bytes) -> dict[Name, Plain | None]:
     """Decode what a set stages. Raises DecodeError, also for a parameter that is in it twice."""
-    reader = _Reader(data)
+    reader = _ValueReader(data)
     changes: dict[Name, Plain | None] = {}
     while reader.left:
         name = reader.text(), reader.text()
@@ -270,7 +270,7 @@ def encode_part(stage: int, offset: int, data: bytes = b"") -> bytes:
 
 def decode_part(argument: bytes) -> tuple[int, int, bytes]:
     """Decode an argument of PARAMETER_STAGE or PARAMETER_COMMIT. Raises DecodeError."""
-    reader = _Reader(argument)
+    reader = _ValueReader(argument)
     stage, offset = reader.unpack(_PART)
     return stage, offset, reader.bytes(reader.left)
 
@@ -282,7 +282,7 @@ def encode_count(count: int) -> bytes:
 
 def decode_count(data: bytes) -> int:
     """Decode a number. Raises DecodeError; what later versions add is left out."""
-    return _Reader(data).unpack(_COUNT)[0]
+    return _ValueReader(data).unpack(_COUNT)[0]
 
 
 def encode_text(text: str) -> bytes:
@@ -296,7 +296,7 @@ def encode_text(text: str) -> bytes:
 
 def decode_text(data: bytes) -> str:
     """Decode a text. Raises DecodeError; what later versions add is left out."""
-    return _Reader(data).text()
+    return _ValueReader(data).text()
 
 
 def encode_value(value: Plain | None, kind: ParameterKind | None = None) -> bytes:

@@ -36,7 +36,7 @@ _NUMBERS = 1 << 32  # of stages; 0 asks for a new one
 _PART_MAX = PAGE_MAX - len(codec.encode_part(0, 0))
 
 
-class _Stage(msgspec.Struct, eq=False):
+class _StagedSet(msgspec.Struct, eq=False):
     """What was sent of a set so far, and when it came (monotonic ns)."""
 
     data: bytearray
@@ -52,7 +52,7 @@ class ParameterServices:
         self._parameters = parameters
         self._clock = clock
         self._random = numbers
-        self._stages: dict[int, _Stage] = {}
+        self._stages: dict[int, _StagedSet] = {}
         services.serve(Operation.PARAMETERS, self._list)
         services.serve(Operation.PARAMETER_CHANGES, self._list_changes)
         services.serve(Operation.PARAMETER_STAGE, self._stage)
@@ -77,7 +77,7 @@ class ParameterServices:
             if len(self._stages) >= STAGES_MAX:
                 raise ParameterError(f"{len(self._stages)} sets are on their way already: try again later")
             number = self._new_number()
-            self._stages[number] = _Stage(bytearray(), 0)
+            self._stages[number] = _StagedSet(bytearray(), 0)
         stage = self._find(number)
         if offset != len(stage.data):
             raise ParameterError(f"a part of the set is missing: it has {len(stage.data)} bytes, not {offset}")
@@ -106,7 +106,7 @@ class ParameterServices:
         node = codec.decode_text(argument) if argument else ""
         return codec.encode_count(self._parameters.reset(node or None))
 
-    def _find(self, number: int) -> _Stage:
+    def _find(self, number: int) -> _StagedSet:
         stage = self._stages.get(number)
         if stage is None:
             raise ParameterError("the module knows nothing of this set any more: set it again")
