@@ -62,7 +62,7 @@ class RoutingTable:
 
     def port_changed(self, port: BridgePort) -> None:
         """Review the topics of a link that is new, or gone, or has another place in the tree, and announce there the
-        topics of other links.
+        topics of other links and of this module.
         """
         there = {topic for name in port.demand.topics() if (topic := self._to_canonical(name, port))}
         self._review_all(there | self._idle)
@@ -75,6 +75,9 @@ class RoutingTable:
             else:
                 relayed.remove(port.name)
             self._announce_on(topic, port)
+        for own in list(self._space.topics.values()):
+            if not own.unused and self._to_canonical(own.name, port) not in self.by_name:
+                port.link.stats.lost.guard(port.link.topic_changed, own)
 
     def check_types(self) -> None:
         """Check whether types or sizes differ from the announced ones."""

@@ -67,6 +67,15 @@ async def test_more_clients_than_ports() -> None:
         assert len(gw.links) == 301
 
 
+async def test_topics_of_the_gateway_itself_are_announced_to_clients_that_come_later() -> None:
+    client = Client()
+    async with r2p.Module("GW", via=["memory:a", client], bridge=True) as gw, node_in(gw, name="own") as own:
+        own.advertise("leds", Led)
+        await asyncio.sleep(CONVERGED)
+        announced = [each.management for each in client.said if each.topic == "R2P"]
+        assert "leds" in [each.topic for each in announced if isinstance(each, management.Advertise)]
+
+
 class Visitors(Client):
     """Clients that come one after the other, each on a link with a name of its own."""
 
